@@ -1,0 +1,121 @@
+"""The sensor's settings by name: type, allowed values, start-up default, meaning.
+
+One table for the command line, the configuration file, the control channel and the ROS parameters. Which
+object of the sensor holds a setting is the server's business (`ethercat_server.objects`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from protocol.errors import SettingError
+
+SettingValue = bool | int
+
+
+class Setting(NamedTuple):
+    """One setting. `choices` is what it may be; bool settings have none."""
+
+    name: str
+    default: SettingValue
+    """What the server sets at start-up unless told otherwise: the note's Listing V.1."""
+    choices: range | tuple[int, ...] | None
+    meaning: str
+    preop_only: bool
+    """The device takes it in the state PREOP only."""
+
+    @property
+    def is_bool(self) -> bool:
+        """Whether the setting is on or off."""
+        return isinstance(self.default, bool)
+
+    def check(self, value: object) -> SettingValue:
+        """Return `value` if the setting can have it, else raise SettingError with the choices."""
+        if self.is_bool:
+            if isinstance(value, bool):
+                return value
+            raise SettingError(f"{self.name} is {value!r}: it must be true or false")
+        if isinstance(value, bool) or not isinstance(value, int) or value not in (self.choices or ()):
+            raise SettingError(f"{self.name} is {value!r}: it must be {self._choices_text()}")
+        return value
+
+    def parse(self, text: str) -> SettingValue:
+        """The value that `text` on a command line means; SettingError if none."""
+        if self.is_bool:
+            word = text.strip().lower()
+            if word in {"true", "yes", "on", "1"}:
+                return True
+            if word in {"false", "no", "off", "0"}:
+                return False
+            raise SettingError(f"{self.name} is {text!r}: it must be true or false")
+        try:
+            return self.check(int(text, 0))
+        except ValueError:
+            raise SettingError(f"{self.name} is {text!r}: it must be {self._choices_text()}") from None
+
+    def _choices_text(self) -> str:
+        if isinstance(self.choices, range):
+            return f"a whole number from {self.choices[0]} to {self.choices[-1]}"
+        return "one of " + ", ".join(str(choice) for choice in self.choices or ())
+
+
+SETTINGS: Final[Mapping[str, Setting]] = {
+    row.name: row
+    for row in (
+        Setting("calibration_matrix", True, None, "give N and Nm instead of raw counts", False),
+        Setting("temperature_compensation", False, None, "correct the force/torque for temperature", False),
+        Setting("imu_active", 1, range(0, 4), "IMU: 0 none, 1 internal, 2 external, 3 both", False),
+        Setting("coordinate_system", False, None, "use the configured coordinate system", False),
+        Setting(
+            "inertia_compensation", False, None, "the sensor's own inertia and gravity compensation", False
+        ),
+        Setting("orientation_estimation", False, None, "the sensor estimates its orientation", False),
+        Setting("acceleration_range_g", 2, (2, 4, 8, 16), "accelerometer full scale, g", True),
+        Setting("angular_rate_range_dps", 250, (250, 500, 1000, 2000), "gyroscope full scale, °/s", True),
+        Setting("acceleration_filter", 1, range(1, 9), "accelerometer filter profile (Table III.6)", True),
+        Setting("angular_rate_filter", 3, range(3, 10), "gyroscope filter profile (Table III.5)", True),
+        # The sensor takes more lengths than the table has; which ones depends on the other filters.
+        Setting(
+            "sinc_length", 64, range(32, 2049), "SINC filter length; sampling rate = 51200 / length", True
+        ),
+        Setting("fir", False, None, "FIR filter: lower cut-off, more delay", True),
+        Setting("fast", False, None, "FAST filter: switches the FIR filter off on steps; needs fir", True),
+        Setting("chop", False, None, "CHOP filter: less drift, unpredictable latency", True),
+    )
+}
+
+BASE_SAMPLING_RATE_HZ: Final = 51200
+"""The ADC's rate: sampling rate = 51200 / SINC length."""
+
+PUBLISHED_RATES_HZ: Final[Mapping[int, int]] = {
+    32: 1600, 51: 1003, 64: 800, 128: 400, 205: 250, 256: 200, 341: 150,
+}  # fmt: skip
+"""SINC length to the rate in object 0x8011, as Table III.4 has it (51 is rounded down, 205 up)."""
+
+
+def sampling_rate_hz(sinc_length: int) -> int:
+    """The rate in whole Hz that object 0x8011 gives for a SINC length."""
+    return PUBLISHED_RATES_HZ.get(sinc_length, round(BASE_SAMPLING_RATE_HZ / sinc_length))
+
+
+def check_settings(values: Mapping[str, object]) -> dict[str, SettingValue]:
+    """Return `values` if every name exists and every value is allowed; else raise SettingError."""
+    checked: dict[str, SettingValue] = {}
+    for name, value in values.items():
+        setting = SETTINGS.get(name)
+        if setting is None:
+            raise SettingError(f"no setting {name!r}: the settings are " + ", ".join(SETTINGS))
+        checked[name] = setting.check(value)
+    return checked
+
+
+def check_combination(values: Mapping[str, SettingValue]) -> None:
+    """Raise SettingError if settings that are each allowed contradict one another."""
+    if values.get("fast") and values.get("fir") is False:
+        raise SettingError("fast is true but fir is false: the FAST filter works only with the FIR filter on")
+
+
+def start_up_defaults() -> dict[str, SettingValue]:
+    """The settings that the server writes at start-up unless told otherwise."""
+    return {row.name: row.default for row in SETTINGS.values()}
