@@ -3,7 +3,7 @@
 ProtocolError
 +-- PdoSizeError          process data of a size no sensor has
 +-- RemoteProtocolError   the peer broke the framing: answer it, then close the connection
-|   +-- BareJsonError     one bad line on a bare JSON connection: answer it and carry on
++-- BadMessageError       one message was no JSON object: answer it and carry on
 +-- RequestError          one request cannot be granted: answer it and carry on
 +-- SettingError          a setting's name or value is wrong
 """
@@ -30,8 +30,8 @@ class RemoteProtocolError(ProtocolError):
     """The peer sent bytes that are not this protocol; nothing after them can be trusted."""
 
 
-class BareJsonError(RemoteProtocolError):
-    """One line of a bare JSON connection was wrong; the next line starts afresh."""
+class BadMessageError(ProtocolError):
+    """One message was not a JSON object; the framing is intact and the next message can be read."""
 
 
 class RequestError(ProtocolError):

@@ -1,0 +1,192 @@
+"""Control messages: the actions, what each may carry, error codes, events, and how replies are built.
+
+One table, `ACTIONS`, says what a request may carry; `parse_request` checks a request against it before any
+code acts on it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from enum import StrEnum
+from typing import Any, Final, NamedTuple
+
+from protocol.errors import RequestError
+from protocol.framing import JsonObject
+
+PROTOCOL_VERSION: Final = 1
+
+
+class ErrorCode(StrEnum):
+    """The `code` of an error reply."""
+
+    BAD_REQUEST = "bad_request"
+    UNKNOWN_ACTION = "unknown_action"
+    DENIED = "denied"
+    BUSY = "busy"
+    NOT_READY = "not_ready"
+    SENSOR = "sensor"
+    """The sensor refused: an SDO abort, with `abort_code`."""
+    INTERNAL = "internal"
+
+
+class Event(StrEnum):
+    """What the server tells framed connections without being asked."""
+
+    SENSOR_LOST = "sensor_lost"
+    SENSOR_BACK = "sensor_back"
+    RECONFIGURED = "reconfigured"
+    SHUTTING_DOWN = "shutting_down"
+
+
+Check = Callable[[object], Any]
+"""Returns the checked value, or raises ValueError whose text says what it must be."""
+
+
+class Parameter(NamedTuple):
+    """One key that a request may carry."""
+
+    check: Check
+    default: Any = None
+    required: bool = False
+
+
+class Action(NamedTuple):
+    """One action: the keys it takes beside `action` and `id`."""
+
+    parameters: Mapping[str, Parameter]
+    controls: bool = False
+    """Changes something, so only those with authority may ask for it."""
+    framed_only: bool = False
+    """Makes sense only on a framed connection."""
+
+
+class Request(NamedTuple):
+    """A checked request. `values` holds every key of the action, defaults filled in."""
+
+    action: str
+    id: object
+    has_id: bool
+    values: Mapping[str, Any]
+
+
+def _is_int(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def whole_number(low: int, high: int) -> Check:
+    """A check for a whole number from `low` to `high`."""
+
+    def check(value: object) -> int:
+        if isinstance(value, int) and _is_int(value) and low <= value <= high:
+            return value
+        raise ValueError(f"a whole number from {low} to {high}")
+
+    return check
+
+
+def _boolean(value: object) -> bool:
+    if isinstance(value, bool):
+        return value
+    raise ValueError("true or false")
+
+
+def _sensor_list(value: object) -> tuple[int, ...]:
+    if isinstance(value, list) and value and all(_is_int(item) and 0 <= item <= 255 for item in value):
+        return tuple(value)
+    raise ValueError("a list of sensors' places on the bus, such as [0]")
+
+
+def six_numbers(value: object) -> tuple[float, ...]:
+    """A check for six finite numbers: a wrench."""
+    if isinstance(value, list) and len(value) == 6:
+        numbers = [v for v in value if isinstance(v, int | float) and not isinstance(v, bool)]
+        if len(numbers) == 6 and all(math.isfinite(v) for v in numbers):
+            return tuple(float(v) for v in numbers)
+    raise ValueError("a list of six finite numbers")
+
+
+ACTIONS: Final[Mapping[str, Action]] = {
+    "describe": Action({}),
+    "subscribe": Action(
+        {
+            "sensors": Parameter(_sensor_list),
+            "every": Parameter(whole_number(1, 1_000_000), default=1),
+            "fresh_only": Parameter(_boolean, default=True),
+        },
+        framed_only=True,
+    ),
+    "unsubscribe": Action({}, framed_only=True),
+    "status": Action({}),
+    "shutdown": Action({}, controls=True),
+}
+
+
+def parse_request(message: JsonObject) -> Request:
+    """Check a request against its action's table.
+
+    RequestError carries `bad_request`, naming the key that is wrong, or `unknown_action`.
+    """
+    name = message.get("action")
+    if name is None:
+        raise RequestError(ErrorCode.BAD_REQUEST, "the key 'action' is missing: say what to do")
+    if not isinstance(name, str):
+        raise RequestError(ErrorCode.BAD_REQUEST, "the key 'action' must be a string")
+    action = ACTIONS.get(name)
+    if action is None:
+        known = ", ".join(ACTIONS)
+        raise RequestError(ErrorCode.UNKNOWN_ACTION, f"no action {_short(name)}: the actions are {known}")
+    for key in message:
+        if key not in action.parameters and key not in {"action", "id"}:
+            known = ", ".join(("id", *action.parameters))
+            raise RequestError(
+                ErrorCode.BAD_REQUEST, f"{name} takes no key {_short(key)}: it takes {known}"
+            )  # fmt: skip
+    values: dict[str, Any] = {}
+    for key, parameter in action.parameters.items():
+        if key not in message:
+            if parameter.required:
+                raise RequestError(ErrorCode.BAD_REQUEST, f"{name} needs the key {key!r}")
+            values[key] = parameter.default
+            continue
+        try:
+            values[key] = parameter.check(message[key])
+        except ValueError as error:
+            raise RequestError(ErrorCode.BAD_REQUEST, f"the key {key!r} must be {error}") from None
+    return Request(name, message.get("id"), "id" in message, values)
+
+
+def _short(text: str) -> str:
+    return repr(text if len(text) <= 40 else text[:37] + "...")
+
+
+def request(action: str, id: object = None, **values: object) -> JsonObject:  # noqa: A002 - the wire's name
+    """A request to send; `id` is left out if None."""
+    message: JsonObject = {"action": action}
+    if id is not None:
+        message["id"] = id
+    message.update(values)
+    return message
+
+
+def reply(message: Request, **values: object) -> JsonObject:
+    """The reply that grants `message`."""
+    head: JsonObject = {"reply": message.action}
+    if message.has_id:
+        head["id"] = message.id
+    return {**head, "ok": True, **values}
+
+
+def error_reply(message: JsonObject | None, code: str, text: str, **extra: object) -> JsonObject:
+    """The reply that refuses `message`, which may be anything or None if it could not be read at all."""
+    message = message or {}
+    action = message.get("action")
+    head: JsonObject = {"reply": action if isinstance(action, str) else None}
+    if "id" in message:
+        head["id"] = message["id"]
+    return {**head, "ok": False, "error": {"code": str(code), "message": text, **extra}}
+
+
+def event(name: Event, **values: object) -> JsonObject:
+    """An event to send."""
+    return {"event": str(name), **values}

@@ -1,0 +1,329 @@
+"""Framing, without sockets: bytes in, messages out, and back.
+
+The rules it keeps:
+
+- A framed message is `length` u32 big-endian, `type` u8, body; length counts type and body.
+- Hostile lengths are refused as soon as the length is there: nothing is buffered for them.
+- RemoteProtocolError is final: the decoder raises it again on every later call.
+- BadMessageError concerns one message: it has been consumed, and the next call goes on after it.
+- On a bare JSON connection a message ends with its closing brace or with a newline, whichever is first,
+  so a client that sends no newline is understood and a broken line costs only itself.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from collections.abc import Iterator
+from enum import IntEnum, IntFlag
+from typing import Any, Final, NamedTuple, NoReturn
+
+from protocol.errors import BadMessageError, RemoteProtocolError
+from protocol.pdo import LAYOUTS
+
+MAX_JSON_LENGTH: Final = 65536
+"""Longest JSON text, bytes, that either side accepts in one message."""
+MAX_JSON_DEPTH: Final = 32
+BARE_JSON_FIRST_BYTE: Final = b"{"
+"""A connection that starts with this byte is a bare JSON connection."""
+
+JsonObject = dict[str, Any]
+
+
+class MessageType(IntEnum):
+    """The `type` byte."""
+
+    DATA = 1
+    JSON = 2
+
+
+class DataFlag(IntFlag):
+    """The `flags` byte of a DATA message."""
+
+    REPEATED = 1
+    """Same process data as the frame before: the sensor had nothing new."""
+    INVALID = 2
+    """Working counter short; the process data is the last good one."""
+    GAP = 4
+    """Samples of this sensor were lost, or withheld from this client, since its previous frame."""
+
+
+class DataMessage(NamedTuple):
+    """One DATA message. Its fields are the wire's, in the wire's order."""
+
+    sequence: int
+    stamp_ns: int
+    monotonic_ns: int
+    sensor: int
+    flags: int
+    wkc: int
+    process_data: bytes
+
+
+_LENGTH: Final = struct.Struct(">I")
+_PREFIX: Final = struct.Struct(">IB")
+_DATA_HEADER: Final = struct.Struct(">QQQBBH")
+_DATA_MESSAGE: Final = struct.Struct(">IBQQQBBH")
+_TYPE_SIZE: Final = 1
+_BODY_OFFSET: Final = _PREFIX.size
+DATA_FLAGS_OFFSET: Final = _PREFIX.size + struct.calcsize(">QQQB")
+"""Where the flags byte stands in an encoded DATA message."""
+_DATA_LENGTHS: Final = frozenset(_TYPE_SIZE + _DATA_HEADER.size + size for size in LAYOUTS)
+MAX_DATA_MESSAGE_SIZE: Final = _LENGTH.size + max(_DATA_LENGTHS)
+
+
+def encode_data(
+    sequence: int, stamp_ns: int, monotonic_ns: int, sensor: int, flags: int, wkc: int, process_data: bytes
+) -> bytes:
+    """A whole DATA message, ready to send. struct.error if a number does not fit its field."""
+    length = _TYPE_SIZE + _DATA_HEADER.size + len(process_data)
+    return (
+        _DATA_MESSAGE.pack(
+            length, MessageType.DATA, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc
+        )
+        + process_data
+    )  # fmt: skip
+
+
+def encode_json_text(message: JsonObject) -> bytes:
+    """Compact JSON text. ValueError for NaN and infinities, which JSON has none of."""
+    return json.dumps(message, separators=(",", ":"), allow_nan=False).encode("ascii")
+
+
+def encode_json(message: JsonObject) -> bytes:
+    """A whole JSON message for a framed connection."""
+    text = encode_json_text(message)
+    return _PREFIX.pack(_TYPE_SIZE + len(text), MessageType.JSON) + text
+
+
+def encode_bare_json(message: JsonObject) -> bytes:
+    """A whole message for a bare JSON connection: one line."""
+    return encode_json_text(message) + b"\n"
+
+
+def parse_json_object(text: bytes) -> JsonObject:
+    """The JSON object in `text`; BadMessageError if it is anything else."""
+    try:
+        decoded = text.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise BadMessageError(f"the message is not UTF-8: {error.reason} at byte {error.start}") from None
+    try:
+        value = json.loads(decoded, parse_constant=_no_constant)
+    except RecursionError:
+        raise BadMessageError("the message is nested too deeply") from None
+    except ValueError as error:
+        raise BadMessageError(f"the message is not valid JSON: {error}") from None
+    if not isinstance(value, dict):
+        raise BadMessageError(f"the message is a JSON {_json_kind(value)}: it must be an object")
+    if decoded.count("[") + decoded.count("{") > MAX_JSON_DEPTH and _depth(value) > MAX_JSON_DEPTH:
+        raise BadMessageError(f"the message is nested more than {MAX_JSON_DEPTH} deep")
+    return value
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _json_kind(value: object) -> str:
+    if value is None:
+        return "null"
+    kinds = {list: "array", str: "string", bool: "boolean", int: "number", float: "number"}
+    return kinds.get(type(value), "value")
+
+
+def _depth(value: object) -> int:
+    level, depth = [value], 0
+    while level:
+        depth += 1
+        below: list[object] = []
+        for item in level:
+            if isinstance(item, dict):
+                below.extend(item.values())
+            elif isinstance(item, list):
+                below.extend(item)
+        level = below
+    return depth
+
+
+class FrameDecoder:
+    """Decodes a framed connection's bytes.
+
+    Put bytes in with `feed`, or without a copy by reading into `get_buffer()` and telling `received()`.
+    Then call `next_message()` until it gives None. What is buffered never exceeds one unfinished message
+    plus what was last put in.
+    """
+
+    def __init__(self, *, max_json_length: int = MAX_JSON_LENGTH, accept_data: bool = True) -> None:
+        """`accept_data=False` makes DATA an unknown type: a server never receives any."""
+        self._max_json_length = max_json_length
+        self._accept_data = accept_data
+        self._buffer = bytearray(65536)
+        self._start = 0
+        self._end = 0
+        self._broken: str | None = None
+
+    def get_buffer(self) -> memoryview:
+        """Writable free space to read into; never empty."""
+        self._make_room(4096)
+        return memoryview(self._buffer)[self._end :]
+
+    def received(self, count: int) -> None:
+        """`count` bytes were written to the start of `get_buffer()`."""
+        self._end += count
+
+    def feed(self, data: bytes | bytearray | memoryview) -> None:
+        """Add received bytes."""
+        self._make_room(len(data))
+        self._buffer[self._end : self._end + len(data)] = data
+        self._end += len(data)
+
+    @property
+    def pending(self) -> int:
+        """Bytes of an unfinished message that are waiting for the rest."""
+        return self._end - self._start
+
+    def next_message(self) -> DataMessage | JsonObject | None:
+        """The next whole message, or None if more bytes are needed.
+
+        Raises RemoteProtocolError (answer it and close the connection) or BadMessageError (answer it and
+        carry on).
+        """
+        if self._broken is not None:
+            raise RemoteProtocolError(self._broken)
+        available = self._end - self._start
+        if available < _LENGTH.size:
+            return None
+        (length,) = _LENGTH.unpack_from(self._buffer, self._start)
+        if not _TYPE_SIZE <= length <= max(self._max_json_length + _TYPE_SIZE, MAX_DATA_MESSAGE_SIZE):
+            self._break(f"message length {length}: it must be from 1 to {self._max_json_length + _TYPE_SIZE}")
+        if available < _PREFIX.size:
+            return None
+        kind = self._buffer[self._start + _LENGTH.size]
+        if kind == MessageType.DATA and self._accept_data:
+            if length not in _DATA_LENGTHS:
+                self._break(f"DATA message of length {length}: it must be one of {sorted(_DATA_LENGTHS)}")
+        elif kind != MessageType.JSON:
+            self._break(f"message type {kind}: this side understands {self._types_text()}")
+        elif length > self._max_json_length + _TYPE_SIZE:
+            self._break(f"JSON message of length {length}: it must be at most {self._max_json_length + 1}")
+        if available < _LENGTH.size + length:
+            return None
+        body = self._start + _BODY_OFFSET
+        end = self._start + _LENGTH.size + length
+        self._start = end
+        if kind == MessageType.DATA:
+            header = _DATA_HEADER.unpack_from(self._buffer, body)
+            return DataMessage._make((*header, bytes(self._buffer[body + _DATA_HEADER.size : end])))
+        return parse_json_object(bytes(self._buffer[body:end]))
+
+    def __iter__(self) -> Iterator[DataMessage | JsonObject]:
+        """The whole messages there are now."""
+        while (message := self.next_message()) is not None:
+            yield message
+
+    def _types_text(self) -> str:
+        return "1 (DATA) and 2 (JSON)" if self._accept_data else "2 (JSON)"
+
+    def _break(self, reason: str) -> NoReturn:
+        self._broken = reason
+        self._start = self._end = 0
+        raise RemoteProtocolError(reason)
+
+    def _make_room(self, count: int) -> None:
+        if self._start == self._end:
+            self._start = self._end = 0
+        if len(self._buffer) - self._end >= count:
+            return
+        pending = self._end - self._start
+        self._buffer[:pending] = self._buffer[self._start : self._end]
+        self._start, self._end = 0, pending
+        if len(self._buffer) - pending < count:
+            self._buffer.extend(bytes(pending + count - len(self._buffer)))
+
+
+class BareJsonDecoder:
+    """Decodes a bare JSON connection's bytes: one JSON object a line, the newline optional.
+
+    Same use as `FrameDecoder`: `feed`, then `next_message` until None. Call `end_of_input` when the peer
+    has closed its side, so that a half-finished object is reported.
+    """
+
+    _STRUCTURE = re.compile(rb'["\\{}\n]')
+    _STRING_STRUCTURE = re.compile(rb'["\\\n]')
+
+    def __init__(self, *, max_json_length: int = MAX_JSON_LENGTH) -> None:
+        self._max_json_length = max_json_length
+        self._buffer = bytearray()
+        self._broken: str | None = None
+        self._ended = False
+        self._reset_scan()
+
+    @property
+    def pending(self) -> int:
+        """Bytes of an unfinished message that are waiting for the rest."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes | bytearray | memoryview) -> None:
+        """Add received bytes."""
+        self._buffer += data
+
+    def end_of_input(self) -> None:
+        """No more bytes will come."""
+        self._ended = True
+
+    def next_message(self) -> JsonObject | None:
+        """The next whole message, or None; raises as `FrameDecoder.next_message`."""
+        if self._broken is not None:
+            raise RemoteProtocolError(self._broken)
+        if not self._scanned:
+            self._buffer = self._buffer.lstrip(b" \t\r\n")
+        end = self._find_end()
+        if end is None and self._ended and self._buffer:
+            end = len(self._buffer)
+        if end is not None and end <= self._max_json_length:
+            text = bytes(self._buffer[:end])
+            del self._buffer[:end]
+            self._reset_scan()
+            return parse_json_object(text)
+        if end is not None or len(self._buffer) > self._max_json_length:
+            self._broken = f"a line of more than {self._max_json_length} bytes"
+            self._buffer.clear()
+            raise RemoteProtocolError(self._broken)
+        return None
+
+    def __iter__(self) -> Iterator[JsonObject]:
+        """The whole messages there are now."""
+        while (message := self.next_message()) is not None:
+            yield message
+
+    def _reset_scan(self) -> None:
+        self._scanned = 0
+        self._depth = 0
+        self._in_string = False
+
+    def _find_end(self) -> int | None:
+        """Where the first message ends, scanning each byte once however it trickles in."""
+        position = self._scanned
+        while True:
+            pattern = self._STRING_STRUCTURE if self._in_string else self._STRUCTURE
+            match = pattern.search(self._buffer, position)
+            if match is None:
+                self._scanned = max(position, len(self._buffer))
+                return None
+            position = match.end()
+            byte = match.group()
+            if byte == b"\n":
+                return position
+            if byte == b'"':
+                self._in_string = not self._in_string
+            elif byte == b"\\":
+                # Skip the escaped byte, which may not have arrived yet; a newline is never escaped.
+                if self._buffer[position : position + 1] != b"\n":
+                    position += 1
+            elif byte == b"{":
+                self._depth += 1
+            elif byte == b"}":
+                self._depth -= 1
+                if self._depth <= 0:
+                    return position
