@@ -33,8 +33,8 @@ def check_interface(ifname: str) -> None:
     missing = _missing_capabilities()
     if missing:
         raise InterfaceError(
-            f"not allowed to open {ifname}: {' and '.join(missing)} missing; run with sudo, or give the service "
-            "CAP_NET_RAW and CAP_NET_ADMIN"
+            f"not allowed to open {ifname}: {' and '.join(missing)} missing; run with sudo, or "
+            "give the service CAP_NET_RAW and CAP_NET_ADMIN"
         )
     if not flags & _IFF_UP:
         raise InterfaceError(f"{ifname} is down: bring it up with 'sudo ip link set {ifname} up'")

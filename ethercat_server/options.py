@@ -53,12 +53,12 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="ethercat-server",
         usage="%(prog)s [options] IFACE [SENSOR_NAME] PORT",
-        description="Owns the EtherCAT bus, sets the Bota sensors on it up and streams their samples over TCP.",
+        description="Owns the EtherCAT bus, sets its Bota sensors up and streams their samples over TCP.",
         epilog="settings: " + "; ".join(f"{row.name} ({row.meaning})" for row in SETTINGS.values()),
     )
     parser.add_argument(
         "arguments", nargs="+", metavar="IFACE [SENSOR_NAME] PORT",
-        help="network interface ('virtual' for a virtual sensor), the name the first sensor must have, TCP port",
+        help="network interface ('virtual' for a virtual sensor), name the first sensor must have, TCP port",
     )  # fmt: skip
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",
