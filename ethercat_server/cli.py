@@ -51,7 +51,7 @@ def serve(options: ServerOptions) -> None:
         bus.open()
         cleanup.callback(bus.close)
         sensors = bring_up(bus, options, signals.check)
-        streams = [SensorStream(sensor.place, sensor.rate_hz) for sensor in sensors]
+        streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]
         cycle = Cycle(bus, streams, hub)
         signals.call(cycle.stop)
         hub.start(Actions(hub, cycle, sensors).handle)

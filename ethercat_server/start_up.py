@@ -42,6 +42,11 @@ class Sensor:
     state: str = "PREOP"
     settings: dict[str, SettingValue] = field(default_factory=dict)
 
+    @property
+    def period_ns(self) -> float:
+        """Nominal sample period; 0x8011 rounds the rate to whole Hz, so it follows from the SINC length."""
+        return 1e9 * self.settings["sinc_length"] / BASE_SAMPLING_RATE_HZ
+
     def describe(self) -> dict[str, Any]:
         """The sensor's part of the `describe` reply."""
         return {
@@ -174,8 +179,7 @@ def _read_settings(bus: Bus, place: int, wanted: dict[str, SettingValue]) -> dic
             continue
         except ValueError as error:
             log.warning("sensor %d: %s", place, error)
-    if "sinc_length" in held:
-        held["sinc_length"] = wanted["sinc_length"]
+    held["sinc_length"] = wanted["sinc_length"]
     return held
 
 

@@ -1,6 +1,6 @@
 """One sensor's stream: which exchanges brought a new sample, and the DATA frame for it.
 
-A frame exists for every new sample. While the sensor has nothing new, there is one REPEATED (or INVALID)
+A frame exists for every new sample. While the sensor has nothing new there is one REPEATED (or INVALID)
 frame for each sample period that passes, so that a silent sensor is visible; the polls in between, which
 find the same data again only because the bus is read more often than the sensor samples, make none.
 """
@@ -10,6 +10,8 @@ from __future__ import annotations
 import time
 from typing import Any, Final
 
+from ethercat_server.distribution import Distribution
+from ethercat_server.sample_clock import SampleClock
 from protocol.framing import DataFlag, encode_data
 
 DISCARDED_AT_START: Final = 3
@@ -20,11 +22,11 @@ REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INV
 
 
 class SensorStream:
-    """Numbers and marks the frames of the sensor at `place`, which samples at `rate_hz`."""
+    """Numbers, stamps and marks the frames of the sensor at `place`, which samples every `period_ns`."""
 
-    def __init__(self, place: int, rate_hz: float) -> None:
+    def __init__(self, place: int, period_ns: float) -> None:
         self.place = place
-        self.period_ns = round(1e9 / rate_hz)
+        self.clock = SampleClock(period_ns)
         self.process_data = b""
         """The newest valid process data."""
         self.sequence = 0
@@ -33,56 +35,71 @@ class SensorStream:
         self.invalid = 0
         self.lost_samples = 0
         self.recoveries = 0
+        self.age = Distribution()
+        """From the estimated instant of a sample to its hand-out, while locked."""
         self._discard = DISCARDED_AT_START
         self._gap = False
-        self._fresh_at_ns = 0
-        self._idle_at_ns = time.monotonic_ns() + self.period_ns
+        self._idle_at_ns = 0.0
 
-    def take(self, process_data: bytes, wkc: int, valid: bool, now_ns: int) -> tuple[bytes, int] | None:
+    def take(
+        self, data: bytes, wkc: int, valid: bool, sent_ns: int, back_ns: int
+    ) -> tuple[bytes, int] | None:
         """The frame that an exchange gives, and its flags; None if it gives none.
 
-        `now_ns` is CLOCK_MONOTONIC when the process data came back.
+        `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the exchange.
         """
-        if valid and process_data != self.process_data:
-            self.process_data = process_data
+        clock = self.clock
+        moment_ns = back_ns
+        fresh = valid and data != self.process_data
+        if valid:
+            clock.observe(sent_ns, back_ns, fresh)
+        if fresh:
+            self.process_data = data
             if self._discard:
                 self._discard -= 1
-                self._fresh_at_ns = 0
                 return None
-            flags = self._new_sample(now_ns)
-        elif now_ns >= self._idle_at_ns and self.process_data and not self._discard:
-            flags = self._nothing_new(valid, now_ns)
+            flags = self._new_sample(back_ns)
+            if clock.locked:
+                moment_ns = int(clock.instant_ns)
+                self.age.record(back_ns - moment_ns)
+        elif back_ns >= self._idle_at_ns and self.sequence:
+            flags = self._nothing_new(valid, back_ns)
         else:
             return None
-        stamp_ns = time.time_ns() - (time.monotonic_ns() - now_ns)
-        frame = encode_data(
-            self.sequence, stamp_ns, now_ns, self.place, flags, max(wkc, 0), self.process_data
-        )  # fmt: skip
+        stamp_ns = time.time_ns() - (time.monotonic_ns() - moment_ns)
+        sequence = self.sequence
         self.sequence += 1
-        return frame, flags
+        return encode_data(
+            sequence, stamp_ns, moment_ns, self.place, flags, max(wkc, 0), self.process_data
+        ), flags  # fmt: skip
 
     def _new_sample(self, now_ns: int) -> int:
-        elapsed = now_ns - self._fresh_at_ns
-        if self._fresh_at_ns and elapsed > 1.75 * self.period_ns:
-            self.lost_samples += round(elapsed / self.period_ns) - 1
-            self._gap = True
-        self._fresh_at_ns = now_ns
-        self._idle_at_ns = now_ns + int(_IDLE_PERIODS * self.period_ns)
+        self._idle_at_ns = now_ns + _IDLE_PERIODS * self.clock.period_ns
         self.fresh += 1
-        flags = GAP if self._gap else 0
+        lost = self.clock.steps - 1 if self.sequence else 0
+        # -1 takes back one that was counted after a stall but came after all.
+        self.lost_samples = max(0, self.lost_samples + lost)
+        flags = GAP if lost > 0 or self._gap else 0
         self._gap = False
         return flags
 
     def _nothing_new(self, valid: bool, now_ns: int) -> int:
         # The next slot is counted from this one, but a stall makes one frame, not a burst.
-        self._idle_at_ns = max(self._idle_at_ns + self.period_ns, now_ns)
+        self._idle_at_ns = max(self._idle_at_ns + self.clock.period_ns, float(now_ns))
         if valid:
             self.repeated += 1
             return REPEATED
         self.invalid += 1
         return INVALID
 
-    def counters(self) -> dict[str, Any]:
+    def restart(self, period_ns: float) -> None:
+        """The sensor is back after it was lost, perhaps with another sample period."""
+        self.recoveries += 1
+        self.clock = SampleClock(period_ns)
+        self._discard = DISCARDED_AT_START
+        self._gap = True
+
+    def status(self) -> dict[str, Any]:
         """The sensor's part of the `status` reply."""
         return {
             "sensor": self.place,
@@ -91,4 +108,6 @@ class SensorStream:
             "invalid": self.invalid,
             "lost_samples": self.lost_samples,
             "recoveries": self.recoveries,
+            "clock": self.clock.describe(),
+            "age_us": self.age.summary_us(),
         }
