@@ -17,6 +17,8 @@ from ethercat_server.stream import SensorStream
 
 _SERVE_MARGIN_NS: Final = 80_000
 """Sockets are left alone this long before a deadline: select may wake late."""
+_SERVE_EVERY_NS: Final = 10_000_000
+"""The sockets' turn comes this often even if the deadlines leave no time."""
 _LATENESS_GAIN: Final = 1 / 64
 _MAX_LEAD_NS: Final = 200_000.0
 
@@ -47,11 +49,13 @@ class Cycle:
         shortest_ns = min(stream.clock.period_ns for stream in streams)
         timeout_s = max(300e-6, 0.75e-9 * shortest_ns)
         lead_ns = 0.0  # how late this thread usually wakes: deadlines are brought forward by it
+        serve_by = 0
         while not self.stopping:
             now = monotonic_ns()
             deadline = int(min([stream.clock.next_poll_ns() for stream in streams]) - lead_ns)
-            if deadline > now:
+            if deadline > now or now > serve_by:
                 hub.serve(deadline - _SERVE_MARGIN_NS)
+                serve_by = now + _SERVE_EVERY_NS
                 if (left := deadline - monotonic_ns()) > 0:
                     sleep(left * 1e-9)
                 sent = monotonic_ns()

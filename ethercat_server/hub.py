@@ -64,8 +64,9 @@ class Hub:
         self._subscribers = [c for c in self.connections.values() if c.subscription is not None]
 
     def serve(self, until_ns: int) -> None:
-        """Serve the sockets until CLOCK_MONOTONIC is `until_ns`, or less long if they are quiet."""
-        while (left := until_ns - time.monotonic_ns()) > 0:
+        """Serve the sockets until CLOCK_MONOTONIC is `until_ns`; looks at each at most once if that is past."""
+        while True:
+            left = max(0, until_ns - time.monotonic_ns())
             writers = [c.fd for c in self.connections.values() if c.needs_writing]
             readable, writable, _ = select.select(self._readers, writers, (), left * 1e-9)
             if not readable and not writable:
@@ -78,8 +79,8 @@ class Hub:
                     self._accept(fd)
                 else:
                     self._read(connection)
-                if time.monotonic_ns() >= until_ns:
-                    break
+            if time.monotonic_ns() >= until_ns:
+                break
         if time.monotonic_ns() >= self._sweep_at_ns:
             self._sweep()
 

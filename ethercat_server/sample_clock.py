@@ -48,8 +48,8 @@ class SampleClock:
         "instant_ns", "locked", "period_ns", "steps",
     )  # fmt: skip
 
-    def __init__(self, period_ns: float) -> None:
-        """`period_ns` is the nominal sample period."""
+    def __init__(self, period_ns: float, start_ns: int = 0) -> None:
+        """`period_ns` is the nominal sample period; the first poll is due soon after `start_ns`."""
         self._nominal_ns = period_ns
         self.period_ns = period_ns
         self.locked = False
@@ -59,7 +59,7 @@ class SampleClock:
         """How many samples the newest one is after the one handed out before it: more than 1, some were
         lost; 0, one was counted as lost that was not."""
         self._quality = 0.0
-        self._polled_ns = 0
+        self._polled_ns = start_ns
         """When the last exchange was sent."""
         self._low = self._high = 0.0
         """Bracket in which the next sample is expected."""
@@ -99,7 +99,7 @@ class SampleClock:
         if self._high == 0.0 or after > self._high + self.period_ns:
             # Nothing was expected, or the sensor was watched and silent for longer than a period: its
             # clock begins anew. Only what fell into the time it was not watched can have been lost.
-            self.steps = 1 + int((received_ns - after) // self.period_ns) if after else 1
+            self.steps = 1 + int((received_ns - after) // self.period_ns)
             self._low, self._high = max(after, received_ns - self.period_ns), float(received_ns)
             self._expect_next(received_ns)
             return

@@ -1,7 +1,7 @@
 """One sensor's stream: which exchanges brought a new sample, and the DATA frame for it.
 
-A frame exists for every new sample. While the sensor has nothing new there is one REPEATED (or INVALID)
-frame for each sample period that passes, so that a silent sensor is visible; the polls in between, which
+A frame exists for every new sample. While the sensor is silent there is one REPEATED (or INVALID)
+frame for each sample period that passes, so that its silence is visible; the polls in between samples, which
 find the same data again only because the bus is read more often than the sensor samples, make none.
 """
 
@@ -16,7 +16,8 @@ from protocol.framing import DataFlag, encode_data
 
 DISCARDED_AT_START: Final = 3
 """Bota's own driver throws the first three frames after entering OP away."""
-_IDLE_PERIODS: Final = 1.5
+_IDLE_PERIODS: Final = 3.0
+"""A sensor that has given nothing new for this many periods is silent, not just late."""
 
 REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))
 
@@ -26,7 +27,7 @@ class SensorStream:
 
     def __init__(self, place: int, period_ns: float) -> None:
         self.place = place
-        self.clock = SampleClock(period_ns)
+        self.clock = SampleClock(period_ns, time.monotonic_ns())
         self.process_data = b""
         """The newest valid process data."""
         self.sequence = 0
@@ -95,7 +96,7 @@ class SensorStream:
     def restart(self, period_ns: float) -> None:
         """The sensor is back after it was lost, perhaps with another sample period."""
         self.recoveries += 1
-        self.clock = SampleClock(period_ns)
+        self.clock = SampleClock(period_ns, time.monotonic_ns())
         self._discard = DISCARDED_AT_START
         self._gap = True
 
