@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from types import FrameType
 
+from ethercat_server import realtime
 from ethercat_server.actions import Actions
 from ethercat_server.bus import Bus
 from ethercat_server.cycle import Cycle
@@ -45,7 +46,7 @@ def serve(options: ServerOptions) -> None:
         cleanup.callback(hub.close)
         ifname = options.ifname
         if options.is_virtual:
-            ifname = cleanup.enter_context(VirtualBus(options.virtual_arguments)).ifname
+            ifname = cleanup.enter_context(VirtualBus(options.virtual_arguments, options.rt_priority)).ifname
         check_interface(ifname)
         bus = Bus(ifname)
         bus.open()
@@ -54,6 +55,7 @@ def serve(options: ServerOptions) -> None:
         streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]
         cycle = Cycle(bus, streams, hub)
         signals.call(cycle.stop)
+        realtime.prepare(options.rt_priority, options.cpu)
         hub.start(Actions(hub, cycle, sensors).handle)
         for sensor in sensors:
             log.info(

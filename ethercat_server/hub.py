@@ -64,7 +64,7 @@ class Hub:
         self._subscribers = [c for c in self.connections.values() if c.subscription is not None]
 
     def serve(self, until_ns: int) -> None:
-        """Serve the sockets until CLOCK_MONOTONIC is `until_ns`; looks at each at most once if that is past."""
+        """Serve the sockets until CLOCK_MONOTONIC is `until_ns`; one look at each if that is past."""
         while True:
             left = max(0, until_ns - time.monotonic_ns())
             writers = [c.fd for c in self.connections.values() if c.needs_writing]

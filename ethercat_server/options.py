@@ -18,6 +18,9 @@ VIRTUAL_INTERFACE: Final = "virtual"
 """The interface name that stands for a virtual bus with a virtual sensor on it."""
 
 
+DEFAULT_RT_PRIORITY: Final = 80
+
+
 @dataclass(frozen=True, slots=True)
 class ServerOptions:
     """Everything the server needs to know to start."""
@@ -27,6 +30,9 @@ class ServerOptions:
     sensor_name: str | None = None
     hosts: tuple[str, ...] = ("127.0.0.1", "::1")
     virtual_arguments: str = ""
+    rt_priority: int = 0
+    """Of SCHED_FIFO; 0 is ordinary scheduling."""
+    cpu: int | None = None
     common_settings: dict[str, SettingValue] = field(default_factory=dict)
     """Asked for every sensor."""
     sensor_settings: dict[int, dict[str, SettingValue]] = field(default_factory=dict)
@@ -72,6 +78,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--virtual", default="", metavar="ARGUMENTS",
         help="arguments for the virtual sensor, such as '--pdo 77 --sensors 2' (see ethercat-virtual-sensor)",
     )  # fmt: skip
+    parser.add_argument(
+        "--rt-priority", type=_priority, default=DEFAULT_RT_PRIORITY, metavar="N",
+        help="SCHED_FIFO priority, used when allowed; 0 for ordinary scheduling (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--cpu", type=int, metavar="N", help="the only CPU to run on, used when allowed")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
@@ -95,6 +106,8 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
         port=_port(arguments[-1]),
         sensor_name=arguments[1] if len(arguments) == 3 else None,
         virtual_arguments=parsed.virtual,
+        rt_priority=parsed.rt_priority,
+        cpu=parsed.cpu,
         common_settings={**common, **assigned},
         sensor_settings={place: {**settings, **assigned} for place, settings in by_sensor.items()},
     )
@@ -151,6 +164,12 @@ def read_config(path: Path) -> tuple[dict[str, SettingValue], dict[int, dict[str
         return check_settings(common), by_sensor
     except SettingError as error:
         raise UsageError(f"the configuration {path}: {error}") from None
+
+
+def _priority(text: str) -> int:
+    if not text.isdecimal() or int(text) > 99:
+        raise argparse.ArgumentTypeError(f"{text!r} must be from 0 to 99")
+    return int(text)
 
 
 def _port(text: str) -> int:

@@ -29,15 +29,20 @@ _FAR_END: Final = "sensor"
 class VirtualBus:
     """Brings a virtual bus up and down; `ifname` is the end for the master."""
 
-    def __init__(self, arguments: str = "") -> None:
-        """`arguments` are `ethercat-virtual-sensor`'s own options, as on a command line."""
+    def __init__(self, arguments: str = "", master_priority: int = 0) -> None:
+        """`arguments` are `ethercat-virtual-sensor`'s own options, as on a command line.
+
+        The sensor gets a real-time priority above `master_priority`: real ones do not wait for a CPU.
+        """
+        self._priority = min(99, master_priority + 1) if master_priority else 0
         self.ifname = f"ecat{os.getpid()}"
         self._arguments = shlex.split(arguments)
         self._process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> VirtualBus:
         """Start the sensor's process and wait until it answers; ServerError if it does not."""
-        command = [sys.executable, "-P", "-m", "ethercat_server.virtual_bus", self.ifname, *self._arguments]
+        command = [sys.executable, "-P", "-m", "ethercat_server.virtual_bus"]
+        command += [self.ifname, str(self._priority), *self._arguments]
         # Its own session: Ctrl-C is for the server, which then ends the sensor in its own time. Its standard
         # input ends with this process, however that ends, and so tells it to end too.
         self._process = subprocess.Popen(
@@ -95,11 +100,15 @@ def veth_pair(near: str) -> Iterator[str]:
 
 
 def main(argv: Sequence[str]) -> int:
-    """The sensor's process: `argv` is the near end's name, then `ethercat-virtual-sensor`'s options."""
+    """The sensor's process: `argv` is the near end's name, a priority, the sensor's options."""
     from ethercat_server.virtual_sensor import cli  # noqa: PLC0415 - only this process needs it
 
-    with veth_pair(argv[0]) as far:
-        return cli.main([far, "--exit-on-eof", *argv[1:]])
+    near, priority, *arguments = argv
+    with veth_pair(near) as far:
+        if int(priority):
+            with contextlib.suppress(PermissionError):
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(priority)))
+        return cli.main([far, "--exit-on-eof", *arguments])
 
 
 if __name__ == "__main__":
