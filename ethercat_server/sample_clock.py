@@ -21,7 +21,7 @@ _NARROW: Final = 0.4
 """A bracket narrower than this part of a period holds one instant for sure."""
 _UNDISTURBED: Final = 1.25
 """A bracket wider than this many periods comes from a stall."""
-_NEAR: Final = 0.1
+_NEAR: Final = 0.08
 """A sample is as expected when it moves the estimate by less than this part of a period."""
 _SLACK_NS: Final = 1_000.0
 """How far a period may differ from the estimate: the expected bracket grows by this at each end."""
@@ -34,7 +34,7 @@ _MAX_PULL: Final = 0.002
 """The period may differ from the nominal one by this part: four times what an oscillator is off."""
 _LOCK_GAIN: Final = 1 / 32
 _LOCK_AT: Final = 0.85
-_UNLOCK_AT: Final = 0.4
+_UNLOCK_AT: Final = 0.6
 
 
 class SampleClock:
