@@ -92,7 +92,7 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
 
     argparse itself exits with code 2 for what it finds.
     """
-    parsed = build_parser().parse_args(argv)
+    parsed = build_parser().parse_intermixed_args(argv)
     arguments: list[str] = parsed.arguments
     if len(arguments) not in {2, 3}:
         raise UsageError(
@@ -158,7 +158,7 @@ def read_config(path: Path) -> tuple[dict[str, SettingValue], dict[int, dict[str
         for key, values in single.items():
             if not key.isdecimal() or int(key) > 255:
                 raise SettingError(
-                    f"[sensor.{key}]: the table's name must be a place on the bus, such as sensor.0"
+                    f"[sensor.{key}]: the table must be named by a place, such as sensor.0"
                 )
             by_sensor[int(key)] = check_settings({**common, **values})
         return check_settings(common), by_sensor
