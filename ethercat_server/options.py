@@ -157,9 +157,7 @@ def read_config(path: Path) -> tuple[dict[str, SettingValue], dict[int, dict[str
         by_sensor = {}
         for key, values in single.items():
             if not key.isdecimal() or int(key) > 255:
-                raise SettingError(
-                    f"[sensor.{key}]: the table must be named by a place, such as sensor.0"
-                )
+                raise SettingError(f"[sensor.{key}]: the table must be named by a place, such as sensor.0")
             by_sensor[int(key)] = check_settings({**common, **values})
         return check_settings(common), by_sensor
     except SettingError as error:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 import struct
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 
 import pytest
 
@@ -37,7 +39,9 @@ class Served:
         request = parse_request(message)
         if request.action == "subscribe":
             values = request.values
-            connection.subscription = Subscription(2, values["sensors"], values["every"], values["fresh_only"])
+            connection.subscription = Subscription(
+                2, values["sensors"], values["every"], values["fresh_only"]
+            )
             self.hub.subscriptions_changed()
         return reply(request)
 
@@ -255,7 +259,7 @@ def test_a_client_that_does_not_read_loses_the_oldest_whole_frames_and_is_told(s
         assert frames[-1].sequence == total - 1
         jumps = [
             (after.flags & DataFlag.GAP, after.sequence - before.sequence)
-            for before, after in zip(frames, frames[1:], strict=False)
+            for before, after in pairwise(frames)
         ]
         assert all(bool(gap) == (step > 1) for gap, step in jumps)
         assert sum(step - 1 for _, step in jumps) == slow_connection.withheld
@@ -276,10 +280,8 @@ def test_a_client_that_asks_and_never_reads_is_closed(served: Served) -> None:
         request = encode_json({"action": "describe", "id": "x" * 10_000})
         sock.settimeout(0.01)
         for _ in range(2000):
-            try:
+            with contextlib.suppress(TimeoutError, ConnectionError):
                 sock.sendall(request)
-            except (TimeoutError, ConnectionError):
-                pass
             served.serve(0.002)
             if not served.hub.connections:
                 return
