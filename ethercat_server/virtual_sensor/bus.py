@@ -88,11 +88,15 @@ class Bus:
         return True
 
     def prepare(self) -> None:
-        """Work ahead: make the samples that the next frame will want if frames keep their period."""
+        """The frames that waited are answered: look at the watchdogs, and work ahead.
+
+        Makes the samples that the next frame will want if frames keep their period.
+        """
         period = min(self.now - self._last_frame, _LONGEST_PERIOD_NS)
         expected = self.now + period
         self._last_frame = self.now
         for life in self._alive:
+            life.check_watchdog(self.now)
             life.prepare(expected)
 
     def idle(self, now: int) -> None:

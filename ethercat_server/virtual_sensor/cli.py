@@ -106,6 +106,8 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
         stopped = True
 
     previous = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    # In the background of a terminal, what is typed there is not for us: reading it must not stop us.
+    previous[signal.SIGTTIN] = signal.signal(signal.SIGTTIN, signal.SIG_IGN)
     try:
         yield lambda: stopped
     finally:

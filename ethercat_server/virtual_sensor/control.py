@@ -1,4 +1,7 @@
-"""Where fault commands come from: a text stream (stdin), and a Unix stream socket with many connections."""
+"""Where fault commands come from: a text stream (stdin), and a Unix stream socket with many connections.
+
+Commands from the text stream are answered on standard output.
+"""
 
 from __future__ import annotations
 
@@ -97,8 +100,17 @@ class CommandChannel:
             self.ended = True
             data = b"\n" if self._pending[descriptor] else b""
         for line in self._lines(descriptor, data):
-            with contextlib.suppress(OSError):
-                os.write(1, obey(self._bus, line).encode() + b"\n")
+            try:
+                answer = obey(self._bus, line)
+            except QuitCommand:
+                self._tell("ok")
+                raise
+            self._tell(answer)
+
+    @staticmethod
+    def _tell(answer: str) -> None:
+        with contextlib.suppress(OSError):
+            os.write(1, answer.encode() + b"\n")
 
     def _from_connection(self, descriptor: int) -> None:
         connection = self._connections[descriptor]

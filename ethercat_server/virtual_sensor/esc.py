@@ -116,6 +116,8 @@ class Esc:
 
     def write(self, address: int, data: bytes) -> bool:
         """Write `data` as a master does; False if it may write none of it."""
+        if not data:
+            return False
         for manager in self.sync_managers:
             if manager.active and manager.start == address and manager.length == len(data):
                 return self._write_manager(manager, 0, data)

@@ -73,7 +73,8 @@ class Fmmu:
         mask = (1 << self._bits) - 1
         value = int.from_bytes(data, "little") >> self.first_bit & mask
         kept = int.from_bytes(current, "little") & ~(mask << self.physical_bit)
-        return (kept | value << self.physical_bit).to_bytes(len(current), "little")
+        inside = (1 << len(current) * 8) - 1  # the end of memory cuts it off
+        return ((kept | value << self.physical_bit) & inside).to_bytes(len(current), "little")
 
     def extract(self, physical: bytes | bytearray, current: bytes) -> bytes:
         """`current` logical bytes with the mapped bits of `physical` put in."""

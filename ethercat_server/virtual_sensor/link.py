@@ -83,7 +83,7 @@ def run(
 
     Stops when `should_stop` is set or returns true (looked at every 10 ms), on the command `quit`, and at
     the end of `commands` if `exit_on_eof`. Leaves nothing behind. LinkError if the interface cannot be
-    used, goes down or disappears; ControlError if `control_path` cannot be used.
+    used, or disappears (one that is only down is waited for); ControlError if `control_path` cannot be used.
     """
     stop = should_stop.is_set if isinstance(should_stop, threading.Event) else should_stop
     with contextlib.ExitStack() as stack:
@@ -108,23 +108,27 @@ def _serve(
 ) -> None:
     descriptor = raw.fileno()
     buffer = bytearray(_BUFFER)
+    index = socket.if_nametoindex(ifname)
+    up = True
     while not stop():
         if exit_on_eof and channel.ended:
             return
         events = poller.poll(_IDLE_MS)
         if not events:
             bus.idle(time.monotonic_ns())
+            if not up:  # like a cable pulled out: it may come back, unless it is gone for good
+                _check_there(ifname, index)
             continue
         for ready, event in events:
             if ready != descriptor:
                 bus.set_time(time.monotonic_ns())
                 channel.handle(ready, event)
         if any(ready == descriptor for ready, _ in events):
-            _answer_waiting(raw, bus, buffer, ifname)
+            up = _answer_waiting(raw, bus, buffer, ifname)
 
 
-def _answer_waiting(raw: socket.socket, bus: Bus, buffer: bytearray, ifname: str) -> None:
-    """Answer the frames that wait; not too many at once, so that commands are not kept waiting."""
+def _answer_waiting(raw: socket.socket, bus: Bus, buffer: bytearray, ifname: str) -> bool:
+    """Answer the frames that wait; False if the interface is down. Not too many at once: commands wait."""
     view = memoryview(buffer)
     for _ in range(_FRAMES_PER_TURN):
         try:
@@ -134,19 +138,19 @@ def _answer_waiting(raw: socket.socket, bus: Bus, buffer: bytearray, ifname: str
                 raw.send(view[:size])
         except BlockingIOError:
             bus.prepare()
-            return
+            return True
         except OSError as error:
             if error.errno in (errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR):
                 continue  # the frame is lost, as on a cable
             if error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
-                _explain_loss(ifname)
-                continue
+                return False
             raise LinkError(f"interface {ifname} failed: {error.strerror}") from None
+    return True
 
 
-def _explain_loss(ifname: str) -> None:
-    try:
-        socket.if_nametoindex(ifname)
-    except OSError:
-        raise LinkError(f"interface {ifname} has disappeared: the virtual sensor ends") from None
-    raise LinkError(f"interface {ifname} went down: bring it up and start the virtual sensor again")
+def _check_there(ifname: str, index: int) -> None:
+    """LinkError if the interface is no longer the one that was opened."""
+    with contextlib.suppress(OSError):
+        if socket.if_nametoindex(ifname) == index:
+            return
+    raise LinkError(f"interface {ifname} has disappeared: make it again and start the virtual sensor again")

@@ -14,6 +14,7 @@ from ethercat_server.virtual_sensor.firmware import Firmware
 from ethercat_server.virtual_sensor.options import SensorOptions
 
 _WRITES_REMEMBERED: Final = 1000
+_WRITES_TOLD: Final = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,7 @@ class VirtualSensor:
         self._options = options
         self._flash: dict[Address, bytes] = {}
         self._writes: deque[SdoWrite] = deque(maxlen=_WRITES_REMEMBERED)
-        self.calibration_writes = 0
+        self.sdo_write_count = self.calibration_writes = 0
         self.life: Firmware | None = None
         self._apply_sinc()
         self.power(True)
@@ -57,6 +58,7 @@ class VirtualSensor:
 
     def _remember(self, index: int, subindex: int, data: bytes, state: AlState, abort: int) -> None:
         self._writes.append(SdoWrite(index, subindex, data, state, abort))
+        self.sdo_write_count += 1
         if index == FACTORY_CALIBRATION:
             self.calibration_writes += 1
 
@@ -102,6 +104,7 @@ class VirtualSensor:
             "sinc_length": life.clock.sinc_length if life else None,
             "ppm": self._options.ppm,
             "calibration_writes": self.calibration_writes,
+            "sdo_write_count": self.sdo_write_count,
             "sdo_writes": [
                 {
                     "index": f"0x{w.index:04X}",
@@ -110,6 +113,6 @@ class VirtualSensor:
                     "state": w.state.name,
                     "abort": f"0x{w.abort:08X}" if w.abort else None,
                 }
-                for w in self._writes
+                for w in self.sdo_writes[-_WRITES_TOLD:]
             ],
         }

@@ -128,6 +128,16 @@ def test_the_watchdog_bites_when_outputs_stay_away() -> None:
     assert master.read(0x0442, 1) == b"\0"
 
 
+def test_the_watchdog_bites_while_other_frames_come() -> None:
+    master = RawMaster().go(OP)
+    master.cycle()
+    for _ in range(120):
+        master.now += MS
+        master.read(0x0130, 2)
+        master.bus.prepare()
+    assert master.read16(0x0134) == 0x001B
+
+
 @pytest.mark.parametrize(("register", "value"), [(0x0420, 0), (0x0420, 65535)])
 def test_the_watchdog_can_be_set(register: int, value: int) -> None:
     master = RawMaster().go(OP)

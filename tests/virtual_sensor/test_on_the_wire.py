@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -202,6 +203,17 @@ def test_safeop_with_error_is_seen_and_cleared(
     slave.state = pysoem.SAFEOP_STATE + pysoem.STATE_ACK
     slave.write_state()
     reach_op(master)
+    assert exchange(master) == 3
+
+
+def test_an_interface_down_for_a_while(
+    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
+) -> None:
+    start(veth[0])
+    for state in ("down", "up"):
+        subprocess.run(["ip", "link", "set", veth[0], state], check=True)
+    master = open_master()
+    bring_up(master)
     assert exchange(master) == 3
 
 

@@ -127,6 +127,18 @@ def test_written_bits_leave_the_others() -> None:
     assert master.read16(0x0F80) == 0xFFFF & ~(0xF << 6) | 5 << 6
 
 
+def test_bits_at_the_end_of_memory() -> None:
+    master = RawMaster()
+    master.write(0x0600, fmmu(0, 4, 0x1FFE, 3, 0, 7, 5))
+    assert master.one(Command.LRW, 0, 0, b"\xff" * 4)[1] == 3
+    assert master.read(0x1FFE, 2) == b"\xe0\xff"
+
+
+def test_a_datagram_without_data_counts_nothing() -> None:
+    master = RawMaster().go(PREOP)
+    assert master.one(Command.APRW, 0, 0x1000, b"") == (b"", 0)
+
+
 def test_process_data_needs_the_state() -> None:
     master = RawMaster().go(PREOP)
     master.set_up_process_data()
