@@ -6,6 +6,7 @@ code acts on it.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping
 from enum import StrEnum
@@ -101,8 +102,10 @@ def six_numbers(value: object) -> tuple[float, ...]:
     """A check for six finite numbers: a wrench."""
     if isinstance(value, list) and len(value) == 6:
         numbers = [v for v in value if isinstance(v, int | float) and not isinstance(v, bool)]
-        if len(numbers) == 6 and all(math.isfinite(v) for v in numbers):
-            return tuple(float(v) for v in numbers)
+        with contextlib.suppress(OverflowError):  # JSON has whole numbers that no float can be
+            floats = tuple(float(v) for v in numbers)
+            if len(floats) == 6 and all(map(math.isfinite, floats)):
+                return floats
     raise ValueError("a list of six finite numbers")
 
 

@@ -1,0 +1,41 @@
+"""The program `ros2 run bridge client`, on PATH as `bridge-client`: arguments, signals, exit codes.
+
+Exit codes: 0 ended as asked (SIGINT, SIGTERM, supervisor), 1 could not start or failed, 2 wrong usage.
+Everything of ROS is imported only after the signals are in hand, so that Ctrl-C is never a traceback.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from bridge.signals import block_stop_signals
+
+USAGE = """\
+usage: ros2 run bridge client [--ros-args -p NAME:=VALUE ... --params-file FILE ...]
+       bridge-client          [--ros-args ...]
+
+Publishes the force/torque sensor that ethercat-server serves. Parameters, topics and their
+defaults: share/bridge/config/bridge.yaml.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node until it is told to stop; returns the exit code."""
+    block_stop_signals()
+    own = list(sys.argv[1:] if arguments is None else arguments)
+    if own and own[0] in {"-h", "--help"}:
+        sys.stdout.write(USAGE)
+        return 0
+    try:
+        from bridge.node import run  # noqa: PLC0415 - rclpy takes a while to load, see above
+    except ImportError as error:
+        sys.stderr.write(
+            f"bridge-client: rclpy cannot be loaded ({error}): source ROS 2, or pip install the extra 'ros'\n"
+        )
+        return 1
+    return run(own)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""The node: what is wired to what, and in which order it is taken apart."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import rclpy
+from diagnostic_msgs.msg import KeyValue
+from rclpy.exceptions import InvalidTopicNameException, ParameterException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from rclpy.utilities import remove_ros_args
+
+from bridge.messages import ArrayOutput
+from bridge.parameters import ParameterError, declare
+from bridge.reader import Reader
+from bridge.signals import call_on_stop_signal
+
+SUPERVISOR_TOPIC = "/supervisor_status_data"
+SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
+
+
+class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
+    """The node `bridge`. `finished` becomes the exit code as soon as something ends it."""
+
+    def __init__(self) -> None:
+        """ParameterError or InvalidTopicNameException if a parameter is wrong."""
+        super().__init__("bridge")
+        self.finished: Future = Future()
+        parameters = declare(self)
+        outputs = [ArrayOutput(self, parameters.array_topic)]
+        self.reader = Reader(parameters, outputs, self.get_logger(), self._fail)
+        self.create_subscription(
+            KeyValue,
+            SUPERVISOR_TOPIC,
+            self._on_supervisor,
+            10,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+    def finish(self, exit_code: int) -> None:
+        """End the node, from any thread; the first call counts."""
+        if not self.finished.done():
+            self.finished.set_result(exit_code)
+
+    def _fail(self, reason: str) -> None:
+        self.get_logger().error(reason)
+        self.finish(1)
+
+    def _on_supervisor(self, message: KeyValue) -> None:
+        if message.key != SUPERVISOR_KEY or message.value != SUPERVISOR_STOP or self.finished.done():
+            return
+        self.get_logger().info("the supervisor stops the force/torque sensors")
+        self.get_logger().info(self.reader.shut_server_down())
+        self.finish(0)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the node with these command-line arguments until it ends; returns the exit code."""
+    try:
+        unknown = remove_ros_args(["bridge-client", *arguments])[1:]
+        if unknown:
+            return _refuse(f"unknown argument {unknown[0]!r}: see --help", 2)
+        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # noqa: BLE001 - rclpy raises several unrelated ones, most about arguments
+        return _refuse(f"ROS cannot start: {' '.join(str(error).split())}", 1)
+    try:
+        try:
+            node = BridgeNode()
+        except (ParameterError, InvalidTopicNameException, ParameterException) as error:
+            return _refuse(" ".join(str(error).split()), 1)
+        return _spin(node)
+    finally:
+        rclpy.try_shutdown()
+
+
+def _spin(node: BridgeNode) -> int:
+    call_on_stop_signal(lambda _signal: node.finish(0))
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    node.reader.start()
+    try:
+        executor.spin_until_future_complete(node.finished)
+        return int(node.finished.result() if node.finished.done() else 0)
+    finally:
+        if not node.reader.stop():
+            node.get_logger().error("the reader did not end in time")
+        executor.shutdown()
+        node.destroy_node()
+
+
+def _refuse(text: str, exit_code: int) -> int:
+    sys.stderr.write(f"bridge-client: {text}\n")
+    return exit_code

@@ -1,0 +1,231 @@
+"""The reader thread: connects, receives, publishes, reconnects. Nothing else touches the stream.
+
+`_stream` is the hot path: one blocking read, every whole message there is, and straight to the outputs.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from typing import Any, Final, Protocol
+
+from bridge.connection import (
+    SILENCE_S,
+    Connection,
+    ConnectionFailedError,
+    UnreachableError,
+    printable,
+    refusal,
+)
+from bridge.messages import Output
+from bridge.parameters import Parameters
+from bridge.selection import FrameCounts, FrameSelector
+from protocol.framing import DataMessage, JsonObject
+from protocol.pdo import LAYOUTS, SampleDecoder
+
+_FIRST_DELAY_S: Final = 0.1
+_LONGEST_DELAY_S: Final = 1.0
+_STEADY_S: Final = 1.0
+"""A connection that lasted this long was a good one: the next attempt may come at once."""
+_LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
+"""A ROS time cannot be later."""
+_MAX_READS: Final = 256
+"""More buffers full than this in one go is a flood: select from what there is."""
+_WARN_EVERY_S: Final = 10.0
+
+
+class Log(Protocol):
+    """The part of a ROS logger that is used here."""
+
+    def info(self, message: str) -> Any:
+        """Say what happened."""
+
+    def warning(self, message: str) -> Any:
+        """Say what is not as it should be."""
+
+    def error(self, message: str) -> Any:
+        """Say what failed."""
+
+
+class Reader:
+    """Feeds `outputs` from the server until `stop`. `on_failure` hears of an error that should not be."""
+
+    def __init__(
+        self, parameters: Parameters, outputs: Sequence[Output], log: Log, on_failure: Callable[[str], object]
+    ) -> None:
+        self._parameters = parameters
+        self._outputs = tuple(outputs)
+        self._log = log
+        self._on_failure = on_failure
+        self.counts = FrameCounts()
+        self.not_finite = 0
+        self._decoders = {size: SampleDecoder(size, parameters.imu_units) for size in LAYOUTS}
+        self._address = f"{printable(parameters.server_host)}:{parameters.server_port}"
+        self._stopping = threading.Event()
+        self._connection: Connection | None = None
+        self._problem: str | None = None
+        self._was_connected = False
+        self._next_warning_s = 0.0
+        self._thread = threading.Thread(target=self._run, name="reader", daemon=True)
+
+    def start(self) -> None:
+        """Start reading."""
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 5.0) -> bool:
+        """Stop reading and wait for the thread; False if it does not end in time."""
+        self._stopping.set()
+        connection = self._connection
+        if connection is not None:
+            connection.shutdown()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def shut_server_down(self, timeout_s: float = 3.0) -> str:
+        """Ask the server to shut down, from another thread; a sentence that says what came of it.
+
+        Uses the reader's connection, or where it has none makes one attempt of its own.
+        """
+        deadline = time.monotonic() + timeout_s
+        connection, own = self._connection, None
+        try:
+            if connection is None:
+                own = Connection(self._parameters.server_host, self._parameters.server_port, timeout_s)
+                reply = own.ask("shutdown")
+            else:
+                waiting = connection.send_request("shutdown")
+                reply = waiting.result(max(deadline - time.monotonic(), 0.1))
+                if reply.get("ok") is not True:
+                    return f"the server at {self._address} refused to shut down: {refusal(reply)}"
+        except FutureTimeoutError:
+            return f"the server at {self._address} did not answer the request to shut down"
+        except ConnectionFailedError as error:
+            return f"the server at {self._address} could not be told to shut down: {error}"
+        finally:
+            if own is not None:
+                own.close()
+        return f"the server at {self._address} is shutting down"
+
+    def _run(self) -> None:
+        try:
+            self._connect_for_ever()
+        except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a dead node
+            if not self._stopping.is_set():
+                self._on_failure(f"the reader failed: {type(error).__name__}: {error}")
+
+    def _connect_for_ever(self) -> None:
+        delay_s = _FIRST_DELAY_S
+        while not self._stopping.is_set():
+            began_s = time.monotonic()
+            try:
+                self._session()
+            except ConnectionFailedError as error:
+                if self._stopping.is_set():
+                    return
+                if time.monotonic() - began_s > _STEADY_S and not isinstance(error, UnreachableError):
+                    delay_s = _FIRST_DELAY_S
+                    self._problem = None
+                self._say_problem(error)
+            self._stopping.wait(delay_s)
+            delay_s = min(delay_s * 1.5, _LONGEST_DELAY_S)
+
+    def _session(self) -> None:
+        """One connection from beginning to end; ConnectionFailedError is how it ends."""
+        connection = Connection(self._parameters.server_host, self._parameters.server_port)
+        self._connection = connection
+        try:
+            if self._stopping.is_set():
+                return
+            info = connection.subscribe(self._parameters.sensor)
+            again = " again" if self._was_connected else ""
+            self._log.info(f"connected{again} to {self._address}: {info}")
+            self._was_connected = True
+            self._stream(connection)
+        finally:
+            self._connection = None
+            connection.close()
+
+    def _stream(self, connection: Connection) -> None:
+        selector = FrameSelector(
+            self._parameters.sensor,
+            self.counts,
+            same_clock=connection.same_machine,
+            limit_hz=self._parameters.publishing_frequency,
+        )
+        decoders, outputs, monotonic_ns = self._decoders, self._outputs, time.monotonic_ns
+        frames: list[DataMessage] = []
+        silent = False
+        self._take(connection, frames)  # what followed the reply
+        while not self._stopping.is_set():
+            more = connection.receive()
+            if more is None:
+                if not silent:
+                    self._log.warning(f"nothing came from {self._address} for {SILENCE_S:g} s")
+                silent = True
+                continue
+            if silent:
+                self._log.info(f"{self._address} sends again")
+                silent = False
+            self._take(connection, frames)
+            reads = 1
+            while more and reads < _MAX_READS:
+                more = connection.receive(wait=False)
+                self._take(connection, frames)
+                reads += 1
+            for frame in selector.select(frames, monotonic_ns()):
+                sample = decoders[len(frame.process_data)].decode(frame.process_data)
+                for output in outputs:
+                    if not output.publish(sample, frame.stamp_ns):
+                        self._count_not_finite()
+            frames.clear()
+
+    def _take(self, connection: Connection, frames: list[DataMessage]) -> None:
+        """Move every whole message that has been received to `frames`; answer the others."""
+        while (message := connection.next_message()) is not None:
+            if isinstance(message, DataMessage):
+                if message.stamp_ns > _LAST_STAMP_NS:
+                    raise ConnectionFailedError(f"a frame has the impossible time {message.stamp_ns} ns")
+                frames.append(message)
+            elif not connection.take_reply(message):
+                self._say_event(message)
+
+    def _count_not_finite(self) -> None:
+        self.not_finite += 1
+        now_s = time.monotonic()
+        if now_s >= self._next_warning_s:
+            self._next_warning_s = now_s + _WARN_EVERY_S
+            self._log.warning(
+                f"a sample with numbers that are not finite was not published ({self.not_finite} so far)"
+            )
+
+    def _say_event(self, message: JsonObject) -> None:
+        if "event" not in message:
+            return
+        say, text = EVENTS.get(printable(message["event"], 40), ("info", "the server says {event}"))
+        details = {key: value for key, value in message.items() if key != "event"}
+        suffix = f" {printable(details)}" if details else ""
+        getattr(self._log, say)(text.format(event=printable(message["event"], 40)) + suffix)
+
+    def _say_problem(self, error: ConnectionFailedError) -> None:
+        """Log a problem once, however often it comes back."""
+        if isinstance(error, UnreachableError):
+            # After a connection that ended, this only says what is known already.
+            text = f"no server at {self._address}: {error}; trying until there is one"
+            known = self._problem is not None
+        else:
+            text = f"connection to {self._address} ended: {error}; connecting again"
+            known = self._problem == text
+        if not known:
+            self._problem = text
+            self._log.warning(text)
+
+
+EVENTS: Final[Mapping[str, tuple[str, str]]] = {
+    "sensor_lost": ("warning", "the server has lost the sensor"),
+    "sensor_back": ("info", "the sensor is back"),
+    "reconfigured": ("info", "the sensor was reconfigured"),
+    "shutting_down": ("info", "the server is shutting down"),
+}
+"""What the server's events are called in the log, and how loud."""

@@ -1,0 +1,159 @@
+"""Which frames are news: nothing old as new, nothing twice, nothing invalid. No sockets, no ROS.
+
+The rules it keeps:
+
+- Every fresh frame is selected exactly once, in order.
+- REPEATED and INVALID frames, and frames older than one already seen, never are.
+- When a queued frame is older than BACKLOG_NS (this process was stopped, or is slower than the stream),
+  everything is skipped and counted up to the first frame younger than FRESH_NS.
+- Age is CLOCK_MONOTONIC now minus the frame's, if the server's clock is ours. Otherwise it is relative to
+  the least such difference seen, which may rise slowly as clocks drift apart.
+- With a limit to the rate, the newest of what is queued is selected, whenever the limit allows one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from protocol.framing import DataFlag, DataMessage
+
+BACKLOG_NS: Final = 50_000_000
+FRESH_NS: Final = 4_000_000
+_LONGEST_SKIP_NS: Final = 250_000_000
+"""After this long with nothing fresh the clocks cannot be the same: ages are relative from there."""
+_DRIFT_DIVISOR: Final = 5000
+"""Two machines' clocks drift apart by less than 1/5000."""
+
+_REPEATED: Final = int(DataFlag.REPEATED)
+_INVALID: Final = int(DataFlag.INVALID)
+_GAP: Final = int(DataFlag.GAP)
+
+
+@dataclass
+class FrameCounts:
+    """What has come of the sensor's frames since the node started."""
+
+    fresh: int = 0
+    repeated: int = 0
+    invalid: int = 0
+    old: int = 0
+    """Frames not newer than one before them."""
+    gaps: int = 0
+    """Frames that the server marked with GAP."""
+    lost: int = 0
+    """Samples missing in those gaps, as far as `sequence` tells; at least one a gap."""
+    skipped: int = 0
+    """Fresh frames left out because newer ones were waiting."""
+    limited: int = 0
+    """Fresh frames left out by the limit to the rate."""
+
+
+class FrameSelector:
+    """Selects the frames of one connection that are to be published. A new connection needs a new one."""
+
+    def __init__(self, sensor: int, counts: FrameCounts, *, same_clock: bool, limit_hz: float = 0.0) -> None:
+        """`same_clock`: the server's CLOCK_MONOTONIC is ours. `limit_hz` 0 is no limit."""
+        self._sensor = sensor
+        self._counts = counts
+        self._limit = RateLimit(limit_hz) if limit_hz > 0 else None
+        self._sequence = -1
+        self._monotonic_ns = -1
+        self._same_clock = same_clock
+        self._offset_ns: int | None = 0 if same_clock else None
+        self._now_ns = 0
+        self._skipping_since_ns: int | None = None
+
+    def select(self, frames: Sequence[DataMessage], now_ns: int) -> list[DataMessage]:
+        """The frames of `frames`, all that were queued, that are to be published, oldest first.
+
+        `now_ns` is CLOCK_MONOTONIC after the last was received.
+        """
+        fresh = [frame for frame in frames if self._is_fresh(frame)]
+        if not fresh:
+            return fresh
+        newest = fresh[-1]
+        age_ns = self._age_ns(newest, now_ns)
+        if self._skipping_since_ns is None:
+            if age_ns + newest.monotonic_ns - fresh[0].monotonic_ns > BACKLOG_NS:
+                self._skipping_since_ns = now_ns
+        elif now_ns - self._skipping_since_ns > _LONGEST_SKIP_NS:
+            self._same_clock = False
+            self._offset_ns = now_ns - newest.monotonic_ns
+            age_ns = 0
+        if self._skipping_since_ns is not None:
+            if age_ns > FRESH_NS:
+                self._counts.skipped += len(fresh)
+                return []
+            self._skipping_since_ns = None
+            self._counts.skipped += len(fresh) - 1
+            fresh = [newest]
+        if self._limit is not None:
+            allowed = self._limit.allows(newest.monotonic_ns)
+            self._counts.limited += len(fresh) - allowed
+            return [newest] if allowed else []
+        return fresh
+
+    def _age_ns(self, newest: DataMessage, now_ns: int) -> int:
+        difference = now_ns - newest.monotonic_ns
+        if self._same_clock:
+            return difference
+        if self._offset_ns is None:
+            self._offset_ns = difference
+        else:
+            self._offset_ns = min(
+                self._offset_ns + (now_ns - self._now_ns) // _DRIFT_DIVISOR, difference
+            )  # fmt: skip
+        self._now_ns = now_ns
+        return difference - self._offset_ns
+
+    def _is_fresh(self, frame: DataMessage) -> bool:
+        """Count `frame` and tell whether it is a new, valid sample of our sensor."""
+        sequence, _, monotonic_ns, sensor, flags, _, _ = frame
+        if sensor != self._sensor:
+            return False
+        counts = self._counts
+        if sequence <= self._sequence and monotonic_ns <= self._monotonic_ns:
+            counts.old += 1
+            return False
+        if flags & _GAP:
+            counts.gaps += 1
+            missing = sequence - self._sequence - 1 if self._sequence >= 0 else 1
+            counts.lost += max(missing, 1)
+        self._sequence, self._monotonic_ns = sequence, monotonic_ns
+        if flags & _INVALID:
+            counts.invalid += 1
+            return False
+        if flags & _REPEATED:
+            counts.repeated += 1
+            return False
+        counts.fresh += 1
+        return True
+
+
+class RateLimit:
+    """At most so many a second, on average and over every second (one more at its edges).
+
+    It counts in the samples' own time and saves up half a message, so that a limit equal to the stream's
+    rate lets every sample pass though their distance varies.
+    """
+
+    _CREDIT_LIMIT: Final = 1.5
+
+    def __init__(self, hz: float) -> None:
+        self._per_ns = hz / 1e9
+        self._credit = self._CREDIT_LIMIT
+        self._last_ns: int | None = None
+
+    def allows(self, time_ns: int) -> bool:
+        """Whether a sample of this time may pass; counts it if so."""
+        if self._last_ns is not None:
+            elapsed = max(time_ns - self._last_ns, 0)
+            self._credit = min(self._credit + elapsed * self._per_ns, self._CREDIT_LIMIT)
+        self._last_ns = time_ns
+        # A hair less than 1: a hundred times 1.25 ms at 800 Hz is to make a hundred.
+        if self._credit < 1.0 - 1e-6:
+            return False
+        self._credit -= 1.0
+        return True

@@ -1,0 +1,152 @@
+"""A server that does as a test tells it: speaks the wire protocol from `protocol`, knows no sensor.
+
+`ScriptedServer` answers describe, subscribe and shutdown by itself and sends what `send_sample` and
+`send_raw` are given. `python scripted_server.py PORT RATE` streams by itself, for measurements.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from protocol.control import PROTOCOL_VERSION
+from protocol.errors import ProtocolError
+from protocol.framing import DataMessage, FrameDecoder, JsonObject, encode_data, encode_json
+from protocol.pdo import encode
+
+Answer = Callable[[JsonObject], JsonObject | None]
+
+
+def description(sensor: int = 0, **changes: Any) -> JsonObject:
+    """A `describe` reply's content."""
+    row = {
+        "sensor": sensor, "name": "BFT-SENS-ECAT-M8", "serial": 1, "pdo_size": 61, "rate_hz": 800,
+        "state": "OP", "hardware": "h", "firmware": "f", "settings": {},
+    }  # fmt: skip
+    return {"protocol": PROTOCOL_VERSION, "version": "0.1.0", "sensors": [row], **changes}
+
+
+def process_data(number: float, size: int = 61) -> bytes:
+    """Process data whose twelve values follow from `number`."""
+    names = [f"{v}.{a}" for v in ("force", "torque", "acceleration", "angular_rate") for a in "xyz"]
+    return encode(size, {name: number + i / 16 for i, name in enumerate(names)})
+
+
+class ScriptedServer:
+    """Listens on a free port of the loopback; one connection after the other, one at a time."""
+
+    def __init__(self, port: int = 0) -> None:
+        self._listener = socket.create_server(("127.0.0.1", port))
+        self.port: int = self._listener.getsockname()[1]
+        self.requests: list[JsonObject] = []
+        self.connections = 0
+        self.description = description()
+        self.answers: dict[str, Answer] = {}
+        self.on_subscribe: Callable[[], None] = lambda: None
+        self.subscribed = threading.Event()
+        self.disconnected = threading.Event()
+        self.sequence = 0
+        self._peer: socket.socket | None = None
+        self._closing = False
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> ScriptedServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop listening and drop the connection."""
+        self._closing = True
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self.drop()
+        self._thread.join(5)
+
+    def drop(self) -> None:
+        """Drop the connection."""
+        self.subscribed.clear()
+        if self._peer is not None:
+            with contextlib.suppress(OSError):
+                self._peer.shutdown(socket.SHUT_RDWR)
+
+    def send_raw(self, data: bytes) -> None:
+        """Send these bytes."""
+        assert self._peer is not None
+        self._peer.sendall(data)
+
+    def send_json(self, message: JsonObject) -> None:
+        """Send a JSON message."""
+        self.send_raw(encode_json(message))
+
+    def send_sample(self, number: float, flags: int = 0, **changes: Any) -> None:
+        """Send the next frame of sensor 0."""
+        self.send_raw(self.frame(number, flags, **changes))
+
+    def frame(self, number: float, flags: int = 0, **changes: Any) -> bytes:
+        """The next frame of sensor 0, encoded."""
+        self.sequence += 1
+        message = DataMessage(
+            self.sequence, time.time_ns(), time.monotonic_ns(), 0, flags, 3, process_data(number)
+        )
+        return encode_data(*message._replace(**changes))
+
+    def _serve(self) -> None:
+        while not self._closing:
+            try:
+                self._peer, _ = self._listener.accept()
+            except OSError:
+                return
+            self.connections += 1
+            with self._peer, contextlib.suppress(OSError, ProtocolError):
+                for message in self._messages(self._peer):
+                    self.requests.append(message)
+                    self._answer(message)
+            self.subscribed.clear()
+            self.disconnected.set()
+
+    def _messages(self, peer: socket.socket) -> Iterator[JsonObject]:
+        decoder = FrameDecoder()
+        while data := peer.recv(65536):
+            decoder.feed(data)
+            for message in decoder:
+                assert isinstance(message, dict)
+                yield message
+
+    def _answer(self, message: JsonObject) -> None:
+        action = str(message["action"])
+        reply: JsonObject | None = {"ok": True}
+        if action in {"describe", "subscribe"}:
+            reply = {"ok": True, **self.description}
+        if action in self.answers:
+            reply = self.answers[action](message)
+        if reply is not None:
+            self.send_json({"reply": action, "id": message.get("id"), **reply})
+        if action == "subscribe" and reply is not None and reply["ok"]:
+            self.on_subscribe()
+            self.subscribed.set()
+
+
+def stream(port: int, rate_hz: float) -> None:
+    """Serve a sine on `port` at `rate_hz` for ever."""
+    with ScriptedServer(port) as server:
+        due = time.monotonic()
+        while True:
+            due += 1 / rate_hz
+            time.sleep(max(due - time.monotonic(), 0))
+            if server.subscribed.is_set():
+                with contextlib.suppress(OSError):
+                    server.send_sample(math.sin(due))
+
+
+if __name__ == "__main__":
+    stream(int(sys.argv[1]), float(sys.argv[2]))

@@ -1,0 +1,130 @@
+"""Requests are checked against one table before anything acts on them."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.control import (
+    ACTIONS,
+    ErrorCode,
+    Event,
+    error_reply,
+    event,
+    parse_request,
+    reply,
+    request,
+    six_numbers,
+    whole_number,
+)
+from protocol.errors import RequestError
+
+scalars: st.SearchStrategy[Any] = (
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8)
+)
+anything = scalars | st.lists(scalars, max_size=7)
+
+
+def refused(message: dict[str, Any]) -> RequestError:
+    with pytest.raises(RequestError) as caught:
+        parse_request(message)
+    return caught.value
+
+
+def test_subscribe_gets_its_defaults() -> None:
+    parsed = parse_request({"action": "subscribe"})
+    assert parsed.values == {"sensors": None, "every": 1, "fresh_only": True}
+    assert not parsed.has_id
+
+
+def test_subscribe_takes_what_the_contract_names() -> None:
+    message = request("subscribe", 5, sensors=[0, 2], every=4, fresh_only=False)
+    assert parse_request(message).values == {"sensors": (0, 2), "every": 4, "fresh_only": False}
+
+
+@pytest.mark.parametrize("action", ["describe", "subscribe", "unsubscribe", "status", "shutdown"])
+def test_the_actions_are_there(action: str) -> None:
+    assert parse_request({"action": action}).action == action
+
+
+def test_only_what_changes_something_needs_authority() -> None:
+    free = {"describe", "subscribe", "unsubscribe", "status", "sdo_read"}
+    assert {name for name, action in ACTIONS.items() if not action.controls} <= free
+    assert ACTIONS["shutdown"].controls
+
+
+@pytest.mark.parametrize(
+    ("message", "code", "word"),
+    [
+        ({}, ErrorCode.BAD_REQUEST, "action"),
+        ({"action": None}, ErrorCode.BAD_REQUEST, "action"),
+        ({"action": 5}, ErrorCode.BAD_REQUEST, "string"),
+        ({"action": ["describe"]}, ErrorCode.BAD_REQUEST, "string"),
+        ({"action": "dance"}, ErrorCode.UNKNOWN_ACTION, "dance"),
+        ({"action": "x" * 5000}, ErrorCode.UNKNOWN_ACTION, "no action"),
+        ({"action": "describe", "loud": 1}, ErrorCode.BAD_REQUEST, "loud"),
+        ({"action": "subscribe", "every": 0}, ErrorCode.BAD_REQUEST, "every"),
+        ({"action": "subscribe", "every": True}, ErrorCode.BAD_REQUEST, "every"),
+        ({"action": "subscribe", "every": 1.0}, ErrorCode.BAD_REQUEST, "every"),
+        ({"action": "subscribe", "sensors": []}, ErrorCode.BAD_REQUEST, "sensors"),
+        ({"action": "subscribe", "sensors": [256]}, ErrorCode.BAD_REQUEST, "sensors"),
+        ({"action": "subscribe", "sensors": [False]}, ErrorCode.BAD_REQUEST, "sensors"),
+        ({"action": "subscribe", "sensors": 0}, ErrorCode.BAD_REQUEST, "sensors"),
+        ({"action": "subscribe", "fresh_only": 1}, ErrorCode.BAD_REQUEST, "fresh_only"),
+    ],
+)
+def test_what_is_wrong_is_named(message: dict[str, Any], code: ErrorCode, word: str) -> None:
+    error = refused(message)
+    assert error.code == code
+    assert word in str(error)
+    assert len(str(error)) < 400
+
+
+@given(st.sampled_from([*ACTIONS, "other"]), st.dictionaries(st.text(max_size=8), anything, max_size=4))
+def test_nothing_but_request_error_escapes(action: str, values: dict[str, Any]) -> None:
+    with contextlib.suppress(RequestError):
+        assert parse_request({**values, "action": action}).action == action
+
+
+def test_replies_repeat_action_and_id() -> None:
+    for identifier in (0, None, "x", [1, {}]):
+        parsed = parse_request({"action": "describe", "id": identifier})
+        assert reply(parsed, sensors=[]) == {
+            "reply": "describe", "id": identifier, "ok": True, "sensors": []
+        }  # fmt: skip
+    assert reply(parse_request({"action": "describe"})) == {"reply": "describe", "ok": True}
+
+
+def test_refusals_answer_anything() -> None:
+    assert error_reply(None, ErrorCode.BAD_REQUEST, "why") == {
+        "reply": None, "ok": False, "error": {"code": "bad_request", "message": "why"}
+    }  # fmt: skip
+    assert error_reply({"action": "tare", "id": 3}, ErrorCode.SENSOR, "why", abort_code=1) == {
+        "reply": "tare", "id": 3, "ok": False, "error": {"code": "sensor", "message": "why", "abort_code": 1}
+    }  # fmt: skip
+    assert error_reply({"action": {}}, ErrorCode.BAD_REQUEST, "why")["reply"] is None
+
+
+def test_events_have_the_contracts_names() -> None:
+    assert [str(e) for e in Event] == ["sensor_lost", "sensor_back", "reconfigured", "shutting_down"]
+    assert event(Event.SENSOR_LOST, sensor=1) == {"event": "sensor_lost", "sensor": 1}
+
+
+def test_whole_number_and_six_numbers() -> None:
+    assert whole_number(1, 3)(3) == 3
+    assert six_numbers([1, 2.5, 0, 0, 0, 0]) == (1.0, 2.5, 0.0, 0.0, 0.0, 0.0)
+    for wrong in (
+        [1, 2, 3],
+        [True] * 6,
+        [float("nan")] * 6,
+        [float("inf")] * 6,
+        "123456",
+        None,
+        [10**400] * 6,
+    ):
+        with pytest.raises(ValueError, match="six finite numbers"):
+            six_numbers(wrong)

@@ -1,0 +1,143 @@
+"""The process data, against Table III.2 of the design note written out."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.errors import PdoSizeError
+from protocol.pdo import LAYOUTS, PDO_FIELDS, ImuUnits, SampleDecoder, encode, layout_for
+
+# Name, offset, struct code, sub-index.
+TABLE = [
+    ("status", 0, "B", 0x01),
+    ("warnings", 1, "I", 0x02),
+    ("force.x", 5, "f", 0x04),
+    ("force.y", 9, "f", 0x05),
+    ("force.z", 13, "f", 0x06),
+    ("torque.x", 17, "f", 0x07),
+    ("torque.y", 21, "f", 0x08),
+    ("torque.z", 25, "f", 0x09),
+    ("force_torque_saturated", 29, "H", 0x0A),
+    ("acceleration.x", 31, "f", 0x0B),
+    ("acceleration.y", 35, "f", 0x0C),
+    ("acceleration.z", 39, "f", 0x0D),
+    ("acceleration_saturated", 43, "B", 0x0E),
+    ("angular_rate.x", 44, "f", 0x0F),
+    ("angular_rate.y", 48, "f", 0x10),
+    ("angular_rate.z", 52, "f", 0x11),
+    ("angular_rate_saturated", 56, "B", 0x12),
+    ("temperature", 57, "f", 0x13),
+    ("orientation.x", 61, "f", 0x14),
+    ("orientation.y", 65, "f", 0x15),
+    ("orientation.z", 69, "f", 0x16),
+    ("orientation.w", 73, "f", 0x17),
+]
+float32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
+
+
+def numbered(size: int) -> bytes:
+    """Every field holds its own number, counted from 1."""
+    names = [row[0] for row in TABLE if row[1] < size]
+    return encode(size, {name: float(n) for n, name in enumerate(names, 1)})
+
+
+def test_offsets_types_and_subindices_are_the_tables() -> None:
+    layout = layout_for(77)
+    assert [(f.name, layout.offsets[f.name], f.type.value, f.subindex) for f in PDO_FIELDS] == TABLE
+    assert sorted(LAYOUTS) == [61, 77]
+    assert not layout_for(61).has_orientation
+    assert layout.has_orientation
+
+
+@pytest.mark.parametrize("size", [61, 77])
+def test_every_field_lies_where_the_table_says(size: int) -> None:
+    data = numbered(size)
+    assert len(data) == size
+    for number, (name, offset, code, _) in enumerate((r for r in TABLE if r[1] < size), 1):
+        assert struct.unpack_from("<" + code, data, offset) == (number,), name
+        assert layout_for(size).fields[layout_for(size).index(name)].name == name
+
+
+def test_decoded_in_si_units() -> None:
+    sample = SampleDecoder(77).decode(numbered(77))
+    assert (sample.status, sample.warnings) == (1, 2)
+    assert list(sample.force) == [3, 4, 5]
+    assert list(sample.torque) == [6, 7, 8]
+    assert sample.acceleration == pytest.approx([10 * 9.80665, 11 * 9.80665, 12 * 9.80665])
+    assert sample.angular_rate == pytest.approx([math.radians(v) for v in (14, 15, 16)])
+    assert sample.temperature == 18
+    assert sample.orientation == (19, 20, 21, 22)
+    saturated = (sample.force_torque_saturated, sample.acceleration_saturated, sample.angular_rate_saturated)
+    assert saturated == (9, 13, 17)
+    assert sample.array == [
+        *sample.force, *sample.torque, *sample.acceleration, *sample.angular_rate
+    ]  # fmt: skip
+
+
+def test_a_sensor_that_sends_si_is_taken_at_its_word() -> None:
+    sample = SampleDecoder(61, ImuUnits.SI).decode(numbered(61))
+    assert list(sample.acceleration) == [10, 11, 12]
+    assert list(sample.angular_rate) == [14, 15, 16]
+
+
+def test_no_orientation_without_an_estimate() -> None:
+    assert SampleDecoder(61).decode(numbered(61)).orientation is None
+    assert SampleDecoder(77).decode(bytes(77)).orientation is None
+
+
+def test_decodes_in_the_middle_of_a_buffer() -> None:
+    decoder = SampleDecoder(61)
+    assert decoder.decode(memoryview(b"?" * 7 + numbered(61) + b"?"), 7) == decoder.decode(numbered(61))
+
+
+def test_too_few_bytes_are_an_error() -> None:
+    with pytest.raises(ValueError, match="cut short"):
+        SampleDecoder(77).decode(bytes(76))
+
+
+@pytest.mark.parametrize("size", [0, 1, 60, 62, 76, 78, 1000])
+def test_other_sizes_are_named(size: int) -> None:
+    for refuse in (layout_for, SampleDecoder, lambda s: encode(s, {})):
+        with pytest.raises(PdoSizeError, match=f"{size} bytes"):
+            refuse(size)
+
+
+def test_encode_knows_its_fields() -> None:
+    with pytest.raises(KeyError, match=r"orientation\.x"):
+        encode(61, {"orientation.x": 1.0})
+    with pytest.raises(KeyError, match="weight"):
+        encode(77, {"weight": 1.0})
+
+
+@given(st.lists(float32, min_size=6, max_size=6), float32)
+def test_round_trip(wrench: list[float], temperature: float) -> None:
+    names = [f"{vector}.{axis}" for vector in ("force", "torque") for axis in "xyz"]
+    data = encode(61, {**dict(zip(names, wrench, strict=True)), "temperature": temperature})
+    sample = SampleDecoder(61).decode(data)
+    assert [*sample.force, *sample.torque] == wrench
+    assert sample.temperature == temperature
+    assert sample.is_finite
+
+
+@pytest.mark.parametrize("name", [row[0] for row in TABLE if row[2] == "f"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_one_number_that_is_not_finite_is_noticed(name: str, value: float) -> None:
+    assert not SampleDecoder(77).decode(encode(77, {"orientation.w": 1.0, name: value})).is_finite
+
+
+def test_infinities_that_cancel_are_noticed() -> None:
+    data = encode(61, {"force.x": math.inf, "torque.x": -math.inf})
+    assert not SampleDecoder(61).decode(data).is_finite
+    largest = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
+    data = encode(61, {row[0]: largest for row in TABLE if row[2] == "f" and row[1] < 61})
+    assert SampleDecoder(61).decode(data).is_finite
+
+
+@given(st.sampled_from((61, 77)).flatmap(lambda n: st.binary(min_size=n, max_size=n)))
+def test_any_bytes_decode_to_something(data: bytes) -> None:
+    assert len(SampleDecoder(len(data)).decode(data).array) == 12

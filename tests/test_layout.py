@@ -1,0 +1,96 @@
+"""Who may import whom, read from the sources; and what must be the same everywhere."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PROTOCOL = sorted((ROOT / "protocol").rglob("*.py"))
+SERVER = sorted((ROOT / "ethercat_server").rglob("*.py"))
+BRIDGE = sorted((ROOT / "ros2_bridge" / "bridge").rglob("*.py"))
+OTHERS = [
+    ROOT / "ros2_bridge" / "setup.py",
+    *(
+        p
+        for folder in ("ros2_bridge/launch", "scripts", "tests")
+        for p in sorted((ROOT / folder).rglob("*.py"))
+    ),
+]
+
+
+def imports(path: Path) -> set[str]:
+    """The top-level names that a file imports, wherever in it."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names.update(alias.name.split(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names.add(str(node.module).split(".")[0])
+    return names
+
+
+def importers(paths: list[Path], name: str) -> Iterator[str]:
+    return (str(path.relative_to(ROOT)) for path in paths if name in imports(path))
+
+
+def test_protocol_is_standard_library_without_sockets_or_threads() -> None:
+    assert PROTOCOL
+    allowed = set(sys.stdlib_module_names) | {"protocol"}
+    forbidden = {"socket", "socketserver", "select", "selectors", "asyncio", "ssl", "threading", "_thread"}
+    forbidden |= {"multiprocessing", "concurrent", "subprocess", "queue"}
+    for path in PROTOCOL:
+        assert imports(path) <= allowed - forbidden, path
+
+
+def test_server_and_bridge_do_not_know_each_other() -> None:
+    assert SERVER
+    assert BRIDGE
+    assert not list(importers(SERVER, "bridge"))
+    assert not list(importers(BRIDGE, "ethercat_server"))
+
+
+def test_pysoem_is_used_in_at_most_one_file() -> None:
+    assert not list(importers(PROTOCOL + BRIDGE, "pysoem"))
+    assert len(list(importers(SERVER, "pysoem"))) <= 1
+
+
+def test_ros_is_used_by_the_bridge_only() -> None:
+    for name in ("rclpy", "std_msgs", "diagnostic_msgs", "sensor_msgs", "geometry_msgs"):
+        assert not list(importers(PROTOCOL + SERVER, name))
+
+
+def test_connection_and_selection_need_no_ros() -> None:
+    for name in ("client", "connection", "selection", "signals"):
+        assert not imports(ROOT / "ros2_bridge" / "bridge" / f"{name}.py") & {"rclpy", "std_msgs"}, name
+
+
+@pytest.mark.parametrize("path", PROTOCOL + SERVER + BRIDGE + OTHERS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_every_file_says_what_it_is_for(path: Path) -> None:
+    assert ast.get_docstring(ast.parse(path.read_text())), path
+
+
+def test_one_version() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    for name, pattern in (("package.xml", r"<version>(.*?)</version>"), ("setup.py", r'version="(.*?)"')):
+        found = re.search(pattern, (ROOT / "ros2_bridge" / name).read_text())
+        assert found is not None
+        assert found[1] == version, name
+
+
+def test_the_ros_package_is_whole() -> None:
+    package = ROOT / "ros2_bridge"
+    manifest = (package / "package.xml").read_text()
+    # colcon takes a package with an invalid address for plain Python.
+    assert re.search(r'<maintainer email="[^@" ]+@[^@" ]+\.[a-z]+">', manifest)
+    assert "<build_type>ament_python</build_type>" in manifest
+    assert (package / "resource" / "bridge").exists()
+    assert (package / "resource" / "client").stat().st_mode & 0o111
+    assert (package / "protocol" / "framing.py").samefile(ROOT / "protocol" / "framing.py")
