@@ -78,6 +78,11 @@ class Child:
                 preexec_fn=die_with_parent,  # noqa: PLW1509 - there are no threads yet
             )
 
+    @property
+    def pid(self) -> int:
+        """Its process number."""
+        return self._process.pid
+
     def check(self) -> None:
         """DemoError, with its last words, if it has ended."""
         code = self._process.poll()
@@ -265,7 +270,8 @@ def show(screen: Screen, ears: Ears, children: Sequence[Child], seconds: float |
             screen.show(ears.measurement)
 
 
-def _on_signal(_number: int, _frame: FrameType | None) -> None:
+def on_signal(_number: int, _frame: FrameType | None) -> None:
+    """End what runs with Stopped."""
     ignore_signals()  # taking things down is not to be stopped half-way
     raise Stopped
 
@@ -279,7 +285,7 @@ def ignore_signals() -> None:
 def main() -> int:
     """Parse the arguments and run."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _on_signal)
+        signal.signal(number, on_signal)
     directory = Path(os.environ.get("DEMO_DIRECTORY") or tempfile.mkdtemp())
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})

@@ -1,0 +1,208 @@
+"""The benchmark, started by scripts/benchmark in a network namespace of its own: arguments, order, files."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import datetime
+import json
+import os
+import platform
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from rich.console import Console
+
+from ethercat_server.errors import ServerError
+from scripts import _benchmark_chains as chains
+from scripts._benchmark_chain import OVERSAMPLING_HZ, Setup, virtual_bus
+from scripts._benchmark_plot import Curves, draw
+from scripts._benchmark_records import may_be_real_time
+from scripts._benchmark_report import print_configuration
+from scripts._benchmark_soak import soak
+from scripts._demo import DemoError, Stopped, ignore_signals, loopback_up, on_signal
+
+MOST_CPUS: Final = 4
+"""More are left alone, so that a canary can sit on every CPU that is used."""
+_SECONDS: Final = 6.0
+_QUICK_SECONDS: Final = 3.0
+_RATES: Final = tuple(OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512))
+
+
+@dataclass
+class Progress:
+    """Says what is being measured."""
+
+    console: Console
+    total: int
+    done: int = 0
+
+    @contextlib.contextmanager
+    def part(self, what: str) -> Iterator[None]:
+        """One chain."""
+        self.done += 1
+        text = f"[{self.done}/{self.total}] {what}"
+        if self.console.is_terminal:
+            with self.console.status(text):
+                yield
+        else:
+            print(text, flush=True)
+            yield
+
+
+def measure(setup: Setup, with_ros: bool, progress: Progress) -> tuple[dict[str, Any], Curves]:
+    """One configuration: everything side by side on the same virtual sensors."""
+    name = f"{setup.rate_hz} Hz, {setup.sensors} sensor{'s' * (setup.sensors > 1)}"
+    result: dict[str, Any] = {"rate_hz": setup.rate_hz, "sensors": setup.sensors, "project": {}, "note": None}
+    curves: Curves = {}
+    floor_s = max(1.0, setup.seconds / 3)
+    with virtual_bus(setup) as (ifname, sensor):
+        with progress.part(f"{name}: floor"):
+            result["floor"], curves["floor"] = chains.floor(setup, ifname, floor_s, setup.priority)
+            if setup.priority:
+                result["floor_ordinary"], _ = chains.floor(setup, ifname, floor_s, 0)
+        programs = {"project": (chains.project_tcp, chains.project_ros)}
+        if setup.sensors == 1:  # the note's programs know one sensor only
+            programs["note"] = (chains.note_tcp, chains.note_ros)
+        for program, (to_client, to_subscriber) in programs.items():
+            with progress.part(f"{name}: {program}, TCP"):
+                figures, curves[f"{program}, TCP"] = to_client(setup, ifname, sensor)
+                result[program] = {"tcp": figures, "ros": None}
+            if with_ros:
+                with progress.part(f"{name}: {program}, ROS"):
+                    figures, curves[f"{program}, ROS"] = to_subscriber(setup, ifname, sensor)
+                    result[program]["ros"] = figures
+    return result, curves
+
+
+def run(options: argparse.Namespace, console: Console) -> None:
+    """Measure, show, write. DemoError or Stopped end it early."""
+    loopback_up()
+    os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:MOST_CPUS]))
+    priority = options.rt_priority
+    if priority and not may_be_real_time():
+        console.print("no real-time scheduling here (CAP_SYS_NICE): everything runs with ordinary scheduling")
+        priority = 0
+    seconds = options.seconds or (_QUICK_SECONDS if options.quick else _SECONDS)
+
+    def setup(rate: int, sensors: int) -> Setup:
+        return Setup(rate, sensors, seconds, warm_up_s=1.0, priority=priority, ppm=options.ppm)
+
+    if options.soak:
+        result: dict[str, Any] = soak(setup(options.rates[0], options.sensors[0]), options.soak * 60, console)
+        write_json(options.json, options, priority, soak=result)
+        console.print(f"written: {options.json}")
+        return
+    wanted = [setup(rate, sensors) for rate in options.rates for sensors in options.sensors]
+    ways = 2 if options.ros else 1
+    progress = Progress(console, sum(1 + ways * (2 if one.sensors == 1 else 1) for one in wanted))
+    began = time.monotonic()
+    results, curves = [], {}
+    for one in wanted:
+        result, curves[one.rate_hz, one.sensors] = measure(one, options.ros, progress)
+        results.append(result)
+    for result in results:
+        print_configuration(result, console)
+    write_json(options.json, options, priority, seconds=seconds, configurations=results)
+    draw(curves, options.plot)
+    console.print(f"{time.monotonic() - began:.0f} s; written: {options.json}, {options.plot}")
+
+
+def write_json(path: Path, options: argparse.Namespace, priority: int, **results: Any) -> None:
+    """Everything that was measured, and where and how."""
+    content = {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "machine": {
+            "kernel": platform.release(),
+            "machine": platform.machine(),
+            "cpus_used": len(os.sched_getaffinity(0)),
+            "python": platform.python_version(),
+            "load_average": os.getloadavg(),
+        },
+        "rt_priority": priority,
+        "ppm": options.ppm,
+        **results,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def parse(argv: list[str] | None = None) -> argparse.Namespace:
+    """The command line; argparse exits with 2 for what is wrong with it."""
+    parser = argparse.ArgumentParser(
+        prog="scripts/benchmark",
+        description="Measure this project beside the floor of this machine and beside the note's design.",
+    )
+    here = Path(os.environ.get("CALLED_FROM") or Path.cwd())
+    folder = here / "benchmark-results"
+    parser.add_argument("--quick", action="store_true", help="one configuration only, in half a minute")
+    parser.add_argument("--seconds", type=_seconds, help=f"how long each chain is measured ({_SECONDS:g})")
+    parser.add_argument("--json", type=Path, default=folder / "benchmark.json", metavar="FILE")
+    parser.add_argument("--plot", type=Path, default=folder / "benchmark.png", metavar="FILE.png")
+    parser.add_argument("--rates", type=_rates, metavar="HZ,...", help="sample rates (800,1600)")
+    parser.add_argument("--sensors", type=_counts, metavar="N,...", help="sensors on the bus (1,2)")
+    parser.add_argument("--ppm", type=float, default=150.0, help="the sensors' clock error (%(default)g)")
+    parser.add_argument("--soak", type=float, metavar="MINUTES", help="only the server, for so long")
+    parser.add_argument("--no-ros", dest="ros", action="store_false", help="TCP only")
+    parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
+                        help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip
+    options = parser.parse_args(argv)
+    options.json, options.plot = here / options.json, here / options.plot
+    only_one = options.quick or options.soak
+    options.rates = options.rates or ([800] if only_one else [800, 1600])
+    options.sensors = options.sensors or ([1] if only_one else [1, 2])
+    return options
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.5 <= value <= 3600:
+        raise argparse.ArgumentTypeError("must be from 0.5 to 3600")
+    return value
+
+
+def _rates(text: str) -> list[int]:
+    rates = [int(word) for word in text.split(",")]
+    if not set(rates) <= set(_RATES):
+        raise argparse.ArgumentTypeError(f"rates must be among {', '.join(map(str, sorted(_RATES)))}")
+    return rates
+
+
+def _counts(text: str) -> list[int]:
+    counts = [int(word) for word in text.split(",")]
+    if not all(1 <= count <= 16 for count in counts):
+        raise argparse.ArgumentTypeError("numbers of sensors must be from 1 to 16")
+    return counts
+
+
+def main() -> int:
+    """Run; returns the exit code."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    directory = os.environ.get("DEMO_DIRECTORY")
+    made = None if directory else tempfile.mkdtemp()
+    os.environ["DEMO_DIRECTORY"] = directory or str(made)
+    try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+        run(parse(), Console())
+    except Stopped:
+        print("stopped; nothing is written", file=sys.stderr)
+        return 130
+    except (DemoError, ServerError, OSError) as error:
+        print(f"benchmark: {error}", file=sys.stderr)
+        return 1
+    finally:
+        ignore_signals()
+        shutil.rmtree(os.environ["DEMO_DIRECTORY"], ignore_errors=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
