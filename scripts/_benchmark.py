@@ -31,6 +31,8 @@ from scripts._demo import DemoError, Stopped, ignore_signals, loopback_up, on_si
 
 MOST_CPUS: Final = 4
 """More are left alone, so that a canary can sit on every CPU that is used."""
+_WIDTH: Final = 100
+"""Of the tables, at least."""
 _SECONDS: Final = 6.0
 _QUICK_SECONDS: Final = 3.0
 _RATES: Final = tuple(OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512))
@@ -62,11 +64,11 @@ def measure(setup: Setup, with_ros: bool, progress: Progress) -> tuple[dict[str,
     name = f"{setup.rate_hz} Hz, {setup.sensors} sensor{'s' * (setup.sensors > 1)}"
     result: dict[str, Any] = {"rate_hz": setup.rate_hz, "sensors": setup.sensors, "project": {}, "note": None}
     curves: Curves = {}
-    floor_s = max(1.0, setup.seconds / 3)
+    floor_s = setup.seconds / 2
     with virtual_bus(setup) as (ifname, sensor):
         with progress.part(f"{name}: floor"):
             result["floor"], curves["floor"] = chains.floor(setup, ifname, floor_s, setup.priority)
-            if setup.priority:
+            if setup.priority and setup.sensors == 1:
                 result["floor_ordinary"], _ = chains.floor(setup, ifname, floor_s, 0)
         programs = {"project": (chains.project_tcp, chains.project_ros)}
         if setup.sensors == 1:  # the note's programs know one sensor only
@@ -98,7 +100,7 @@ def run(options: argparse.Namespace, console: Console) -> None:
     if options.soak:
         result: dict[str, Any] = soak(setup(options.rates[0], options.sensors[0]), options.soak * 60, console)
         write_json(options.json, options, priority, soak=result)
-        console.print(f"written: {options.json}")
+        print(f"written: {options.json}")
         return
     wanted = [setup(rate, sensors) for rate in options.rates for sensors in options.sensors]
     ways = 2 if options.ros else 1
@@ -111,8 +113,13 @@ def run(options: argparse.Namespace, console: Console) -> None:
     for result in results:
         print_configuration(result, console)
     write_json(options.json, options, priority, seconds=seconds, configurations=results)
-    draw(curves, options.plot)
-    console.print(f"{time.monotonic() - began:.0f} s; written: {options.json}, {options.plot}")
+    written = str(options.json)
+    try:
+        draw(curves, options.plot)
+        written += f" and {options.plot}"
+    except DemoError as error:
+        console.print(str(error))
+    print(f"{time.monotonic() - began:.0f} s; written: {written}")
 
 
 def write_json(path: Path, options: argparse.Namespace, priority: int, **results: Any) -> None:
@@ -191,7 +198,8 @@ def main() -> int:
     os.environ["DEMO_DIRECTORY"] = directory or str(made)
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
-        run(parse(), Console())
+        options = parse()
+        run(options, Console(width=max(Console().width, _WIDTH)))
     except Stopped:
         print("stopped; nothing is written", file=sys.stderr)
         return 130

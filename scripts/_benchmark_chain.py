@@ -120,6 +120,7 @@ class Chain:
         """Wait for a recording, which has been started, to be whole; CPU and memory meanwhile."""
         self.wait(lambda: began(path).exists() or path.exists(), "nothing was received")
         before = {name: process.cpu_times() for name, process in self.watched.items()}
+        others = cpu_of_others()
         started = time.monotonic()
         ending = started + self.setup.seconds - 0.1
         self.wait(lambda: time.monotonic() > ending or path.exists(), "", self.setup.seconds + 5)
@@ -130,6 +131,7 @@ class Chain:
             used = now.user + now.system - before[name].user - before[name].system
             usage["cpu_percent"][name] = round(100 * used / wall, 1)
             usage["rss_mb"][name] = round(process.memory_info().rss / _MEGABYTE, 1)
+        usage["cpu_percent"]["everything else"] = round(100 * (cpu_of_others() - others) / wall, 1)
         self.wait(path.exists, "the recording did not end")
         return usage
 
@@ -149,6 +151,17 @@ class Chain:
         result, ages = statistics.summary(statistics.read_arrivals(path), self.setup.period_ns, stopped)
         longest = float(np.max(stopped[:, 1] - stopped[:, 0])) / 1000 if len(stopped) else 0.0
         return {**result, "machine_stops": len(stopped), "longest_stop_us": round(longest, 1)}, ages
+
+
+def cpu_of_others() -> float:
+    """CPU seconds that all but this benchmark have taken, the host of a virtual machine included."""
+    times = psutil.cpu_times()
+    ours = 0.0
+    for process in (me := psutil.Process(), *me.children(recursive=True)):
+        with contextlib.suppress(psutil.Error):
+            mine = process.cpu_times()
+            ours += mine.user + mine.system
+    return float(sum(times) - times.idle - times.iowait - times.guest - times.guest_nice - ours)
 
 
 @contextlib.contextmanager

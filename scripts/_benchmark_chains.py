@@ -23,6 +23,7 @@ def floor(setup: Setup, ifname: str, seconds: float, priority: int) -> tuple[Fig
     port = PORT + _PORTS_BESIDE
     paced = ("--rate", setup.rate_hz, "--seconds", seconds, "--priority", priority)
     with chain(setup) as running:
+        running.start_canaries()  # they keep the CPUs awake here as they do in the other chains
         exchanges = running.directory / "exchange"
         running.start_recorder(exchanges, _FLOOR, "exchange", exchanges, "--ifname", ifname, *paced)
         running.wait(exchanges.exists, "the bare exchange did not end", seconds + 30)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from scripts._benchmark_statistics import Floats
+from scripts._demo import DemoError
 
 Curves = dict[str, Floats]
 """Ages in ns, by what they are of."""
@@ -20,7 +22,6 @@ _LOOKS: Final = {
     "note, TCP": ("note's design, TCP client", "tab:orange", "-"),
     "note, ROS": ("note's design, ROS subscriber", "tab:orange", "--"),
 }
-_FEWEST_US: Final = 10.0
 
 
 def tail(ages_ns: Floats) -> tuple[Floats, Floats]:
@@ -30,16 +31,19 @@ def tail(ages_ns: Floats) -> tuple[Floats, Floats]:
 
 
 def draw(configurations: Mapping[tuple[int, int], Curves], path: Path) -> None:
-    """Write the plot as PNG."""
+    """Write the plot as PNG; DemoError if there is nothing to draw it with."""
+    if find_spec("matplotlib") is None:
+        raise DemoError("there is no plot: matplotlib is missing (pip install matplotlib)")
     import matplotlib as mpl  # noqa: PLC0415 - slow, and an extra
 
     mpl.use("Agg")
     from matplotlib import pyplot  # noqa: PLC0415
 
+    everything = np.concatenate([ages for curves in configurations.values() for ages in curves.values()])
     columns = min(2, len(configurations))
     lines = -(-len(configurations) // columns)
     figure, axes = pyplot.subplots(
-        lines, columns, figsize=(6.4 * columns, 4.4 * lines + 0.7), squeeze=False, sharex=True, sharey=True
+        lines, columns, figsize=(6.8 * columns, 4.4 * lines + 0.9), squeeze=False, sharex=True, sharey=True
     )
     for place, ((rate, sensors), curves) in enumerate(configurations.items()):
         panel = axes[place // columns][place % columns]
@@ -49,7 +53,7 @@ def draw(configurations: Mapping[tuple[int, int], Curves], path: Path) -> None:
         panel.set_title(f"{rate} Hz, {sensors} sensor{'s' * (sensors > 1)}")
         panel.set_xscale("log")
         panel.set_yscale("log")
-        panel.set_xlim(left=_FEWEST_US)
+        panel.set_xlim(everything.min() / 1200, everything.max() / 800)
         panel.set_ylim(5e-5, 1.3)
         panel.axvline(1e6 / rate, color="0.7", linestyle=":", linewidth=1)
         panel.annotate(
@@ -64,8 +68,10 @@ def draw(configurations: Mapping[tuple[int, int], Curves], path: Path) -> None:
         axes[place // columns][place % columns].set_axis_off()
     shown = [look for name, look in _LOOKS.items() if any(name in c for c in configurations.values())]
     handles = [pyplot.Line2D([], [], color=colour, linestyle=style) for _, colour, style in shown]
-    figure.legend(handles, [text for text, _, _ in shown], loc="lower center", ncols=3, frameon=False)
-    figure.tight_layout(rect=(0, 0.6 / figure.get_figheight(), 1, 1))
+    figure.legend(
+        handles, [text for text, _, _ in shown], loc="lower center", ncols=1 + columns, frameon=False
+    )
+    figure.tight_layout(rect=(0, 0.9 / figure.get_figheight(), 1, 1))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)

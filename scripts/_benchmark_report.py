@@ -3,78 +3,79 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
-_CLIENTS: Final = (("tcp", "TCP client"), ("ros", "ROS subscriber"))
-_POINTS: Final = ("p50", "p99", "p999")
-_POINT_NAMES: Final = {"p50": "p50", "p99": "p99", "p999": "p99.9", "max": "max"}
+_POINTS: Final = {"p50": "p50", "p99": "p99", "p999": "p99.9"}
 _NONE: Final = "-"
+
+
+class Row(NamedTuple):
+    """A line of the table; one with a name only is a heading."""
+
+    name: str
+    project: str = ""
+    note: str = ""
+    floor: str = ""
+    project_by_floor: str = ""
+    note_by_project: str = ""
 
 
 def print_configuration(result: Mapping[str, Any], console: Console) -> None:
     """One configuration as a table."""
-    title = f"{result['rate_hz']} Hz, {result['sensors']} virtual sensor{'s' * (result['sensors'] > 1)}"
-    table = Table(title=title, title_justify="left", title_style="bold")
-    table.add_column("", min_width=30)
+    table = Table(title=title(result), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    table.add_column("", no_wrap=True)
     for name in ("this project", "note's design", "floor", "this/floor", "note/this"):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     for row in rows(result):
-        if row is None:
+        if len(list(filter(None, row))) == 1:
             table.add_section()
+            table.add_row(f"[bold]{row.name}[/bold]")
         else:
-            table.add_row(*row)
+            table.add_row(f"  {row.name}", *row[1:])
     console.print(table)
 
 
-def rows(result: Mapping[str, Any]) -> list[tuple[str, ...] | None]:
-    """The table's rows; None where a line is drawn."""
-    found: list[tuple[str, ...] | None] = []
-    for chain, client in _CLIENTS:
-        if get(result, "project", chain) is None:
-            continue
-        for key, name in (
-            ("made", "Samples made"),
-            ("lost", "lost"),
-            ("lost_in_stops", "  of them in machine stops"),
-            ("repeated", "repeated"),
-            ("machine_stops", "Machine stops"),
-        ):
-            found.append(_counts(f"{name}, {client}", result, chain, key))
-        found += [
-            _figure(f"Age at {client}, {_POINT_NAMES[point]}, µs", result, (chain, "age_us", point),
-                    floor=("age_us", point) if chain == "tcp" else None)
-            for point in _POINTS
-        ]  # fmt: skip
-        found.append(None)
-    for key, name in (("p50", "p50"), ("p99_absolute", "p99 of its size")):
-        found.append(_figure(f"Error of the stamp, {name}, µs", result, ("tcp", "stamp_error_us", key)))
-    found.append(
-        _figure("Hand-out to TCP client, p50, µs", result, ("tcp", "hand_out_to_client_us"),
-                floor=("loopback_us", "p50"))
-    )  # fmt: skip
-    for key, name in (("wake_us", "Late at waking"), ("exchange_us", "Exchange")):
-        found += [
-            _figure(
-                f"{name}, {_POINT_NAMES[point]}, µs",
-                result,
-                ("tcp", "server", key, point),
-                floor=(key, point),
-            )
-            for point in _POINTS
-        ]
-    found.append(None)
+def title(configuration: Mapping[str, Any]) -> str:
+    """What a configuration is called."""
+    sensors = configuration["sensors"]
+    return f"{configuration['rate_hz']} Hz, {sensors} virtual sensor{'s' * (sensors > 1)}"
+
+
+def rows(result: Mapping[str, Any]) -> list[Row]:
+    """The table's rows, headings and all."""
+    found = [Row("Up to a TCP client"), *_counts(result, "tcp")]
+    found += _points("age", result, ("tcp", "age_us"), ("age_us",))
     found += [
-        _figure("CPU of server, %", result, ("tcp", "cpu_percent", "server")),
-        _figure("CPU of virtual sensor, %", result, ("tcp", "cpu_percent", "sensor")),
-        _figure("Memory of server, MB", result, ("tcp", "rss_mb", "server")),
+        _figure("error of the stamp, p50, µs", result, ("tcp", "stamp_error_us", "p50")),
+        _figure("size of that error, p99, µs", result, ("tcp", "stamp_error_us", "p99_absolute")),
+        _figure(
+            "hand-out to client, p50, µs", result, ("tcp", "hand_out_to_client_us"), ("loopback_us", "p50")
+        ),
     ]
-    for node in sorted(get(result, "project", "ros", "cpu_percent") or {}):
-        if node.startswith("node"):
-            found.append(_figure(f"CPU of {node}, %", result, ("ros", "cpu_percent", node)))
-            found.append(_figure(f"Memory of {node}, MB", result, ("ros", "rss_mb", node)))
+    if get(result, "project", "ros") is not None:
+        found += [Row("Up to a ROS subscriber"), *_counts(result, "ros")]
+        found += _points("age", result, ("ros", "age_us"))
+    found.append(Row("The server's loop"))
+    found += _points("late at waking", result, ("tcp", "server", "wake_us"), ("wake_us",))
+    found += _points("exchange", result, ("tcp", "server", "exchange_us"), ("exchange_us",))
+    found += [
+        Row("What it takes"),
+        _figure("CPU of the server, %", result, ("tcp", "cpu_percent", "server")),
+        _figure("memory of the server, MB", result, ("tcp", "rss_mb", "server")),
+    ]
+    for name in sorted(get(result, "project", "ros", "cpu_percent") or {}):
+        if name.startswith("node"):
+            found.append(_figure(f"CPU of the {name}, %", result, ("ros", "cpu_percent", name)))
+            found.append(_figure(f"memory of the {name}, MB", result, ("ros", "rss_mb", name)))
+    found.append(_figure("CPU of the virtual sensor, %", result, ("tcp", "cpu_percent", "sensor")))
+    found.append(_figure("CPU of everything else, TCP, %", result, ("tcp", "cpu_percent", "everything else")))
+    if get(result, "project", "ros") is not None:
+        others = ("ros", "cpu_percent", "everything else")
+        found.append(_figure("CPU of everything else, ROS, %", result, others))
     return found
 
 
@@ -87,25 +88,46 @@ def get(content: Any, *path: str) -> Any:
     return content
 
 
-def _counts(name: str, result: Mapping[str, Any], chain: str, key: str) -> tuple[str, ...]:
-    texts = []
-    for program in ("project", "note"):
-        value, made = get(result, program, chain, key), get(result, program, chain, "made")
-        if value is None:
-            texts.append(_NONE)
-        elif key in {"lost", "repeated"} and value:
-            texts.append(f"{value} ({value / made:.2%})")
-        else:
-            texts.append(str(value))
-    return (name, *texts, "", "", "")
+def _counts(result: Mapping[str, Any], chain: str) -> list[Row]:
+    found = []
+    for key, name in (
+        ("made", "samples made"),
+        ("lost", "lost"),
+        ("lost_in_stops", "  of them in stops of the machine"),
+        ("repeated", "repeated"),
+        ("machine_stops", "stops of the machine meanwhile"),
+    ):
+        texts = []
+        for program in ("project", "note"):
+            value, made = get(result, program, chain, key), get(result, program, chain, "made")
+            if value is None:
+                texts.append(_NONE)
+            elif key in {"lost", "repeated"} and value:
+                texts.append(f"{value} ({value / made:.2%})")
+            else:
+                texts.append(str(value))
+        found.append(Row(name, *texts))
+    return found
+
+
+def _points(
+    name: str, result: Mapping[str, Any], path: tuple[str, ...], floor: tuple[str, ...] | None = None
+) -> list[Row]:
+    return [
+        _figure(f"{name}, {text}, µs", result, (*path, point), (*floor, point) if floor else None)
+        for point, text in _POINTS.items()
+    ]
 
 
 def _figure(
     name: str, result: Mapping[str, Any], path: tuple[str, ...], floor: tuple[str, ...] | None = None
-) -> tuple[str, ...]:
+) -> Row:
     project, note = get(result, "project", *path), get(result, "note", *path)
     least = get(result, "floor", *floor) if floor else None
-    return (name, _text(project), _text(note), _text(least), _ratio(project, least), _ratio(note, project))
+    return Row(
+        name, _text(project), _text(note), _text(least) if floor else "",
+        _ratio(project, least), _ratio(note, project) if "error" not in name else "",
+    )  # fmt: skip
 
 
 def _text(value: float | None) -> str:

@@ -1,0 +1,267 @@
+"""The benchmark: what it makes of made-up records, and a short run of its parts."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from array import array
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+np = pytest.importorskip("numpy")
+
+from scripts import _benchmark as benchmark  # noqa: E402
+from scripts import _benchmark_statistics as statistics  # noqa: E402
+from scripts._benchmark_records import Recording, began  # noqa: E402
+from scripts._benchmark_report import rows  # noqa: E402
+from scripts._benchmark_soak import Tally, slope_kb_per_hour  # noqa: E402
+from scripts._benchmark_statistics import Arrivals, Counts, Ints  # noqa: E402
+from tests.server.running import needs_bus  # noqa: E402
+
+ROOT = Path(__file__).parent.parent
+PERIOD = 1_250_000
+NO_STOPS = np.empty((0, 2), dtype=np.int64)
+
+
+def arrivals(*numbers: int, age: int = 100_000, stamp_error: int = 7) -> Arrivals:
+    """Samples of a sensor that began at 10 s."""
+    number = np.array(numbers, dtype=np.int64)
+    instant = 10 * 10**9 + number * PERIOD
+    return Arrivals(number, instant, instant + stamp_error, instant + age)
+
+
+def stop(first: float, last: float) -> Ints:
+    """A stop from one to another time, both in sample periods since the sensor began."""
+    times = [[10 * 10**9 + int(first * PERIOD), 10 * 10**9 + int(last * PERIOD)]]
+    made: Ints = np.array(times, dtype=np.int64)
+    return made
+
+
+# -- lost, repeated, and whose fault it was
+
+
+def test_everything_once() -> None:
+    assert statistics.count(arrivals(*range(5, 105)), PERIOD, NO_STOPS) == Counts(100, 100, 0, 0, 0)
+
+
+def test_lost_and_repeated() -> None:
+    stream = arrivals(5, 6, 6, 7, 10, 11, 11, 11)
+    assert statistics.count(stream, PERIOD, NO_STOPS) == Counts(7, 8, lost=2, lost_in_stops=0, repeated=3)
+
+
+def test_a_late_one_is_not_lost() -> None:
+    assert statistics.count(arrivals(5, 7, 6, 8), PERIOD, NO_STOPS) == Counts(4, 4, 0, 0, 0)
+
+
+def test_nothing_arrived() -> None:
+    assert statistics.count(arrivals(), PERIOD, NO_STOPS) == Counts(0, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "explained"),
+    [
+        (20.9, 23.1, 2),  # samples 21 and 22 came and went meanwhile
+        (21.1, 23.1, 2),  # 21 was born, but nobody could fetch it
+        (21.6, 23.1, 1),  # 21 could have been fetched
+        (30.0, 33.0, 0),  # some other time
+    ],
+)
+def test_only_a_stop_at_that_time_explains_a_loss(first: float, last: float, explained: int) -> None:
+    numbers = [n for n in range(100) if n not in {21, 22, 50}]
+    counts = statistics.count(arrivals(*numbers), PERIOD, stop(first, last))
+    assert (counts.lost, counts.lost_in_stops) == (3, explained)
+
+
+def test_pauses_become_stops_only_if_longer_than_a_period() -> None:
+    one = np.array([[0, PERIOD], [5 * PERIOD, 7 * PERIOD]])
+    other = np.array([[6 * PERIOD, 8 * PERIOD], [20 * PERIOD, 20 * PERIOD + 900_000]])
+    assert statistics.stops([one, other], PERIOD).tolist() == [[5 * PERIOD, 8 * PERIOD]]
+    assert statistics.stops([], PERIOD).shape == (0, 2)
+
+
+def test_what_wraps_in_the_signal_is_made_continuous() -> None:
+    top = 2**24
+    uptime = 2**20 * 10**9 + 5_000_000_000  # the machine has been up for longer than the signal can say
+    records = [
+        [0, (top - 2 + k) % top, (uptime + k * PERIOD) % (2**20 * 10**9), 0, uptime + k * PERIOD + 90_000]
+        for k in range(5)
+    ]
+    (stream,) = statistics.split(np.array(records, dtype=np.int64))
+    assert stream.number.tolist() == [top - 2 + k for k in range(5)]
+    assert statistics.ages(stream).tolist() == [90_000] * 5
+    assert statistics.stamp_errors(stream).size == 0
+
+
+def test_summary_of_two_sensors() -> None:
+    streams = [arrivals(1, 2, 3, age=100_000), arrivals(7, 9, age=200_000)]
+    figures, ages = statistics.summary(streams, PERIOD, NO_STOPS)
+    assert (figures["made"], figures["arrivals"], figures["lost"]) == (6, 5, 1)
+    assert figures["age_us"] == {"p50": 100.0, "p99": 200.0, "p999": 200.0, "max": 200.0}
+    assert figures["stamp_error_us"] == {"p50": 0.0, "p99_absolute": 0.0}
+    assert len(ages) == 5
+
+
+def test_floor_adds_up() -> None:
+    age = statistics.floor_of_age(np.full(9, -5.0), np.full(9, 30.0), np.full(9, 40.0))
+    assert set(age.tolist()) == {70.0}  # waking early is no head start
+
+
+# -- recording, soak, table, command line
+
+
+def test_recording_begins_after_the_warm_up(tmp_path: Path) -> None:
+    path = tmp_path / "records"
+    recording = Recording(path, warm_up_s=1.0, seconds=2.0)
+    times = iter(range(0, 10**10, 500_000_000))
+    assert not began(path).exists()
+    taken = 0
+    while recording.take(0, taken, 0, 0, next(times)):
+        taken += 1
+    recording.write()
+    assert began(path).exists()
+    assert statistics.read_numbers(path, 5)[:, 4].tolist() == [n * 500_000_000 for n in range(2, 7)]
+
+
+def test_soak_tally() -> None:
+    tally = Tally()
+    for number in (2**24 - 2, 2**24 - 1, 0, 3, 3):
+        tally.take(0, number, 10**9, 80_000, PERIOD)
+    tally.take(1, 500, 10**9, 80_000, PERIOD)
+    assert (tally.arrivals, tally.repeated) == (6, 1)
+    assert tally.losses == [10**9 - PERIOD, 10**9 - 2 * PERIOD]
+
+
+def test_memory_slope_leaves_the_start_out() -> None:
+    seconds = np.arange(0, 3600.0, 10)
+    rss = np.where(seconds < 300, 10e6, 20e6 + seconds / 3600 * 5000)
+    assert slope_kb_per_hour(seconds, rss) == pytest.approx(5.0)
+
+
+def test_table_has_what_there_is() -> None:
+    result = {
+        "project": {"tcp": {"made": 200, "lost": 1, "age_us": {"p50": 80.0, "p99": 120.0, "p999": 150.0}}},
+        "note": None,
+        "floor": {"age_us": {"p50": 40.0}},
+    }
+    table = {row.name: row[1:] for row in rows(result)}
+    assert table["lost"][:2] == ("1 (0.50%)", "-")
+    assert table["age, p50, µs"] == ("80.0", "-", "40.0", "2.0", "")
+    assert "Up to a ROS subscriber" not in table
+
+
+@pytest.mark.parametrize(
+    "wrong", [["--rates", "801"], ["--sensors", "0"], ["--seconds", "x"], ["--rt-priority", "99"]]
+)
+def test_wrong_arguments_are_refused(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as refused:
+        benchmark.parse(wrong)
+    assert refused.value.code == 2
+    assert wrong[0] in capsys.readouterr().err
+
+
+# -- the thing itself
+
+
+def run(tmp_path: Path, *arguments: str) -> subprocess.Popen[str]:
+    """The benchmark in a network namespace of its own."""
+    files = ("--json", str(tmp_path / "b.json"), "--plot", str(tmp_path / "b.png"))
+    command = ["unshare", "--net", sys.executable, "-m", "scripts._benchmark", *files, *arguments]
+    return subprocess.Popen(
+        command,
+        cwd=ROOT,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "TMPDIR": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def numbers(content: Any) -> Iterator[float]:
+    if isinstance(content, dict | list):
+        for item in content.values() if isinstance(content, dict) else content:
+            yield from numbers(item)
+    elif isinstance(content, int | float):
+        yield content
+
+
+@needs_bus
+@pytest.mark.bus
+@pytest.mark.long
+@pytest.mark.ros
+def test_a_run_with_ros_and_two_sensors(tmp_path: Path) -> None:
+    pytest.importorskip("rclpy")
+    said, _ = (running := run(tmp_path, "--seconds", "1", "--rates", "400")).communicate(timeout=100)
+    assert running.returncode == 0, said
+    content = json.loads((tmp_path / "b.json").read_text())
+    assert all(map(math.isfinite, numbers(content)))
+    one, two = content["configurations"]
+    assert two["note"] is None
+    for figures, made in (
+        (one["project"]["ros"], 400),
+        (two["project"]["ros"], 800),
+        (one["note"]["ros"], 400),
+    ):
+        assert 0.9 * made < figures["made"] < 1.1 * made
+        assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"]
+    assert {"server", "node 0", "node 1"} < set(two["project"]["ros"]["cpu_percent"])
+    assert "Up to a ROS subscriber" in said
+
+
+@needs_bus
+@pytest.mark.bus
+def test_a_short_run(tmp_path: Path) -> None:
+    short = ("--no-ros", "--seconds", "1", "--rates", "800", "--sensors", "1")
+    running = run(tmp_path, *short)
+    said, _ = running.communicate(timeout=90)
+    assert running.returncode == 0, said
+    content = json.loads((tmp_path / "b.json").read_text())
+    (result,) = content["configurations"]
+    assert all(map(math.isfinite, numbers(content)))
+    assert (result["rate_hz"], result["sensors"]) == (800, 1)
+    for program in ("project", "note"):
+        figures = result[program]["tcp"]
+        assert 700 < figures["made"] < 900
+        assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"]
+        assert 0 < figures["age_us"]["p50"] <= figures["age_us"]["p99"] <= figures["age_us"]["max"]
+        assert figures["rss_mb"]["server"] > 1
+    assert set(result["floor"]["age_us"]) == {"p50", "p99", "p999", "max"}
+    project = result["project"]["tcp"]
+    # Some may be lost to a busy machine, but only while it kept the server from running at all.
+    unexplained = project["lost"] - project["lost_in_stops"]
+    assert unexplained <= project["server"]["missed_deadlines"] + project["server"]["lost_frames"]
+    assert project["repeated"] == 0
+    assert "Up to a TCP client" in said
+    assert (tmp_path / "b.png").exists() == (find_spec("matplotlib") is not None)
+
+
+@needs_bus
+@pytest.mark.bus
+def test_it_can_be_stopped_at_any_time(tmp_path: Path) -> None:
+    running = run(tmp_path, "--soak", "10")
+    deadline = time.monotonic() + 30
+    while not list(tmp_path.glob("*/*/canary-0.log")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(1.0)
+    running.send_signal(signal.SIGINT)
+    said, _ = running.communicate(timeout=30)
+    assert running.returncode in {0, 130}, said
+    assert "Traceback" not in said
+    assert not list(tmp_path.glob("tmp*"))
+
+
+def test_numbers_are_written_whole(tmp_path: Path) -> None:
+    from scripts._benchmark_records import write  # noqa: PLC0415
+
+    write(tmp_path / "some", array("q", [1, 2, 3, 4]))
+    assert statistics.read_numbers(tmp_path / "some", 2).tolist() == [[1, 2], [3, 4]]
+    assert [p.name for p in tmp_path.iterdir()] == ["some"]
