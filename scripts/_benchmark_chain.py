@@ -131,7 +131,8 @@ class Chain:
             used = now.user + now.system - before[name].user - before[name].system
             usage["cpu_percent"][name] = round(100 * used / wall, 1)
             usage["rss_mb"][name] = round(process.memory_info().rss / _MEGABYTE, 1)
-        usage["cpu_percent"]["everything else"] = round(100 * (cpu_of_others() - others) / wall, 1)
+        since = sum(taken - others.get(pid, 0.0) for pid, taken in cpu_of_others().items())
+        usage["cpu_percent"]["everything else"] = round(100 * since / wall, 1)
         self.wait(path.exists, "the recording did not end")
         return usage
 
@@ -153,15 +154,17 @@ class Chain:
         return {**result, "machine_stops": len(stopped), "longest_stop_us": round(longest, 1)}, ages
 
 
-def cpu_of_others() -> float:
-    """CPU seconds that all but this benchmark have taken, the host of a virtual machine included."""
-    times = psutil.cpu_times()
-    ours = 0.0
-    for process in (me := psutil.Process(), *me.children(recursive=True)):
+def cpu_of_others() -> dict[int, float]:
+    """CPU seconds that each process outside this benchmark has taken so far."""
+    me = psutil.Process()
+    ours = {me.pid, *(child.pid for child in me.children(recursive=True))}
+    taken = {}
+    for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
-            mine = process.cpu_times()
-            ours += mine.user + mine.system
-    return float(sum(times) - times.idle - times.iowait - times.guest - times.guest_nice - ours)
+            if process.pid not in ours:
+                times = process.cpu_times()
+                taken[process.pid] = times.user + times.system
+    return taken
 
 
 @contextlib.contextmanager

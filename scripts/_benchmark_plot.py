@@ -53,7 +53,7 @@ def draw(configurations: Mapping[tuple[int, int], Curves], path: Path) -> None:
         panel.set_title(f"{rate} Hz, {sensors} sensor{'s' * (sensors > 1)}")
         panel.set_xscale("log")
         panel.set_yscale("log")
-        panel.set_xlim(everything.min() / 1200, everything.max() / 800)
+        panel.set_xlim(max(everything.min() / 1200, 10), everything.max() / 800)
         panel.set_ylim(5e-5, 1.3)
         panel.axvline(1e6 / rate, color="0.7", linestyle=":", linewidth=1)
         panel.annotate(

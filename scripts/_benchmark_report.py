@@ -28,7 +28,7 @@ def print_configuration(result: Mapping[str, Any], console: Console) -> None:
     """One configuration as a table."""
     table = Table(title=title(result), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
     table.add_column("", no_wrap=True)
-    for name in ("this project", "note's design", "floor", "this/floor", "note/this"):
+    for name in ("this", "note", "floor", "this/floor", "note/this"):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows(result):
         if len(list(filter(None, row))) == 1:
@@ -71,11 +71,14 @@ def rows(result: Mapping[str, Any]) -> list[Row]:
         if name.startswith("node"):
             found.append(_figure(f"CPU of the {name}, %", result, ("ros", "cpu_percent", name)))
             found.append(_figure(f"memory of the {name}, MB", result, ("ros", "rss_mb", name)))
+    found.append(_figure("CPU of the TCP client, %", result, ("tcp", "cpu_percent", "client")))
+    if get(result, "project", "ros") is not None:
+        found.append(_figure("CPU of the subscriber, %", result, ("ros", "cpu_percent", "subscriber")))
     found.append(_figure("CPU of the virtual sensor, %", result, ("tcp", "cpu_percent", "sensor")))
-    found.append(_figure("CPU of everything else, TCP, %", result, ("tcp", "cpu_percent", "everything else")))
+    found.append(_figure("CPU of all else (TCP), %", result, ("tcp", "cpu_percent", "everything else")))
     if get(result, "project", "ros") is not None:
         others = ("ros", "cpu_percent", "everything else")
-        found.append(_figure("CPU of everything else, ROS, %", result, others))
+        found.append(_figure("CPU of all else (ROS), %", result, others))
     return found
 
 

@@ -52,6 +52,11 @@ def slope_kb_per_hour(seconds: Floats, rss: Floats) -> float:
     return float(np.polyfit(seconds[settled], rss[settled], 1)[0]) * 3600 / 1000
 
 
+def mb(size: float) -> float:
+    """Bytes in MB, rounded."""
+    return round(float(size) / 1e6, 2)
+
+
 def soak(setup: Setup, seconds: float, console: Console) -> dict[str, Any]:
     """Run it and print what came of it. DemoError ends it early; Stopped ends it with what there is."""
     tally, memory = Tally(), []
@@ -96,8 +101,8 @@ def soak(setup: Setup, seconds: float, console: Console) -> dict[str, Any]:
         "machine_stops": len(stopped),
         "age_us": tally.ages.summary_us(),
         "cpu_percent": round(100 * (cpu.user + cpu.system) / used_s, 1),
-        "rss_mb": {"first": rss[0] / 1e6, "last": rss[-1] / 1e6, "highest": rss.max() / 1e6},
-        "rss_slope_kb_per_hour": round(slope_kb_per_hour(seconds_at, rss), 1),
+        "rss_mb": {"first": mb(rss[0]), "last": mb(rss[-1]), "highest": mb(rss.max())},
+        "rss_slope_kb_per_hour": round(slope_kb_per_hour(seconds_at, rss), 1) + 0.0,
     }
     for name, value in result.items():
         console.print(f"{name.replace('_', ' '):24} {value}")

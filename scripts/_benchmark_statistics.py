@@ -147,11 +147,11 @@ def floor_of_age(wake: Floats, exchange: Floats, loopback: Floats) -> Floats:
 
 
 def spread_us(values_ns: Floats) -> dict[str, float] | None:
-    """p50, p99, p999 and max in microseconds; None if there are no values."""
+    """p50, p99, p999, min and max in microseconds; None if there are no values."""
     if not len(values_ns):
         return None
     figures = {name: float(np.quantile(values_ns, q)) for name, q in _QUANTILES.items()}
-    figures["max"] = float(np.max(values_ns))
+    figures["min"], figures["max"] = float(np.min(values_ns)), float(np.max(values_ns))
     return {name: round(value / 1000, 1) for name, value in figures.items()}
 
 

@@ -9,9 +9,12 @@ from __future__ import annotations
 import argparse
 import gc
 import time
+from typing import Final
 
 from ethercat_server.virtual_sensor.signals import decode_clock
 from scripts._benchmark_records import Recording, recording_arguments
+
+_DEPTH: Final = 50
 
 
 def main() -> None:
@@ -35,7 +38,7 @@ def receive(topics: list[str], recording: Recording) -> None:
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
     handles = [
-        node.create_subscription(Float64MultiArray, topic, lambda _message: None, 10).handle
+        node.create_subscription(Float64MultiArray, topic, lambda _message: None, _DEPTH).handle
         for topic in topics
     ]
     with node.context.handle:
@@ -46,11 +49,10 @@ def receive(topics: list[str], recording: Recording) -> None:
         for handle in handles:
             wait_set.add_subscription(handle)
         wait_set.wait(1_000_000_000)
-        now = time.monotonic_ns()
         for place, handle in enumerate(handles):
             while (taken := handle.take_message(Float64MultiArray, False)) is not None:
-                going_on = recording.take(place, *decode_clock(taken[0].data), 0, now)
                 now = time.monotonic_ns()
+                going_on = recording.take(place, *decode_clock(taken[0].data), 0, now)
     node.destroy_node()
     rclpy.try_shutdown()
 

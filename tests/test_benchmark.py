@@ -105,7 +105,9 @@ def test_summary_of_two_sensors() -> None:
     streams = [arrivals(1, 2, 3, age=100_000), arrivals(7, 9, age=200_000)]
     figures, ages = statistics.summary(streams, PERIOD, NO_STOPS)
     assert (figures["made"], figures["arrivals"], figures["lost"]) == (6, 5, 1)
-    assert figures["age_us"] == {"p50": 100.0, "p99": 200.0, "p999": 200.0, "max": 200.0}
+    assert figures["age_us"] == {
+        "p50": 100.0, "p99": 200.0, "p999": 200.0, "min": 100.0, "max": 200.0,
+    }  # fmt: skip
     assert figures["stamp_error_us"] == {"p50": 0.0, "p99_absolute": 0.0}
     assert len(ages) == 5
 
@@ -234,7 +236,7 @@ def test_a_short_run(tmp_path: Path) -> None:
         assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"]
         assert 0 < figures["age_us"]["p50"] <= figures["age_us"]["p99"] <= figures["age_us"]["max"]
         assert figures["rss_mb"]["server"] > 1
-    assert set(result["floor"]["age_us"]) == {"p50", "p99", "p999", "max"}
+    assert set(result["floor"]["age_us"]) == {"p50", "p99", "p999", "min", "max"}
     project = result["project"]["tcp"]
     # Some may be lost to a busy machine, but only while it kept the server from running at all.
     unexplained = project["lost"] - project["lost_in_stops"]
