@@ -88,13 +88,15 @@ class Chain:
         self.watched[name] = psutil.Process(pid)
 
     def start_canaries(self) -> None:
-        """One on each CPU, above everything else: the sensor has the priority above the server's."""
+        """One on each CPU, above everything else: the sensor has the priority above the server's.
+
+        They wake twice a sample period.
+        """
+        priority = min(99, self.setup.priority + 2) if self.setup.priority else 0
+        how = ("--priority", priority, "--tick-us", self.setup.period_ns / 2000)
         for cpu in sorted(os.sched_getaffinity(0)):
             path = self.directory / f"canary-{cpu}"
-            priority = min(99, self.setup.priority + 2) if self.setup.priority else 0
-            self.start(
-                f"canary-{cpu}", "scripts._benchmark_canary", path, "--cpu", cpu, "--priority", priority
-            )
+            self.start(f"canary-{cpu}", "scripts._benchmark_canary", path, "--cpu", cpu, *how)
             self.canaries.append(path)
 
     def check(self) -> None:
