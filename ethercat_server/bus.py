@@ -12,7 +12,7 @@ import os
 import select
 import socket
 import time
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
 import pysoem
 
@@ -20,6 +20,7 @@ from ethercat_server.errors import BusError, SdoAbortError
 
 _SDO_ATTEMPTS: Final = 3
 _OP_TIMEOUT_S: Final = 5.0
+_DATAGRAM_TIMEOUT_US: Final = 2000
 _PYSOEM_ERRORS: Final = (
     pysoem.SdoError,
     pysoem.MailboxError,
@@ -30,7 +31,6 @@ _PYSOEM_ERRORS: Final = (
     pysoem.NetworkInterfaceNotOpenError,
 )
 _STATE_NAMES: Final = {0: "NONE", 1: "INIT", 2: "PREOP", 3: "BOOT", 4: "SAFEOP", 8: "OP"}
-_T = TypeVar("_T")
 
 
 class SlaveIdentity(NamedTuple):
@@ -130,7 +130,7 @@ class Bus:
         -1 if the frame did not come back. Only after `go_operational`.
         """
         # A frame that came too late for its own exchange would end this one's wait at once: drop it.
-        with contextlib.suppress(BlockingIOError):
+        with contextlib.suppress(OSError):  # nothing there, or the link is down
             while os.read(self._fd, 2048):
                 pass
         self._master.send_processdata()
@@ -139,10 +139,38 @@ class Bus:
         wkc: int = self._master.receive_processdata(100)
         return wkc
 
+    def working_counter(self, slave: int) -> int:
+        """What `slave` adds to the working counter of an exchange: 2 for its outputs, 1 for its inputs."""
+        return 2 * bool(self._slaves[slave].output) + bool(self._slaves[slave].input)
+
     def process_data(self, slave: int) -> bytes:
         """The inputs of `slave` as of the last exchange, byte for byte."""
         data: bytes = self._slaves[slave].input
         return data
+
+    def read_register(self, slave: int, address: int, size: int) -> bytes | None:
+        """Read ESC registers or a mailbox of `slave` with one datagram; None if it did not do it."""
+        try:
+            data: bytes = self._slaves[slave]._fprd(address, size, _DATAGRAM_TIMEOUT_US)
+        except pysoem.WkcError:
+            return None
+        return data
+
+    def write_register(self, slave: int, address: int, data: bytes) -> bool:
+        """Write ESC registers or a mailbox of `slave` with one datagram; False if it did not do it."""
+        try:
+            self._slaves[slave]._fpwr(address, data, _DATAGRAM_TIMEOUT_US)
+        except pysoem.WkcError:
+            return False
+        return True
+
+    def reclaim(self, slave: int) -> bool:
+        """Give a slave that lost its station address (its power was cut) the address back.
+
+        True if the slave at that place now has it. SOEM checks vendor, product and revision; who the
+        sensor is remains to be asked.
+        """
+        return bool(self._slaves[slave].recover(_DATAGRAM_TIMEOUT_US) > 0)
 
     def close(self) -> None:
         """Take the slaves to INIT and close the socket. May be called at any time, any number of times."""

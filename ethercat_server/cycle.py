@@ -13,12 +13,15 @@ from typing import Any, Final
 from ethercat_server.bus import Bus
 from ethercat_server.distribution import Distribution
 from ethercat_server.hub import Hub
+from ethercat_server.recovery import Recovery
 from ethercat_server.stream import SensorStream
 
 _SERVE_MARGIN_NS: Final = 80_000
 """Sockets are left alone this long before a deadline: select may wake late."""
 _SERVE_EVERY_NS: Final = 10_000_000
 """The sockets' turn comes this often even if the deadlines leave no time."""
+_RECOVERY_STEP_NS: Final = 500_000
+"""Time between two exchanges while no sensor is left to be read."""
 _LATENESS_GAIN: Final = 1 / 64
 _MAX_LEAD_NS: Final = 200_000.0
 
@@ -26,11 +29,12 @@ _MAX_LEAD_NS: Final = 200_000.0
 class Cycle:
     """Reads the sensors and hands their samples to the hub until told to stop."""
 
-    def __init__(self, bus: Bus, streams: Sequence[SensorStream], hub: Hub) -> None:
+    def __init__(self, bus: Bus, streams: Sequence[SensorStream], hub: Hub, recovery: Recovery) -> None:
         self.stopping = False
         self._bus = bus
         self._streams = streams
         self._hub = hub
+        self._recovery = recovery
         self._cycles = 0
         self._missed_deadlines = 0
         self._lost_frames = 0
@@ -44,8 +48,8 @@ class Cycle:
 
     def run(self) -> None:
         """The loop."""
-        bus, hub, streams = self._bus, self._hub, self._streams
-        expected_wkc, monotonic_ns, sleep = bus.expected_wkc, time.monotonic_ns, time.sleep
+        bus, hub, streams, recovery = self._bus, self._hub, self._streams, self._recovery
+        monotonic_ns, sleep = time.monotonic_ns, time.sleep
         shortest_ns = min(stream.clock.period_ns for stream in streams)
         timeout_s = max(300e-6, 0.75e-9 * shortest_ns)
         lead_ns = 0.0  # how late this thread usually wakes: deadlines are brought forward by it
@@ -53,6 +57,8 @@ class Cycle:
         while not self.stopping:
             now = monotonic_ns()
             deadline = int(min([stream.clock.next_poll_ns() for stream in streams]) - lead_ns)
+            if recovery.all_lost:
+                deadline = now + _RECOVERY_STEP_NS
             if deadline > now or now > serve_by:
                 hub.serve(deadline - _SERVE_MARGIN_NS)
                 serve_by = now + _SERVE_EVERY_NS
@@ -68,10 +74,13 @@ class Cycle:
                 sent = now
             wkc = bus.exchange(timeout_s)
             back = monotonic_ns()
+            complete = wkc >= recovery.alive_wkc
             for stream in streams:
-                made = stream.take(bus.process_data(stream.place), wkc, wkc >= expected_wkc, sent, back)
+                valid = complete and stream.alive
+                made = stream.take(bus.process_data(stream.place), wkc, valid, sent, back)
                 if made:
                     hub.publish(made[0], stream.place, made[1], back)
+            recovery.attend(wkc, back)
             self._cycles += 1
             self._lost_frames += wkc < 0
             self._exchange.record(back - sent)

@@ -30,6 +30,8 @@ class SensorStream:
         self.clock = SampleClock(period_ns, time.monotonic_ns())
         self.process_data = b""
         """The newest valid process data."""
+        self.alive = True
+        """False while the sensor is lost: what the bus gives for it is not its own."""
         self.sequence = 0
         self.fresh = 0
         self.repeated = 0
@@ -93,12 +95,14 @@ class SensorStream:
         self.invalid += 1
         return INVALID
 
-    def restart(self, period_ns: float) -> None:
-        """The sensor is back after it was lost, perhaps with another sample period."""
+    def recover(self, period_ns: float | None) -> None:
+        """The sensor is back after it was lost; `period_ns` if it entered OP anew, None if it never left."""
         self.recoveries += 1
-        self.clock = SampleClock(period_ns, time.monotonic_ns())
-        self._discard = DISCARDED_AT_START
-        self._gap = True
+        self.alive = True
+        if period_ns is not None:
+            self.clock = SampleClock(period_ns, time.monotonic_ns())
+            self._discard = DISCARDED_AT_START
+            self._gap = True
 
     def status(self) -> dict[str, Any]:
         """The sensor's part of the `status` reply."""
