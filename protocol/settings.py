@@ -18,8 +18,8 @@ class Setting(NamedTuple):
     """One setting. `choices` is what it may be; bool settings have none."""
 
     name: str
-    default: SettingValue
-    """What the server sets at start-up unless told otherwise: the note's Listing V.1."""
+    default: SettingValue | None
+    """What the server sets at start-up unless told otherwise (the note's Listing V.1); None = left alone."""
     choices: range | tuple[int, ...] | None
     meaning: str
     preop_only: bool
@@ -28,7 +28,7 @@ class Setting(NamedTuple):
     @property
     def is_bool(self) -> bool:
         """Whether the setting is on or off."""
-        return isinstance(self.default, bool)
+        return self.choices is None
 
     def check(self, value: object) -> SettingValue:
         """Return `value` if the setting can have it, else raise SettingError with the choices."""
@@ -66,11 +66,11 @@ SETTINGS: Final[Mapping[str, Setting]] = {
         Setting("calibration_matrix", True, None, "give N and Nm instead of raw counts", False),
         Setting("temperature_compensation", False, None, "correct the force/torque for temperature", False),
         Setting("imu_active", 1, range(0, 4), "IMU: 0 none, 1 internal, 2 external, 3 both", False),
-        Setting("coordinate_system", False, None, "use the configured coordinate system", False),
+        Setting("coordinate_system", None, None, "use the configured coordinate system", False),
         Setting(
-            "inertia_compensation", False, None, "the sensor's own inertia and gravity compensation", False
+            "inertia_compensation", None, None, "the sensor's own inertia and gravity compensation", False
         ),
-        Setting("orientation_estimation", False, None, "the sensor estimates its orientation", False),
+        Setting("orientation_estimation", None, None, "the sensor estimates its orientation", False),
         Setting("acceleration_range_g", 2, (2, 4, 8, 16), "accelerometer full scale, g", True),
         Setting("angular_rate_range_dps", 250, (250, 500, 1000, 2000), "gyroscope full scale, °/s", True),
         Setting("acceleration_filter", 1, range(1, 9), "accelerometer filter profile (Table III.6)", True),
@@ -118,4 +118,4 @@ def check_combination(values: Mapping[str, SettingValue]) -> None:
 
 def start_up_defaults() -> dict[str, SettingValue]:
     """The settings that the server writes at start-up unless told otherwise."""
-    return {row.name: row.default for row in SETTINGS.values()}
+    return {row.name: row.default for row in SETTINGS.values() if row.default is not None}

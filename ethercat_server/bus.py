@@ -1,0 +1,224 @@
+"""The EtherCAT bus: the only file that knows pysoem.
+
+Everything pysoem raises is translated here, and its traps are kept in here: the descriptor it leaks on a
+failed open, its close that must happen once, its receive whose timeout the kernel rounds up to a jiffy,
+and its error ring, which can hand one call's error to the next.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import time
+from typing import Any, Final, NamedTuple, TypeVar
+
+import pysoem
+
+from ethercat_server.errors import BusError, SdoAbortError
+
+_SDO_ATTEMPTS: Final = 3
+_OP_TIMEOUT_S: Final = 5.0
+_PYSOEM_ERRORS: Final = (
+    pysoem.SdoError,
+    pysoem.MailboxError,
+    pysoem.PacketError,
+    pysoem.WkcError,
+    pysoem.ConfigMapError,
+    pysoem.EepromError,
+    pysoem.NetworkInterfaceNotOpenError,
+)
+_STATE_NAMES: Final = {0: "NONE", 1: "INIT", 2: "PREOP", 3: "BOOT", 4: "SAFEOP", 8: "OP"}
+_T = TypeVar("_T")
+
+
+class SlaveIdentity(NamedTuple):
+    """What the SII of a slave says."""
+
+    vendor: int
+    product: int
+    revision: int
+    name: str
+
+
+class Bus:
+    """An EtherCAT bus on one network interface. Used by one thread."""
+
+    def __init__(self, ifname: str) -> None:
+        self.ifname = ifname
+        self.expected_wkc = 0
+        self._master: Any = pysoem.Master()
+        self._slaves: list[Any] = []
+        self._opened = False
+        self._fd = -1
+
+    def open(self) -> None:
+        """Open the raw socket. BusError if that fails; `interface.check_interface` says why beforehand."""
+        before = _packet_sockets()
+        try:
+            self._master.open(self.ifname)
+        except ConnectionError:
+            for fd in _packet_sockets() - before:
+                os.close(fd)
+            raise BusError(
+                f"cannot open {self.ifname} for EtherCAT: it went away or may not be opened; "
+                "check 'ip link' and the permissions"
+            ) from None
+        self._opened = True
+        self._fd = (_packet_sockets() - before).pop()
+
+    def scan(self) -> list[SlaveIdentity]:
+        """Find the slaves and take them to PREOP; BusError if none answers."""
+        self._set_blocking(True)
+        if self._master.config_init() <= 0:
+            raise BusError(
+                f"no EtherCAT slave answers on {self.ifname}: check the cable, that the sensor has power and "
+                "that this is the interface it is connected to"
+            )
+        self._slaves = list(self._master.slaves)
+        return [SlaveIdentity(s.man, s.id, s.rev, s.name) for s in self._slaves]
+
+    def check_preop(self) -> None:
+        """Wait until every slave is in PREOP or above; BusError names one that is not."""
+        self._wait_state(pysoem.PREOP_STATE, "PREOP")
+
+    def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
+        """Upload an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
+        what = f"reading object 0x{index:04X}:{subindex}"
+        data: bytes = self._sdo(slave, index, subindex, what, None)
+        return data
+
+    def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
+        """Download an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
+        self._sdo(slave, index, subindex, f"writing {data.hex()} to object 0x{index:04X}:{subindex}", data)
+
+    def map_process_data(self) -> list[int]:
+        """Map the process data and take the slaves to SAFEOP; returns each slave's input size in bytes."""
+        try:
+            self._master.config_map()
+        except pysoem.ConfigMapError as error:
+            raise BusError(
+                f"the process data of {self.ifname} cannot be mapped: {_texts(error.error_list)}; "
+                "power the sensor off and on, then start again"
+            ) from None
+        except _PYSOEM_ERRORS as error:
+            raise BusError(f"the process data of {self.ifname} cannot be mapped: {_texts([error])}") from None
+        self.expected_wkc = self._master.expected_wkc
+        for slave in self._slaves:
+            slave.output = bytes(len(slave.output))
+        return [len(slave.input) for slave in self._slaves]
+
+    def go_operational(self) -> None:
+        """Take every slave to OP, exchanging process data all the while; BusError names one that refuses."""
+        self._wait_state(pysoem.SAFEOP_STATE, "SAFEOP")
+        self._master.state = pysoem.OP_STATE
+        self._master.write_state()
+        deadline = time.monotonic() + _OP_TIMEOUT_S
+        while time.monotonic() < deadline:
+            for _ in range(5):
+                self._master.send_processdata()
+                self._master.receive_processdata(2000)
+            if self._master.state_check(pysoem.OP_STATE, 2000) == pysoem.OP_STATE:
+                self._set_blocking(False)
+                return
+        raise BusError(self._state_complaint(pysoem.OP_STATE, "OP"))
+
+    def exchange(self, timeout_s: float) -> int:
+        """Send the process data, wait at most `timeout_s` for it to come back; returns the working counter.
+
+        -1 if the frame did not come back. Only after `go_operational`.
+        """
+        # A frame that came too late for its own exchange would end this one's wait at once: drop it.
+        with contextlib.suppress(BlockingIOError):
+            while os.read(self._fd, 2048):
+                pass
+        self._master.send_processdata()
+        # SOEM's own wait ignores timeouts shorter than a jiffy, so wait here and let it only collect.
+        select.select((self._fd,), (), (), timeout_s)
+        wkc: int = self._master.receive_processdata(100)
+        return wkc
+
+    def process_data(self, slave: int) -> bytes:
+        """The inputs of `slave` as of the last exchange, byte for byte."""
+        data: bytes = self._slaves[slave].input
+        return data
+
+    def close(self) -> None:
+        """Take the slaves to INIT and close the socket. May be called at any time, any number of times."""
+        if not self._opened:
+            return
+        self._opened = False
+        with contextlib.suppress(*_PYSOEM_ERRORS):
+            self._set_blocking(True)
+            self._master.state = pysoem.INIT_STATE
+            self._master.write_state()
+        self._master.close()
+
+    def _sdo(self, slave: int, index: int, subindex: int, what: str, data: bytes | None) -> Any:
+        target, last = self._slaves[slave], "no answer"
+        for _ in range(_SDO_ATTEMPTS):
+            try:
+                if data is None:
+                    return target.sdo_read(index, subindex)
+                return target.sdo_write(index, subindex, data)
+            except pysoem.SdoError as error:
+                # Another object's abort is a stale entry of the error ring, not an answer to this call.
+                if (error.index, error.subindex) == (index, subindex):
+                    code = error.abort_code & 0xFFFFFFFF
+                    text = f"sensor {slave} refused {what}: {error.desc.strip()} (abort 0x{code:08X})"
+                    raise SdoAbortError(text, code) from None
+                last = "an answer about another object"
+            except _PYSOEM_ERRORS as error:
+                last = _texts([error])
+        raise BusError(f"sensor {slave} did not answer {what}: {last}; check cable and power")
+
+    def _wait_state(self, state: int, name: str) -> None:
+        for _ in range(40):
+            if self._master.state_check(state, 50_000) == state:
+                return
+            # state_check wants the state itself; a slave that is above it is fine as well.
+            self._master.read_state()
+            if any(s.state & pysoem.STATE_ERROR or s.state == pysoem.NONE_STATE for s in self._slaves):
+                break
+        raise BusError(self._state_complaint(state, name))
+
+    def _state_complaint(self, state: int, name: str) -> str:
+        self._master.read_state()
+        for place, slave in enumerate(self._slaves):
+            if slave.state != state:
+                found = _STATE_NAMES.get(slave.state & 0x0F, f"state {slave.state}")
+                why = ""
+                if slave.state & pysoem.STATE_ERROR:
+                    why = f" with AL status 0x{slave.al_status:04X} ("
+                    why += pysoem.al_status_code_to_string(slave.al_status).strip() + ")"
+                return (
+                    f"sensor {place} does not reach {name}: it stays in {found}{why}; "
+                    "power it off and on, then start again"
+                )
+        return f"the bus on {self.ifname} does not reach {name}: start again"
+
+    def _set_blocking(self, blocking: bool) -> None:
+        # Blocking for SOEM's own waits, which would otherwise spin; non-blocking for `exchange`.
+        os.set_blocking(self._fd, blocking)
+
+
+def _packet_sockets() -> set[int]:
+    """Descriptors of this process that are AF_PACKET sockets."""
+    found = set()
+    for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - plain descriptor numbers
+        fd = int(name)
+        try:
+            duplicate = socket.socket(fileno=os.dup(fd))
+        except OSError:
+            continue
+        with duplicate:
+            if duplicate.family == socket.AF_PACKET:
+                found.add(fd)
+    return found
+
+
+def _texts(errors: list[Any]) -> str:
+    return "; ".join(
+        getattr(error, "desc", None) or str(error) or type(error).__name__ for error in errors
+    )  # fmt: skip

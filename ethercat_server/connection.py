@@ -1,0 +1,248 @@
+"""One client's connection: what it sent so far, what waits to be sent to it, what it subscribed to.
+
+It never blocks. What cannot be sent at once waits in a bounded queue of whole frames; when that is full the
+oldest DATA goes, never part of a frame and never a reply.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections import deque
+from typing import Final
+
+from protocol.errors import BadMessageError, RemoteProtocolError
+from protocol.framing import (
+    BARE_JSON_FIRST_BYTE,
+    DATA_FLAGS_OFFSET,
+    BareJsonDecoder,
+    DataFlag,
+    FrameDecoder,
+    JsonObject,
+    encode_bare_json,
+    encode_json,
+)
+
+MAX_REQUEST_LENGTH: Final = 16384
+MAX_QUEUED_DATA: Final = 256
+MAX_QUEUED_JSON: Final = 64
+"""Replies and events that may wait; a client that asks and never reads is closed at this many."""
+_SEND_BUFFER: Final = 65536
+"""Small, so that a client that stalls finds fresh data soon after, not seconds of old."""
+_IDLE_FRAME_NS: Final = 10_000_000
+"""A `fresh_only` client gets a REPEATED frame only when it has had nothing for this long."""
+
+
+class Subscription:
+    """Which DATA a client wants. Lists are by sensor place."""
+
+    __slots__ = ("every", "fresh_only", "gap", "last_ns", "skipped", "wanted")
+
+    def __init__(
+        self, sensor_count: int, sensors: tuple[int, ...] | None, every: int, fresh_only: bool
+    ) -> None:
+        self.wanted = [sensors is None or place in sensors for place in range(sensor_count)]
+        self.every = every
+        self.fresh_only = fresh_only
+        self.skipped = [every - 1] * sensor_count
+        self.last_ns = [0] * sensor_count
+        self.gap = [False] * sensor_count
+
+
+class Connection:
+    """A client's socket and everything that belongs to it."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+        self.sock = sock
+        self.fd = sock.fileno()
+        self.peer = _address_text(sock)
+        self.framed: FrameDecoder | None = None
+        self.bare: BareJsonDecoder | None = None
+        self.subscription: Subscription | None = None
+        self.sent = 0
+        """DATA frames sent."""
+        self.withheld = 0
+        """DATA frames dropped because the client did not read."""
+        self.dead = False
+        """Close it without more ado."""
+        self.closing = False
+        """What it still sends is thrown away; close it once everything is sent."""
+        self.end_of_input = False
+        """The peer has closed its side."""
+        self._queue: deque[tuple[bytes, int]] = deque()  # frame, sensor place or -1 for JSON
+        self._queued_data = 0
+        self._head_sent = 0
+        self.needs_writing = False
+
+    # -- receiving
+
+    def receive(self) -> list[JsonObject | BadMessageError | RemoteProtocolError]:
+        """Read what is there; returns whole messages, and errors in the places of bad ones.
+
+        After a RemoteProtocolError, or when the peer closed its side, `closing` is set.
+        """
+        try:
+            data = self.sock.recv(MAX_REQUEST_LENGTH)
+        except BlockingIOError:
+            return []
+        except OSError:
+            self.dead = True
+            return []
+        if not data:
+            self.end_of_input = True
+        if self.closing:
+            return []  # thrown away, so that closing does not reset the connection under the last reply
+        if self.framed is None and self.bare is None and data:
+            if data.startswith(BARE_JSON_FIRST_BYTE):
+                self.bare = BareJsonDecoder(max_json_length=MAX_REQUEST_LENGTH)
+            else:
+                self.framed = FrameDecoder(max_json_length=MAX_REQUEST_LENGTH, accept_data=False)
+        if not data:
+            self.closing = True
+            self.subscription = None
+            if self.bare is not None:
+                self.bare.end_of_input()
+        decoder = self.framed or self.bare
+        if decoder is None:
+            return []
+        decoder.feed(data)
+        return self._messages(decoder)
+
+    def _messages(
+        self, decoder: FrameDecoder | BareJsonDecoder
+    ) -> list[JsonObject | BadMessageError | RemoteProtocolError]:
+        found: list[JsonObject | BadMessageError | RemoteProtocolError] = []
+        while True:
+            try:
+                message = decoder.next_message()
+            except BadMessageError as error:
+                found.append(error)
+                continue
+            except RemoteProtocolError as error:
+                self.closing = True
+                self.subscription = None
+                found.append(error)
+                return found
+            if not isinstance(message, dict):  # None: the server's decoder gives no DATA
+                return found
+            found.append(message)
+
+    # -- sending
+
+    def send_json(self, message: JsonObject) -> None:
+        """Send a reply or an event in this connection's own form."""
+        if len(self._queue) - self._queued_data >= MAX_QUEUED_JSON:
+            self.dead = True
+            return
+        self._send(encode_bare_json(message) if self.bare is not None else encode_json(message), -1)
+
+    def offer(self, frame: bytes, place: int, flags: int, now_ns: int) -> None:
+        """Send a DATA frame if the subscription wants it."""
+        wants = self.subscription
+        if wants is None or not wants.wanted[place]:
+            return
+        if flags & DataFlag.REPEATED and wants.fresh_only and now_ns - wants.last_ns[place] < _IDLE_FRAME_NS:
+            return
+        if flags & DataFlag.GAP:
+            wants.gap[place] = True
+        if wants.skipped[place] < wants.every - 1:
+            wants.skipped[place] += 1
+            return
+        wants.skipped[place] = 0
+        wants.last_ns[place] = now_ns
+        if wants.gap[place]:
+            wants.gap[place] = False
+            if not flags & DataFlag.GAP:
+                frame = with_gap(frame)
+        self._send(frame, place)
+
+    def _send(self, frame: bytes, place: int) -> None:
+        if not self._queue:
+            try:
+                sent = self.sock.send(frame)
+            except BlockingIOError:
+                sent = 0
+            except OSError:
+                self.dead = True
+                return
+            if sent == len(frame):
+                if place >= 0:
+                    self.sent += 1
+                return
+            self._head_sent = sent
+            self.needs_writing = True
+        self._queue.append((frame, place))
+        if place >= 0:
+            self._queued_data += 1
+            if self._queued_data > MAX_QUEUED_DATA:
+                self._drop_oldest_data()
+
+    def flush(self) -> None:
+        """Send what waits, as far as the socket takes it."""
+        while self._queue:
+            frame, place = self._queue[0]
+            try:
+                sent = self.sock.send(memoryview(frame)[self._head_sent :])
+            except BlockingIOError:
+                return
+            except OSError:
+                self.dead = True
+                return
+            self._head_sent += sent
+            if self._head_sent < len(frame):
+                return
+            self._queue.popleft()
+            self._head_sent = 0
+            if place >= 0:
+                self.sent += 1
+                self._queued_data -= 1
+        self.needs_writing = False
+
+    def _drop_oldest_data(self) -> None:
+        first = 1 if self._head_sent else 0  # a frame that is partly sent must go out whole
+        for position in range(first, len(self._queue)):
+            place = self._queue[position][1]
+            if place < 0:
+                continue
+            del self._queue[position]
+            self._queued_data -= 1
+            self.withheld += 1
+            for later in range(position, len(self._queue)):
+                frame, its_place = self._queue[later]
+                if its_place == place:
+                    self._queue[later] = (with_gap(frame), place)
+                    return
+            if self.subscription is not None:
+                self.subscription.gap[place] = True
+            return
+
+    @property
+    def all_sent(self) -> bool:
+        """Whether nothing waits to be sent."""
+        return not self._queue
+
+    def end_sending(self) -> None:
+        """Tell the peer that nothing more comes; what it still sends is read and thrown away."""
+        with contextlib.suppress(OSError):
+            self.sock.shutdown(socket.SHUT_WR)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self.sock.close()
+
+
+def with_gap(frame: bytes) -> bytes:
+    """A copy of an encoded DATA frame with the GAP flag set."""
+    flags = frame[DATA_FLAGS_OFFSET] | DataFlag.GAP
+    return frame[:DATA_FLAGS_OFFSET] + bytes((flags,)) + frame[DATA_FLAGS_OFFSET + 1 :]
+
+
+def _address_text(sock: socket.socket) -> str:
+    try:
+        host, port = sock.getpeername()[:2]
+    except OSError:
+        return "unknown"
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

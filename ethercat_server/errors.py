@@ -1,0 +1,49 @@
+"""Every exception the server raises on purpose. Each text is one sentence for a person.
+
+ServerError
++-- UsageError        wrong arguments or configuration (exit code 2)
++-- InterfaceError    the network interface cannot be used
++-- BusError          the bus or a sensor on it does not do what it must
+|   +-- SdoAbortError      the sensor refused an SDO, with its abort code
++-- StopRequestedError       asked to stop while starting up
+"""
+
+from __future__ import annotations
+
+
+class ServerError(Exception):
+    """Base of all errors here."""
+
+    exit_code = 1
+
+
+class UsageError(ServerError):
+    """Wrong arguments or a wrong configuration file."""
+
+    exit_code = 2
+
+
+class InterfaceError(ServerError):
+    """The network interface does not exist, is down, or may not be used."""
+
+
+class BusError(ServerError):
+    """The bus, or a sensor on it, does not do what it must."""
+
+
+class SdoAbortError(BusError):
+    """The sensor refused to read or write an object."""
+
+    def __init__(self, message: str, abort_code: int) -> None:
+        super().__init__(message)
+        self.abort_code = abort_code
+
+
+OBJECT_MISSING = frozenset({0x06020000, 0x06090011})
+"""Abort codes of an object or sub-index that this firmware does not have."""
+
+
+class StopRequestedError(ServerError):
+    """A signal asked the server to stop before it was up."""
+
+    exit_code = 0

@@ -1,0 +1,189 @@
+"""The TCP side: listens, accepts, serves the connections in the time between two exchanges.
+
+It runs in the acquisition's own thread and only until the deadline it is given, so that no client can delay
+the bus.
+"""
+
+from __future__ import annotations
+
+import errno
+import select
+import socket
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from ethercat_server.connection import Connection
+from ethercat_server.errors import ServerError
+from protocol.control import ErrorCode, error_reply
+from protocol.errors import BadMessageError, RemoteProtocolError, RequestError
+from protocol.framing import JsonObject
+
+MAX_CLIENTS: Final = 64
+_LAST_WORDS_S: Final = 1.0
+"""How long a closing connection may take to accept its last reply."""
+
+_SWEEP_NS: Final = 50_000_000
+
+Handler = Callable[[Connection, JsonObject], JsonObject]
+"""Turns a request into its reply; RequestError refuses it."""
+
+
+class Hub:
+    """All client connections. Not thread-safe: one thread does everything."""
+
+    def __init__(self, hosts: Sequence[str], port: int) -> None:
+        """Binds at once, so that a taken port is found before the bus is touched; ServerError then."""
+        self.port = port
+        self.connections: dict[int, Connection] = {}
+        self._subscribers: list[Connection] = []
+        self._closing_since: dict[int, float] = {}
+        self._handler: Handler | None = None
+        self._listeners = _listen(hosts, port)
+        self._readers: list[int] = []
+        self._sweep_at_ns = 0
+
+    def start(self, handler: Handler) -> None:
+        """Begin to accept; until now clients waited in the kernel's queue."""
+        self._handler = handler
+        self._update_readers()
+
+    def publish(self, frame: bytes, place: int, flags: int, now_ns: int) -> None:
+        """Hand a DATA frame of the sensor at `place` to every subscriber that wants it."""
+        for connection in self._subscribers:
+            connection.offer(frame, place, flags, now_ns)
+
+    def broadcast(self, message: JsonObject) -> None:
+        """Send an event to every framed connection."""
+        for connection in self.connections.values():
+            if connection.framed is not None and not connection.closing:
+                connection.send_json(message)
+
+    def subscriptions_changed(self) -> None:
+        """A connection's subscription was made or ended."""
+        self._subscribers = [c for c in self.connections.values() if c.subscription is not None]
+
+    def serve(self, until_ns: int) -> None:
+        """Serve the sockets until CLOCK_MONOTONIC is `until_ns`; one look at each if that is past."""
+        while True:
+            left = max(0, until_ns - time.monotonic_ns())
+            writers = [c.fd for c in self.connections.values() if c.needs_writing]
+            readable, writable, _ = select.select(self._readers, writers, (), left * 1e-9)
+            if not readable and not writable:
+                break
+            for fd in writable:
+                self.connections[fd].flush()
+            for fd in readable:
+                connection = self.connections.get(fd)
+                if connection is None:
+                    self._accept(fd)
+                else:
+                    self._read(connection)
+            if time.monotonic_ns() >= until_ns:
+                break
+        if time.monotonic_ns() >= self._sweep_at_ns:
+            self._sweep()
+
+    def close(self) -> None:
+        """Send what waits, for a bounded time, then close everything."""
+        for listener in self._listeners:
+            listener.close()
+        self._listeners = []
+        self._update_readers()
+        deadline = time.monotonic() + _LAST_WORDS_S
+        for connection in self.connections.values():
+            connection.subscription = None
+            connection.closing = True
+        self.subscriptions_changed()
+        while self.connections and time.monotonic() < deadline:
+            self.serve(time.monotonic_ns() + 20_000_000)
+        for connection in self.connections.values():
+            connection.close()
+        self.connections.clear()
+
+    def _accept(self, fd: int) -> None:
+        listener = next((item for item in self._listeners if item.fileno() == fd), None)
+        if listener is None:
+            return
+        try:
+            sock, _ = listener.accept()
+        except OSError:
+            return
+        if len(self.connections) >= MAX_CLIENTS:
+            sock.close()
+            return
+        connection = Connection(sock)
+        self.connections[connection.fd] = connection
+        self._update_readers()
+
+    def _read(self, connection: Connection) -> None:
+        for message in connection.receive():
+            if isinstance(message, RemoteProtocolError | BadMessageError):
+                connection.send_json(error_reply(None, ErrorCode.BAD_REQUEST, str(message)))
+            else:
+                connection.send_json(self._answer(connection, message))
+        if connection.closing or connection.dead:
+            self._sweep_at_ns = 0
+            self.subscriptions_changed()
+            self._update_readers()
+
+    def _answer(self, connection: Connection, message: JsonObject) -> JsonObject:
+        assert self._handler is not None
+        try:
+            return self._handler(connection, message)
+        except RequestError as error:
+            return error_reply(message, error.code, str(error), **error.extra)
+
+    def _sweep(self) -> None:
+        """Close what is dead or has said its last words."""
+        self._sweep_at_ns = time.monotonic_ns() + _SWEEP_NS
+        gone = []
+        for connection in self.connections.values():
+            if connection.closing and not connection.dead and connection.all_sent:
+                since = self._closing_since.setdefault(connection.fd, time.monotonic())
+                connection.end_sending()
+                connection.dead = time.monotonic() - since > _LAST_WORDS_S or connection.end_of_input
+            if connection.dead:
+                gone.append(connection)
+        for connection in gone:
+            del self.connections[connection.fd]
+            self._closing_since.pop(connection.fd, None)
+            connection.close()
+        if gone:
+            self.subscriptions_changed()
+            self._update_readers()
+
+    def _update_readers(self) -> None:
+        self._readers = [listener.fileno() for listener in self._listeners]
+        self._readers += [fd for fd, connection in self.connections.items() if not connection.end_of_input]
+
+
+def _listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
+    listeners: list[socket.socket] = []
+    for host in hosts:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        try:
+            listener = socket.socket(family, socket.SOCK_STREAM)
+        except OSError:
+            continue  # no IPv6 on this machine
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((host, port))
+            listener.listen(16)
+        except OSError as error:
+            listener.close()
+            if error.errno == errno.EADDRNOTAVAIL and listeners:
+                continue  # no address ::1 on this machine
+            for other in listeners:
+                other.close()
+            reason = (
+                "is taken by another program"
+                if error.errno == errno.EADDRINUSE
+                else f"cannot be used: {error.strerror}"
+            )
+            raise ServerError(
+                f"port {port} on {host} {reason}; stop that program or choose another port"
+            ) from None
+        listener.setblocking(False)
+        listeners.append(listener)
+    return listeners

@@ -1,0 +1,67 @@
+"""Checks a network interface before the bus is opened on it: SOEM itself would say only that it failed."""
+
+from __future__ import annotations
+
+import fcntl
+import socket
+import struct
+from pathlib import Path
+from typing import Final
+
+from ethercat_server.errors import InterfaceError
+
+MAX_NAME_LENGTH: Final = 15
+"""Linux's limit; a longer name would overflow SOEM's buffer."""
+
+_SIOCGIFFLAGS: Final = 0x8913
+_IFF_UP: Final = 0x1
+_IFF_LOOPBACK: Final = 0x8
+_IFF_RUNNING: Final = 0x40
+_CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
+
+
+def check_interface(ifname: str) -> None:
+    """Raise InterfaceError unless `ifname` exists, is up, has a carrier and may be opened."""
+    if not 0 < len(ifname.encode()) <= MAX_NAME_LENGTH or "/" in ifname:
+        raise InterfaceError(
+            f"{ifname!r} is no name of a network interface: it must have 1 to {MAX_NAME_LENGTH} characters; "
+            "'ip link' lists them"
+        )
+    flags = _flags(ifname)
+    if flags & _IFF_LOOPBACK:
+        raise InterfaceError(f"{ifname} is the loopback interface: name the one the sensor is connected to")
+    missing = _missing_capabilities()
+    if missing:
+        raise InterfaceError(
+            f"not allowed to open {ifname}: {' and '.join(missing)} missing; run with sudo, or "
+            "give the service CAP_NET_RAW and CAP_NET_ADMIN"
+        )
+    if not flags & _IFF_UP:
+        raise InterfaceError(f"{ifname} is down: bring it up with 'sudo ip link set {ifname} up'")
+    if not flags & _IFF_RUNNING:
+        raise InterfaceError(
+            f"{ifname} has no carrier: check the cable, the PoE injector and its power supply"
+        )
+
+
+def _flags(ifname: str) -> int:
+    # Asked of the kernel, not of /sys: /sys shows the namespace it was mounted in, which may be another.
+    request = struct.pack("16sH14x", ifname.encode(), 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            answer = fcntl.ioctl(probe, _SIOCGIFFLAGS, request)
+        except OSError:
+            names = ", ".join(name for _, name in socket.if_nameindex())
+            raise InterfaceError(
+                f"no network interface {ifname!r} on this machine: there are {names}"
+            ) from None
+    flags: int = struct.unpack("16xH14x", answer)[0]
+    return flags
+
+
+def _missing_capabilities() -> list[str]:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("CapEff:"):
+            effective = int(line.split()[1], 16)
+            return [name for bit, name in _CAPABILITIES.items() if not effective >> bit & 1]
+    return []

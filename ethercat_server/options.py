@@ -1,0 +1,180 @@
+"""What the server is asked to do: command line and configuration file, read into one checked object."""
+
+from __future__ import annotations
+
+import argparse
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from ethercat_server import __version__
+from ethercat_server.errors import UsageError
+from protocol.errors import SettingError
+from protocol.settings import SETTINGS, SettingValue, check_combination, check_settings, start_up_defaults
+
+VIRTUAL_INTERFACE: Final = "virtual"
+"""The interface name that stands for a virtual bus with a virtual sensor on it."""
+
+
+DEFAULT_RT_PRIORITY: Final = 80
+
+
+@dataclass(frozen=True, slots=True)
+class ServerOptions:
+    """Everything the server needs to know to start."""
+
+    ifname: str
+    port: int
+    sensor_name: str | None = None
+    hosts: tuple[str, ...] = ("127.0.0.1", "::1")
+    virtual_arguments: str = ""
+    rt_priority: int = 0
+    """Of SCHED_FIFO; 0 is ordinary scheduling."""
+    cpu: int | None = None
+    common_settings: dict[str, SettingValue] = field(default_factory=dict)
+    """Asked for every sensor."""
+    sensor_settings: dict[int, dict[str, SettingValue]] = field(default_factory=dict)
+    """Asked for one sensor, by place; these win over the file's common ones."""
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether to bring up a virtual bus."""
+        return self.ifname == VIRTUAL_INTERFACE
+
+    def asked_settings(self, place: int) -> dict[str, SettingValue]:
+        """The settings a person asked for, for the sensor at `place`."""
+        return {**self.common_settings, **self.sensor_settings.get(place, {})}
+
+    def wanted_settings(self, place: int) -> dict[str, SettingValue]:
+        """The same over the start-up defaults; SettingError if they contradict one another."""
+        wanted = {**start_up_defaults(), **self.asked_settings(place)}
+        check_combination(wanted)
+        return wanted
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line of `ethercat-server`."""
+    parser = argparse.ArgumentParser(
+        prog="ethercat-server",
+        usage="%(prog)s [options] IFACE [SENSOR_NAME] PORT",
+        description="Owns the EtherCAT bus, sets its Bota sensors up and streams their samples over TCP.",
+        epilog="settings: " + "; ".join(f"{row.name} ({row.meaning})" for row in SETTINGS.values()),
+    )
+    parser.add_argument(
+        "arguments", nargs="+", metavar="IFACE [SENSOR_NAME] PORT",
+        help="network interface ('virtual' for a virtual sensor), name the first sensor must have, TCP port",
+    )  # fmt: skip
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",
+        help="a setting of every sensor at start-up; may be given more than once",
+    )  # fmt: skip
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE.toml",
+        help="settings from a file: table [sensor], or [sensor.0], [sensor.1] for a chain",
+    )  # fmt: skip
+    parser.add_argument(
+        "--virtual", default="", metavar="ARGUMENTS",
+        help="arguments for the virtual sensor, such as '--pdo 77 --sensors 2' (see ethercat-virtual-sensor)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--rt-priority", type=_priority, default=DEFAULT_RT_PRIORITY, metavar="N",
+        help="SCHED_FIFO priority, used when allowed; 0 for ordinary scheduling (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--cpu", type=int, metavar="N", help="the only CPU to run on, used when allowed")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    return parser
+
+
+def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
+    """Read the command line and the file it names; UsageError says what is wrong with either.
+
+    argparse itself exits with code 2 for what it finds.
+    """
+    parsed = build_parser().parse_intermixed_args(argv)
+    arguments: list[str] = parsed.arguments
+    if len(arguments) not in {2, 3}:
+        raise UsageError(
+            f"{len(arguments)} arguments given: it takes IFACE [SENSOR_NAME] PORT, "
+            "for example 'ethercat-server ens5 12001'"
+        )
+    common, by_sensor = read_config(parsed.config) if parsed.config else ({}, {})
+    assigned = parse_assignments(parsed.assignments)
+    options = ServerOptions(
+        ifname=arguments[0],
+        port=_port(arguments[-1]),
+        sensor_name=arguments[1] if len(arguments) == 3 else None,
+        virtual_arguments=parsed.virtual,
+        rt_priority=parsed.rt_priority,
+        cpu=parsed.cpu,
+        common_settings={**common, **assigned},
+        sensor_settings={place: {**settings, **assigned} for place, settings in by_sensor.items()},
+    )
+    if options.virtual_arguments and not options.is_virtual:
+        raise UsageError(f"--virtual goes with the interface 'virtual', not with {options.ifname}")
+    try:
+        for place in (-1, *options.sensor_settings):
+            options.wanted_settings(place)
+    except SettingError as error:
+        raise UsageError(str(error)) from None
+    return options
+
+
+def parse_assignments(assignments: Sequence[str]) -> dict[str, SettingValue]:
+    """The settings in NAME=VALUE texts; UsageError names the one that is wrong."""
+    values: dict[str, SettingValue] = {}
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        setting = SETTINGS.get(name.strip())
+        if not equals:
+            raise UsageError(f"--set {assignment}: it must be NAME=VALUE, for example --set sinc_length=64")
+        if setting is None:
+            raise UsageError(f"no setting {name.strip()!r}: the settings are " + ", ".join(SETTINGS))
+        try:
+            values[setting.name] = setting.parse(text)
+        except SettingError as error:
+            raise UsageError(f"--set {assignment}: {error}") from None
+    return values
+
+
+def read_config(path: Path) -> tuple[dict[str, SettingValue], dict[int, dict[str, SettingValue]]]:
+    """Settings for every sensor, and for single ones by place; UsageError names file and key."""
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"cannot read the configuration {path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"the configuration {path} is not valid TOML: {error}") from None
+    unknown = content.keys() - {"sensor"}
+    table: Any = content.get("sensor", {})
+    if unknown or not isinstance(table, dict):
+        key = sorted(unknown)[0] if unknown else "sensor"
+        raise UsageError(f"the configuration {path} has an unexpected {key!r}: it takes a table [sensor]")
+    common = {key: value for key, value in table.items() if not isinstance(value, dict)}
+    single = {key: value for key, value in table.items() if isinstance(value, dict)}
+    try:
+        by_sensor = {}
+        for key, values in single.items():
+            if not key.isdecimal() or int(key) > 255:
+                raise SettingError(f"[sensor.{key}]: the table must be named by a place, such as sensor.0")
+            by_sensor[int(key)] = check_settings({**common, **values})
+        return check_settings(common), by_sensor
+    except SettingError as error:
+        raise UsageError(f"the configuration {path}: {error}") from None
+
+
+def _priority(text: str) -> int:
+    if not text.isdecimal() or int(text) > 99:
+        raise argparse.ArgumentTypeError(f"{text!r} must be from 0 to 99")
+    return int(text)
+
+
+def _port(text: str) -> int:
+    try:
+        port = int(text)
+    except ValueError:
+        raise UsageError(f"port {text!r} is no number: it must be from 1 to 65535") from None
+    if not 1 <= port <= 65535:
+        raise UsageError(f"port {port} is out of range: it must be from 1 to 65535")
+    return port

@@ -1,0 +1,155 @@
+"""Follows a sensor's own sampling clock, so that a poll falls right after each sample came to be.
+
+The sensor samples freely; an exchange only tells whether the process data changed since the one before. The
+change then happened after the earlier exchange was sent and before the later one was back: a bracket that
+holds however late either of them was. Brackets of successive samples, moved on by the period, are
+intersected; what remains is where the next sample is expected. Two polls aim at its two edges, as the gates
+of an early-late tracker do: if the early one already sees the change the clock is ahead of the estimate and
+the late one is not needed; if neither does it is behind, and further polls search for it. Stalls and lost
+frames only make a bracket wide: they teach nothing wrong.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+_POLLS_UNLOCKED: Final = 4
+"""Exchanges a sample while the clock is unknown."""
+_SEARCH_STEPS: Final = 8
+"""Exchanges a sample once one is overdue."""
+_NARROW: Final = 0.4
+"""A bracket narrower than this part of a period holds one instant for sure."""
+_UNDISTURBED: Final = 1.25
+"""A bracket wider than this many periods comes from a stall."""
+_NEAR: Final = 0.08
+"""A sample is as expected when it moves the estimate by less than this part of a period."""
+_SLACK_NS: Final = 1_000.0
+"""How far a period may differ from the estimate: the expected bracket grows by this at each end."""
+_SILENT: Final = 8
+"""A sensor that has given nothing new for this many periods is no longer followed."""
+_MIN_WIDTH_NS: Final = 10_000.0
+_PHASE_GAIN: Final = 0.5
+_PERIOD_GAIN: Final = 0.02
+_MAX_PULL: Final = 0.002
+"""The period may differ from the nominal one by this part: four times what an oscillator is off."""
+_LOCK_GAIN: Final = 1 / 32
+_LOCK_AT: Final = 0.85
+_UNLOCK_AT: Final = 0.6
+
+
+class SampleClock:
+    """The sampling clock of one sensor, as far as the exchanges have shown it. Times are CLOCK_MONOTONIC ns.
+
+    Call `observe` after every valid exchange; ask `next_poll_ns` when the next one is wanted.
+    """
+
+    __slots__ = (
+        "_high", "_low", "_nominal_ns", "_polled_ns", "_quality",
+        "instant_ns", "locked", "period_ns", "steps",
+    )  # fmt: skip
+
+    def __init__(self, period_ns: float, start_ns: int = 0) -> None:
+        """`period_ns` is the nominal sample period; the first poll is due soon after `start_ns`."""
+        self._nominal_ns = period_ns
+        self.period_ns = period_ns
+        self.locked = False
+        self.instant_ns = 0.0
+        """Estimated instant of the newest sample."""
+        self.steps = 1
+        """How many samples the newest one is after the one handed out before it: more than 1, some were
+        lost; 0, one was counted as lost that was not."""
+        self._quality = 0.0
+        self._polled_ns = start_ns
+        """When the last exchange was sent."""
+        self._low = self._high = 0.0
+        """Bracket in which the next sample is expected."""
+
+    @property
+    def uncertainty_ns(self) -> float:
+        """Half the width of the bracket that the newest sample's instant was estimated from."""
+        return (self._high - self._low) / 2 - _SLACK_NS
+
+    def describe(self) -> dict[str, Any]:
+        """What `status` says of it."""
+        return {
+            "mode": "locked" if self.locked else "oversampling",
+            "period_us": self.period_ns / 1000,
+            "offset_ppm": round((self._nominal_ns / self.period_ns - 1) * 1e6, 1),
+            "uncertainty_us": round(self.uncertainty_ns / 1000, 1) if self.locked else None,
+        }
+
+    def next_poll_ns(self) -> float:
+        """When the next exchange should be sent, as far as this sensor is concerned."""
+        if not self.locked:
+            return self._polled_ns + self.period_ns / _POLLS_UNLOCKED
+        if self._polled_ns < self._low:
+            return self._low
+        if self._polled_ns < self._high:
+            return self._high
+        overdue = self._polled_ns > self._high + self.period_ns
+        return self._polled_ns + self.period_ns / (_POLLS_UNLOCKED if overdue else _SEARCH_STEPS)
+
+    def observe(self, sent_ns: int, received_ns: int, fresh: bool) -> None:
+        """Learn from one valid exchange whether it brought a new sample (`fresh`)."""
+        after, self._polled_ns = self._polled_ns, sent_ns
+        if not fresh:
+            if self.locked and sent_ns > self._high + _SILENT * self.period_ns:
+                self.restart()
+            return
+        if self._high == 0.0 or after > self._high + self.period_ns:
+            # Nothing was expected, or the sensor was watched and silent for longer than a period: its
+            # clock begins anew. Only what fell into the time it was not watched can have been lost.
+            self.steps = 1 + int((received_ns - after) // self.period_ns)
+            self._low, self._high = max(after, received_ns - self.period_ns), float(received_ns)
+            self._expect_next(received_ns)
+            return
+        narrow = received_ns - after < _NARROW * self.period_ns
+        self.steps = self._count_steps(after, sent_ns, received_ns, narrow)
+        moved = (self.steps - 1) * self.period_ns
+        low, high = self._low + moved, self._high + moved
+        believed = (low + high) / 2
+        if after > high:  # the sample came later than was thought possible
+            self._low, self._high = low + _PHASE_GAIN * (after - high), high + _PHASE_GAIN * (after - high)
+        elif received_ns < low:  # earlier
+            self._low = low - _PHASE_GAIN * (low - received_ns)
+            self._high = high - _PHASE_GAIN * (low - received_ns)
+        else:
+            self._low, self._high = max(low, after), min(high, received_ns)
+        error = (self._low + self._high) / 2 - believed
+        undisturbed = received_ns - after < _UNDISTURBED * self.period_ns
+        if undisturbed:
+            self._learn_period(error)
+        self._judge(undisturbed and abs(error) < _NEAR * self.period_ns)
+        self._expect_next(received_ns)
+
+    def restart(self) -> None:
+        """The sensor's clock starts again (its power was cut, say): keep only what is known of its rate."""
+        self.locked = False
+        self._quality = 0.0
+        self._low = self._high = 0.0
+
+    def _count_steps(self, after: int, sent: int, received: int, narrow: bool) -> int:
+        expected = (self._low + self._high) / 2
+        if narrow:
+            return max(0, 1 + round(((after + received) / 2 - expected) / self.period_ns))
+        # Several samples may lie in a wide bracket: the newest is the last one due before the exchange.
+        return max(1, 1 + int(((sent + received) / 2 - expected) // self.period_ns))
+
+    def _learn_period(self, error_ns: float) -> None:
+        pull = _MAX_PULL * self._nominal_ns
+        period = self.period_ns + _PERIOD_GAIN * max(-pull * 8, min(pull * 8, error_ns))
+        self.period_ns = max(self._nominal_ns - pull, min(self._nominal_ns + pull, period))
+
+    def _judge(self, as_expected: bool) -> None:
+        self._quality += _LOCK_GAIN * (as_expected - self._quality)
+        if self.locked:
+            self.locked = self._quality > _UNLOCK_AT
+        else:
+            self.locked = self._quality > _LOCK_AT
+
+    def _expect_next(self, received_ns: int) -> None:
+        middle, half = (self._low + self._high) / 2, (self._high - self._low) / 2
+        self.instant_ns = min(middle, float(received_ns))
+        half = max(half, _MIN_WIDTH_NS / 2) + _SLACK_NS
+        self._low = middle + self.period_ns - half
+        self._high = middle + self.period_ns + half

@@ -1,0 +1,114 @@
+"""One sensor's stream: which exchanges brought a new sample, and the DATA frame for it.
+
+A frame exists for every new sample. While the sensor is silent there is one REPEATED (or INVALID)
+frame for each sample period that passes, so that its silence is visible; the polls in between samples, which
+find the same data again only because the bus is read more often than the sensor samples, make none.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Final
+
+from ethercat_server.distribution import Distribution
+from ethercat_server.sample_clock import SampleClock
+from protocol.framing import DataFlag, encode_data
+
+DISCARDED_AT_START: Final = 3
+"""Bota's own driver throws the first three frames after entering OP away."""
+_IDLE_PERIODS: Final = 3.0
+"""A sensor that has given nothing new for this many periods is silent, not just late."""
+
+REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))
+
+
+class SensorStream:
+    """Numbers, stamps and marks the frames of the sensor at `place`, which samples every `period_ns`."""
+
+    def __init__(self, place: int, period_ns: float) -> None:
+        self.place = place
+        self.clock = SampleClock(period_ns, time.monotonic_ns())
+        self.process_data = b""
+        """The newest valid process data."""
+        self.sequence = 0
+        self.fresh = 0
+        self.repeated = 0
+        self.invalid = 0
+        self.lost_samples = 0
+        self.recoveries = 0
+        self.age = Distribution()
+        """From the estimated instant of a sample to its hand-out, while locked."""
+        self._discard = DISCARDED_AT_START
+        self._gap = False
+        self._idle_at_ns = 0.0
+
+    def take(
+        self, data: bytes, wkc: int, valid: bool, sent_ns: int, back_ns: int
+    ) -> tuple[bytes, int] | None:
+        """The frame that an exchange gives, and its flags; None if it gives none.
+
+        `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the exchange.
+        """
+        clock = self.clock
+        moment_ns = back_ns
+        fresh = valid and data != self.process_data
+        if valid:
+            clock.observe(sent_ns, back_ns, fresh)
+        if fresh:
+            self.process_data = data
+            if self._discard:
+                self._discard -= 1
+                return None
+            flags = self._new_sample(back_ns)
+            if clock.locked:
+                moment_ns = int(clock.instant_ns)
+                self.age.record(back_ns - moment_ns)
+        elif back_ns >= self._idle_at_ns and self.sequence:
+            flags = self._nothing_new(valid, back_ns)
+        else:
+            return None
+        stamp_ns = time.time_ns() - (time.monotonic_ns() - moment_ns)
+        sequence = self.sequence
+        self.sequence += 1
+        return encode_data(
+            sequence, stamp_ns, moment_ns, self.place, flags, max(wkc, 0), self.process_data
+        ), flags  # fmt: skip
+
+    def _new_sample(self, now_ns: int) -> int:
+        self._idle_at_ns = now_ns + _IDLE_PERIODS * self.clock.period_ns
+        self.fresh += 1
+        lost = self.clock.steps - 1 if self.sequence else 0
+        # -1 takes back one that was counted after a stall but came after all.
+        self.lost_samples = max(0, self.lost_samples + lost)
+        flags = GAP if lost > 0 or self._gap else 0
+        self._gap = False
+        return flags
+
+    def _nothing_new(self, valid: bool, now_ns: int) -> int:
+        # The next slot is counted from this one, but a stall makes one frame, not a burst.
+        self._idle_at_ns = max(self._idle_at_ns + self.clock.period_ns, float(now_ns))
+        if valid:
+            self.repeated += 1
+            return REPEATED
+        self.invalid += 1
+        return INVALID
+
+    def restart(self, period_ns: float) -> None:
+        """The sensor is back after it was lost, perhaps with another sample period."""
+        self.recoveries += 1
+        self.clock = SampleClock(period_ns, time.monotonic_ns())
+        self._discard = DISCARDED_AT_START
+        self._gap = True
+
+    def status(self) -> dict[str, Any]:
+        """The sensor's part of the `status` reply."""
+        return {
+            "sensor": self.place,
+            "fresh": self.fresh,
+            "repeated": self.repeated,
+            "invalid": self.invalid,
+            "lost_samples": self.lost_samples,
+            "recoveries": self.recoveries,
+            "clock": self.clock.describe(),
+            "age_us": self.age.summary_us(),
+        }

@@ -1,0 +1,152 @@
+"""`ethercat-virtual-sensor IFACE`: the command line of the virtual sensor."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+
+from ethercat_server import __version__
+from ethercat_server.objects import MODELS
+from ethercat_server.virtual_sensor import link
+from ethercat_server.virtual_sensor.control import ControlError
+from ethercat_server.virtual_sensor.faults import COMMANDS, PPM_LIMIT, CommandError, real, whole
+from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
+from ethercat_server.virtual_sensor.signals import SIGNALS
+from protocol.pdo import LAYOUTS
+from protocol.settings import SETTINGS
+
+MOST_SENSORS = 16
+
+
+class UsageError(Exception):
+    """Arguments that contradict one another; the text is one sentence."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line, and nothing done yet."""
+    commands = "\n".join(f"  {c.usage:34} {c.meaning}" for c in COMMANDS)
+    parser = argparse.ArgumentParser(
+        prog="ethercat-virtual-sensor",
+        description="Answer EtherCAT frames on a network interface as Bota force/torque sensors do.",
+        epilog=f"commands, one a line on stdin or on the --control socket:\n{commands}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    several = "; several, comma separated or repeated, for a chain"
+    parser.add_argument("iface", metavar="IFACE", help="interface, up: one end of a veth pair, say")
+    parser.add_argument("--sensors", metavar="N", help="sensors on the bus (default: as many as named, or 1)")
+    parser.add_argument("--model", action="append", metavar="NAME", help=f"default {MODELS[0]}{several}")
+    parser.add_argument("--serial", action="append", metavar="N", help=f"default 1, 2, ...{several}")
+    parser.add_argument(
+        "--pdo", choices=[str(n) for n in LAYOUTS], default="61", help="bytes of process data"
+    )
+    parser.add_argument("--sinc", metavar="N", help="SINC length after power-on (default 64)")
+    parser.add_argument("--ppm", action="append", metavar="X", help=f"clock error{several}")
+    parser.add_argument("--signal", choices=SIGNALS, default="scene", help="what is measured (default scene)")
+    parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of the scene")
+    parser.add_argument("--seed", default="0", metavar="N", help="of the noise")
+    parser.add_argument("--control", metavar="PATH", help="Unix socket for commands")
+    parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    return parser
+
+
+def _list(given: Sequence[str] | None) -> list[str]:
+    return [word for text in given or () for word in text.split(",") if word]
+
+
+def options_from(args: argparse.Namespace) -> BusOptions:
+    """The sensors that parsed arguments name; UsageError if they make no sense."""
+    models, serials, errors = _list(args.model), _list(args.serial), _list(args.ppm)
+    named = max(len(models), len(serials), len(errors), 1)
+    sinc_range = SETTINGS["sinc_length"].choices
+    assert isinstance(sinc_range, range)
+    try:
+        count = whole(args.sensors, 1, MOST_SENSORS) if args.sensors is not None else named
+        seed = whole(args.seed, 0, 2**63)
+        sinc = None if args.sinc is None else whole(args.sinc, sinc_range[0], sinc_range[-1])
+        serial_numbers = [whole(text, 0, 0xFFFFFFFF) for text in serials]
+        ppms = [real(text, -PPM_LIMIT, PPM_LIMIT) for text in errors]
+    except CommandError as error:
+        raise UsageError(str(error)) from None
+    if named > count:
+        raise UsageError(f"{named} sensors are named but --sensors is {count}: name at most as many")
+    for model in models:
+        if not model.isascii() or len(model) > 20:
+            raise UsageError(f"model {model!r} must have at most 20 ASCII characters, such as {MODELS[0]}")
+    sensors = []
+    for place in range(count):
+        first_serial = serial_numbers[-1] if serial_numbers else 1
+        given = len(serial_numbers) - 1 if serial_numbers else 0
+        sensors.append(
+            SensorOptions(
+                # The last one named goes for the rest; serial numbers go on counting.
+                model=models[min(place, len(models) - 1)] if models else MODELS[0],
+                serial=serial_numbers[place] if place < len(serial_numbers) else first_serial + place - given,
+                pdo_size=int(args.pdo),
+                sinc_length=sinc,
+                ppm=ppms[min(place, len(ppms) - 1)] if ppms else 0.0,
+                signal=args.signal,
+                noise=args.noise == "on",
+                seed=seed + place,
+            )
+        )
+    return BusOptions(tuple(sensors))
+
+
+@contextlib.contextmanager
+def _stop_signals() -> Iterator[Callable[[], bool]]:
+    """While open, SIGTERM and SIGINT only set a flag, which is yielded."""
+    stopped = False
+
+    def stop(_number: int, _frame: object) -> None:
+        nonlocal stopped
+        stopped = True
+
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    # In the background of a terminal, what is typed there is not for us: reading it must not stop us.
+    previous[signal.SIGTTIN] = signal.signal(signal.SIGTTIN, signal.SIG_IGN)
+    try:
+        yield lambda: stopped
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the virtual sensor: 0 when told to end, 1 when it cannot go on, 2 for wrong arguments."""
+    args = build_parser().parse_args(argv)
+    try:
+        options = options_from(args)
+        if len(args.iface.encode()) > link.LONGEST_NAME:
+            raise UsageError(f"interface name {args.iface!r} is longer than {link.LONGEST_NAME} characters")
+    except UsageError as error:
+        print(f"ethercat-virtual-sensor: {error}", file=sys.stderr)
+        return 2
+    models = ", ".join(dict.fromkeys(sensor.model for sensor in options.sensors))
+    first = options.sensors[0]
+
+    def ready() -> None:
+        print(
+            f"ready: {len(options.sensors)} sensor(s) {models} on {args.iface}, "
+            f"{first.pdo_size} bytes of process data, signal {first.signal}",
+            flush=True,
+        )
+
+    try:
+        with _stop_signals() as stopped:
+            link.run(
+                args.iface,
+                options,
+                control_path=args.control,
+                commands=sys.stdin,
+                exit_on_eof=args.exit_on_eof,
+                on_ready=ready,
+                should_stop=stopped,
+            )
+    except (link.LinkError, ControlError) as error:
+        print(f"ethercat-virtual-sensor: {error}", file=sys.stderr)
+        return 1
+    return 0

@@ -1,0 +1,215 @@
+"""Faults on command: one table of text commands, what they do, and the help text made from it.
+
+A command is one line: its name, arguments, and `@N` anywhere to mean sensor N of the chain (from 0;
+without it sensor 0). The answer is one line: `ok ...`, or `error: ` and a sentence.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from ethercat_server.objects import MODELS
+from ethercat_server.virtual_sensor.al import AlState
+from ethercat_server.virtual_sensor.bus import Bus
+from ethercat_server.virtual_sensor.firmware import Firmware
+from ethercat_server.virtual_sensor.sensor import VirtualSensor
+
+LONGEST_LINE: Final = 1000
+PPM_LIMIT: Final = 100_000.0
+
+
+class CommandError(Exception):
+    """A command that cannot be done; its text is a sentence."""
+
+
+class QuitCommand(Exception):  # noqa: N818
+    """Someone asked the virtual sensor to end."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Call:
+    bus: Bus
+    sensor: VirtualSensor
+    arguments: list[str]
+
+    @property
+    def life(self) -> Firmware:
+        if self.sensor.life is None:
+            raise CommandError("that sensor has no power: switch it on first with `power on`")
+        return self.sensor.life
+
+
+@dataclass(frozen=True, slots=True)
+class FaultCommand:
+    """One command."""
+
+    name: str
+    usage: str
+    counts: tuple[int, ...]
+    """Numbers of arguments that it takes."""
+    meaning: str
+    run: Callable[[_Call], str | None]
+
+
+def whole(text: str, lowest: int, highest: int) -> int:
+    """A whole number, decimal or 0x...; CommandError if it is none or out of range."""
+    try:
+        value = int(text, 0)
+    except ValueError:
+        raise CommandError(f"{text!r} is no whole number: write it as 27 or 0x1B") from None
+    if not lowest <= value <= highest:
+        raise CommandError(f"{text} is out of range: it must be from {lowest} to {highest}")
+    return value
+
+
+def real(text: str, lowest: float, highest: float) -> float:
+    """A finite number; CommandError if it is none or out of range."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not lowest <= value <= highest:
+        raise CommandError(f"{text!r} must be a number from {lowest:g} to {highest:g}")
+    return value
+
+
+def _lose(call: _Call) -> None:
+    call.bus.lose = whole(call.arguments[0], 0, 2**31)
+
+
+def _deaf(call: _Call) -> None:
+    seconds = real(call.arguments[0], 0, 1e6) if call.arguments else math.inf
+    call.bus.deaf_until = call.bus.now + seconds * 1e9
+
+
+def _hear(call: _Call) -> None:
+    call.bus.deaf_until = None
+    call.bus.lose = 0
+
+
+def _power(call: _Call) -> None:
+    match call.arguments:
+        case ["on"]:
+            call.bus.power(call.sensor, True)
+        case ["off"]:
+            call.bus.power(call.sensor, False)
+        case ["cycle", seconds]:
+            call.bus.power(call.sensor, False, real(seconds, 0, 1e6))
+        case _:
+            raise CommandError("power takes `on`, `off` or `cycle SECONDS`")
+
+
+def _safeop(call: _Call) -> None:
+    code = whole(call.arguments[0], 0, 0xFFFF)
+    call.life.fail(AlState.SAFEOP, code)
+
+
+def _error(call: _Call) -> None:
+    code = whole(call.arguments[0], 0, 0xFFFF)
+    call.life.fail(call.life.al.state, code)
+
+
+def _warn(call: _Call) -> None:
+    bits = whole(call.arguments[0], 0, 0xFFFFFFFF)
+    samples = whole(call.arguments[1], 1, 2**31) if len(call.arguments) > 1 else None
+    call.life.set_warnings(bits, samples)
+
+
+def _stick(call: _Call) -> None:
+    call.life.stick(True)
+
+
+def _unstick(call: _Call) -> None:
+    call.life.stick(False)
+
+
+def _swap(call: _Call) -> None:
+    model, serial = call.arguments
+    if not model.isascii() or not 1 <= len(model) <= 20:
+        raise CommandError(f"model {model!r} must have 1 to 20 ASCII characters, such as {MODELS[0]}")
+    call.sensor.swap(model, whole(serial, 0, 0xFFFFFFFF))
+    call.bus.power(call.sensor, True)
+
+
+def _abort(call: _Call) -> None:
+    index, subindex = whole(call.arguments[0], 0, 0xFFFF), whole(call.arguments[1], 0, 0xFF)
+    call.life.aborts[index, subindex] = whole(call.arguments[2], 0, 0xFFFFFFFF)
+
+
+def _mute(call: _Call) -> None:
+    call.life.mailbox.mute = whole(call.arguments[0], 0, 2**31)
+
+
+def _ppm(call: _Call) -> None:
+    call.sensor.set_ppm(real(call.arguments[0], -PPM_LIMIT, PPM_LIMIT))
+
+
+def _stats(call: _Call) -> str:
+    return json.dumps(call.bus.statistics(), separators=(",", ":"))
+
+
+def _help(_call: _Call) -> str:
+    return " | ".join(f"{c.usage}: {c.meaning}" for c in COMMANDS)
+
+
+def _quit(_call: _Call) -> None:
+    raise QuitCommand
+
+
+COMMANDS: Final[tuple[FaultCommand, ...]] = (
+    FaultCommand("lose", "lose N", (1,), "lose the next N frames", _lose),
+    FaultCommand("deaf", "deaf [SECONDS]", (0, 1), "lose every frame, until `hear` or for a time", _deaf),
+    FaultCommand("hear", "hear", (0,), "end `deaf` and `lose`", _hear),
+    FaultCommand(
+        "power", "power off|on|cycle SECONDS [@N]", (1, 2),
+        "switch a sensor off or on; what was not saved is gone, and sensors behind it are cut off", _power,
+    ),
+    FaultCommand("safeop", "safeop CODE [@N]", (1,), "fall to SAFEOP with this AL status code", _safeop),
+    FaultCommand("error", "error CODE [@N]", (1,), "set the error bit and this AL status code", _error),
+    FaultCommand(
+        "warn", "warn BITS [SAMPLES] [@N]", (1, 2), "set warnings, for ever or some samples", _warn
+    ),
+    FaultCommand("stick", "stick [@N]", (0,), "give the same process data for ever", _stick),
+    FaultCommand("unstick", "unstick [@N]", (0,), "end `stick`", _unstick),
+    FaultCommand("swap", "swap MODEL SERIAL [@N]", (2,), "put another sensor in its place", _swap),
+    FaultCommand(
+        "abort", "abort INDEX SUBINDEX CODE [@N]", (3,), "abort the next SDO on that entry", _abort
+    ),
+    FaultCommand("mute-mailbox", "mute-mailbox N [@N]", (1,), "swallow the next N mailbox requests", _mute),
+    FaultCommand("ppm", "ppm X [@N]", (1,), "change the error of the sensor's clock", _ppm),
+    FaultCommand("stats", "stats", (0,), "counters and states, as JSON", _stats),
+    FaultCommand("help", "help", (0,), "this list", _help),
+    FaultCommand("quit", "quit", (0,), "end the virtual sensor", _quit),
+)  # fmt: skip
+
+_BY_NAME: Final = {command.name: command for command in COMMANDS}
+
+
+def obey(bus: Bus, line: str) -> str:
+    """Do one command and give the answer, without a line end. QuitCommand if it was `quit`."""
+    try:
+        result = _run(bus, line)
+    except CommandError as error:
+        return f"error: {error}"
+    return f"ok {result}" if result else "ok"
+
+
+def _run(bus: Bus, line: str) -> str | None:
+    words = line.split()
+    places = [word for word in words if word.startswith("@")]
+    words = [word for word in words if not word.startswith("@")]
+    if not words:
+        raise CommandError("an empty line: type `help` for the commands")
+    command = _BY_NAME.get(words[0].lower())
+    if command is None:
+        raise CommandError(f"no command {words[0][:40]!r}: type `help` for the commands")
+    if len(words) - 1 not in command.counts:
+        raise CommandError(f"wrong number of arguments: {command.usage}")
+    if len(places) > 1:
+        raise CommandError("more than one sensor named: one `@N` a command")
+    place = whole(places[0][1:], 0, len(bus.sensors) - 1) if places else 0
+    return command.run(_Call(bus, bus.sensors[place], words[1:]))

@@ -1,0 +1,264 @@
+"""The firmware of one sensor: one life of it, from power-on to power-off.
+
+It sits behind the EtherCAT controller and ties together AL states, mailbox, objects, clock and measurement.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Final
+
+from ethercat_server.virtual_sensor import registers as reg
+from ethercat_server.virtual_sensor.al import AlCode, AlState, AlStateMachine
+from ethercat_server.virtual_sensor.clock import SampleClock
+from ethercat_server.virtual_sensor.coe import CoeServer
+from ethercat_server.virtual_sensor.dictionary import Address, Dictionary
+from ethercat_server.virtual_sensor.esc import Esc
+from ethercat_server.virtual_sensor.layout import SYNC_MANAGERS, sync_manager_lengths
+from ethercat_server.virtual_sensor.mailbox import Mailbox
+from ethercat_server.virtual_sensor.measurement import Measurement
+from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.scene import Scene
+from ethercat_server.virtual_sensor.sdo_abort import SdoAbortError
+from ethercat_server.virtual_sensor.sdo_information import SdoInformation
+from ethercat_server.virtual_sensor.signals import FORMULAS, Signal
+from ethercat_server.virtual_sensor.sii import build_image
+from protocol.pdo import layout_for
+
+_SM_CONTROL_MASK: Final = 0x0F  # operation mode and direction
+_WATCHDOG_UNIT_NS: Final = 40
+
+
+def make_signal(options: SensorOptions) -> Signal:
+    """The signal that `options` name."""
+    if options.signal == "scene":
+        return Scene(options.seed, options.noise)
+    return FORMULAS[options.signal]()
+
+
+OnWrite = Callable[[int, int, bytes, AlState, int], None]
+
+
+class Firmware:
+    """One life of a sensor: what its controller calls (`esc.Pdi`) and what SDOs reach (`coe.Objects`).
+
+    `on_write` is told of every SDO write: index, sub-index, data, AL state, abort code or 0.
+
+    Attributes:
+        now: CLOCK_MONOTONIC in ns; whoever hands over a frame sets it first.
+    """
+
+    def __init__(
+        self, options: SensorOptions, flash: dict[Address, bytes], now: int, on_write: OnWrite
+    ) -> None:
+        self.now = now
+        self._on_write = on_write
+        self._options = options
+        self._layout = layout_for(options.pdo_size)
+        self._signal = make_signal(options)
+        self.dictionary = Dictionary(
+            options.model, options.serial, options.pdo_size, flash, self.inputs, self._settings_changed
+        )
+        sinc_length = int(self.dictionary.settings()["sinc_length"])
+        self._power_on = self.now
+        self.clock = SampleClock(self.now, sinc_length, options.ppm)
+        self.esc = Esc(self, build_image(options.model, options.serial, options.pdo_size))
+        self.al = AlStateMachine(self._mailbox_fault, self._process_data_fault)
+        self._coe = CoeServer(self, SdoInformation(self.dictionary))
+        managers = self.esc.sync_managers
+        self.mailbox = Mailbox(managers[0], managers[1], self._coe.answer)
+        self.made = 0
+        self._warnings, self._warnings_until = 0, -1
+        self._stuck = b""
+        self.aborts: dict[Address, int] = {}
+        self._fed = 0  # when the process data watchdog was last triggered; 0 = not running
+        self._number, self._data = -1, b""
+        self._prepared_number, self._prepared = -1, b""
+        self._settings_changed()
+        self._show_state()
+
+    # Process data.
+
+    def inputs(self) -> bytes:
+        """The newest process data at `now`."""
+        if self._stuck:
+            return self._stuck
+        number = self.clock.number_at(self.now)
+        if number != self._number:
+            if number == self._prepared_number:
+                self._data = self._prepared
+            else:
+                self._data = self._make(number)
+            self._number = number
+        return self._data
+
+    def prepare(self, expected: int) -> None:
+        """Make the sample that a frame at the time `expected` will ask for, while there is time."""
+        number = self.clock.number_at(expected)
+        if number not in (self._number, self._prepared_number) and not self._stuck:
+            self._prepared = self._make(number)
+            self._prepared_number = number
+
+    def _make(self, number: int) -> bytes:
+        self.made += 1
+        instant = self.clock.instant(number)
+        reading = self._signal.reading(number, instant, (instant - self._power_on) * 1e-9)
+        return self._measurement.pack(reading, self._warnings if number < self._warnings_until else 0)
+
+    def _settings_changed(self) -> None:
+        settings = self.dictionary.settings()
+        sinc_length = int(settings["sinc_length"])
+        if sinc_length != self.clock.sinc_length:
+            self.clock.change(self.now, sinc_length=sinc_length)
+        if isinstance(self._signal, Scene):
+            self._signal.set_sinc_length(sinc_length)
+        self._measurement = Measurement(
+            self._layout,
+            settings,
+            self.dictionary.offsets(0x8000),
+            self.dictionary.offsets(0x8001)[:3],
+            self.dictionary.offsets(0x8002)[:3],
+            self._signal.exact,
+        )
+        # The newest sample stays what it is: the change shows from the next one on.
+        self._prepared_number = -1
+
+    def outputs(self, data: bytes) -> None:
+        """The master wrote the outputs; they count in OP only."""
+        self._fed = self.now
+        if self.al.state is AlState.OP:
+            self.dictionary.set_output(data)
+
+    # Application layer.
+
+    def al_control(self, value: int) -> None:
+        """The master asks for a state."""
+        before = self.al.state
+        self.al.request(value)
+        if self.al.state is not before:
+            self._fed = 0
+        self._show_state()
+
+    def sync_managers_changed(self) -> None:
+        """The master wrote sync manager registers: they may no longer fit the state."""
+        self.al.check()
+        self._show_state()
+
+    def fail(self, state: AlState, code: int) -> None:
+        """Fall to `state` with the error bit and `code`."""
+        self.al.drop(state, code)
+        self._show_state()
+
+    def _show_state(self) -> None:
+        state, managers = self.al.state, self.esc.sync_managers
+        mailbox_on = state >= AlState.PREOP
+        if mailbox_on == managers[0].locked:
+            self.mailbox.reset()
+        # Writes to the outputs count in SAFEOP too, as with most controllers. After an error they do not:
+        # that is how a master that looks only at the working counter sees it.
+        inputs_on = state >= AlState.SAFEOP
+        wanted = (mailbox_on, mailbox_on, inputs_on and not self.al.error, inputs_on)
+        for manager, on in zip(managers, wanted, strict=True):
+            if on == manager.locked:
+                manager.allow(on)
+        shown = struct.unpack_from("<H", self.esc.memory, reg.AL_STATUS)[0]
+        code = struct.unpack_from("<H", self.esc.memory, reg.AL_STATUS_CODE)[0]
+        if (shown, code) != (self.al.status, self.al.code):
+            self.esc.set_al_status(self.al.status, self.al.code)
+
+    def _manager_wrong(self, number: int) -> bool:
+        manager, row = self.esc.sync_managers[number], SYNC_MANAGERS[number]
+        length = sync_manager_lengths(self._options.pdo_size)[number]
+        right = (row.start, length, row.control & _SM_CONTROL_MASK)
+        found = (manager.start, manager.length, manager.control & _SM_CONTROL_MASK)
+        return not manager.active or found != right
+
+    def _mailbox_fault(self) -> int:
+        wrong = self._manager_wrong(0) or self._manager_wrong(1)
+        return AlCode.INVALID_MAILBOX_CONFIGURATION if wrong else 0
+
+    def _process_data_fault(self) -> int:
+        if self._manager_wrong(2):
+            return AlCode.INVALID_OUTPUT_CONFIGURATION
+        return AlCode.INVALID_INPUT_CONFIGURATION if self._manager_wrong(3) else 0
+
+    def check_watchdog(self, now: int) -> None:
+        """Fall to SAFEOP if outputs stayed away for too long. To be called when no frame is waiting."""
+        if self.al.state is not AlState.OP or not self._fed or not self.esc.sync_managers[2].watched:
+            return
+        memory = self.esc.memory
+        (divider,) = struct.unpack_from("<H", memory, reg.WATCHDOG_DIVIDER)
+        (ticks,) = struct.unpack_from("<H", memory, reg.WATCHDOG_TIME)
+        if ticks and now - self._fed > ticks * (divider + 2) * _WATCHDOG_UNIT_NS:
+            counter = memory[reg.WATCHDOG_COUNTER]
+            memory[reg.WATCHDOG_COUNTER] = min(counter + 1, 0xFF)
+            self._fed = 0
+            self.fail(AlState.SAFEOP, AlCode.SYNC_MANAGER_WATCHDOG)
+
+    # Mailbox and SDO.
+
+    def mailbox_written(self) -> None:
+        """A request has arrived."""
+        self.mailbox.work()
+
+    def mailbox_read(self) -> None:
+        """The last reply has been taken."""
+        self.mailbox.work()
+
+    def repeat_requested(self) -> None:
+        """The last reply was lost on the way."""
+        self.mailbox.repeat()
+
+    def _fault_on(self, index: int, subindex: int) -> None:
+        code = self.aborts.pop((index, subindex), None)
+        if code is not None:
+            raise SdoAbortError(code)
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """An SDO upload."""
+        self._fault_on(index, subindex)
+        return self.dictionary.read(index, subindex)
+
+    def check_download(self, index: int, subindex: int, length: int) -> None:
+        """Refuse a download of the wrong length before its data has come."""
+        try:
+            self.dictionary.check_write(self.dictionary.entry(index, subindex), length, self.al.state)
+        except SdoAbortError as error:
+            self._on_write(index, subindex, b"", self.al.state, error.code)
+            raise
+
+    def length(self, index: int, subindex: int) -> int:
+        """Bytes of an entry."""
+        return self.dictionary.size(self.dictionary.entry(index, subindex))
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """An SDO download."""
+        abort = 0
+        try:
+            self._fault_on(index, subindex)
+            self.dictionary.write(index, subindex, data, self.al.state)
+        except SdoAbortError as error:
+            abort = error.code
+            raise
+        finally:
+            self._on_write(index, subindex, data, self.al.state, abort)
+
+    # Faults.
+
+    def set_warnings(self, bits: int, samples: int | None) -> None:
+        """OR `bits` into the warnings of the next `samples` samples, or of all."""
+        newest = self.clock.number_at(self.now)
+        self._warnings = bits
+        # The newest sample stays as it is: it may have been given away already.
+        self._warnings_until = 2**63 if samples is None else newest + 1 + samples
+        self._prepared_number = -1
+
+    def stick(self, on: bool) -> None:
+        """Give the same process data for ever, or stop doing so."""
+        self._stuck = self.inputs() if on else b""
+
+    def set_ppm(self, ppm: float) -> None:
+        """Another error of the clock, from the newest sample on."""
+        self.clock.change(self.now, ppm=ppm)
+        self._prepared_number = -1

@@ -1,0 +1,156 @@
+"""The raw socket: frames from one network interface through the bus and back, commands in between.
+
+One thread, one poll. It sleeps until there is a frame, a command, or a watchdog to look at.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import select
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, TextIO
+
+from ethercat_server.virtual_sensor.bus import Bus
+from ethercat_server.virtual_sensor.control import CommandChannel
+from ethercat_server.virtual_sensor.faults import QuitCommand
+from ethercat_server.virtual_sensor.options import BusOptions
+from ethercat_server.virtual_sensor.wire import ETHERTYPE
+
+LONGEST_NAME: Final = 15
+"""Characters in the name of a network interface."""
+_BUFFER = 2048
+_IDLE_MS = 10
+_FRAMES_PER_TURN = 64
+_IFF_UP = 0x1
+
+
+class LinkError(Exception):
+    """The interface cannot be used, or no longer; the text is one sentence."""
+
+
+def open_interface(ifname: str) -> socket.socket:
+    """A raw socket for EtherCAT frames on `ifname`; LinkError if there is none to be had."""
+    if not ifname or len(ifname.encode()) > LONGEST_NAME:
+        raise LinkError(f"interface name {ifname!r}: it must have 1 to {LONGEST_NAME} characters")
+    try:
+        socket.if_nametoindex(ifname)
+    except OSError:
+        raise LinkError(f"no network interface {ifname!r}: `ip link` lists those there are") from None
+    try:
+        raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE))
+    except PermissionError:
+        raise LinkError(
+            f"not allowed to open a raw socket on {ifname}: it needs CAP_NET_RAW, so run it as root"
+        ) from None
+    try:
+        if not _is_up(ifname):
+            raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
+        raw.bind((ifname, ETHERTYPE))
+        raw.setblocking(False)
+    except OSError as error:
+        raw.close()
+        raise LinkError(f"interface {ifname} cannot be used: {error.strerror}") from None
+    except LinkError:
+        raw.close()
+        raise
+    return raw
+
+
+def _is_up(ifname: str) -> bool:
+    try:
+        flags = int(Path(f"/sys/class/net/{ifname}/flags").read_text(), 16)
+    except (OSError, ValueError):
+        return True  # no sysfs here: sending will tell
+    return bool(flags & _IFF_UP)
+
+
+def run(
+    ifname: str,
+    options: BusOptions,
+    *,
+    control_path: str | None = None,
+    commands: TextIO | None = None,
+    exit_on_eof: bool = False,
+    on_ready: Callable[[], None] = lambda: None,
+    should_stop: threading.Event | Callable[[], bool] = lambda: False,
+) -> None:
+    """Answer EtherCAT frames on `ifname` until told to stop.
+
+    Stops when `should_stop` is set or returns true (looked at every 10 ms), on the command `quit`, and at
+    the end of `commands` if `exit_on_eof`. Leaves nothing behind. LinkError if the interface cannot be
+    used, or disappears (one that is only down is waited for); ControlError if `control_path` cannot be used.
+    """
+    stop = should_stop.is_set if isinstance(should_stop, threading.Event) else should_stop
+    with contextlib.ExitStack() as stack:
+        raw = stack.enter_context(open_interface(ifname))
+        bus = Bus(options, time.monotonic_ns())
+        poller = select.poll()
+        poller.register(raw, select.POLLIN)
+        channel = stack.enter_context(CommandChannel(bus, poller, control_path, commands))
+        on_ready()
+        with contextlib.suppress(QuitCommand):
+            _serve(raw, bus, poller, channel, ifname, stop, exit_on_eof)
+
+
+def _serve(
+    raw: socket.socket,
+    bus: Bus,
+    poller: select.poll,
+    channel: CommandChannel,
+    ifname: str,
+    stop: Callable[[], bool],
+    exit_on_eof: bool,
+) -> None:
+    descriptor = raw.fileno()
+    buffer = bytearray(_BUFFER)
+    index = socket.if_nametoindex(ifname)
+    up = True
+    while not stop():
+        if exit_on_eof and channel.ended:
+            return
+        events = poller.poll(_IDLE_MS)
+        if not events:
+            bus.idle(time.monotonic_ns())
+            if not up:  # like a cable pulled out: it may come back, unless it is gone for good
+                _check_there(ifname, index)
+            continue
+        for ready, event in events:
+            if ready != descriptor:
+                bus.set_time(time.monotonic_ns())
+                channel.handle(ready, event)
+        if any(ready == descriptor for ready, _ in events):
+            up = _answer_waiting(raw, bus, buffer, ifname)
+
+
+def _answer_waiting(raw: socket.socket, bus: Bus, buffer: bytearray, ifname: str) -> bool:
+    """Answer the frames that wait; False if the interface is down. Not too many at once: commands wait."""
+    view = memoryview(buffer)
+    for _ in range(_FRAMES_PER_TURN):
+        try:
+            size = raw.recv_into(buffer)
+            now = time.monotonic_ns()
+            if bus.process(buffer, size, now):
+                raw.send(view[:size])
+        except BlockingIOError:
+            bus.prepare()
+            return True
+        except OSError as error:
+            if error.errno in (errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR):
+                continue  # the frame is lost, as on a cable
+            if error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
+                return False
+            raise LinkError(f"interface {ifname} failed: {error.strerror}") from None
+    return True
+
+
+def _check_there(ifname: str, index: int) -> None:
+    """LinkError if the interface is no longer the one that was opened."""
+    with contextlib.suppress(OSError):
+        if socket.if_nametoindex(ifname) == index:
+            return
+    raise LinkError(f"interface {ifname} has disappeared: make it again and start the virtual sensor again")

@@ -1,0 +1,118 @@
+"""A sensor on the bench: it can be switched off and on, replaced, and asked what was done to it."""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from ethercat_server.objects import FACTORY_CALIBRATION
+from ethercat_server.virtual_sensor.al import AlState
+from ethercat_server.virtual_sensor.dictionary import Address
+from ethercat_server.virtual_sensor.firmware import Firmware
+from ethercat_server.virtual_sensor.options import SensorOptions
+
+_WRITES_REMEMBERED: Final = 1000
+_WRITES_TOLD: Final = 200
+
+
+@dataclass(frozen=True, slots=True)
+class SdoWrite:
+    """One SDO write that the sensor was asked for."""
+
+    index: int
+    subindex: int
+    data: bytes
+    state: AlState
+    abort: int
+    """Abort code; 0 if it was carried out."""
+
+
+class VirtualSensor:
+    """A sensor on the bench, powered or not."""
+
+    def __init__(self, options: SensorOptions, now: int) -> None:
+        self.now = now
+        self._options = options
+        self._flash: dict[Address, bytes] = {}
+        self._writes: deque[SdoWrite] = deque(maxlen=_WRITES_REMEMBERED)
+        self.sdo_write_count = self.calibration_writes = 0
+        self.life: Firmware | None = None
+        self._apply_sinc()
+        self.power(True)
+
+    def _apply_sinc(self) -> None:
+        if self._options.sinc_length is not None:
+            self._flash[0x8006, 1] = struct.pack("<H", self._options.sinc_length)
+
+    @property
+    def options(self) -> SensorOptions:
+        """What it is."""
+        return self._options
+
+    @property
+    def sdo_writes(self) -> list[SdoWrite]:
+        """The latest SDO writes, oldest first, through all its lives."""
+        return list(self._writes)
+
+    def _remember(self, index: int, subindex: int, data: bytes, state: AlState, abort: int) -> None:
+        self._writes.append(SdoWrite(index, subindex, data, state, abort))
+        self.sdo_write_count += 1
+        if index == FACTORY_CALIBRATION:
+            self.calibration_writes += 1
+
+    def set_time(self, now: int) -> None:
+        """It is `now`, CLOCK_MONOTONIC in ns."""
+        self.now = now
+        if self.life is not None:
+            self.life.now = now
+
+    def power(self, on: bool) -> None:
+        """Switch it off, or on (again: nothing happens)."""
+        if not on:
+            self.life = None
+        elif self.life is None:
+            self.life = Firmware(self._options, self._flash, self.now, self._remember)
+
+    def swap(self, model: str, serial: int) -> None:
+        """Put a new sensor of another model or serial number in its place, just switched on."""
+        self._options = replace(self._options, model=model, serial=serial)
+        self._flash.clear()
+        self._apply_sinc()
+        self.life = None
+        self.power(True)
+
+    def set_ppm(self, ppm: float) -> None:
+        """Another error of its clock, now and after a power cycle."""
+        self._options = replace(self._options, ppm=ppm)
+        if self.life is not None:
+            self.life.set_ppm(ppm)
+
+    def statistics(self) -> dict[str, Any]:
+        """What `stats` says of it."""
+        life = self.life
+        return {
+            "model": self._options.model,
+            "serial": self._options.serial,
+            "powered": life is not None,
+            "al_state": life.al.state.name if life else None,
+            "al_error": life is not None and life.al.error,
+            "al_status_code": life.al.code if life else 0,
+            "sample": life.clock.number_at(self.now) if life else None,
+            "samples_made": life.made if life else 0,
+            "sinc_length": life.clock.sinc_length if life else None,
+            "ppm": self._options.ppm,
+            "calibration_writes": self.calibration_writes,
+            "sdo_write_count": self.sdo_write_count,
+            "sdo_writes": [
+                {
+                    "index": f"0x{w.index:04X}",
+                    "subindex": w.subindex,
+                    "hex": w.data.hex(),
+                    "state": w.state.name,
+                    "abort": f"0x{w.abort:08X}" if w.abort else None,
+                }
+                for w in self.sdo_writes[-_WRITES_TOLD:]
+            ],
+        }

@@ -1,0 +1,237 @@
+"""Runs `ethercat-server` and `ethercat-virtual-sensor` as processes, and talks to them over real sockets."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from protocol.control import request
+from protocol.framing import DataFlag, DataMessage, FrameDecoder, JsonObject, encode_json
+
+START_TIMEOUT_S = 40.0
+PATIENCE_S = 30.0
+
+
+def why_no_bus() -> str | None:
+    """Why this machine cannot run a bus over a veth pair; None if it can."""
+    name = f"ec{os.getpid()}t"
+    made = subprocess.run(
+        ["ip", "link", "add", name, "type", "veth", "peer", "name", name + "x"],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    if made.returncode:
+        return f"no veth pairs here ({made.stderr.strip()}): run as root with CAP_NET_ADMIN"
+    subprocess.run(["ip", "link", "del", name], check=True)
+    try:
+        socket.socket(socket.AF_PACKET, socket.SOCK_RAW).close()
+    except PermissionError:
+        return "no raw sockets here: run as root with CAP_NET_RAW"
+    return None
+
+
+NO_BUS = why_no_bus()
+needs_bus = pytest.mark.skipif(NO_BUS is not None, reason=NO_BUS or "")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def wait_until(condition: Callable[[], bool], what: str, seconds: float = PATIENCE_S) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {seconds} s for {what}"
+        time.sleep(0.02)
+
+
+class Program:
+    """A program of ours running as a process, its standard error in a file."""
+
+    def __init__(self, module: str, arguments: Sequence[str]) -> None:
+        self.log = Path(tempfile.mkstemp(prefix="ethercat-test-")[1])
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments],
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                text=True,
+                start_new_session=True,
+            )
+
+    def said(self) -> str:
+        return self.log.read_text()
+
+    def wait_for(self, text: str) -> None:
+        def arrived() -> bool:
+            assert self.process.poll() is None, f"ended with {self.process.returncode}: {self.said()}"
+            return text in self.said()
+
+        wait_until(
+            arrived, f"{text!r} from {self.process.args!r}, which said {self.said()!r}", START_TIMEOUT_S
+        )
+
+    def wait(self) -> int:
+        return self.process.wait(timeout=PATIENCE_S)
+
+    def signal(self, number: int) -> None:
+        self.process.send_signal(number)
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+            try:
+                self.process.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        if self.process.stdin:
+            with contextlib.suppress(BrokenPipeError):
+                self.process.stdin.close()
+        self.log.unlink(missing_ok=True)
+
+
+class Server(Program):
+    """A running server on a free port."""
+
+    def __init__(self, ifname: str, *arguments: str, name: str | None = None) -> None:
+        self.port = free_port()
+        names = [name] if name else []
+        super().__init__("ethercat_server.cli", [ifname, *names, str(self.port), *arguments])
+
+    @property
+    def ifname(self) -> str:
+        """The bus's interface, which for `virtual` is named after the process."""
+        return f"ecat{self.process.pid}"
+
+    def wait_streaming(self) -> Server:
+        self.wait_for("streaming")
+        return self
+
+    def connect(self) -> Client:
+        return Client(self.port)
+
+
+@contextlib.contextmanager
+def server(ifname: str, *arguments: str) -> Iterator[Server]:
+    running = Server(ifname, *arguments)
+    try:
+        yield running.wait_streaming()
+    finally:
+        running.close()
+
+
+class Veth:
+    """A veth pair of this test's own: `near` for the master, `far` for the sensor."""
+
+    def __init__(self) -> None:
+        unique = f"{os.getpid() % 1_000_000:06d}{time.monotonic_ns() // 1000 % 100_000:05d}"
+        self.near, self.far = f"en{unique}", f"ef{unique}"
+
+    def __enter__(self) -> Veth:
+        self.ip("link", "add", self.near, "type", "veth", "peer", "name", self.far)
+        self.ip("link", "set", self.near, "up")
+        self.ip("link", "set", self.far, "up")
+        wait_until(lambda: "LOWER_UP" in self.ip("link", "show", self.near), "the carrier")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        subprocess.run(["ip", "link", "del", self.near], check=False, capture_output=True)
+
+    @staticmethod
+    def ip(*arguments: str) -> str:
+        return subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True).stdout
+
+
+@contextlib.contextmanager
+def virtual_sensor(*arguments: str) -> Iterator[tuple[Veth, Program]]:
+    """A veth pair with a virtual sensor on its far end."""
+    with Veth() as veth:
+        sensor = Program("ethercat_server.virtual_sensor", [veth.far, *arguments])
+        try:
+            sensor.wait_for("ready")
+            yield veth, sensor
+        finally:
+            sensor.close()
+
+
+class Client:
+    """A framed connection."""
+
+    def __init__(self, port: int) -> None:
+        self.sock = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
+        self.decoder = FrameDecoder()
+        self.events: list[JsonObject] = []
+        self.frames: list[DataMessage] = []
+        self._id = 0
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.sock.close()
+
+    def receive(self) -> JsonObject | None:
+        """Wait for one message; a reply is returned, frames and events are put by."""
+        while True:
+            message = self.decoder.next_message()
+            if message is None:
+                data = self.sock.recv(65536)
+                if not data:
+                    raise ConnectionError("the server closed the connection")
+                self.decoder.feed(data)
+                continue
+            if isinstance(message, DataMessage):
+                self.frames.append(message)
+                return None
+            if "event" in message:
+                self.events.append(message)
+                return None
+            return message
+
+    def receive_all(self) -> None:
+        """Receive until the server closes the connection."""
+        with contextlib.suppress(ConnectionError):
+            while True:
+                self.receive()
+
+    def ask(self, action: str, **values: object) -> dict[str, Any]:
+        """The reply to a request."""
+        self._id += 1
+        self.sock.sendall(encode_json(request(action, self._id, **values)))
+        while True:
+            message = self.receive()
+            if message is not None:
+                assert message["id"] == self._id
+                return message
+
+    def collect(self, count: int) -> list[DataMessage]:
+        """The next `count` frames."""
+        self.frames.clear()
+        while len(self.frames) < count:
+            self.receive()
+        return list(self.frames)
+
+    def fresh(self, count: int) -> list[DataMessage]:
+        """The next `count` frames that are new and valid samples."""
+        self.frames.clear()
+        old = DataFlag.REPEATED | DataFlag.INVALID
+        while sum(not frame.flags & old for frame in self.frames) < count:
+            self.receive()
+        return [frame for frame in self.frames if not frame.flags & old]

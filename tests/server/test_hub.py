@@ -1,0 +1,317 @@
+"""The TCP side with real sockets and no bus: both kinds of connection, hostile bytes, slow readers."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+
+import pytest
+
+from ethercat_server import hub as hub_module
+from ethercat_server.connection import MAX_QUEUED_DATA, MAX_REQUEST_LENGTH, Connection, Subscription
+from ethercat_server.errors import ServerError
+from ethercat_server.hub import Hub
+from protocol.control import parse_request, reply
+from protocol.framing import DataFlag, DataMessage, FrameDecoder, JsonObject, encode_data, encode_json
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class Served:
+    """A hub and the means to talk to it from the same thread."""
+
+    def __init__(self) -> None:
+        self.hub = Hub(("127.0.0.1",), free_port())
+        self.hub.start(self.handle)
+        self.sequence = 0
+
+    def handle(self, connection: Connection, message: JsonObject) -> JsonObject:
+        request = parse_request(message)
+        if request.action == "subscribe":
+            values = request.values
+            connection.subscription = Subscription(
+                2, values["sensors"], values["every"], values["fresh_only"]
+            )
+            self.hub.subscriptions_changed()
+        return reply(request)
+
+    def serve(self, seconds: float = 0.02) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.hub.serve(time.monotonic_ns() + 2_000_000)
+
+    def connect(self) -> socket.socket:
+        sock = socket.create_connection(("127.0.0.1", self.hub.port), timeout=5)
+        self.serve()
+        return sock
+
+    def publish(self, place: int = 0, flags: int = 0) -> None:
+        frame = encode_data(self.sequence, 1, 2, place, flags, 3, bytes(61))
+        self.hub.publish(frame, place, flags, time.monotonic_ns())
+        self.sequence += 1
+
+    def read(self, sock: socket.socket) -> list[DataMessage | JsonObject]:
+        """Everything that has arrived, decoded."""
+        self.serve()
+        sock.setblocking(False)
+        decoder, found = FrameDecoder(), []
+        while True:
+            try:
+                data = sock.recv(65536)
+            except BlockingIOError:
+                break
+            if not data:
+                break
+            decoder.feed(data)
+            found += list(decoder)
+        sock.settimeout(5)
+        return found
+
+    def subscribe(self, **keys: object) -> socket.socket:
+        sock = self.connect()
+        sock.sendall(encode_json({"action": "subscribe", **keys}))
+        assert self.read(sock) == [{"reply": "subscribe", "ok": True}]
+        return sock
+
+    def is_closed(self, sock: socket.socket) -> bool:
+        self.serve()
+        sock.settimeout(0.05)
+        try:
+            while sock.recv(65536):
+                pass
+        except TimeoutError:
+            return False
+        except ConnectionError:
+            pass
+        return True
+
+
+@pytest.fixture
+def served() -> Iterator[Served]:
+    server = Served()
+    yield server
+    server.hub.close()
+
+
+def test_framed_request_is_answered_with_its_id(served: Served) -> None:
+    with served.connect() as sock:
+        sock.sendall(encode_json({"action": "describe", "id": {"any": ["thing", None]}}))
+        assert served.read(sock) == [{"reply": "describe", "id": {"any": ["thing", None]}, "ok": True}]
+
+
+def test_pipelined_requests_are_answered_in_order(served: Served) -> None:
+    with served.connect() as sock:
+        sock.sendall(b"".join(encode_json({"action": "describe", "id": n}) for n in range(20)))
+        answers = served.read(sock)
+        assert [answer["id"] for answer in answers if isinstance(answer, dict)] == list(range(20))
+
+
+@pytest.mark.parametrize("ending", [b"", b"\n", b" \r\n"])
+def test_bare_json_needs_no_newline(served: Served, ending: bytes) -> None:
+    with served.connect() as sock:
+        sock.sendall(b'{"action":"describe","id":7}' + ending)
+        served.serve()
+        assert json.loads(sock.recv(4096)) == {"reply": "describe", "id": 7, "ok": True}
+
+
+def test_bare_json_connection_answers_then_closes_when_the_client_half_closes(served: Served) -> None:
+    with served.connect() as sock:
+        sock.sendall(b'{"action":"describe"}\n{"action":"describe"}\n')
+        sock.shutdown(socket.SHUT_WR)
+        served.serve(0.1)
+        assert len(sock.recv(4096).splitlines()) == 2
+        assert sock.recv(10) == b""
+
+
+@pytest.mark.parametrize(
+    ("body", "complaint"),
+    [
+        (b"{nonsense", "not valid JSON"),
+        (b"[1, 2]", "must be an object"),
+        (b'{"action": 5}', "must be a string"),
+        (b"{}", "'action' is missing"),
+        (b'{"action": "dance"}', "no action 'dance'"),
+        (b'{"action": "describe", "colour": 1}', "takes no key 'colour'"),
+        (b'{"action": "subscribe", "every": 0}', "'every' must be"),
+        (b"\xff\xfe", "not UTF-8"),
+        (b"[" * 5000, "nested"),
+    ],
+)
+def test_bad_json_gets_an_error_and_the_connection_goes_on(
+    served: Served, body: bytes, complaint: str
+) -> None:
+    with served.connect() as sock:
+        sock.sendall(struct.pack(">IB", len(body) + 1, 2) + body)
+        sock.sendall(encode_json({"action": "describe", "id": 1}))
+        bad, good = served.read(sock)
+        assert isinstance(bad, dict)
+        assert bad["ok"] is False
+        assert complaint in bad["error"]["message"]
+        assert good == {"reply": "describe", "id": 1, "ok": True}
+
+
+@pytest.mark.parametrize(
+    "poison",
+    [
+        struct.pack(">IB", 0, 2),
+        struct.pack(">IB", MAX_REQUEST_LENGTH + 2, 2),
+        struct.pack(">IB", 0xFFFFFFFF, 2),
+        struct.pack(">IB", 5, 9) + b"abcd",
+        encode_data(0, 0, 0, 0, 0, 0, bytes(61)),
+        b"GET / HTTP/1.1\r\n\r\n",
+    ],
+)
+def test_broken_framing_gets_an_error_and_is_closed_and_others_notice_nothing(
+    served: Served, poison: bytes
+) -> None:
+    with served.subscribe() as bystander, served.connect() as sock:
+        sock.sendall(poison)
+        served.publish()
+        (answer,) = served.read(sock)
+        assert isinstance(answer, dict)
+        assert answer["error"]["code"] == "bad_request"
+        assert served.is_closed(sock)
+        served.publish()
+        frames = served.read(bystander)
+        assert [f.sequence for f in frames if isinstance(f, DataMessage)] == [0, 1]
+
+
+def test_endless_bare_line_is_cut_off(served: Served) -> None:
+    with served.connect() as sock:
+        sock.sendall(b'{"action": "' + b"x" * (MAX_REQUEST_LENGTH + 10))
+        served.serve(0.05)
+        assert b"a line of more than" in sock.recv(4096)
+        assert served.is_closed(sock)
+
+
+def test_disconnect_in_the_middle_of_a_frame(served: Served) -> None:
+    with served.subscribe() as bystander:
+        sock = served.connect()
+        sock.sendall(encode_json({"action": "describe"})[:7])
+        served.serve()
+        sock.close()
+        served.serve(0.15)
+        served.publish()
+        assert [type(m) for m in served.read(bystander)] == [DataMessage]
+        assert len(served.hub.connections) == 1
+
+
+def test_subscription_filters(served: Served) -> None:
+    with (
+        served.subscribe(sensors=[1]) as only_second,
+        served.subscribe(every=3) as third,
+        served.subscribe(fresh_only=False) as everything,
+        served.subscribe() as default,
+    ):
+        for number in range(9):
+            served.publish(place=number % 2, flags=DataFlag.REPEATED if number >= 6 else 0)
+
+        def sequences(sock: socket.socket) -> list[int]:
+            return [m.sequence for m in served.read(sock) if isinstance(m, DataMessage)]
+
+        assert sequences(only_second) == [1, 3, 5]
+        assert sequences(third) == [0, 1]
+        assert sequences(everything) == list(range(9))
+        assert sequences(default) == list(range(6))
+        # After 10 ms with nothing, a silent sensor becomes visible.
+        served.serve(0.02)
+        served.publish(place=0, flags=DataFlag.REPEATED)
+        assert sequences(default) == [9]
+
+
+def test_gap_is_kept_for_a_client_that_skips_the_frame_that_had_it(served: Served) -> None:
+    with served.subscribe(every=2) as sock:
+        served.publish()
+        served.publish(flags=DataFlag.GAP)
+        served.publish()
+        served.publish()
+        served.publish()
+        frames = [m for m in served.read(sock) if isinstance(m, DataMessage)]
+        assert [(f.sequence, f.flags) for f in frames] == [(0, 0), (2, DataFlag.GAP), (4, 0)]
+
+
+def test_a_client_that_does_not_read_loses_the_oldest_whole_frames_and_is_told(served: Served) -> None:
+    with served.subscribe() as slow, served.subscribe() as quick:
+        (slow_connection, quick_connection) = served.hub.connections.values()
+        received_quick: list[DataMessage | JsonObject] = []
+        total = 0
+        while slow_connection.withheld < 500:
+            for _ in range(50):
+                served.publish()
+            total += 50
+            received_quick += served.read(quick)
+            assert total < 200_000
+        received_slow = served.read(slow)
+        while more := served.read(slow):
+            received_slow += more
+        frames = [m for m in received_slow if isinstance(m, DataMessage)]
+        assert len(frames) == total - slow_connection.withheld
+        assert frames[-1].sequence == total - 1
+        jumps = [
+            (after.flags & DataFlag.GAP, after.sequence - before.sequence)
+            for before, after in pairwise(frames)
+        ]
+        assert all(bool(gap) == (step > 1) for gap, step in jumps)
+        assert sum(step - 1 for _, step in jumps) == slow_connection.withheld
+        assert len([m for m in received_quick if isinstance(m, DataMessage)]) == total
+        assert quick_connection.withheld == 0
+
+
+def test_queue_is_bounded(served: Served) -> None:
+    with served.subscribe():
+        (connection,) = served.hub.connections.values()
+        for _ in range(20_000):
+            served.publish()
+        assert len(connection._queue) <= MAX_QUEUED_DATA
+
+
+def test_a_client_that_asks_and_never_reads_is_closed(served: Served) -> None:
+    with served.connect() as sock:
+        request = encode_json({"action": "describe", "id": "x" * 10_000})
+        sock.settimeout(0.01)
+        for _ in range(2000):
+            with contextlib.suppress(TimeoutError, ConnectionError):
+                sock.sendall(request)
+            served.serve(0.002)
+            if not served.hub.connections:
+                return
+        pytest.fail("the connection is still open")
+
+
+def test_too_many_clients_are_turned_away(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hub_module, "MAX_CLIENTS", 2)
+    with served.connect() as first, served.connect() as second, served.connect() as third:
+        assert served.is_closed(third)
+        for sock in (first, second):
+            sock.sendall(encode_json({"action": "describe"}))
+            assert served.read(sock) == [{"reply": "describe", "ok": True}]
+
+
+def test_taken_port_is_said_at_once() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(ServerError, match=f"port {port} on 127.0.0.1 is taken"):
+            Hub(("127.0.0.1",), port)
+
+
+def test_close_delivers_what_waits_and_is_bounded(served: Served) -> None:
+    with served.subscribe() as sock:
+        served.publish()
+        served.hub.broadcast({"event": "shutting_down"})
+        sock.shutdown(socket.SHUT_RD)
+        started = time.monotonic()
+        served.hub.close()
+        assert time.monotonic() - started < 10
+        assert not served.hub.connections

@@ -1,0 +1,95 @@
+"""Command line and configuration file, and what each complaint names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ethercat_server.errors import UsageError
+from ethercat_server.options import parse_options
+
+
+def test_both_forms_of_the_command() -> None:
+    short = parse_options(["ens5", "12001"])
+    assert (short.ifname, short.sensor_name, short.port) == ("ens5", None, 12001)
+    note = parse_options(["ens5", "BFT-SENS-ECAT-M8", "12001"])
+    assert (note.ifname, note.sensor_name, note.port) == ("ens5", "BFT-SENS-ECAT-M8", 12001)
+
+
+def test_options_may_stand_anywhere() -> None:
+    options = parse_options(["--set", "sinc_length=128", "ens5", "--set", "fir=yes", "12001"])
+    assert options.asked_settings(0) == {"sinc_length": 128, "fir": True}
+
+
+def test_defaults_are_the_notes() -> None:
+    wanted = parse_options(["ens5", "1"]).wanted_settings(0)
+    assert wanted == {
+        "calibration_matrix": True,
+        "temperature_compensation": False,
+        "imu_active": 1,
+        "acceleration_range_g": 2,
+        "angular_rate_range_dps": 250,
+        "acceleration_filter": 1,
+        "angular_rate_filter": 3,
+        "fir": False,
+        "fast": False,
+        "chop": False,
+        "sinc_length": 64,
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["ens5"], "IFACE"),
+        (["a", "b", "c", "d"], "4 arguments"),
+        (["ens5", "port"], "'port' is no number"),
+        (["ens5", "0"], "port 0 is out of range"),
+        (["ens5", "70000"], "port 70000 is out of range"),
+        (["ens5", "1", "--set", "colour=red"], "no setting 'colour'"),
+        (["ens5", "1", "--set", "fir"], "NAME=VALUE"),
+        (["ens5", "1", "--set", "fir=maybe"], "true or false"),
+        (["ens5", "1", "--set", "sinc_length=0"], "from 32 to 2048"),
+        (["ens5", "1", "--set", "acceleration_range_g=3"], "one of 2, 4, 8, 16"),
+        (["ens5", "1", "--set", "angular_rate_filter=2"], "from 3 to 9"),
+        (["ens5", "1", "--set", "fast=true"], "fast is true but fir is false"),
+        (["ens5", "1", "--virtual", "--pdo 77"], "goes with the interface 'virtual'"),
+    ],
+)
+def test_wrong_arguments_are_refused_by_name(arguments: list[str], complaint: str) -> None:
+    with pytest.raises(UsageError, match=complaint) as error:
+        parse_options(arguments)
+    assert error.value.exit_code == 2
+    assert "\n" not in str(error.value)
+
+
+def test_configuration_file(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text("[sensor]\nsinc_length = 128\nfir = true\n[sensor.1]\nsinc_length = 256\n")
+    options = parse_options(["ens5", "1", "--config", str(file), "--set", "fir=off"])
+    assert options.asked_settings(0) == {"sinc_length": 128, "fir": False}
+    assert options.asked_settings(1) == {"sinc_length": 256, "fir": False}
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("[sensor]\nfir = 1\n", "fir is 1"),
+        ("[sensor]\ncolour = 1\n", "no setting 'colour'"),
+        ("[server]\n", "unexpected 'server'"),
+        ("sensor = 3\n", "unexpected 'sensor'"),
+        ("[sensor.first]\nfir = true\n", "named by a place"),
+        ("[sensor\n", "not valid TOML"),
+    ],
+)
+def test_wrong_configuration_is_refused_by_name(tmp_path: Path, text: str, complaint: str) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text(text)
+    with pytest.raises(UsageError, match=complaint):
+        parse_options(["ens5", "1", "--config", str(file)])
+
+
+def test_missing_configuration_file(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="No such file"):
+        parse_options(["ens5", "1", "--config", str(tmp_path / "none.toml")])

@@ -1,0 +1,100 @@
+"""Which exchanges become frames, with which flags and numbers."""
+
+from __future__ import annotations
+
+from ethercat_server.stream import DISCARDED_AT_START, GAP, INVALID, REPEATED, SensorStream
+from protocol.framing import DataMessage, FrameDecoder
+
+PERIOD_NS = 1_250_000
+
+
+class Feeder:
+    """Feeds a stream exchanges on a simulated clock and decodes what comes out."""
+
+    def __init__(self) -> None:
+        self.stream = SensorStream(0, PERIOD_NS)
+        self.now = 10**12
+        self.sample = 0
+
+    def exchange(
+        self, *, new: bool, valid: bool = True, after_ns: int = PERIOD_NS // 4
+    ) -> DataMessage | None:
+        self.now += after_ns
+        self.sample += new
+        data = self.sample.to_bytes(61, "little")
+        made = self.stream.take(data, 3 if valid else -1, valid, self.now - 50_000, self.now)
+        if made is None:
+            return None
+        decoder = FrameDecoder()
+        decoder.feed(made[0])
+        message = decoder.next_message()
+        assert isinstance(message, DataMessage)
+        assert message.flags == made[1]
+        return message
+
+    def start(self) -> Feeder:
+        for _ in range(DISCARDED_AT_START):
+            assert self.exchange(new=True, after_ns=PERIOD_NS) is None
+        return self
+
+
+def test_each_sample_makes_one_frame_and_polls_between_make_none() -> None:
+    feeder = Feeder().start()
+    sequences = []
+    for _ in range(20):
+        message = feeder.exchange(new=True)
+        assert message is not None
+        assert message.flags == 0
+        assert message.wkc == 3
+        assert message.process_data == feeder.sample.to_bytes(61, "little")
+        sequences.append(message.sequence)
+        assert [feeder.exchange(new=False) for _ in range(3)] == [None] * 3
+    assert sequences == list(range(20))
+
+
+def test_silence_shows_as_repeated_frames_once_a_period() -> None:
+    feeder = Feeder().start()
+    feeder.exchange(new=True)
+    made = [feeder.exchange(new=False) for _ in range(4 * 20)]
+    repeats = [message for message in made if message is not None]
+    assert len(repeats) in range(16, 20)
+    assert {message.flags for message in repeats} == {REPEATED}
+    assert [m.sequence for m in repeats] == list(range(1, len(repeats) + 1))
+
+
+def test_invalid_exchanges_show_the_last_good_data() -> None:
+    feeder = Feeder().start()
+    good = feeder.exchange(new=True)
+    assert good is not None
+    made = [feeder.exchange(new=True, valid=False) for _ in range(40)]
+    invalid = [message for message in made if message is not None]
+    assert invalid
+    assert {m.flags for m in invalid} == {INVALID}
+    assert {m.process_data for m in invalid} == {good.process_data}
+    assert {m.wkc for m in invalid} == {0}
+
+
+def test_a_gap_is_flagged_and_counted() -> None:
+    feeder = Feeder().start()
+    for _ in range(100):
+        feeder.exchange(new=True)
+        for _ in range(3):
+            feeder.exchange(new=False)
+    feeder.sample += 4
+    message = feeder.exchange(new=True, after_ns=PERIOD_NS // 4 + 4 * PERIOD_NS)
+    assert message is not None
+    assert message.flags == GAP
+    assert feeder.stream.lost_samples == 4
+
+
+def test_sequence_goes_on_after_a_recovery_and_the_first_frame_has_gap() -> None:
+    feeder = Feeder().start()
+    before = feeder.exchange(new=True)
+    feeder.stream.restart(PERIOD_NS)
+    feeder.start()
+    after = feeder.exchange(new=True)
+    assert before is not None
+    assert after is not None
+    assert after.sequence == before.sequence + 1
+    assert after.flags == GAP
+    assert feeder.stream.recoveries == 1

@@ -1,0 +1,168 @@
+"""Bad input and trouble at start: one sentence on stderr, a non-zero exit, nothing left behind."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.server.running import Server, Veth, free_port, needs_bus, server, virtual_sensor
+
+pytestmark = [pytest.mark.bus, needs_bus]
+
+
+def interfaces() -> set[str]:
+    return {name for _, name in socket.if_nameindex() if name.startswith("ecat")}
+
+
+def fails(ifname: str, *arguments: str, name: str | None = None, code: int = 1) -> str:
+    """Run a server that cannot start; returns the sentence it said."""
+    running = Server(ifname, *arguments, name=name)
+    try:
+        assert running.wait() == code, running.said()
+        said = [line for line in running.said().splitlines() if not line.startswith("ready")]
+        assert "Traceback" not in running.said()
+        assert said, "it said nothing"
+        assert said[-1].startswith("ethercat-server: ")
+        assert not [n for n in interfaces() if n == running.ifname]
+        with socket.socket() as sock:
+            assert sock.connect_ex(("127.0.0.1", running.port)) != 0
+        return said[-1]
+    finally:
+        running.close()
+
+
+def test_no_such_interface() -> None:
+    assert re.search("no network interface 'nope0'.*there are", fails("nope0"))
+
+
+def test_interface_name_too_long_for_soem() -> None:
+    assert "1 to 15 characters" in fails("a-name-that-is-too-long")
+
+
+def test_loopback_is_refused() -> None:
+    assert "loopback" in fails("lo")
+
+
+def test_interface_down_and_no_carrier() -> None:
+    with Veth() as veth:
+        veth.ip("link", "set", veth.near, "down")
+        assert f"{veth.near} is down: bring it up" in fails(veth.near)
+        veth.ip("link", "set", veth.far, "down")
+        veth.ip("link", "set", veth.near, "up")
+        assert f"{veth.near} has no carrier: check the cable" in fails(veth.near)
+
+
+def test_no_slave_answers() -> None:
+    with Veth() as veth:
+        assert "no EtherCAT slave answers" in fails(veth.near)
+
+
+def test_not_allowed_names_the_capabilities() -> None:
+    # Drops the capabilities from the bounding set, so that the new program has none, even as root.
+    pr_capbset_drop = 24
+
+    def drop() -> None:
+        libc = ctypes.CDLL(None)
+        for capability in (12, 13):
+            libc.prctl(pr_capbset_drop, capability, 0, 0, 0)
+
+    with Veth() as veth:
+        done = subprocess.run(
+            [sys.executable, "-m", "ethercat_server.cli", veth.near, str(free_port())],
+            preexec_fn=drop, capture_output=True, text=True, check=False, timeout=60,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert "CAP_NET_ADMIN and CAP_NET_RAW missing" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("sensor", "complaint"),
+    [
+        (("--model", "BFT-GENA-THING"), "'BFT-GENA-THING', a model this server does not know"),
+    ],
+)
+def test_another_model_is_refused_by_name(sensor: tuple[str, ...], complaint: str) -> None:
+    with virtual_sensor(*sensor) as (veth, _):
+        assert complaint in fails(veth.near)
+
+
+def test_name_on_the_command_line_must_be_the_sensors() -> None:
+    with virtual_sensor("--model", "BFT-ROKS-ECAT-M8") as (veth, _):
+        said = fails(veth.near, name="BFT-SENS-ECAT-M8")
+        assert "is a BFT-ROKS-ECAT-M8, not a BFT-SENS-ECAT-M8" in said
+        running = Server(veth.near, name="BFT-ROKS-ECAT-M8")
+        try:
+            running.wait_streaming()
+        finally:
+            running.close()
+
+
+def test_port_taken() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        done = subprocess.run(
+            [sys.executable, "-m", "ethercat_server.cli", "virtual", str(port)],
+            capture_output=True, text=True, check=False, timeout=60,
+        )  # fmt: skip
+        assert done.returncode == 1
+        assert f"port {port} on 127.0.0.1 is taken" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("--set", "colour=1"), "no setting 'colour'"),
+        (("--config", "/nonexistent.toml"), "cannot read the configuration"),
+        (("--virtual", "--sensors 0"), "the virtual sensor did not start"),
+    ],
+)
+def test_wrong_arguments(arguments: tuple[str, ...], complaint: str) -> None:
+    code = 1 if "--virtual" in arguments else 2
+    assert complaint in fails("virtual", *arguments, code=code)
+
+
+def test_settings_for_a_sensor_that_is_not_there(tmp_path_factory: pytest.TempPathFactory) -> None:
+    config = tmp_path_factory.mktemp("config") / "c.toml"
+    config.write_text("[sensor.3]\nfir = true\n")
+    assert "settings for sensor 3, but the bus has 1" in fails("virtual", "--config", str(config), code=2)
+
+
+def test_an_object_that_aborts_is_named() -> None:
+    with virtual_sensor() as (veth, sensor):
+        assert sensor.process.stdin is not None
+        sensor.process.stdin.write("abort 0x8006 1 0x06090030\n")
+        sensor.process.stdin.flush()
+        sensor.wait_for("ok")
+        said = fails(veth.near)
+        assert "sinc_length = 64 did not take" in said
+        assert "0x06090030" in said
+
+
+def test_stopped_while_starting() -> None:
+    for _ in range(3):
+        running = Server("virtual")
+        try:
+            # Wherever it is by then: signal handlers, virtual bus, bus scan, settings.
+            time.sleep(0.4 + 0.3 * (os.getpid() % 3))
+            running.signal(15)
+            assert running.wait() in {0, -15}
+            assert "Traceback" not in running.said()
+            assert running.ifname not in interfaces()
+        finally:
+            running.close()
+
+
+def test_sensor_that_maps_an_unexpected_size_is_refused() -> None:
+    pytest.importorskip("ethercat_server.virtual_sensor")
+    with server("virtual", "--virtual", "--pdo 77") as running, running.connect() as client:
+        assert client.ask("describe")["sensors"][0]["pdo_size"] == 77

@@ -1,0 +1,173 @@
+"""A small EtherCAT master over a `Bus` in memory: no sockets, its own clock."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+from ethercat_server.virtual_sensor import wire
+from ethercat_server.virtual_sensor.bus import Bus
+from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
+from ethercat_server.virtual_sensor.wire import Command
+
+MAILBOX = 128
+INIT, PREOP, BOOT, SAFEOP, OP = 1, 2, 3, 4, 8
+ACK = 0x10
+
+
+def sync_manager(start: int, length: int, control: int, active: int = 1) -> bytes:
+    return struct.pack("<HHBBBB", start, length, control, 0, active, 0)
+
+
+def fmmu(logical: int, length: int, physical: int, kind: int, *bits: int) -> bytes:
+    first, last, physical_bit = bits or (0, 7, 0)
+    return struct.pack("<IHBBHBBB3x", logical, length, first, last, physical, physical_bit, kind, 1)
+
+
+class Abort(Exception):  # noqa: N818
+    def __init__(self, code: int) -> None:
+        super().__init__(hex(code))
+        self.code = code
+
+
+class RawMaster:
+    """Time passes only by `wait`; each exchange takes one microsecond."""
+
+    def __init__(self, *sensors: SensorOptions, start: int = 5_000_000_123) -> None:
+        self.now = start
+        self.bus = Bus(BusOptions(sensors or (SensorOptions(),)), start)
+        self.count = len(sensors) or 1
+        self.mailbox_counter = 0
+        self.pdo_size = self.bus.sensors[0].options.pdo_size
+
+    def wait(self, ns: int) -> None:
+        self.now += ns
+        self.bus.idle(self.now)
+
+    def frame(self, *datagrams: tuple[int, int, int, bytes]) -> list[tuple[bytes, int]] | None:
+        """Data and working counter of each datagram; None if the frame did not come back."""
+        frame = wire.build(*datagrams)
+        size = len(frame)
+        self.now += 1000
+        if not self.bus.process(frame, size, self.now):
+            return None
+        assert len(frame) == size
+        assert frame[6] & 2
+        return [
+            (bytes(frame[d.data : d.end]), wire.working_counter(frame, d)) for d in wire.parse(frame, size)
+        ]
+
+    def one(self, command: int, adp: int, ado: int, data: bytes) -> tuple[bytes, int]:
+        answer = self.frame((command, adp, ado, data))
+        assert answer is not None
+        return answer[0]
+
+    def read(self, register: int, length: int, place: int = 0) -> bytes:
+        data, counter = self.one(Command.APRD, -place, register, bytes(length))
+        assert counter == 1
+        return data
+
+    def read16(self, register: int, place: int = 0) -> int:
+        return int.from_bytes(self.read(register, 2, place), "little")
+
+    def write(self, register: int, data: bytes, place: int = 0) -> int:
+        return self.one(Command.APWR, -place, register, data)[1]
+
+    def request(self, state: int, place: int = 0) -> tuple[int, int]:
+        """Ask for a state; returns AL status and AL status code."""
+        assert self.write(0x0120, struct.pack("<H", state), place) == 1
+        return self.read16(0x0130, place), self.read16(0x0134, place)
+
+    def set_up_mailbox(self, place: int = 0) -> None:
+        managers = sync_manager(0x1000, MAILBOX, 0x26) + sync_manager(0x1080, MAILBOX, 0x22)
+        assert self.write(0x0800, managers, place) == 1
+
+    def set_up_process_data(self, place: int = 0, logical: int = 0) -> None:
+        managers = sync_manager(0x1100, 1, 0x64) + sync_manager(0x1180, self.pdo_size, 0x20)
+        assert self.write(0x0810, managers, place) == 1
+        units = fmmu(logical, 1, 0x1100, 2) + fmmu(logical + 1, self.pdo_size, 0x1180, 1)
+        assert self.write(0x0600, units, place) == 1
+
+    def go(self, state: int) -> RawMaster:
+        """Take every slave to `state`, the ordinary way."""
+        for place in range(self.count):
+            self.set_up_mailbox(place)
+            steps = [s for s in (PREOP, SAFEOP, OP) if s <= state]
+            for step in steps:
+                if step == SAFEOP:
+                    self.set_up_process_data(place, place * (self.pdo_size + 1))
+                assert self.request(step, place) == (step, 0)
+        return self
+
+    def cycle(self, output: int = 0) -> tuple[bytes, int]:
+        """One LRW over all slaves: all data, working counter."""
+        return self.one(Command.LRW, 0, 0, (bytes([output]) + bytes(self.pdo_size)) * self.count)
+
+    def inputs(self, place: int = 0) -> bytes:
+        data, _ = self.cycle()
+        start = place * (self.pdo_size + 1) + 1
+        return data[start : start + self.pdo_size]
+
+    # Mailbox.
+
+    def send_mailbox(self, kind: int, body: bytes, counter: int | None = None, place: int = 0) -> int:
+        if counter is None:
+            self.mailbox_counter = self.mailbox_counter % 7 + 1
+            counter = self.mailbox_counter
+        message = struct.pack("<HHBB", len(body), 0, 0, kind | counter << 4) + body
+        return self.write(0x1000, message.ljust(MAILBOX, b"\0"), place)
+
+    def mailbox_full(self, place: int = 0) -> bool:
+        return bool(self.read(0x080D, 1, place)[0] & 8)
+
+    def fetch_mailbox(self, place: int = 0) -> tuple[int, bytes] | None:
+        """Type and body of the reply that waits; None if there is none."""
+        data, counter = self.one(Command.APRD, -place, 0x1080, bytes(MAILBOX))
+        if counter == 0:
+            return None
+        length, _, _, kind = struct.unpack_from("<HHBB", data)
+        return kind & 0x0F, data[6 : 6 + length]
+
+    def coe(self, request: bytes, service: int = 2, place: int = 0) -> bytes:
+        """A CoE request and its reply, without the CoE header."""
+        assert self.send_mailbox(3, struct.pack("<H", service << 12) + request, place=place) == 1
+        reply = self.fetch_mailbox(place)
+        assert reply is not None
+        kind, body = reply
+        assert kind == 3
+        if body[2] == 0x80 and service == 2:
+            assert body[1] >> 4 == 2, "an abort is coded as an SDO request"
+            raise Abort(struct.unpack_from("<I", body, 6)[0])
+        assert body[1] >> 4 == (3 if service == 2 else 8)
+        return body[2:]
+
+    def upload(self, index: int, subindex: int, place: int = 0) -> bytes:
+        reply = self.coe(struct.pack("<BHBI", 0x40, index, subindex, 0), place=place)
+        assert struct.unpack_from("<HB", reply, 1) == (index, subindex)
+        if reply[0] & 2:
+            return reply[4 : 8 - (reply[0] >> 2 & 3)]
+        size = struct.unpack_from("<I", reply, 4)[0]
+        assert len(reply) == 8 + size
+        return reply[8:]
+
+    def download(self, index: int, subindex: int, data: bytes, place: int = 0) -> None:
+        if 0 < len(data) <= 4:
+            command = 0x23 | (4 - len(data)) << 2
+            request = struct.pack("<BHB", command, index, subindex) + data.ljust(4, b"\0")
+        else:
+            request = struct.pack("<BHBI", 0x21, index, subindex, len(data)) + data
+        reply = self.coe(request, place=place)
+        assert reply[0] == 0x60
+
+    def information(self, operation: int, body: bytes) -> list[bytes]:
+        """Every fragment of the answer to an SDO Information request, from the operation byte on."""
+        assert self.send_mailbox(3, struct.pack("<HBBH", 8 << 12, operation, 0, 0) + body) == 1
+        found: list[bytes] = []
+        while (reply := self.fetch_mailbox()) is not None:
+            assert reply[0] == 3
+            found.append(reply[1][2:])
+        return found
+
+
+def chain(count: int, **each: object) -> Sequence[SensorOptions]:
+    return [SensorOptions(serial=n + 1, **each) for n in range(count)]  # type: ignore[arg-type]

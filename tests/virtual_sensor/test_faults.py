@@ -1,0 +1,224 @@
+"""Faults on command: what each does to the frames, and how bad commands are answered."""
+
+import json
+import struct
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ethercat_server.virtual_sensor.faults import COMMANDS, QuitCommand, obey
+from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.signals import decode_clock
+from ethercat_server.virtual_sensor.wire import Command
+from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, Abort, RawMaster, chain
+
+PERIOD = 1_250_000
+PING = (Command.BRD, 0, 0x0130, bytes(2))
+
+
+def answering(master: RawMaster) -> int:
+    """How many slaves answer a broadcast; 0 if the frame is lost."""
+    answer = master.frame(PING)
+    return 0 if answer is None else answer[0][1]
+
+
+def do(master: RawMaster, line: str) -> str:
+    answer = obey(master.bus, line)
+    assert answer.split()[0] == "ok", answer
+    return answer[3:]
+
+
+def stats(master: RawMaster) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(do(master, "stats"))
+    return found
+
+
+def clock_of(master: RawMaster) -> int:
+    return decode_clock(struct.unpack_from("<4f", master.inputs(), 5)).number
+
+
+def test_lose() -> None:
+    master = RawMaster()
+    do(master, "lose 3")
+    assert [answering(master) for _ in range(5)] == [0, 0, 0, 1, 1]
+    assert stats(master)["frames_lost"] == 3
+
+
+def test_deaf_and_hear() -> None:
+    master = RawMaster()
+    do(master, "deaf")
+    master.wait(10**12)
+    assert answering(master) == 0
+    do(master, "hear")
+    assert answering(master) == 1
+    do(master, "deaf 0.5")
+    assert answering(master) == 0
+    master.wait(500_000_000)
+    assert answering(master) == 1
+
+
+def test_power_cuts_off_those_behind() -> None:
+    master = RawMaster(*chain(3)).go(OP)
+    do(master, "power off @1")
+    assert answering(master) == 1
+    assert master.read16(0x0110) & 0x0C00 == 0x0400, "port 1 closed"
+    do(master, "@1 power on")
+    assert answering(master) == 3
+    assert master.read16(0x0110) & 0x0C00 == 0x0800
+    assert [master.read16(0x0130, n) for n in range(3)] == [OP, INIT, OP]
+    assert master.read16(0x0800, 1) == 0, "registers are gone"
+
+
+def test_power_cycle_ends_by_itself() -> None:
+    master = RawMaster(SensorOptions(signal="clock")).go(OP)
+    do(master, "power cycle 2")
+    assert answering(master) == 0
+    master.wait(1_900_000_000)
+    assert answering(master) == 0
+    master.wait(200_000_000)
+    assert master.read16(0x0130) == INIT
+    master.go(OP)
+    assert clock_of(master) < 100, "sample numbers start afresh"
+
+
+def test_safeop_and_error() -> None:
+    master = RawMaster(*chain(2)).go(OP)
+    do(master, "safeop 0x1B @1")
+    assert [master.read16(0x0130, n) for n in (0, 1)] == [OP, SAFEOP | 0x10]
+    assert master.read16(0x0134, 1) == 0x1B
+    do(master, "error 0x8001")
+    assert (master.read16(0x0130), master.read16(0x0134)) == (OP | 0x10, 0x8001)
+
+
+def test_warn_for_some_samples() -> None:
+    master = RawMaster(SensorOptions(signal="clock")).go(OP)
+
+    def warnings() -> int:
+        value: int = struct.unpack_from("<I", master.inputs(), 1)[0]
+        return value
+
+    first = clock_of(master)
+    do(master, "warn 0x22 3")
+    seen = []
+    for _ in range(6):
+        seen.append(warnings())
+        master.wait(PERIOD)
+    assert seen == [0, 0x22, 0x22, 0x22, 0, 0], first
+    do(master, "warn 1")
+    master.wait(1000 * PERIOD)
+    assert warnings() == 1
+    do(master, "warn 0")
+    master.wait(PERIOD)
+    assert warnings() == 0
+
+
+def test_stick() -> None:
+    master = RawMaster(SensorOptions(signal="clock")).go(OP)
+    do(master, "stick")
+    stuck = master.inputs()
+    master.wait(1000 * PERIOD)
+    assert master.inputs() == stuck
+    do(master, "unstick")
+    assert clock_of(master) >= 1000
+
+
+def test_swap() -> None:
+    master = RawMaster(*chain(2)).go(OP)
+    do(master, "swap BFT-MEDS-ECAT-M8 4711 @1")
+    assert master.read16(0x0130, 1) == INIT
+    master.set_up_mailbox(1)
+    master.request(PREOP, 1)
+    assert master.upload(0x1008, 0, place=1).rstrip(b"\0") == b"BFT-MEDS-ECAT-M8"
+    assert master.upload(0x1018, 4, place=1) == struct.pack("<I", 4711)
+    master.write(0x0502, struct.pack("<HI", 0x0100, 0x0E), 1)
+    assert master.read(0x0508, 4, 1) == struct.pack("<I", 4711)
+
+
+def test_abort_once() -> None:
+    master = RawMaster().go(PREOP)
+    do(master, "abort 0x8010 3 0x08000000")
+    do(master, "abort 0x8006 1 0x06040043")
+    with pytest.raises(Abort, match="0x8000000"):
+        master.upload(0x8010, 3)
+    assert master.upload(0x8010, 3) == b"\1"
+    with pytest.raises(Abort, match="0x6040043"):
+        master.download(0x8006, 1, b"\x40\0")
+    master.download(0x8006, 1, b"\x40\0")
+
+
+def test_mute_mailbox() -> None:
+    master = RawMaster().go(PREOP)
+    do(master, "mute-mailbox 1")
+    request = struct.pack("<HBHBI", 0x2000, 0x40, 0x1000, 0, 0)
+    assert master.send_mailbox(3, request) == 1
+    assert master.fetch_mailbox() is None
+    assert len(master.upload(0x1000, 0)) == 4
+
+
+def test_ppm_keeps_the_phase() -> None:
+    master = RawMaster(SensorOptions(signal="clock")).go(OP)
+    master.wait(100 * PERIOD)
+    before = clock_of(master)
+    do(master, "ppm 50000")
+    assert clock_of(master) == before
+    master.wait(1000 * PERIOD)
+    assert clock_of(master) - before in (1049, 1050, 1051)
+
+
+def test_stats_tell_what_was_written() -> None:
+    master = RawMaster().go(OP)
+    master.download(0x2000, 1, bytes(4))
+    with pytest.raises(Abort):
+        master.download(0x8006, 1, b"\x40\0")
+    [sensor] = stats(master)["sensors"]
+    assert sensor["al_state"] == "OP"
+    assert sensor["calibration_writes"] == 1
+    assert sensor["sdo_writes"] == [
+        {"index": "0x2000", "subindex": 1, "hex": "00000000", "state": "OP", "abort": None},
+        {"index": "0x8006", "subindex": 1, "hex": "4000", "state": "OP", "abort": "0x08000022"},
+    ]
+
+
+def test_help_names_every_command() -> None:
+    text = do(RawMaster(), "help")
+    assert "\n" not in text
+    assert all(command.usage in text for command in COMMANDS)
+
+
+def test_quit() -> None:
+    with pytest.raises(QuitCommand):
+        obey(RawMaster().bus, "quit")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "", "jump", "lose", "lose x", "lose -1", "lose 1 2", "power", "power maybe", "power cycle", "safeop",
+        "safeop 0x10000", "deaf nan", "deaf -1", "ppm inf", "warn 1 0", "swap A", "swap é 1", "stick @1",
+        "stick @x", "stick @0 @0", "abort 1 2", "abort 0x8000 256 0",
+    ],
+)  # fmt: skip
+def test_bad_commands_are_answered_with_a_sentence(line: str) -> None:
+    answer = obey(RawMaster().bus, line)
+    assert answer.startswith("error: ")
+    assert len(answer) > 20
+    assert "\n" not in answer
+
+
+def test_commands_to_a_sensor_without_power() -> None:
+    master = RawMaster()
+    do(master, "power off")
+    for line in ("safeop 1", "stick", "warn 1", "abort 1 1 1", "mute-mailbox 1"):
+        assert "power on" in obey(master.bus, line)
+    do(master, "ppm 5")
+    do(master, "stats")
+
+
+@given(st.text(max_size=60))
+def test_any_line_gets_one_line(line: str) -> None:
+    if line.split()[:1] != ["quit"]:
+        answer = obey(RawMaster().bus, line)
+        assert answer.startswith(("ok", "error: "))
+        assert "\n" not in answer

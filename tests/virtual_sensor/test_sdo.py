@@ -1,0 +1,274 @@
+"""SDO: every access rule in every state, every abort code, transfers of every kind, SDO Information."""
+
+import struct
+
+import pytest
+
+from ethercat_server.objects import BY_SETTING, OBJECTS, Access
+from ethercat_server.virtual_sensor.coe import CoeServer
+from ethercat_server.virtual_sensor.dictionary import entries_of
+from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.sdo_information import SdoInformation
+from protocol.pdo import LAYOUTS
+from protocol.settings import SETTINGS
+from tests.virtual_sensor.raw_master import OP, PREOP, SAFEOP, Abort, RawMaster
+
+STATES = [PREOP, SAFEOP, OP]
+
+
+def abort_of(master: RawMaster, index: int, subindex: int, data: bytes | None = None) -> int:
+    try:
+        if data is None:
+            master.upload(index, subindex)
+        else:
+            master.download(index, subindex, data)
+    except Abort as abort:
+        return abort.code
+    pytest.fail(f"0x{index:04X}:{subindex} was not refused")
+
+
+@pytest.mark.parametrize("state", STATES)
+@pytest.mark.parametrize("size", list(LAYOUTS))
+def test_everything_can_be_read(state: int, size: int) -> None:
+    master = RawMaster(SensorOptions(pdo_size=size, noise=False)).go(state)
+    entries = entries_of(size)
+    for (index, subindex), row in entries.items():
+        data = master.upload(index, subindex)
+        assert len(data) == (row.type.size or len(data)), hex(index)
+    for row in OBJECTS:
+        if (row.index, row.subindex) not in entries:
+            assert abort_of(master, row.index, row.subindex) == 0x06090011
+
+
+def test_identity_and_mapping() -> None:
+    master = RawMaster(SensorOptions(model="BFT-MEGS-ECAT-M8", serial=77, pdo_size=77)).go(PREOP)
+    assert master.upload(0x1008, 0) == b"BFT-MEGS-ECAT-M8".ljust(20, b"\0")
+    assert master.upload(0x1018, 4) == struct.pack("<I", 77)
+    count = master.upload(0x1A00, 0)[0]
+    bits = sum(master.upload(0x1A00, n)[0] for n in range(1, count + 1))
+    assert bits == 77 * 8
+    assert [master.upload(0x1C00, n)[0] for n in range(5)] == [4, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_access_rules(state: int) -> None:
+    master = RawMaster(SensorOptions(noise=False)).go(state)
+    for row in OBJECTS:
+        if row.index == 0x6000 and row.subindex > 0x13:
+            continue
+        before = master.upload(row.index, row.subindex)
+        if row.access is Access.RO:
+            assert abort_of(master, row.index, row.subindex, before) == 0x06010002
+        elif row.access is Access.RW_PREOP and state != PREOP:
+            assert abort_of(master, row.index, row.subindex, before) == 0x08000022
+        else:
+            master.download(row.index, row.subindex, before)
+    assert abort_of(master, 0x1018, 0, b"\4") == 0x06010002
+
+
+def test_what_is_not_there() -> None:
+    master = RawMaster().go(PREOP)
+    assert abort_of(master, 0x8003, 1) == 0x06020000
+    assert abort_of(master, 0x6000, 3) == 0x06090011
+    assert abort_of(master, 0x1000, 1) == 0x06090011
+    assert abort_of(master, 0x5000, 0, b"\0") == 0x06020000
+
+
+def test_lengths() -> None:
+    master = RawMaster().go(PREOP)
+    assert abort_of(master, 0x8006, 1, b"\x40") == 0x06070013
+    assert abort_of(master, 0x8006, 1, b"\x40\0\0\0") == 0x06070012
+    assert abort_of(master, 0x8000, 1, b"\0" * 9) == 0x06070012
+    assert abort_of(master, 0x8000, 1, b"\0" * 100) == 0x06070012
+
+
+@pytest.mark.parametrize("name", list(SETTINGS))
+def test_setting_ranges(name: str) -> None:
+    master = RawMaster().go(PREOP)
+    row, setting = BY_SETTING[name], SETTINGS[name]
+    for value in (False, True) if setting.is_bool else tuple(setting.choices or ()):
+        master.download(row.index, row.subindex, row.encode_setting(value))
+        assert master.upload(row.index, row.subindex) == row.encode_setting(value)
+    too_high = b"\xff" * row.type.size
+    assert abort_of(master, row.index, row.subindex, too_high) == 0x06090031
+    if name in ("sinc_length", "acceleration_filter", "angular_rate_filter"):
+        assert abort_of(master, row.index, row.subindex, bytes(row.type.size)) == 0x06090032
+
+
+def test_a_normal_download_of_a_short_value() -> None:
+    master = RawMaster().go(PREOP)
+    value = struct.pack("<f", 2.5)
+    assert master.coe(struct.pack("<BHBI", 0x21, 0x8000, 1, 4) + value)[0] == 0x60
+    assert master.upload(0x8000, 1) == value
+
+
+def test_an_expedited_download_that_does_not_say_its_size() -> None:
+    master = RawMaster().go(PREOP)
+    assert master.coe(struct.pack("<BHBI", 0x22, 0x8006, 1, 128))[0] == 0x60
+    assert master.upload(0x8011, 0) == struct.pack("<H", 400)
+
+
+def test_a_segmented_download() -> None:
+    master = RawMaster().go(PREOP)
+    assert master.coe(struct.pack("<BHBI", 0x21, 0x8000, 1, 4) + b"\0")[0] == 0x60
+    assert master.coe(b"\x08" + b"\0\0\x40" + bytes(4))[0] == 0x20, "three more bytes, then more to come"
+    assert master.coe(b"\x1f" + bytes(7))[0] == 0x30
+    assert master.upload(0x8000, 1) == struct.pack("<f", 2.0)
+
+
+def test_segments_out_of_turn() -> None:
+    master = RawMaster().go(PREOP)
+    for request in (b"\x60" + bytes(7), b"\x00" + bytes(7), b"\xa0" + bytes(7)):
+        with pytest.raises(Abort) as caught:
+            master.coe(request)
+        assert caught.value.code == 0x05040001
+    master.coe(struct.pack("<BHBI", 0x21, 0x8000, 1, 4))
+    with pytest.raises(Abort) as caught:
+        master.coe(b"\x10" + bytes(7))
+    assert caught.value.code == 0x05030000
+
+
+def test_complete_access_is_refused() -> None:
+    master = RawMaster().go(PREOP)
+    with pytest.raises(Abort) as caught:
+        master.coe(struct.pack("<BHBI", 0x50, 0x1018, 1, 0))
+    assert caught.value.code == 0x06010000
+
+
+class _Store:
+    """One long object behind a CoE server."""
+
+    def __init__(self) -> None:
+        self.data = bytes(range(50))
+
+    def read(self, index: int, subindex: int) -> bytes:
+        return self.data
+
+    def length(self, index: int, subindex: int) -> int:
+        return len(self.data)
+
+    def check_download(self, index: int, subindex: int, length: int) -> None:
+        pass
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        self.data = data
+
+    def answer(self, request: bytes, room: int) -> list[bytes]:
+        return []
+
+
+@pytest.mark.parametrize("room", [10, 12, 16, 20, 29, 59, 60, 61, 122])
+def test_uploads_are_segmented_when_the_mailbox_is_small(room: int) -> None:
+    store = _Store()
+    server = CoeServer(store, store)
+    [reply] = server.answer(struct.pack("<HBHBI", 0x2000, 0x40, 0x2222, 0, 0), room)
+    assert struct.unpack_from("<I", reply, 6)[0] == 50
+    data, toggle = reply[10:], 0
+    while len(data) < 50:
+        [reply] = server.answer(struct.pack("<HB7x", 0x2000, 0x60 | toggle), room)
+        assert len(reply) <= max(room, 10)
+        assert reply[2] & 0x10 == toggle
+        part = reply[3:]
+        data += part[: 7 - (reply[2] >> 1 & 7)] if len(part) == 7 else part
+        assert bool(reply[2] & 1) == (len(data) == 50)
+        toggle ^= 0x10
+    assert data == store.data
+
+
+def test_sampling_rate_follows_sinc() -> None:
+    master = RawMaster().go(PREOP)
+    for length, rate in ((32, 1600), (51, 1003), (64, 800), (205, 250), (341, 150), (512, 100)):
+        master.download(0x8006, 1, struct.pack("<H", length))
+        assert master.upload(0x8011, 0) == struct.pack("<H", rate)
+
+
+def test_every_order_of_filters_is_taken() -> None:
+    master = RawMaster().go(PREOP)
+    master.download(0x8006, 3, b"\1")  # FAST before FIR, as the server writes them
+    master.download(0x8006, 2, b"\0")
+
+
+def test_save_outlives_a_power_cut_and_nothing_else_does() -> None:
+    master = RawMaster().go(PREOP)
+    master.download(0x8006, 1, struct.pack("<H", 128))
+    master.download(0x8030, 1, b"\1")
+    assert master.upload(0x8030, 2) == b"\0"
+    master.download(0x8010, 1, b"\0")
+    sensor = master.bus.sensors[0]
+    master.bus.power(sensor, False)
+    assert master.frame((7, 0, 0, b"\0")) is None
+    master.bus.power(sensor, True)
+    master.go(PREOP)
+    assert master.upload(0x8011, 0) == struct.pack("<H", 400)
+    assert master.upload(0x8010, 1) == b"\1"
+
+
+def test_an_unknown_command_gives_a_bad_status() -> None:
+    master = RawMaster().go(PREOP)
+    master.download(0x8030, 1, b"\x07")
+    assert master.upload(0x8030, 2) != b"\0"
+
+
+def test_writes_to_the_factory_calibration_are_remembered() -> None:
+    master = RawMaster().go(OP)
+    assert master.bus.sensors[0].calibration_writes == 0
+    master.download(0x2000, 5, struct.pack("<f", 1.0))
+    assert master.bus.sensors[0].calibration_writes == 1
+    write = master.bus.sensors[0].sdo_writes[-1]
+    assert (write.index, write.subindex, write.state, write.abort) == (0x2000, 5, OP, 0)
+
+
+def test_measured_values_by_sdo() -> None:
+    master = RawMaster(SensorOptions(signal="constant")).go(PREOP)
+    assert master.upload(0x6000, 4) == struct.pack("<f", 1.5)
+    assert master.upload(0x6000, 0) == b"\x13"
+
+
+# SDO Information.
+
+
+def test_object_lists() -> None:
+    master = RawMaster().go(PREOP)
+    expected = sorted({index for index, _ in entries_of(61)})
+    fragments = master.information(1, struct.pack("<H", 1))
+    assert [f[0] & 0x80 for f in fragments] == [0x80] * (len(fragments) - 1) + [0]
+    assert [struct.unpack_from("<H", f, 2)[0] for f in fragments] == list(range(len(fragments)))[::-1]
+    found = b"".join(f[4:] for f in fragments)
+    assert found[:2] == b"\1\0"
+    assert list(struct.unpack(f"<{len(found) // 2}H", found)[1:]) == expected
+    [lengths] = master.information(1, struct.pack("<H", 0))
+    counts = struct.unpack("<6H", lengths[4:])
+    assert counts[:2] == (0, len(expected))
+    for kind in range(2, 6):
+        [one] = master.information(1, struct.pack("<H", kind))
+        assert (len(one) - 6) // 2 == counts[kind]
+    [error] = master.information(1, struct.pack("<H", 9))
+    assert error[0] == 7
+
+
+def test_a_list_longer_than_the_mailbox_comes_in_fragments() -> None:
+    life = RawMaster().bus.sensors[0].life
+    assert life is not None
+    fragments = SdoInformation(life.dictionary).answer(struct.pack("<BBHH", 1, 0, 0, 1), 24)
+    assert len(fragments) > 2
+    assert all(len(fragment) <= 24 for fragment in fragments)
+    assert struct.unpack_from("<H", fragments[0], 2)[0] == len(fragments) - 1
+    assert (fragments[0][0], fragments[-1][0]) == (0x82, 0x02)
+
+
+def test_descriptions() -> None:
+    master = RawMaster().go(PREOP)
+    [reply] = master.information(3, struct.pack("<H", 0x8006))
+    index, _, highest, code = struct.unpack_from("<HHBB", reply, 4)
+    assert (reply[0], index, highest, code) == (4, 0x8006, 4, 9)
+    assert reply[10:]
+    [reply] = master.information(3, struct.pack("<H", 0x1008))
+    assert struct.unpack_from("<HHBB", reply, 4) == (0x1008, 0x0009, 0, 7)
+    [reply] = master.information(5, struct.pack("<HBB", 0x8006, 1, 0))
+    assert struct.unpack_from("<HBBHHH", reply, 4) == (0x8006, 1, 0, 0x0006, 16, 0x0F)
+    assert reply[14:] == b"SINC length"
+    [reply] = master.information(5, struct.pack("<HBB", 0x6000, 4, 0))
+    assert struct.unpack_from("<H", reply, 12)[0] == 0x87
+    for request in ((3, struct.pack("<H", 0x5555)), (5, struct.pack("<HBB", 0x1018, 9, 0)), (9, b"")):
+        [reply] = master.information(*request)
+        assert reply[0] == 7

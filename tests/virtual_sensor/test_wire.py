@@ -1,0 +1,91 @@
+"""Frames: parsing, and what hostile ones do (nothing)."""
+
+import struct
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ethercat_server.virtual_sensor import wire
+from ethercat_server.virtual_sensor.wire import Command
+from tests.virtual_sensor.raw_master import OP, RawMaster
+
+HEADERS = st.integers(0, 0xFFFF)
+DATAGRAMS = st.lists(
+    st.tuples(
+        st.integers(0, 20),
+        st.sampled_from([0, 1, 0xFFFF, 0x1001]),
+        st.one_of(st.integers(0, 0xFFFF), st.sampled_from([0x0120, 0x0500, 0x0600, 0x0800, 0x1000, 0x1080])),
+        st.binary(max_size=140),
+    ),
+    min_size=1,
+    max_size=8,
+)
+
+
+def test_what_is_built_is_parsed() -> None:
+    frame = wire.build((Command.BRD, 0, 0x0130, b"ab"), (Command.LRW, 2, 1, b"xyz"))
+    first, second = wire.parse(frame, len(frame))
+    assert (first.command, first.ado, first.length) == (Command.BRD, 0x0130, 2)
+    assert bytes(frame[second.data : second.end]) == b"xyz"
+    assert (second.adp, second.ado, second.number) == (2, 1, 1)
+
+
+def test_other_ethernet_types_are_no_datagrams() -> None:
+    frame = wire.build((Command.BRD, 0, 0, b"\0"))
+    frame[12:14] = b"\x08\x00"
+    assert wire.parse(frame, len(frame)) == []
+
+
+def test_a_header_that_promises_more_than_there_is() -> None:
+    frame = wire.build((Command.BRD, 0, 0, bytes(40)))
+    assert wire.parse(frame, len(frame) - 1) == []
+
+
+def test_a_broken_datagram_leaves_those_before_it_alone() -> None:
+    master = RawMaster()
+    frame = wire.build((Command.BRD, 0, 0x0130, bytes(2)), (Command.BRD, 0, 0x0130, bytes(2)))
+    second = wire.parse(frame, len(frame))[1]
+    struct.pack_into("<H", frame, second.header + 6, 0x07FF)
+    assert master.bus.process(frame, len(frame), master.now)
+    assert frame[second.header - 2 : second.header] == b"\1\0"
+    assert frame[second.data : second.end + 2] == bytes(4)
+
+
+@given(st.binary(max_size=200))
+def test_noise_never_crashes_it(noise: bytes) -> None:
+    master = RawMaster()
+    for head in (b"", b"\xff" * 12 + b"\x88\xa4"):
+        frame = bytearray(head + noise)
+        before = len(frame)
+        master.bus.process(frame, before, master.now)
+        assert len(frame) == before
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(DATAGRAMS, min_size=1, max_size=4), st.integers(0, 2))
+def test_hostile_datagrams_never_crash_it(frames: list[list[tuple[int, int, int, bytes]]], chop: int) -> None:
+    master = RawMaster().go(OP)
+    master.write(0x0010, b"\x01\x10")
+    for datagrams in frames:
+        frame = wire.build(*datagrams)
+        del frame[len(frame) - chop :]
+        size = len(frame)
+        master.bus.process(frame, size, master.now)
+        master.wait(1_000_000)
+        assert len(frame) == size
+    # Whatever they did, a master that starts afresh is served.
+    master.write(0x0600, bytes(48))
+    master.write(0x0500, b"\2")
+    master.write(0x0500, b"\0")
+    master.write(0x0800, bytes(32))
+    assert master.request(0x11)[0] == 1
+    assert master.request(0x11) == (1, 0)
+    master.go(OP)
+    assert master.cycle()[1] == 3
+
+
+@given(HEADERS, st.binary(max_size=60))
+def test_hostile_frame_headers(header: int, body: bytes) -> None:
+    frame = bytearray(b"\xff" * 12 + b"\x88\xa4" + struct.pack("<H", header) + body)
+    for datagram in wire.parse(frame, len(frame)):
+        assert datagram.end + 2 <= len(frame)
