@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import socket
 import struct
+import time
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +18,7 @@ _SIOCGIFFLAGS: Final = 0x8913
 _IFF_UP: Final = 0x1
 _IFF_LOOPBACK: Final = 0x8
 _IFF_RUNNING: Final = 0x40
+_CARRIER_TIMEOUT_S: Final = 5.0
 _CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
 
 
@@ -38,7 +40,12 @@ def check_interface(ifname: str) -> None:
         )
     if not flags & _IFF_UP:
         raise InterfaceError(f"{ifname} is down: bring it up with 'sudo ip link set {ifname} up'")
-    if not flags & _IFF_RUNNING:
+    # A link that was just brought up takes a moment, with a real network card up to some seconds.
+    deadline = time.monotonic() + _CARRIER_TIMEOUT_S
+    while not _flags(ifname) & _IFF_RUNNING:
+        if time.monotonic() < deadline:
+            time.sleep(0.02)
+            continue
         raise InterfaceError(
             f"{ifname} has no carrier: check the cable, the PoE injector and its power supply"
         )
