@@ -169,7 +169,10 @@ class Bus:
                     text = f"sensor {slave} refused {what}: {error.desc.strip()} (abort 0x{code:08X})"
                     raise SdoAbortError(text, code) from None
                 last = "an answer about another object"
-            except _PYSOEM_ERRORS as error:
+            except Exception as error:
+                # pysoem raises a plain Exception for an entry of its error ring that it does not know.
+                if not isinstance(error, _PYSOEM_ERRORS) and type(error) is not Exception:
+                    raise
                 last = _texts([error])
         raise BusError(f"sensor {slave} did not answer {what}: {last}; check cable and power")
 

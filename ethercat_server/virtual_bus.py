@@ -13,8 +13,10 @@ import ctypes
 import os
 import select
 import shlex
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from types import TracebackType
 from typing import Final
@@ -23,6 +25,7 @@ from ethercat_server.errors import ServerError
 
 _CLONE_NEWNET: Final = 0x40000000
 _START_TIMEOUT_S: Final = 20.0
+_GONE_TIMEOUT_S: Final = 3.0
 _FAR_END: Final = "sensor"
 
 
@@ -77,6 +80,10 @@ class VirtualBus:
             process.kill()
             process.wait()
         process.stdout.close()
+        # The kernel takes a namespace away a moment after its last process.
+        deadline = time.monotonic() + _GONE_TIMEOUT_S
+        while time.monotonic() < deadline and self.ifname in {name for _, name in socket.if_nameindex()}:
+            time.sleep(0.01)
 
 
 @contextlib.contextmanager

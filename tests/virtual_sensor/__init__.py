@@ -1,0 +1,1 @@
+"""Tests of the virtual sensor, from single registers to pysoem over a veth pair."""

@@ -1,0 +1,1 @@
+"""Tests of the server, from its parts to the whole process."""
