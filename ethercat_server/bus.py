@@ -11,6 +11,7 @@ import contextlib
 import os
 import select
 import socket
+import stat
 import time
 from typing import Any, Final, NamedTuple
 
@@ -240,10 +241,11 @@ def _packet_sockets() -> set[int]:
     for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - plain descriptor numbers
         fd = int(name)
         try:
-            duplicate = socket.socket(fileno=os.dup(fd))
+            if not stat.S_ISSOCK(os.fstat(fd).st_mode):
+                continue
         except OSError:
-            continue
-        with duplicate:
+            continue  # the descriptor of the listing itself
+        with socket.socket(fileno=os.dup(fd)) as duplicate:
             if duplicate.family == socket.AF_PACKET:
                 found.add(fd)
     return found

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from ethercat_server.bus import Bus
-from ethercat_server.distribution import Distribution
+from ethercat_server.distribution import SLOT_NS, RecentDistribution
 from ethercat_server.hub import Hub
 from ethercat_server.recovery import Recovery
 from ethercat_server.stream import SensorStream
@@ -38,8 +38,8 @@ class Cycle:
         self._cycles = 0
         self._missed_deadlines = 0
         self._lost_frames = 0
-        self._wake = Distribution()
-        self._exchange = Distribution()
+        self._wake = RecentDistribution()
+        self._exchange = RecentDistribution()
         self._started = time.monotonic()
 
     def stop(self) -> None:
@@ -53,7 +53,7 @@ class Cycle:
         shortest_ns = min(stream.clock.period_ns for stream in streams)
         timeout_s = max(300e-6, 0.75e-9 * shortest_ns)
         lead_ns = 0.0  # how late this thread usually wakes: deadlines are brought forward by it
-        serve_by = 0
+        serve_by = roll_at = 0
         while not self.stopping:
             now = monotonic_ns()
             deadline = int(min([stream.clock.next_poll_ns() for stream in streams]) - lead_ns)
@@ -81,9 +81,19 @@ class Cycle:
                 if made:
                     hub.publish(made[0], stream.place, made[1], back)
             recovery.attend(wkc, back)
+            if back >= roll_at:
+                roll_at = back + SLOT_NS
+                self._roll()
             self._cycles += 1
             self._lost_frames += wkc < 0
             self._exchange.record(back - sent)
+
+    def _roll(self) -> None:
+        """Once a second."""
+        self._wake.roll()
+        self._exchange.roll()
+        for stream in self._streams:
+            stream.age.roll()
 
     def status(self) -> dict[str, Any]:
         """The cycle's part of the `status` reply."""
@@ -91,8 +101,13 @@ class Cycle:
             "cycles": self._cycles,
             "missed_deadlines": self._missed_deadlines,
             "lost_frames": self._lost_frames,
-            "wake_us": self._wake.summary_us(),
-            "exchange_us": self._exchange.summary_us(),
+            "wake_us": self._wake.everything().summary_us(),
+            "exchange_us": self._exchange.everything().summary_us(),
+            "last_10s": {
+                "wake_us": self._wake.last_10s().summary_us(),
+                "exchange_us": self._exchange.last_10s().summary_us(),
+                "age_us": [stream.age.last_10s().summary_us() for stream in self._streams],
+            },
             "sensors": [stream.status() for stream in self._streams],
             "uptime_s": round(time.monotonic() - self._started, 3),
         }

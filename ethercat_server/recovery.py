@@ -22,7 +22,7 @@ from protocol.framing import JsonObject
 
 _SHORT_EXCHANGES: Final = 2
 """So many exchanges in a row with a short working counter are looked into."""
-_SILENCE_NS: Final = 15_000_000
+_SILENCE_NS: Final = 50_000_000
 """So long with no frame coming back, and all sensors are lost; single lost frames are not."""
 _WATCH_EVERY_NS: Final = 100_000_000
 """A sensor can leave OP and still be counted, so its AL status is read this often."""

@@ -79,7 +79,7 @@ class BlockingSdo:
 
 
 class CyclicSdo:
-    """SDO by single datagrams. `mailboxes` are offset and size of the one to the slave and the one from it."""
+    """SDO by single datagrams. `mailboxes`: offset and size of the one to the slave and the one from it."""
 
     def __init__(self, bus: Bus, slave: int, mailboxes: tuple[tuple[int, int], tuple[int, int]]) -> None:
         self._bus, self._slave = bus, slave

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from typing import Any, Final
 
-from ethercat_server.distribution import Distribution
+from ethercat_server.distribution import RecentDistribution
 from ethercat_server.sample_clock import SampleClock
 from protocol.framing import DataFlag, encode_data
 
@@ -38,7 +38,7 @@ class SensorStream:
         self.invalid = 0
         self.lost_samples = 0
         self.recoveries = 0
-        self.age = Distribution()
+        self.age = RecentDistribution()
         """From the estimated instant of a sample to its hand-out, while locked."""
         self._discard = DISCARDED_AT_START
         self._gap = False
@@ -114,5 +114,5 @@ class SensorStream:
             "lost_samples": self.lost_samples,
             "recoveries": self.recoveries,
             "clock": self.clock.describe(),
-            "age_us": self.age.summary_us(),
+            "age_us": self.age.everything().summary_us(),
         }
