@@ -45,7 +45,7 @@ class SampleClock:
 
     __slots__ = (
         "_high", "_low", "_nominal_ns", "_polled_ns", "_quality",
-        "instant_ns", "locked", "period_ns", "steps",
+        "instant_ns", "locked", "period_ns", "steps", "uncertain",
     )  # fmt: skip
 
     def __init__(self, period_ns: float, start_ns: int = 0) -> None:
@@ -58,6 +58,9 @@ class SampleClock:
         self.steps = 1
         """How many samples the newest one is after the one handed out before it: more than 1, some were
         lost; 0, one was counted as lost that was not."""
+        self.uncertain = False
+        """Whether more may have been lost than `steps` says: the sensor may have looked at its data early or
+        late in a slow exchange. The samples after it tell, and their `steps` put it right."""
         self._quality = 0.0
         self._polled_ns = start_ns
         """When the last exchange was sent."""
@@ -100,9 +103,11 @@ class SampleClock:
             # Nothing was expected, or the sensor was watched and silent for longer than a period: its
             # clock begins anew. Only what fell into the time it was not watched can have been lost.
             self.steps = 1 + int((received_ns - after) // self.period_ns)
+            self.uncertain = received_ns - after >= self.period_ns
             self._low, self._high = max(after, received_ns - self.period_ns), float(received_ns)
             self._expect_next(received_ns)
             return
+        self.uncertain = received_ns - after >= self.period_ns and received_ns - self._low >= self.period_ns
         narrow = received_ns - after < _NARROW * self.period_ns
         self.steps = self._count_steps(after, sent_ns, received_ns, narrow)
         moved = (self.steps - 1) * self.period_ns
