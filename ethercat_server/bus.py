@@ -53,6 +53,7 @@ class Bus:
         self._slaves: list[Any] = []
         self._opened = False
         self._fd = -1
+        self._late_frame = False
 
     def open(self) -> None:
         """Open the raw socket. BusError if that fails; `interface.check_interface` says why beforehand."""
@@ -130,15 +131,20 @@ class Bus:
 
         -1 if the frame did not come back. Only after `go_operational`.
         """
-        # A frame that came too late for its own exchange would end this one's wait at once: drop it.
-        with contextlib.suppress(OSError):  # nothing there, or the link is down
-            while os.read(self._fd, 2048):
-                pass
+        if self._late_frame:
+            self._drop_late_frames()
         self._master.send_processdata()
         # SOEM's own wait ignores timeouts shorter than a jiffy, so wait here and let it only collect.
         select.select((self._fd,), (), (), timeout_s)
         wkc: int = self._master.receive_processdata(100)
+        self._late_frame = wkc < 0
         return wkc
+
+    def _drop_late_frames(self) -> None:
+        """A frame that came too late for its own exchange would end the next one's wait at once."""
+        with contextlib.suppress(OSError):  # nothing there any more, or the link is down
+            while os.read(self._fd, 2048):
+                pass
 
     def working_counter(self, slave: int) -> int:
         """What `slave` adds to the working counter of an exchange: 2 for its outputs, 1 for its inputs."""
