@@ -160,6 +160,7 @@ class Bus:
         try:
             data: bytes = self._slaves[slave]._fprd(address, size, _DATAGRAM_TIMEOUT_US)
         except pysoem.WkcError:
+            self._late_frame = True  # it may still come
             return None
         return data
 
@@ -168,6 +169,7 @@ class Bus:
         try:
             self._slaves[slave]._fpwr(address, data, _DATAGRAM_TIMEOUT_US)
         except pysoem.WkcError:
+            self._late_frame = True
             return False
         return True
 
