@@ -19,7 +19,7 @@ from ethercat_server.sensor import Identity, Sensor, identify, set_up
 _STATE_TIMEOUT_S: Final = 2.0
 _ABSENT_PAUSE_S: Final = 0.005
 _REFUSED_PAUSE_S: Final = 0.1
-_READ_ATTEMPTS: Final = 5
+_REMEMBER_TIMEOUT_S: Final = 1.0
 
 _COUNTS: Final = 0x0004
 """Two bytes: how many FMMUs and how many sync managers the slave has."""
@@ -127,10 +127,12 @@ class Ladder:
                 raise BusError(f"sensor {self._place} does not go to {state.name}: it is in {status}")
 
     def _remember(self, address: int, size: int) -> bytes:
-        for _ in range(_READ_ATTEMPTS):
+        deadline = time.monotonic() + _REMEMBER_TIMEOUT_S
+        while time.monotonic() < deadline:
             data = self._bus.read_register(self._place, address, size)
             if data is not None:
                 return data
+            time.sleep(0.005)
         raise BusError(f"sensor {self._place} does not answer in OP: check cable and power")
 
     def _write(self, address: int, data: bytes) -> None:
