@@ -9,7 +9,7 @@ from ethercat_server.authority import may_control
 from ethercat_server.connection import Connection, Subscription
 from ethercat_server.cycle import Cycle
 from ethercat_server.hub import Hub
-from ethercat_server.start_up import Sensor
+from ethercat_server.sensor import Sensor
 from protocol.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
 from protocol.errors import RequestError
 from protocol.framing import JsonObject

@@ -11,8 +11,9 @@ import contextlib
 import os
 import select
 import socket
+import stat
 import time
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
 import pysoem
 
@@ -20,6 +21,7 @@ from ethercat_server.errors import BusError, SdoAbortError
 
 _SDO_ATTEMPTS: Final = 3
 _OP_TIMEOUT_S: Final = 5.0
+_DATAGRAM_TIMEOUT_US: Final = 2000
 _PYSOEM_ERRORS: Final = (
     pysoem.SdoError,
     pysoem.MailboxError,
@@ -30,7 +32,6 @@ _PYSOEM_ERRORS: Final = (
     pysoem.NetworkInterfaceNotOpenError,
 )
 _STATE_NAMES: Final = {0: "NONE", 1: "INIT", 2: "PREOP", 3: "BOOT", 4: "SAFEOP", 8: "OP"}
-_T = TypeVar("_T")
 
 
 class SlaveIdentity(NamedTuple):
@@ -52,6 +53,7 @@ class Bus:
         self._slaves: list[Any] = []
         self._opened = False
         self._fd = -1
+        self._late_frame = False
 
     def open(self) -> None:
         """Open the raw socket. BusError if that fails; `interface.check_interface` says why beforehand."""
@@ -129,20 +131,55 @@ class Bus:
 
         -1 if the frame did not come back. Only after `go_operational`.
         """
-        # A frame that came too late for its own exchange would end this one's wait at once: drop it.
-        with contextlib.suppress(BlockingIOError):
-            while os.read(self._fd, 2048):
-                pass
+        if self._late_frame:
+            self._drop_late_frames()
         self._master.send_processdata()
         # SOEM's own wait ignores timeouts shorter than a jiffy, so wait here and let it only collect.
         select.select((self._fd,), (), (), timeout_s)
         wkc: int = self._master.receive_processdata(100)
+        self._late_frame = wkc < 0
         return wkc
+
+    def _drop_late_frames(self) -> None:
+        """A frame that came too late for its own exchange would end the next one's wait at once."""
+        with contextlib.suppress(OSError):  # nothing there any more, or the link is down
+            while os.read(self._fd, 2048):
+                pass
+
+    def working_counter(self, slave: int) -> int:
+        """What `slave` adds to the working counter of an exchange: 2 for its outputs, 1 for its inputs."""
+        return 2 * bool(self._slaves[slave].output) + bool(self._slaves[slave].input)
 
     def process_data(self, slave: int) -> bytes:
         """The inputs of `slave` as of the last exchange, byte for byte."""
         data: bytes = self._slaves[slave].input
         return data
+
+    def read_register(self, slave: int, address: int, size: int) -> bytes | None:
+        """Read ESC registers or a mailbox of `slave` with one datagram; None if it did not do it."""
+        try:
+            data: bytes = self._slaves[slave]._fprd(address, size, _DATAGRAM_TIMEOUT_US)
+        except pysoem.WkcError:
+            self._late_frame = True  # it may still come
+            return None
+        return data
+
+    def write_register(self, slave: int, address: int, data: bytes) -> bool:
+        """Write ESC registers or a mailbox of `slave` with one datagram; False if it did not do it."""
+        try:
+            self._slaves[slave]._fpwr(address, data, _DATAGRAM_TIMEOUT_US)
+        except pysoem.WkcError:
+            self._late_frame = True
+            return False
+        return True
+
+    def reclaim(self, slave: int) -> bool:
+        """Give a slave that lost its station address (its power was cut) the address back.
+
+        True if the slave at that place now has it. SOEM checks vendor, product and revision; who the
+        sensor is remains to be asked.
+        """
+        return bool(self._slaves[slave].recover(_DATAGRAM_TIMEOUT_US) > 0)
 
     def close(self) -> None:
         """Take the slaves to INIT and close the socket. May be called at any time, any number of times."""
@@ -212,10 +249,11 @@ def _packet_sockets() -> set[int]:
     for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - plain descriptor numbers
         fd = int(name)
         try:
-            duplicate = socket.socket(fileno=os.dup(fd))
+            if not stat.S_ISSOCK(os.fstat(fd).st_mode):
+                continue
         except OSError:
-            continue
-        with duplicate:
+            continue  # the descriptor of the listing itself
+        with socket.socket(fileno=os.dup(fd)) as duplicate:
             if duplicate.family == socket.AF_PACKET:
                 found.add(fd)
     return found

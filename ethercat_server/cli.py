@@ -17,6 +17,7 @@ from ethercat_server.errors import ServerError, StopRequestedError
 from ethercat_server.hub import Hub
 from ethercat_server.interface import check_interface
 from ethercat_server.options import ServerOptions, parse_options
+from ethercat_server.recovery import Recovery
 from ethercat_server.start_up import bring_up
 from ethercat_server.stream import SensorStream
 from ethercat_server.virtual_bus import VirtualBus
@@ -53,14 +54,15 @@ def serve(options: ServerOptions) -> None:
         cleanup.callback(bus.close)
         sensors = bring_up(bus, options, signals.check)
         streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]
-        cycle = Cycle(bus, streams, hub)
+        cycle = Cycle(bus, streams, hub, Recovery(bus, sensors, streams, hub.broadcast))
         signals.call(cycle.stop)
         realtime.prepare(options.rt_priority, options.cpu)
         hub.start(Actions(hub, cycle, sensors).handle)
         for sensor in sensors:
             log.info(
                 "sensor %d: %s, serial %d, firmware %s, %d bytes at %d Hz",
-                sensor.place, sensor.name, sensor.serial, sensor.firmware, sensor.pdo_size, sensor.rate_hz,
+                sensor.place, sensor.identity.name, sensor.identity.serial, sensor.identity.firmware,
+                sensor.pdo_size, sensor.rate_hz,
             )  # fmt: skip
         log.info("streaming %s on port %d", ifname, options.port)
         cycle.run()

@@ -11,14 +11,17 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from ethercat_server.bus import Bus
-from ethercat_server.distribution import Distribution
+from ethercat_server.distribution import SLOT_NS, RecentDistribution
 from ethercat_server.hub import Hub
+from ethercat_server.recovery import Recovery
 from ethercat_server.stream import SensorStream
 
 _SERVE_MARGIN_NS: Final = 80_000
 """Sockets are left alone this long before a deadline: select may wake late."""
 _SERVE_EVERY_NS: Final = 10_000_000
 """The sockets' turn comes this often even if the deadlines leave no time."""
+_RECOVERY_STEP_NS: Final = 500_000
+"""Time between two exchanges while no sensor is left to be read."""
 _LATENESS_GAIN: Final = 1 / 64
 _MAX_LEAD_NS: Final = 200_000.0
 
@@ -26,16 +29,17 @@ _MAX_LEAD_NS: Final = 200_000.0
 class Cycle:
     """Reads the sensors and hands their samples to the hub until told to stop."""
 
-    def __init__(self, bus: Bus, streams: Sequence[SensorStream], hub: Hub) -> None:
+    def __init__(self, bus: Bus, streams: Sequence[SensorStream], hub: Hub, recovery: Recovery) -> None:
         self.stopping = False
         self._bus = bus
         self._streams = streams
         self._hub = hub
+        self._recovery = recovery
         self._cycles = 0
         self._missed_deadlines = 0
         self._lost_frames = 0
-        self._wake = Distribution()
-        self._exchange = Distribution()
+        self._wake = RecentDistribution()
+        self._exchange = RecentDistribution()
         self._started = time.monotonic()
 
     def stop(self) -> None:
@@ -44,15 +48,17 @@ class Cycle:
 
     def run(self) -> None:
         """The loop."""
-        bus, hub, streams = self._bus, self._hub, self._streams
-        expected_wkc, monotonic_ns, sleep = bus.expected_wkc, time.monotonic_ns, time.sleep
+        bus, hub, streams, recovery = self._bus, self._hub, self._streams, self._recovery
+        monotonic_ns, sleep = time.monotonic_ns, time.sleep
         shortest_ns = min(stream.clock.period_ns for stream in streams)
         timeout_s = max(300e-6, 0.75e-9 * shortest_ns)
         lead_ns = 0.0  # how late this thread usually wakes: deadlines are brought forward by it
-        serve_by = 0
+        serve_by = roll_at = 0
         while not self.stopping:
             now = monotonic_ns()
             deadline = int(min([stream.clock.next_poll_ns() for stream in streams]) - lead_ns)
+            if recovery.all_lost:
+                deadline = now + _RECOVERY_STEP_NS
             if deadline > now or now > serve_by:
                 hub.serve(deadline - _SERVE_MARGIN_NS)
                 serve_by = now + _SERVE_EVERY_NS
@@ -68,13 +74,26 @@ class Cycle:
                 sent = now
             wkc = bus.exchange(timeout_s)
             back = monotonic_ns()
+            complete = wkc >= recovery.alive_wkc
             for stream in streams:
-                made = stream.take(bus.process_data(stream.place), wkc, wkc >= expected_wkc, sent, back)
+                valid = complete and stream.alive
+                made = stream.take(bus.process_data(stream.place), wkc, valid, sent, back)
                 if made:
                     hub.publish(made[0], stream.place, made[1], back)
+            recovery.attend(wkc, back)
+            if back >= roll_at:
+                roll_at = back + SLOT_NS
+                self._roll()
             self._cycles += 1
             self._lost_frames += wkc < 0
             self._exchange.record(back - sent)
+
+    def _roll(self) -> None:
+        """Once a second."""
+        self._wake.roll()
+        self._exchange.roll()
+        for stream in self._streams:
+            stream.age.roll()
 
     def status(self) -> dict[str, Any]:
         """The cycle's part of the `status` reply."""
@@ -82,8 +101,13 @@ class Cycle:
             "cycles": self._cycles,
             "missed_deadlines": self._missed_deadlines,
             "lost_frames": self._lost_frames,
-            "wake_us": self._wake.summary_us(),
-            "exchange_us": self._exchange.summary_us(),
+            "wake_us": self._wake.everything().summary_us(),
+            "exchange_us": self._exchange.everything().summary_us(),
+            "last_10s": {
+                "wake_us": self._wake.last_10s().summary_us(),
+                "exchange_us": self._exchange.last_10s().summary_us(),
+                "age_us": [stream.age.last_10s().summary_us() for stream in self._streams],
+            },
             "sensors": [stream.status() for stream in self._streams],
             "uptime_s": round(time.monotonic() - self._started, 3),
         }

@@ -3,9 +3,10 @@
 The sensor samples freely; an exchange only tells whether the process data changed since the one before. The
 change then happened after the earlier exchange was sent and before the later one was back: a bracket that
 holds however late either of them was. Brackets of successive samples, moved on by the period, are
-intersected; what remains is where the next sample is expected. Two polls aim at its two edges, as the gates
-of an early-late tracker do: if the early one already sees the change the clock is ahead of the estimate and
-the late one is not needed; if neither does it is behind, and further polls search for it. Stalls and lost
+intersected; what remains is where the next sample is expected. A poll is aimed just after that instant. If it
+sees the change it was late, and bounds the instant from above; if it does not it was early, bounds it from
+below, and a second one follows at once: an early-late gate whose two gates are one. As the bounds are let
+grow, the poll creeps earlier until it is early once in a while, so it stays at the edge. Stalls and lost
 frames only make a bracket wide: they teach nothing wrong.
 """
 
@@ -23,13 +24,21 @@ _UNDISTURBED: Final = 1.25
 """A bracket wider than this many periods comes from a stall."""
 _NEAR: Final = 0.08
 """A sample is as expected when it moves the estimate by less than this part of a period."""
-_SLACK_NS: Final = 1_000.0
+_SLACK_NS: Final = 500.0
 """How far a period may differ from the estimate: the expected bracket grows by this at each end."""
 _SILENT: Final = 8
 """A sensor that has given nothing new for this many periods is no longer followed."""
+_AIM_NS: Final = 25_000.0
+"""How long after the expected instant a poll is aimed: the spread of wake-ups, about."""
+_EARLY_NS: Final = 50_000.0
+"""A poll this much before its aim was another sensor's, and is not counted as this one's first."""
+_FLIGHT_GAIN: Final = 1 / 64
 _MIN_WIDTH_NS: Final = 10_000.0
 _PHASE_GAIN: Final = 0.5
-_PERIOD_GAIN: Final = 0.02
+_PERIOD_GAIN: Final = 0.03
+_PERIOD_GAIN_LEAST: Final = 0.001
+_PERIOD_LEARNING: Final = 200
+"""Samples after which the gain has come down by half."""
 _MAX_PULL: Final = 0.002
 """The period may differ from the nominal one by this part: four times what an oscillator is off."""
 _LOCK_GAIN: Final = 1 / 32
@@ -44,8 +53,8 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_high", "_low", "_nominal_ns", "_polled_ns", "_quality",
-        "instant_ns", "locked", "period_ns", "steps",
+        "_flight_ns", "_high", "_learned", "_low", "_nominal_ns", "_polled_ns", "_quality",
+        "instant_ns", "locked", "period_ns", "steps", "uncertain",
     )  # fmt: skip
 
     def __init__(self, period_ns: float, start_ns: int = 0) -> None:
@@ -58,9 +67,15 @@ class SampleClock:
         self.steps = 1
         """How many samples the newest one is after the one handed out before it: more than 1, some were
         lost; 0, one was counted as lost that was not."""
+        self.uncertain = False
+        """Whether more may have been lost than `steps` says: the sensor may have looked at its data early or
+        late in a slow exchange. The samples after it tell, and their `steps` put it right."""
         self._quality = 0.0
+        self._learned = 0
         self._polled_ns = start_ns
         """When the last exchange was sent."""
+        self._flight_ns = 0.0
+        """How long an exchange usually takes."""
         self._low = self._high = 0.0
         """Bracket in which the next sample is expected."""
 
@@ -82,16 +97,19 @@ class SampleClock:
         """When the next exchange should be sent, as far as this sensor is concerned."""
         if not self.locked:
             return self._polled_ns + self.period_ns / _POLLS_UNLOCKED
-        if self._polled_ns < self._low:
-            return self._low
+        # So that the sensor, half-way through the exchange, looks at its data just after the instant.
+        first = (self._low + self._high - self._flight_ns) / 2 + _AIM_NS
+        if self._polled_ns < first - _EARLY_NS:
+            return first
         if self._polled_ns < self._high:
-            return self._high
+            return self._polled_ns  # it was early: again, at once
         overdue = self._polled_ns > self._high + self.period_ns
         return self._polled_ns + self.period_ns / (_POLLS_UNLOCKED if overdue else _SEARCH_STEPS)
 
     def observe(self, sent_ns: int, received_ns: int, fresh: bool) -> None:
         """Learn from one valid exchange whether it brought a new sample (`fresh`)."""
         after, self._polled_ns = self._polled_ns, sent_ns
+        self._flight_ns += _FLIGHT_GAIN * (min(received_ns - sent_ns, self.period_ns) - self._flight_ns)
         if not fresh:
             if self.locked and sent_ns > self._high + _SILENT * self.period_ns:
                 self.restart()
@@ -100,9 +118,11 @@ class SampleClock:
             # Nothing was expected, or the sensor was watched and silent for longer than a period: its
             # clock begins anew. Only what fell into the time it was not watched can have been lost.
             self.steps = 1 + int((received_ns - after) // self.period_ns)
+            self.uncertain = received_ns - after >= self.period_ns
             self._low, self._high = max(after, received_ns - self.period_ns), float(received_ns)
             self._expect_next(received_ns)
             return
+        self.uncertain = received_ns - after >= self.period_ns and received_ns - self._low >= self.period_ns
         narrow = received_ns - after < _NARROW * self.period_ns
         self.steps = self._count_steps(after, sent_ns, received_ns, narrow)
         moved = (self.steps - 1) * self.period_ns
@@ -137,7 +157,10 @@ class SampleClock:
 
     def _learn_period(self, error_ns: float) -> None:
         pull = _MAX_PULL * self._nominal_ns
-        period = self.period_ns + _PERIOD_GAIN * max(-pull * 8, min(pull * 8, error_ns))
+        # Quickly while little is known, then ever more steadily.
+        self._learned += 1
+        gain = max(_PERIOD_GAIN_LEAST, _PERIOD_GAIN / (1 + self._learned / _PERIOD_LEARNING))
+        period = self.period_ns + gain * max(-pull * 8, min(pull * 8, error_ns))
         self.period_ns = max(self._nominal_ns - pull, min(self._nominal_ns + pull, period))
 
     def _judge(self, as_expected: bool) -> None:

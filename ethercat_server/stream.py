@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from typing import Any, Final
 
-from ethercat_server.distribution import Distribution
+from ethercat_server.distribution import RecentDistribution
 from ethercat_server.sample_clock import SampleClock
 from protocol.framing import DataFlag, encode_data
 
@@ -30,13 +30,15 @@ class SensorStream:
         self.clock = SampleClock(period_ns, time.monotonic_ns())
         self.process_data = b""
         """The newest valid process data."""
+        self.alive = True
+        """False while the sensor is lost: what the bus gives for it is not its own."""
         self.sequence = 0
         self.fresh = 0
         self.repeated = 0
         self.invalid = 0
         self.lost_samples = 0
         self.recoveries = 0
-        self.age = Distribution()
+        self.age = RecentDistribution()
         """From the estimated instant of a sample to its hand-out, while locked."""
         self._discard = DISCARDED_AT_START
         self._gap = False
@@ -80,7 +82,7 @@ class SensorStream:
         lost = self.clock.steps - 1 if self.sequence else 0
         # -1 takes back one that was counted after a stall but came after all.
         self.lost_samples = max(0, self.lost_samples + lost)
-        flags = GAP if lost > 0 or self._gap else 0
+        flags = GAP if lost > 0 or self.clock.uncertain or self._gap else 0
         self._gap = False
         return flags
 
@@ -93,12 +95,14 @@ class SensorStream:
         self.invalid += 1
         return INVALID
 
-    def restart(self, period_ns: float) -> None:
-        """The sensor is back after it was lost, perhaps with another sample period."""
+    def recover(self, period_ns: float | None) -> None:
+        """The sensor is back after it was lost; `period_ns` if it entered OP anew, None if it never left."""
         self.recoveries += 1
-        self.clock = SampleClock(period_ns, time.monotonic_ns())
-        self._discard = DISCARDED_AT_START
-        self._gap = True
+        self.alive = True
+        if period_ns is not None:
+            self.clock = SampleClock(period_ns, time.monotonic_ns())
+            self._discard = DISCARDED_AT_START
+            self._gap = True
 
     def status(self) -> dict[str, Any]:
         """The sensor's part of the `status` reply."""
@@ -110,5 +114,5 @@ class SensorStream:
             "lost_samples": self.lost_samples,
             "recoveries": self.recoveries,
             "clock": self.clock.describe(),
-            "age_us": self.age.summary_us(),
+            "age_us": self.age.everything().summary_us(),
         }

@@ -33,6 +33,7 @@ PORT: Final = 12001
 TOPIC: Final = "/sensone_sensor_data"
 _START_TIMEOUT_S: Final = 30.0
 _STOP_TIMEOUT_S: Final = 8.0
+_SETTLING_S: Final = 0.3
 _PR_SET_PDEATHSIG: Final = 1
 
 
@@ -233,6 +234,9 @@ def run(seconds: float | None, directory: Path) -> int:
         ears = Ears(link, measurement)
         stack.callback(ears.close)
         wait_for_messages(children, measurement)
+        time.sleep(_SETTLING_S)
+        with ears.lock:
+            measurement.begin()
         with contextlib.suppress(Stopped), Screen(sensor) as screen:
             show(screen, ears, children, seconds)
         ignore_signals()

@@ -48,10 +48,7 @@ class Summary(NamedTuple):
 
 @dataclass
 class Measurement:
-    """Takes samples and messages as they come; not locked, so call it from one thread at a time.
-
-    It begins with the first message that is found among the samples.
-    """
+    """Takes samples and messages as they come; not locked, so call it from one thread at a time."""
 
     latest: Sample | None = None
     messages: int = 0
@@ -74,6 +71,14 @@ class Measurement:
     _places: list[int] = field(default_factory=list)
     _first_ns: int = 0
     _last_ns: int = 0
+
+    def begin(self) -> None:
+        """Count from here: what came while things were starting is none of the figures."""
+        self.messages = self.lost_before = self.repeated = self.not_finite = self.unknown = 0
+        del self._places[:-1]
+        self.ages_ns.clear()
+        self.tcp_ages_ns.clear()
+        self._first_ns = self._last_ns
 
     def take_frame(self, frame: DataMessage, now_ns: int) -> None:
         """A frame came from the server."""
@@ -121,7 +126,6 @@ class Measurement:
     def _count(self, known: Known, arrived_ns: int) -> None:
         if not self._places:
             self._first_ns = arrived_ns
-            self.tcp_ages_ns.clear()
         elif known.place <= self._places[-1]:
             self.repeated += 1
         self.messages += 1

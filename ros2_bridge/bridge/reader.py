@@ -22,6 +22,7 @@ from bridge.connection import (
 from bridge.messages import Output
 from bridge.parameters import Parameters
 from bridge.selection import FrameCounts, FrameSelector
+from protocol.control import Event
 from protocol.framing import DataMessage, JsonObject
 from protocol.pdo import LAYOUTS, SampleDecoder
 
@@ -126,7 +127,6 @@ class Reader:
                     return
                 if time.monotonic() - began_s > _STEADY_S and not isinstance(error, UnreachableError):
                     delay_s = _FIRST_DELAY_S
-                    self._problem = None
                 self._say_problem(error)
             self._stopping.wait(delay_s)
             delay_s = min(delay_s * 1.5, _LONGEST_DELAY_S)
@@ -142,6 +142,7 @@ class Reader:
             again = " again" if self._was_connected else ""
             self._log.info(f"connected{again} to {self._address}: {info}")
             self._was_connected = True
+            self._problem = None
             self._stream(connection)
         finally:
             self._connection = None
@@ -203,10 +204,14 @@ class Reader:
     def _say_event(self, message: JsonObject) -> None:
         if "event" not in message:
             return
-        say, text = EVENTS.get(printable(message["event"], 40), ("info", "the server says {event}"))
+        event = printable(message["event"], 40)
         details = {key: value for key, value in message.items() if key != "event"}
-        suffix = f" {printable(details)}" if details else ""
-        getattr(self._log, say)(text.format(event=printable(message["event"], 40)) + suffix)
+        text = EVENTS.get(event, f"the server says {event}") + (f" {printable(details)}" if details else "")
+        # A line of source has one severity: rclpy insists.
+        if event == Event.SENSOR_LOST:
+            self._log.warning(text)
+        else:
+            self._log.info(text)
 
     def _say_problem(self, error: ConnectionFailedError) -> None:
         """Log a problem once, however often it comes back."""
@@ -222,10 +227,10 @@ class Reader:
             self._log.warning(text)
 
 
-EVENTS: Final[Mapping[str, tuple[str, str]]] = {
-    "sensor_lost": ("warning", "the server has lost the sensor"),
-    "sensor_back": ("info", "the sensor is back"),
-    "reconfigured": ("info", "the sensor was reconfigured"),
-    "shutting_down": ("info", "the server is shutting down"),
+EVENTS: Final[Mapping[str, str]] = {
+    Event.SENSOR_LOST: "the server has lost the sensor",
+    Event.SENSOR_BACK: "the sensor is back",
+    Event.RECONFIGURED: "the sensor was reconfigured",
+    Event.SHUTTING_DOWN: "the server is shutting down",
 }
-"""What the server's events are called in the log, and how loud."""
+"""What the server's events are called in the log."""

@@ -133,24 +133,25 @@ class FrameSelector:
 
 
 class RateLimit:
-    """At most so many a second, on average and over every second (one more at its edges).
+    """At most so many a second on average; over any one stretch of time, two more.
 
-    It counts in the samples' own time and saves up half a message, so that a limit equal to the stream's
-    rate lets every sample pass though their distance varies.
+    It counts in the samples' own time and begins with half a message saved up, so that a limit equal to the
+    stream's rate lets every sample pass though their distance varies.
     """
 
-    _CREDIT_LIMIT: Final = 1.5
+    _MOST_CREDIT: Final = 2.0
+    """With less, a limit just below the stream's rate would not be reached."""
 
     def __init__(self, hz: float) -> None:
         self._per_ns = hz / 1e9
-        self._credit = self._CREDIT_LIMIT
+        self._credit = 1.5
         self._last_ns: int | None = None
 
     def allows(self, time_ns: int) -> bool:
         """Whether a sample of this time may pass; counts it if so."""
         if self._last_ns is not None:
             elapsed = max(time_ns - self._last_ns, 0)
-            self._credit = min(self._credit + elapsed * self._per_ns, self._CREDIT_LIMIT)
+            self._credit = min(self._credit + elapsed * self._per_ns, self._MOST_CREDIT)
         self._last_ns = time_ns
         # A hair less than 1: a hundred times 1.25 ms at 800 Hz is to make a hundred.
         if self._credit < 1.0 - 1e-6:

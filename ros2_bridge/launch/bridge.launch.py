@@ -1,10 +1,11 @@
 """Starts the node with config/bridge.yaml, or with `params_file:=FILE`; `namespace:=NAME` is taken too."""
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
 
 
 def generate_launch_description():

@@ -160,10 +160,12 @@ class Veth:
 
 
 @contextlib.contextmanager
-def virtual_sensor(*arguments: str) -> Iterator[tuple[Veth, Program]]:
-    """A veth pair with a virtual sensor on its far end."""
+def virtual_sensor(
+    *arguments: str, module: str = "ethercat_server.virtual_sensor", first: tuple[str, ...] = ()
+) -> Iterator[tuple[Veth, Program]]:
+    """A veth pair with a virtual sensor on its far end: `module first... IFACE arguments...`."""
     with Veth() as veth:
-        sensor = Program("ethercat_server.virtual_sensor", [veth.far, *arguments])
+        sensor = Program(module, [*first, veth.far, *arguments])
         try:
             sensor.wait_for("ready")
             yield veth, sensor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from ethercat_server.distribution import Distribution
+from ethercat_server.distribution import Distribution, RecentDistribution
 
 
 def test_percentiles_are_exact_to_a_few_percent() -> None:
@@ -27,3 +27,18 @@ def test_extremes() -> None:
     assert distribution.percentile_ns(0.5) == 0
     assert distribution.summary_us()["max"] == 10**12
     assert distribution.count == 2
+
+
+def test_recent_forgets_after_ten_rolls_but_everything_does_not() -> None:
+    recent = RecentDistribution()
+    recent.record(5_000_000)
+    for _ in range(9):
+        recent.roll()
+        recent.record(1_000)
+    assert recent.last_10s().summary_us()["max"] == 5000
+    recent.roll()
+    recent.record(2_000)
+    assert recent.last_10s().count == 10
+    assert recent.last_10s().summary_us()["max"] == 2
+    assert recent.everything().count == 11
+    assert recent.everything().summary_us()["max"] == 5000

@@ -90,7 +90,7 @@ def test_a_gap_is_flagged_and_counted() -> None:
 def test_sequence_goes_on_after_a_recovery_and_the_first_frame_has_gap() -> None:
     feeder = Feeder().start()
     before = feeder.exchange(new=True)
-    feeder.stream.restart(PERIOD_NS)
+    feeder.stream.recover(PERIOD_NS)
     feeder.start()
     after = feeder.exchange(new=True)
     assert before is not None

@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from tests.server.running import Server, Veth, free_port, needs_bus, server, virtual_sensor
+from tests.server.running import Server, Veth, free_port, needs_bus, virtual_sensor
 
 pytestmark = [pytest.mark.bus, needs_bus]
 
@@ -83,15 +83,35 @@ def test_not_allowed_names_the_capabilities() -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_another_model_is_refused_by_name() -> None:
+    with virtual_sensor("--model", "BFT-GENA-THING") as (veth, _):
+        assert "'BFT-GENA-THING', a model this server does not know" in fails(veth.near)
+
+
 @pytest.mark.parametrize(
-    ("sensor", "complaint"),
+    ("way", "arguments", "complaint"),
     [
-        (("--model", "BFT-GENA-THING"), "'BFT-GENA-THING', a model this server does not know"),
+        (
+            "vendor",
+            (),
+            "place 0 of .* is 'BFT-SENS-ECAT-M8' .vendor 0x0000DEAD, .* not a Bota",
+        ),
+        ("product", (), "vendor 0x0000B07A, product 0x00000007"),
+        (
+            "size",
+            ("--pdo", "65"),
+            "sensor 0 .BFT-SENS.* maps process data of 65 bytes: .* 61 or 77",
+        ),
+        ("rate", (), "samples at 500 Hz, but sinc_length 64 implies 800 Hz"),
     ],
 )
-def test_another_model_is_refused_by_name(sensor: tuple[str, ...], complaint: str) -> None:
-    with virtual_sensor(*sensor) as (veth, _):
-        assert complaint in fails(veth.near)
+def test_a_slave_that_is_wrong_in_one_way(way: str, arguments: tuple[str, ...], complaint: str) -> None:
+    with virtual_sensor(*arguments, module="tests.server.odd_sensor", first=(way,)) as (veth, sensor):
+        assert re.search(complaint, fails(veth.near))
+        assert sensor.process.stdin is not None
+        sensor.process.stdin.write("stats\n")
+        sensor.process.stdin.flush()
+        sensor.wait_for('"INIT"')
 
 
 def test_name_on_the_command_line_must_be_the_sensors() -> None:
@@ -160,9 +180,3 @@ def test_stopped_while_starting() -> None:
             assert running.ifname not in interfaces()
         finally:
             running.close()
-
-
-def test_sensor_that_maps_an_unexpected_size_is_refused() -> None:
-    pytest.importorskip("ethercat_server.virtual_sensor")
-    with server("virtual", "--virtual", "--pdo 77") as running, running.connect() as client:
-        assert client.ask("describe")["sensors"][0]["pdo_size"] == 77

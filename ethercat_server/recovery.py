@@ -1,0 +1,147 @@
+"""Notices that a sensor no longer takes part, tells the clients, and has it brought back step by step.
+
+The steps are `ladder.py`'s, one for each exchange, so that neither the other sensors nor the clients wait.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from ethercat_server.al import AlState
+from ethercat_server.bus import Bus
+from ethercat_server.errors import BusError
+from ethercat_server.ladder import DifferentSensorError, GoneError, Ladder
+from ethercat_server.sdo import Steps
+from ethercat_server.sensor import Identity, Sensor
+from ethercat_server.stream import SensorStream
+from protocol.control import Event, event
+from protocol.framing import JsonObject
+
+_SHORT_EXCHANGES: Final = 2
+"""So many exchanges in a row with a short working counter are looked into."""
+_SILENCE_NS: Final = 50_000_000
+"""So long with no frame coming back, and all sensors are lost; single lost frames are not."""
+_WATCH_EVERY_NS: Final = 100_000_000
+"""A sensor can leave OP and still be counted, so its AL status is read this often."""
+_FAILED_PAUSE_S: Final = 0.25
+
+log = logging.getLogger(__name__)
+
+
+class Recovery:
+    """Watches over all sensors of the bus. `announce` sends an event to the clients."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        sensors: Sequence[Sensor],
+        streams: Sequence[SensorStream],
+        announce: Callable[[JsonObject], None],
+    ) -> None:
+        self._bus = bus
+        self._sensors = sensors
+        self._streams = streams
+        self._announce = announce
+        self._ladders = [Ladder(bus, sensor) for sensor in sensors]
+        self._climbing: dict[int, Steps[bool]] = {}
+        self._lost_at: dict[int, float] = {}
+        self._short = 0
+        self._frame_ns = time.monotonic_ns()
+        self._watch_ns = 0
+        self._watched = 0
+        self.alive_wkc = bus.expected_wkc
+        """The working counter of all sensors that are not lost."""
+
+    @property
+    def all_lost(self) -> bool:
+        """Whether no sensor is left to be read."""
+        return len(self._climbing) == len(self._sensors)
+
+    def attend(self, wkc: int, now_ns: int) -> None:
+        """To be called after every exchange; almost always it has nothing to do."""
+        if wkc < 0:
+            # Without frames coming back there is nothing that could be done.
+            if now_ns - self._frame_ns > _SILENCE_NS and not self.all_lost:
+                for place in range(len(self._sensors)):
+                    self._lose(place, "no frame comes back: check cable and power")
+            return
+        self._frame_ns = now_ns
+        self._short = self._short + 1 if wkc < self.alive_wkc else 0
+        if self._short >= _SHORT_EXCHANGES:
+            self._short = 0
+            self._look_for_lost(range(len(self._sensors)))
+        if self._climbing:
+            for place in list(self._climbing):
+                self._step(place)
+        elif now_ns >= self._watch_ns:
+            self._watch_ns = now_ns + _WATCH_EVERY_NS // len(self._sensors)
+            self._watched = (self._watched + 1) % len(self._sensors)
+            self._look_for_lost((self._watched,))
+
+    def _look_for_lost(self, places: Sequence[int]) -> None:
+        for place in places:
+            if place in self._climbing:
+                continue
+            status = self._ladders[place].al_status() or self._ladders[place].al_status()
+            if status is None:
+                self._lose(place, "it does not answer")
+            elif status.state is not AlState.OP or status.error:
+                self._lose(place, f"it is in {status}")
+
+    def _lose(self, place: int, reason: str) -> None:
+        if place in self._climbing:
+            return
+        sensor = self._sensors[place]
+        sensor.state = "LOST"
+        self._streams[place].alive = False
+        self._lost_at[place] = time.monotonic()
+        self._climbing[place] = self._ladders[place].climb()
+        self._count_alive()
+        log.warning("sensor %d (%s) is lost: %s", place, sensor.identity, reason)
+        self._announce(
+            event(Event.SENSOR_LOST, sensor=place, reason=reason, message=f"sensor {place} is lost: {reason}")
+        )
+
+    def _count_alive(self) -> None:
+        alive = [place for place in range(len(self._sensors)) if place not in self._climbing]
+        self.alive_wkc = sum(self._bus.working_counter(place) for place in alive)
+
+    def _step(self, place: int) -> None:
+        try:
+            next(self._climbing[place])
+        except StopIteration as stop:
+            self._bring_back(place, left_op=stop.value)
+        except GoneError:
+            self._climbing[place] = self._ladders[place].climb()
+        except DifferentSensorError as error:
+            self._refuse(place, error.found)
+        except BusError as error:
+            log.warning("sensor %d is not back yet: %s", place, error)
+            self._climbing[place] = self._ladders[place].climb(_FAILED_PAUSE_S)
+
+    def _bring_back(self, place: int, *, left_op: bool) -> None:
+        sensor, stream = self._sensors[place], self._streams[place]
+        del self._climbing[place]
+        self._count_alive()
+        sensor.state = AlState.OP.name
+        stream.recover(sensor.period_ns if left_op else None)
+        lost_s = round(time.monotonic() - self._lost_at.pop(place), 3)
+        log.info("sensor %d (%s) is back after %.3f s", place, sensor.identity, lost_s)
+        self._announce(event(Event.SENSOR_BACK, sensor=place, lost_s=lost_s, settings=dict(sensor.settings)))
+
+    def _refuse(self, place: int, found: Identity) -> None:
+        sensor = self._sensors[place]
+        sensor.state = "REFUSED"
+        message = (
+            f"sensor {place} is now a {found}, not the {sensor.identity}: connect that one again, "
+            "or restart the server to use the new one"
+        )
+        log.error("%s", message)
+        who = {"name": found.name, "serial": found.serial}
+        self._announce(
+            event(Event.SENSOR_LOST, sensor=place, reason="different_sensor", message=message, found=who)
+        )
+        self._climbing[place] = self._ladders[place].wait_for_removal()

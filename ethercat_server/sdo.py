@@ -1,0 +1,164 @@
+"""SDO transfers over CoE, in two forms with one interface: generators that end with the result.
+
+`BlockingSdo` goes through pysoem and never yields; it is for start-up. `CyclicSdo` sends single datagrams
+and yields after each, so that the acquisition loop goes on in between; it is for recovery. Code that
+configures a sensor is written once, with `yield from`, and `finish` runs it to its end at start-up.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Generator
+from typing import Final, Protocol, TypeVar
+
+from ethercat_server.bus import Bus
+from ethercat_server.errors import BusError, SdoAbortError
+
+T = TypeVar("T")
+Steps = Generator[None, None, T]
+"""Work in steps: yields when the loop should have its turn, returns the result."""
+
+_ANSWER_TIMEOUT_S: Final = 0.3
+_ATTEMPTS: Final = 3
+
+SM_READ_STATUS: Final = 0x080D
+"""Status of sync manager 1, the mailbox from the slave."""
+_MAILBOX_FULL: Final = 0x08
+
+_MAILBOX_HEADER: Final = struct.Struct("<HHBB")
+_SDO_HEADER: Final = struct.Struct("<HBHB")
+_TYPE_COE: Final = 3
+_COE_SDO_REQUEST: Final = 2
+_COE_SDO_RESPONSE: Final = 3
+_UPLOAD: Final = 0x40
+_DOWNLOAD: Final = 0x20
+_EXPEDITED: Final = 0x03
+_ABORT: Final = 0x80
+_LONGEST_EXPEDITED: Final = 4
+
+
+class Sdo(Protocol):
+    """Access to one sensor's object dictionary."""
+
+    def read(self, index: int, subindex: int) -> Steps[bytes]:
+        """Upload an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
+        ...
+
+    def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
+        """Download an object; raises as `read`."""
+        ...
+
+
+def finish(steps: Steps[T]) -> T:
+    """Run `steps` to the end, a millisecond apart; returns their result."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as stop:
+            result: T = stop.value
+            return result
+        time.sleep(0.001)
+
+
+class BlockingSdo:
+    """SDO through pysoem: each call blocks until the answer is there."""
+
+    def __init__(self, bus: Bus, slave: int) -> None:
+        self._bus, self._slave = bus, slave
+
+    def read(self, index: int, subindex: int) -> Steps[bytes]:
+        """See `Sdo`."""
+        yield from ()
+        return self._bus.sdo_read(self._slave, index, subindex)
+
+    def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
+        """See `Sdo`."""
+        yield from ()
+        self._bus.sdo_write(self._slave, index, subindex, data)
+
+
+class CyclicSdo:
+    """SDO by single datagrams. `mailboxes`: offset and size of the one to the slave and the one from it."""
+
+    def __init__(self, bus: Bus, slave: int, mailboxes: tuple[tuple[int, int], tuple[int, int]]) -> None:
+        self._bus, self._slave = bus, slave
+        (self._out, self._out_size), (self._in, self._in_size) = mailboxes
+        self._counter = 0
+
+    def read(self, index: int, subindex: int) -> Steps[bytes]:
+        """See `Sdo`."""
+        command, rest = yield from self._transfer(index, subindex, _UPLOAD, b"")
+        if command & 0xE0 != _UPLOAD:
+            raise BusError(
+                self._unanswered("reading", index, subindex, f"unexpected command 0x{command:02X}")
+            )
+        if command & 0x02:  # expedited; bit 0 tells that the size is given
+            return rest[: 4 - (command >> 2 & 3)] if command & 0x01 else rest[:4]
+        size = int.from_bytes(rest[:4], "little")
+        if size > len(rest) - 4:
+            raise BusError(self._unanswered("reading", index, subindex, f"{size} bytes need segments"))
+        return rest[4 : 4 + size]
+
+    def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
+        """See `Sdo`; at most four bytes, which all settings have."""
+        if len(data) > _LONGEST_EXPEDITED:
+            raise ValueError(f"{len(data)} bytes do not fit an expedited download")
+        command = _DOWNLOAD | _EXPEDITED | (_LONGEST_EXPEDITED - len(data)) << 2
+        yield from self._transfer(index, subindex, command, data)
+
+    def _transfer(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
+        doing = "reading" if command == _UPLOAD else f"writing {data.hex()} to"
+        for _ in range(_ATTEMPTS):
+            yield from self._drain()
+            self._counter = self._counter % 7 + 1
+            body = _SDO_HEADER.pack(_COE_SDO_REQUEST << 12, command, index, subindex) + data.ljust(4, b"\0")
+            header = _MAILBOX_HEADER.pack(len(body), 0, 0, _TYPE_COE | self._counter << 4)
+            message = (header + body).ljust(self._out_size, b"\0")
+            if self._bus.write_register(self._slave, self._out, message):
+                deadline = time.monotonic() + _ANSWER_TIMEOUT_S
+                while time.monotonic() < deadline:
+                    yield
+                    answer = self._answer(index, subindex)
+                    if answer is None:
+                        continue
+                    code = int.from_bytes(answer[1][:4], "little")
+                    if answer[0] == _ABORT:
+                        raise SdoAbortError(
+                            f"sensor {self._slave} refused {doing} object 0x{index:04X}:{subindex} "
+                            f"(abort 0x{code:08X})",
+                            code,
+                        )
+                    return answer
+            yield
+        raise BusError(self._unanswered(doing, index, subindex, "no answer"))
+
+    def _drain(self) -> Steps[None]:
+        """Read away what was left in the mailbox from before."""
+        for _ in range(4):
+            status = self._bus.read_register(self._slave, SM_READ_STATUS, 1)
+            if status is None or not status[0] & _MAILBOX_FULL:
+                return
+            self._bus.read_register(self._slave, self._in, self._in_size)
+            yield
+
+    def _answer(self, index: int, subindex: int) -> tuple[int, bytes] | None:
+        """Command and data of the answer about this object if it is there; other messages are dropped."""
+        status = self._bus.read_register(self._slave, SM_READ_STATUS, 1)
+        if status is None or not status[0] & _MAILBOX_FULL:
+            return None
+        message = self._bus.read_register(self._slave, self._in, self._in_size)
+        if message is None:
+            return None
+        length, _, _, kind = _MAILBOX_HEADER.unpack_from(message)
+        body = message[_MAILBOX_HEADER.size : _MAILBOX_HEADER.size + length]
+        if kind & 0x0F != _TYPE_COE or len(body) < _SDO_HEADER.size + 4:
+            return None
+        coe, command, its_index, its_subindex = _SDO_HEADER.unpack_from(body)
+        is_sdo = coe >> 12 == _COE_SDO_RESPONSE or (coe >> 12 == _COE_SDO_REQUEST and command == _ABORT)
+        if not is_sdo or (its_index, its_subindex) != (index, subindex):
+            return None
+        return command, body[_SDO_HEADER.size :]
+
+    def _unanswered(self, doing: str, index: int, subindex: int, what: str) -> str:
+        return f"sensor {self._slave} did not answer {doing} object 0x{index:04X}:{subindex}: {what}"

@@ -1,0 +1,178 @@
+"""A ROS listener in this process, and the node in a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tests.bridge.scripted_server import ScriptedServer
+
+PATIENCE_S = 20.0
+
+
+def wait_until(condition: Callable[[], object], what: str) -> None:
+    """Wait for something that is to happen soon."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain for: {what}"
+        time.sleep(0.01)
+
+
+class Listener:
+    """A subscriber of the node's array topic, and a publisher of the supervisor's."""
+
+    def __init__(self) -> None:
+        import rclpy
+        from diagnostic_msgs.msg import KeyValue
+        from rclpy.executors import SingleThreadedExecutor
+        from std_msgs.msg import Float64MultiArray
+
+        self.tag = f"test_{uuid.uuid4().hex}"
+        self.topic, self.supervisor_topic = f"/{self.tag}/array", f"/{self.tag}/supervisor"
+        self.messages: queue.Queue[Any] = queue.Queue()
+        self._key_value = KeyValue
+        self._node = rclpy.create_node(self.tag)
+        self._node.create_subscription(Float64MultiArray, self.topic, self.messages.put, 2000)
+        self._supervisor = self._node.create_publisher(KeyValue, self.supervisor_topic, 10)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._thread.join(5)
+        self._node.destroy_node()
+
+    def next_number(self) -> float:
+        """The first value of the next message: the number that the sample was made from."""
+        return float(self.messages.get(timeout=PATIENCE_S).data[0])
+
+    def numbers(self) -> list[float]:
+        """The numbers of all messages that have come."""
+        found = []
+        while not self.messages.empty():
+            found.append(float(self.messages.get().data[0]))
+        return found
+
+    def supervise(self, key: str, value: str) -> None:
+        """Publish a supervisor's message as soon as the node listens."""
+        wait_until(self._supervisor.get_subscription_count, "the node's subscription")
+        self._supervisor.publish(self._key_value(key=key, value=value))
+
+
+class NodeProcess:
+    """`bridge-client` in a process of its own."""
+
+    def __init__(self, *arguments: str) -> None:
+        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "bridge.client", *arguments], stdout=self._log, stderr=subprocess.STDOUT
+        )
+
+    @property
+    def log(self) -> str:
+        """All that it has said."""
+        self._log.seek(0)
+        return self._log.read()
+
+    def says(self, words: str, times: int = 1) -> None:
+        """Wait until it has said `words` that often."""
+        wait_until(lambda: self.log.count(words) >= times, f"{words!r} in the log")
+
+    def ends(self) -> int:
+        """Wait until it has ended; its exit code."""
+        return self.process.wait(PATIENCE_S)
+
+    def send_signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.kill()
+            self.process.wait()
+        self._log.close()
+
+
+Start = Callable[..., NodeProcess]
+
+
+@pytest.fixture(scope="session")
+def _ros() -> Iterator[None]:
+    rclpy = pytest.importorskip(
+        "rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2"
+    )
+    from rclpy.signals import SignalHandlerOptions
+
+    os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("ROS_LOG_DIR", tempfile.gettempdir())
+    os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    yield
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def listener(_ros: None) -> Iterator[Listener]:
+    opened = Listener()
+    yield opened
+    opened.close()
+
+
+@contextlib.contextmanager
+def starter(listener: Listener) -> Iterator[Start]:
+    """Gives a function that starts nodes which publish to `listener`; ends them at the end."""
+    started: list[NodeProcess] = []
+
+    def start_node(port: int, **parameters: object) -> NodeProcess:
+        values = {"server_port": port, "array_topic": listener.topic, **parameters}
+        options = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
+        remap = f"/supervisor_status_data:={listener.supervisor_topic}"
+        started.append(NodeProcess("--ros-args", "-r", remap, *options))
+        return started[-1]
+
+    try:
+        yield start_node
+    finally:
+        for process in started:
+            process.close()
+
+
+@pytest.fixture
+def start(listener: Listener) -> Iterator[Start]:
+    with starter(listener) as start_node:
+        yield start_node
+
+
+@pytest.fixture
+def server() -> Iterator[ScriptedServer]:
+    with ScriptedServer() as scripted:
+        yield scripted
+
+
+def establish(server: ScriptedServer, listener: Listener) -> None:
+    """Send samples until one arrives at the listener, then until none is on the way."""
+    assert server.subscribed.wait(PATIENCE_S)
+    number = -1.0
+    listener.numbers()
+    while listener.messages.empty():
+        server.send_sample(number)
+        time.sleep(0.02)
+    server.send_sample(-2.0)
+    while listener.next_number() != -2.0:
+        pass

@@ -1,0 +1,165 @@
+"""Which frames are news: every fresh one once and in order, nothing old as new."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.selection import BACKLOG_NS, FRESH_NS, FrameCounts, FrameSelector, RateLimit
+from protocol.framing import DataFlag, DataMessage
+
+PERIOD_NS = 1_250_000
+REPEATED, INVALID, GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
+
+
+def frame(number: int, flags: int = 0, *, sensor: int = 0, sequence: int | None = None) -> DataMessage:
+    """Frame `number` of a stream that began at time 0."""
+    return DataMessage(number if sequence is None else sequence, 0, number * PERIOD_NS, sensor, flags, 3, b"")
+
+
+def frames(numbers: Iterable[int]) -> list[DataMessage]:
+    return [frame(number) for number in numbers]
+
+
+def selector(*, same_clock: bool = True, limit_hz: float = 0.0) -> tuple[FrameSelector, FrameCounts]:
+    counts = FrameCounts()
+    return FrameSelector(0, counts, same_clock=same_clock, limit_hz=limit_hz), counts
+
+
+def numbers(selected: list[DataMessage]) -> list[int]:
+    return [item.sequence for item in selected]
+
+
+def test_fresh_frames_pass_once_and_in_order() -> None:
+    select, counts = selector()
+    got = [n for i in range(100) for n in numbers(select.select([frame(i)], i * PERIOD_NS))]
+    assert got == list(range(100))
+    assert (counts.fresh, counts.lost, counts.skipped) == (100, 0, 0)
+
+
+def test_a_short_queue_passes_whole() -> None:
+    select, _ = selector()
+    assert numbers(select.select(frames(range(20)), 20 * PERIOD_NS)) == list(range(20))
+
+
+def test_repeated_invalid_and_other_sensors_frames_do_not_pass() -> None:
+    select, counts = selector()
+    queue = [
+        frame(1),
+        frame(2, REPEATED),
+        frame(3, INVALID),
+        frame(4, sensor=1),
+        frame(5, REPEATED | INVALID),
+    ]
+    assert numbers(select.select([*queue, frame(6)], 6 * PERIOD_NS)) == [1, 6]
+    assert (counts.fresh, counts.repeated, counts.invalid) == (2, 1, 2)
+
+
+def test_what_was_seen_does_not_pass_again() -> None:
+    select, counts = selector()
+    queue = [frame(5), frame(5), frame(4), frame(6)]
+    assert numbers(select.select(queue, 6 * PERIOD_NS)) == [5, 6]
+    assert counts.old == 2
+
+
+def test_a_server_that_counts_from_the_start_again_is_no_old_news() -> None:
+    select, counts = selector()
+    assert select.select([frame(100)], 100 * PERIOD_NS)
+    assert select.select([frame(101, sequence=0)], 101 * PERIOD_NS)
+    assert counts.old == 0
+
+
+def test_lost_samples_are_counted_where_the_server_says_so() -> None:
+    select, counts = selector()
+    select.select([frame(1), frame(5, GAP), frame(6, GAP), frame(9)], 9 * PERIOD_NS)
+    assert counts.gaps == 2
+    assert counts.lost == 3 + 1  # 2, 3, 4, and at least one before 6; repeated frames withheld are no loss
+
+
+def test_a_gap_in_the_first_frame_counts_one() -> None:
+    select, counts = selector()
+    select.select([frame(1_000_000, GAP)], 1_000_000 * PERIOD_NS)
+    assert counts.lost == 1
+
+
+def test_after_a_stall_only_the_newest_passes() -> None:
+    select, counts = selector()
+    stall = frames(range(1600))
+    assert numbers(select.select(stall, 1600 * PERIOD_NS)) == [1599]
+    assert counts.skipped == 1599
+    assert numbers(select.select([frame(1600)], 1600 * PERIOD_NS)) == [1600]
+
+
+def test_a_stall_in_several_reads_gives_nothing_until_it_is_fresh() -> None:
+    select, counts = selector()
+    now_ns = 1600 * PERIOD_NS
+    for start in range(0, 1500, 500):
+        assert select.select(frames(range(start, start + 500)), now_ns) == []
+    assert numbers(select.select(frames(range(1500, 1600)), now_ns)) == [1599]
+    assert counts.skipped == 1599
+
+
+def test_one_old_frame_alone_does_not_pass_on_the_same_machine() -> None:
+    select, counts = selector()
+    assert select.select([frame(1)], PERIOD_NS + BACKLOG_NS + 1) == []
+    late = 100 * PERIOD_NS
+    assert select.select([frame(100)], late + FRESH_NS + 1) == []
+    assert numbers(select.select([frame(101)], 101 * PERIOD_NS + FRESH_NS)) == [101]
+    assert counts.skipped == 2
+
+
+def test_clocks_that_differ_make_ages_relative() -> None:
+    for offset_ns in (-(10**15), 10**15):
+        select, _ = selector(same_clock=False)
+        for i in range(1000):
+            now_ns = offset_ns + i * PERIOD_NS + (i * 7919 % 1000) * 1000
+            assert numbers(select.select([frame(i)], now_ns)) == [i]
+        now_ns = offset_ns + 3000 * PERIOD_NS
+        assert select.select(frames(range(1000, 2000)), now_ns) == []
+        assert numbers(select.select(frames(range(2000, 3000)), now_ns)) == [2999]
+
+
+def test_a_clock_wrongly_taken_for_ours_does_not_silence_the_stream() -> None:
+    select, _ = selector()
+    offset_ns = 10**12
+    got = [n for i in range(1000) for n in numbers(select.select([frame(i)], offset_ns + i * PERIOD_NS))]
+    assert 0 < got[0] < 250
+    assert got == list(range(got[0], 1000))
+
+
+def test_a_limit_takes_the_newest() -> None:
+    select, counts = selector(limit_hz=100)
+    got = numbers(select.select(frames(range(8)), 8 * PERIOD_NS))
+    got += numbers(select.select(frames(range(8, 16)), 16 * PERIOD_NS))
+    assert got == [7, 15]
+    assert counts.limited == 14
+
+
+@given(st.sampled_from([1.0, 10.0, 99.9, 100.0, 333.0, 799.0]), st.integers(800, 1700))
+def test_a_limit_below_the_streams_rate_is_kept_and_reached(limit_hz: float, rate_hz: int) -> None:
+    limit = RateLimit(limit_hz)
+    passed = sum(limit.allows(i * 1_000_000_000 // rate_hz) for i in range(10 * rate_hz))
+    assert 10 * limit_hz - 1 <= passed <= 10 * limit_hz + 2
+
+
+@given(st.randoms(use_true_random=False))
+def test_a_limit_equal_to_the_streams_rate_lets_all_pass(random: object) -> None:
+    limit = RateLimit(800.0)
+    jitter = getattr(random, "randint")  # noqa: B009
+    assert all(limit.allows(i * PERIOD_NS + jitter(-200_000, 200_000)) for i in range(1, 2000))
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 2**64 - 1), st.integers(0, 255)), max_size=20
+    )
+)
+def test_hostile_numbers_are_survived(rows: list[tuple[int, int, int]]) -> None:
+    for limit_hz in (0.0, 100.0):
+        for same_clock in (True, False):
+            select, _ = selector(same_clock=same_clock, limit_hz=limit_hz)
+            for sequence, monotonic_ns, flags in rows:
+                message = DataMessage(sequence, 0, monotonic_ns, 0, flags, 3, b"")
+                assert len(select.select([message], 10**12)) <= 1

@@ -1,0 +1,53 @@
+"""A virtual sensor that is wrong in one way: `odd_sensor.py WAY IFACE ...`, for tests of what is refused.
+
+The tables are changed before the virtual sensor is imported, so that it works them out as its own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+import sys
+
+from ethercat_server import objects
+from protocol import pdo, settings
+
+
+def change_default(address: tuple[int, int], value: int) -> None:
+    rows = [
+        dataclasses.replace(row, default=value) if row.address == address else row for row in objects.OBJECTS
+    ]
+    objects.OBJECTS = tuple(rows)  # type: ignore[misc]
+    objects.BY_ADDRESS.update({row.address: row for row in rows})  # type: ignore[attr-defined]
+
+
+def odd_size() -> None:
+    """65 bytes of process data: a quarter of a quaternion."""
+    layout = pdo.PdoLayout(pdo.PDO_FIELDS[:19])
+    # The measurement gives the 18 values of 61 bytes; the rest stays empty.
+    layout.struct = struct.Struct("<" + "".join(f.type.value for f in layout.fields[:18]) + "4x")
+    pdo.LAYOUTS[layout.size] = layout
+
+
+def wrong_rate() -> None:
+    """A sampling rate that the SINC length does not imply."""
+    settings.sampling_rate_hz = lambda sinc_length: 500
+
+
+def other_vendor() -> None:
+    objects.VENDOR_ID = 0xDEAD  # type: ignore[misc]
+    change_default((0x1018, 1), 0xDEAD)
+
+
+def other_product() -> None:
+    objects.PRODUCT_CODE = 7  # type: ignore[misc]
+    change_default((0x1018, 2), 7)
+
+
+WAYS = {"size": odd_size, "rate": wrong_rate, "vendor": other_vendor, "product": other_product}
+
+if __name__ == "__main__":
+    WAYS[sys.argv[1]]()
+    from ethercat_server.virtual_sensor import cli
+
+    sys.exit(cli.main(sys.argv[2:]))

@@ -1,0 +1,91 @@
+"""What the demo measures and how it judges."""
+
+from __future__ import annotations
+
+import math
+
+from protocol.framing import DataFlag, DataMessage
+from protocol.pdo import SampleDecoder, encode
+from scripts._measure import Measurement, percentile, verdict
+
+PERIOD_NS = 1_250_000
+SECOND_NS = 1_000_000_000
+
+
+def frame(number: int, flags: int = 0) -> DataMessage:
+    data = encode(61, {"force.x": number, "acceleration.z": 1.0})
+    return DataMessage(number, 0, number * PERIOD_NS, 0, flags, 3, data)
+
+
+def values(number: int) -> list[float]:
+    return SampleDecoder(61).decode(frame(number).process_data).array
+
+
+def measured(count: int = 801) -> Measurement:
+    measurement = Measurement()
+    for number in range(count):
+        measurement.take_frame(frame(number), number * PERIOD_NS + 200_000)
+        measurement.take_message(values(number), number * PERIOD_NS + 400_000)
+    return measurement
+
+
+def test_a_good_run() -> None:
+    summary = measured().summary()
+    assert (summary.messages, summary.lost, summary.repeated) == (801, 0, 0)
+    assert summary.rate_hz == 800.0
+    assert summary.age_p50_ms == summary.age_p99_ms == 0.4
+    assert summary.tcp_age_p50_ms == 0.2
+    assert verdict(summary, 800) is None
+
+
+def test_a_message_may_overtake_its_sample() -> None:
+    measurement = measured()
+    measurement.take_message(values(801), 801 * PERIOD_NS + 100_000)
+    measurement.take_frame(frame(801), 801 * PERIOD_NS + 300_000)
+    assert measurement.messages == 802
+    assert measurement.age_ns == 100_000
+
+
+def test_each_fault_is_found() -> None:
+    lost = measured()
+    lost.take_frame(frame(801), 801 * PERIOD_NS)
+    lost.take_frame(frame(802), 802 * PERIOD_NS)
+    lost.take_message(values(802), 802 * PERIOD_NS)
+    assert lost.summary().lost == 1
+
+    repeated = measured()
+    repeated.take_message(values(800), 801 * PERIOD_NS)
+    assert repeated.summary().repeated == 1
+    assert "twice" in str(verdict(repeated.summary(), 800))
+
+    wrong = measured()
+    wrong.take_message([1.5] * 12, 801 * PERIOD_NS)
+    wrong.take_frame(frame(1700), 801 * PERIOD_NS + 2 * SECOND_NS)
+    assert "no sample" in str(verdict(wrong.summary(), 800))
+
+    infinite = measured()
+    infinite.take_message([math.inf] * 12, 801 * PERIOD_NS)
+    assert "finite" in str(verdict(infinite.summary(), 800))
+
+    assert "800.0 messages/s" in str(verdict(measured().summary(), 1600))
+    assert "nothing" in str(verdict(Measurement().summary(), 800))
+
+    gap = measured()
+    gap.take_frame(frame(805, DataFlag.GAP), 805 * PERIOD_NS)
+    assert gap.summary().lost_before == 4
+
+
+def test_counting_begins_anew() -> None:
+    measurement = measured()
+    measurement.begin()
+    for number in range(801, 1602):
+        measurement.take_frame(frame(number), number * PERIOD_NS + 200_000)
+        measurement.take_message(values(number), number * PERIOD_NS + 400_000)
+    summary = measurement.summary()
+    assert (summary.messages, summary.lost, summary.repeated, summary.rate_hz) == (801, 0, 0, 800.0)
+
+
+def test_percentile() -> None:
+    assert percentile([], 0.5) == 0
+    assert percentile([3, 1, 2], 0.5) == 2
+    assert percentile(list(range(100)), 0.99) == 99
