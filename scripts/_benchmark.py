@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -92,6 +93,9 @@ def run(options: argparse.Namespace, console: Console) -> None:
     if priority and not may_be_real_time():
         console.print("no real-time scheduling here (CAP_SYS_NICE): everything runs with ordinary scheduling")
         priority = 0
+    if options.ros and find_spec("rclpy") is None:
+        console.print("no ROS 2 here (rclpy): only up to a TCP client")
+        options.ros = False
     seconds = options.seconds or (_QUICK_SECONDS if options.quick else _SECONDS)
 
     def setup(rate: int, sensors: int) -> Setup:

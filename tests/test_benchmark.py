@@ -21,7 +21,7 @@ np = pytest.importorskip("numpy")
 
 from scripts import _benchmark as benchmark  # noqa: E402
 from scripts import _benchmark_statistics as statistics  # noqa: E402
-from scripts._benchmark_records import Recording, began  # noqa: E402
+from scripts._benchmark_records import Recording, began, write  # noqa: E402
 from scripts._benchmark_report import rows  # noqa: E402
 from scripts._benchmark_soak import Tally, slope_kb_per_hour  # noqa: E402
 from scripts._benchmark_statistics import Arrivals, Counts, Ints  # noqa: E402
@@ -262,8 +262,6 @@ def test_it_can_be_stopped_at_any_time(tmp_path: Path) -> None:
 
 
 def test_numbers_are_written_whole(tmp_path: Path) -> None:
-    from scripts._benchmark_records import write  # noqa: PLC0415
-
     write(tmp_path / "some", array("q", [1, 2, 3, 4]))
     assert statistics.read_numbers(tmp_path / "some", 2).tolist() == [[1, 2], [3, 4]]
     assert [p.name for p in tmp_path.iterdir()] == ["some"]
