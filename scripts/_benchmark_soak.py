@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import Any, Final
 
@@ -15,10 +16,12 @@ from protocol.pdo import SampleDecoder
 from scripts import _benchmark_statistics as statistics
 from scripts._benchmark_chain import Setup, chain, start_server, virtual_bus
 from scripts._benchmark_statistics import Floats
+from scripts._demo import Stopped
 
 _LOOK_EVERY_S: Final = 1.0
 _SETTLED: Final = 0.1
 """The memory of this first part of the time does not count: it is still growing to what it needs."""
+_FEWEST_LOOKS: Final = 10
 _WRAP: Final = 2**24
 
 
@@ -68,20 +71,24 @@ def soak(setup: Setup, seconds: float, console: Console) -> dict[str, Any]:
         decode = SampleDecoder(61).decode
         began = time.monotonic()
         look_at = began + setup.warm_up_s
-        for frame in link.frames():
-            now_ns = time.monotonic_ns()
-            if frame.flags & (DataFlag.REPEATED | DataFlag.INVALID):
-                continue
-            number, instant_ns = decode_clock(decode(frame.process_data).array)
-            age_ns = (now_ns - instant_ns) % (2**20 * 10**9)
-            tally.take(frame.sensor, number, now_ns - age_ns, age_ns, setup.period_ns)
-            now_s = now_ns * 1e-9
-            if now_s >= look_at:
-                running.check()
-                memory.append((now_s - began, server.memory_info().rss))
-                look_at += _LOOK_EVERY_S
-                if now_s - began >= seconds:
-                    break
+        with contextlib.suppress(Stopped):
+            for frame in link.frames():
+                now_ns = time.monotonic_ns()
+                if frame.flags & (DataFlag.REPEATED | DataFlag.INVALID):
+                    continue
+                number, instant_ns = decode_clock(decode(frame.process_data).array)
+                age_ns = (now_ns - instant_ns) % (2**20 * 10**9)
+                tally.take(frame.sensor, number, now_ns - age_ns, age_ns, setup.period_ns)
+                now_s = now_ns * 1e-9
+                if now_s >= look_at:
+                    running.check()
+                    memory.append((now_s - began, server.memory_info().rss))
+                    look_at += _LOOK_EVERY_S
+                    if now_s - began >= seconds:
+                        break
+        if len(memory) < _FEWEST_LOOKS:
+            running.check()
+            raise Stopped
         link.close()
         cpu = server.cpu_times()
         used_s = time.monotonic() - began
