@@ -53,10 +53,10 @@ def serve(options: ServerOptions) -> None:
         bus.open()
         cleanup.callback(bus.close)
         sensors = bring_up(bus, options, signals.check)
+        realtime.prepare(options.rt_priority, options.cpu)
         streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]
         cycle = Cycle(bus, streams, hub, Recovery(bus, sensors, streams, hub.broadcast))
         signals.call(cycle.stop)
-        realtime.prepare(options.rt_priority, options.cpu)
         hub.start(Actions(hub, cycle, sensors).handle)
         for sensor in sensors:
             log.info(
