@@ -70,6 +70,8 @@ class Connection:
         """Close it without more ado."""
         self.closing = False
         """What it still sends is thrown away; close it once everything is sent."""
+        self.unread = False
+        """Whole messages may be waiting to be taken by `next_message`."""
         self.end_of_input = False
         """The peer has closed its side."""
         self._queue: deque[tuple[bytes, int]] = deque()  # frame, sensor place or -1 for JSON
@@ -79,56 +81,58 @@ class Connection:
 
     # -- receiving
 
-    def receive(self) -> list[JsonObject | BadMessageError | RemoteProtocolError]:
-        """Read what is there; returns whole messages, and errors in the places of bad ones.
-
-        After a RemoteProtocolError, or when the peer closed its side, `closing` is set.
-        """
+    def receive(self) -> None:
+        """Read what has arrived, at most one request's worth; then ask `next_message` until it gives None."""
         try:
             data = self.sock.recv(MAX_REQUEST_LENGTH)
         except BlockingIOError:
-            return []
+            return
         except OSError:
             self.dead = True
-            return []
+            return
         if not data:
             self.end_of_input = True
         if self.closing:
-            return []  # thrown away, so that closing does not reset the connection under the last reply
+            return  # thrown away, so that closing does not reset the connection under the last reply
         if self.framed is None and self.bare is None and data:
             if data.startswith(BARE_JSON_FIRST_BYTE):
                 self.bare = BareJsonDecoder(max_json_length=MAX_REQUEST_LENGTH)
             else:
                 self.framed = FrameDecoder(max_json_length=MAX_REQUEST_LENGTH, accept_data=False)
-        if not data:
-            self.closing = True
-            self.subscription = None
-            if self.bare is not None:
-                self.bare.end_of_input()
+        if not data and self.bare is not None:
+            self.bare.end_of_input()
         decoder = self.framed or self.bare
-        if decoder is None:
-            return []
-        decoder.feed(data)
-        return self._messages(decoder)
+        if decoder is not None:
+            decoder.feed(data)
+        self.unread = True
 
-    def _messages(
-        self, decoder: FrameDecoder | BareJsonDecoder
-    ) -> list[JsonObject | BadMessageError | RemoteProtocolError]:
-        found: list[JsonObject | BadMessageError | RemoteProtocolError] = []
-        while True:
+    def next_message(self) -> JsonObject | BadMessageError | RemoteProtocolError | None:
+        """The next whole message received, or the error in the place of a bad one; None if there is none.
+
+        After a RemoteProtocolError, or once the peer has closed its side and everything it sent is read,
+        `closing` is set.
+        """
+        decoder = self.framed or self.bare
+        message = None
+        if decoder is not None and not self.closing:
             try:
                 message = decoder.next_message()
             except BadMessageError as error:
-                found.append(error)
-                continue
+                return error
             except RemoteProtocolError as error:
-                self.closing = True
-                self.subscription = None
-                found.append(error)
-                return found
-            if not isinstance(message, dict):  # None: the server's decoder gives no DATA
-                return found
-            found.append(message)
+                self._finish()
+                return error
+        if isinstance(message, dict):  # the server's decoder gives no DATA
+            return message
+        self.unread = False
+        if self.end_of_input:
+            self._finish()
+        return None
+
+    def _finish(self) -> None:
+        self.closing = True
+        self.unread = False
+        self.subscription = None
 
     # -- sending
 

@@ -41,6 +41,7 @@ class Hub:
         self._handler: Handler | None = None
         self._listeners = _listen(hosts, port)
         self._readers: list[int] = []
+        self._unread: list[Connection] = []
         self._sweep_at_ns = 0
 
     def start(self, handler: Handler) -> None:
@@ -66,19 +67,16 @@ class Hub:
     def serve(self, until_ns: int) -> None:
         """Serve the sockets until CLOCK_MONOTONIC is `until_ns`; one look at each if that is past."""
         while True:
-            left = max(0, until_ns - time.monotonic_ns())
+            left = 0 if self._unread else max(0, until_ns - time.monotonic_ns())
             writers = [c.fd for c in self.connections.values() if c.needs_writing]
             readable, writable, _ = select.select(self._readers, writers, (), left * 1e-9)
-            if not readable and not writable:
+            if not readable and not writable and not self._unread:
                 break
             for fd in writable:
                 self.connections[fd].flush()
             for fd in readable:
-                connection = self.connections.get(fd)
-                if connection is None:
-                    self._accept(fd)
-                else:
-                    self._read(connection)
+                self._read(fd)
+            self._answer_one_each()
             if time.monotonic_ns() >= until_ns:
                 break
         if time.monotonic_ns() >= self._sweep_at_ns:
@@ -116,16 +114,33 @@ class Hub:
         self.connections[connection.fd] = connection
         self._update_readers()
 
-    def _read(self, connection: Connection) -> None:
-        for message in connection.receive():
+    def _read(self, fd: int) -> None:
+        connection = self.connections.get(fd)
+        if connection is None:
+            self._accept(fd)
+            return
+        connection.receive()
+        if connection.unread:
+            # What it sends further stays in the kernel until this is answered: a flood waits its turn.
+            self._unread.append(connection)
+        self._update_readers()
+
+    def _answer_one_each(self) -> None:
+        """Answer one message of each connection that has some: none makes the others wait for all of its."""
+        waiting, self._unread = self._unread, []
+        for connection in waiting:
+            message = connection.next_message()
             if isinstance(message, RemoteProtocolError | BadMessageError):
                 connection.send_json(error_reply(None, ErrorCode.BAD_REQUEST, str(message)))
-            else:
+            elif message is not None:
                 connection.send_json(self._answer(connection, message))
-        if connection.closing or connection.dead:
-            self._sweep_at_ns = 0
-            self.subscriptions_changed()
+            if connection.unread and not connection.dead:
+                self._unread.append(connection)
+                continue
             self._update_readers()
+            if connection.closing or connection.dead:
+                self._sweep_at_ns = 0
+                self.subscriptions_changed()
 
     def _answer(self, connection: Connection, message: JsonObject) -> JsonObject:
         assert self._handler is not None
@@ -139,10 +154,12 @@ class Hub:
         self._sweep_at_ns = time.monotonic_ns() + _SWEEP_NS
         gone = []
         for connection in self.connections.values():
-            if connection.closing and not connection.dead and connection.all_sent:
+            if connection.closing and not connection.dead:
                 since = self._closing_since.setdefault(connection.fd, time.monotonic())
-                connection.end_sending()
-                connection.dead = time.monotonic() - since > _LAST_WORDS_S or connection.end_of_input
+                connection.dead = time.monotonic() - since > _LAST_WORDS_S
+                if connection.all_sent:
+                    connection.end_sending()
+                    connection.dead = connection.dead or connection.end_of_input
             if connection.dead:
                 gone.append(connection)
         for connection in gone:
@@ -155,7 +172,9 @@ class Hub:
 
     def _update_readers(self) -> None:
         self._readers = [listener.fileno() for listener in self._listeners]
-        self._readers += [fd for fd, connection in self.connections.items() if not connection.end_of_input]
+        self._readers += [
+            fd for fd, c in self.connections.items() if not (c.end_of_input or c.unread or c.dead)
+        ]
 
 
 def _listen(hosts: Sequence[str], port: int) -> list[socket.socket]:

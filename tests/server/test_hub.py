@@ -315,3 +315,21 @@ def test_close_delivers_what_waits_and_is_bounded(served: Served) -> None:
         served.hub.close()
         assert time.monotonic() - started < 10
         assert not served.hub.connections
+
+
+def test_a_flood_of_requests_does_not_hold_up_the_acquisition(served: Served) -> None:
+    with served.connect() as sock, served.connect() as other:
+        sock.sendall(encode_json({"action": "describe"}) * 400)
+        other.sendall(encode_json({"action": "describe", "id": 1}))
+        # No time left: each connection still has one message answered, and no more.
+        served.hub.serve(time.monotonic_ns() - 1)
+        answered = [len(list(served.hub.connections.values())[n]._queue) for n in range(2)]
+        assert answered == [0, 0], "replies go out at once"
+        sock.setblocking(False)
+        decoder = FrameDecoder()
+        decoder.feed(sock.recv(65536))
+        assert len(list(decoder)) == 1
+        other.settimeout(5)
+        decoder = FrameDecoder()
+        decoder.feed(other.recv(65536))
+        assert list(decoder) == [{"reply": "describe", "id": 1, "ok": True}]
