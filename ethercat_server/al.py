@@ -79,6 +79,11 @@ class AlStatus(NamedTuple):
         except ValueError:
             return AlState.NONE
 
+    @property
+    def is_op(self) -> bool:
+        """Whether the sensor is in OP, without an error."""
+        return self.raw_state == AlState.OP and not self.error
+
     def acknowledge(self) -> bytes:
         """What to write to AL control to acknowledge the error and stay in this state."""
         return struct.pack("<H", self.raw_state | _ACKNOWLEDGE)

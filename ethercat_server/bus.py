@@ -8,11 +8,14 @@ and its error ring, which can hand one call's error to the next.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import select
 import socket
 import stat
+import threading
 import time
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import pysoem
@@ -20,10 +23,19 @@ import pysoem
 from ethercat_server.errors import BusError, SdoAbortError
 
 _SDO_ATTEMPTS: Final = 3
-_OP_TIMEOUT_S: Final = 5.0
+_OP_TIMEOUT_S: Final = 10.0
 _DATAGRAM_TIMEOUT_US: Final = 2000
+_FRAME_INDICES: Final = 16
+"""SOEM numbers its frames modulo this."""
+_INDEX_OFFSET: Final = 17
+"""Where a frame has its number: behind the Ethernet header (14), the EtherCAT header (2) and the command."""
+_COLLECT_US: Final = 100
+_SCAN_TIMEOUT_S: Final = 15.0
+_STATE_ATTEMPTS: Final = {"PREOP": 80, "SAFEOP": 200}
+"""Of 50 ms each."""
 _PYSOEM_ERRORS: Final = (
     pysoem.SdoError,
+    pysoem.Emergency,
     pysoem.MailboxError,
     pysoem.PacketError,
     pysoem.WkcError,
@@ -31,6 +43,7 @@ _PYSOEM_ERRORS: Final = (
     pysoem.EepromError,
     pysoem.NetworkInterfaceNotOpenError,
 )
+log = logging.getLogger(__name__)
 _STATE_NAMES: Final = {0: "NONE", 1: "INIT", 2: "PREOP", 3: "BOOT", 4: "SAFEOP", 8: "OP"}
 
 
@@ -48,12 +61,19 @@ class Bus:
 
     def __init__(self, ifname: str) -> None:
         self.ifname = ifname
+        self.ifindex = 0
         self.expected_wkc = 0
         self._master: Any = pysoem.Master()
         self._slaves: list[Any] = []
         self._opened = False
+        self._abandoned = False
+        """A thread that never ended still uses the socket: it must not be closed."""
         self._fd = -1
-        self._late_frame = False
+        self._careful = True
+        """The last answer did not come in time, so an older frame may be on its way."""
+        self._index = 0
+        """SOEM's number of the last frame sent; it counts every datagram it sends."""
+        self._index_known = False
 
     def open(self) -> None:
         """Open the raw socket. BusError if that fails; `interface.check_interface` says why beforehand."""
@@ -68,18 +88,46 @@ class Bus:
                 "check 'ip link' and the permissions"
             ) from None
         self._opened = True
+        self.ifindex = socket.if_nametoindex(self.ifname)
         self._fd = (_packet_sockets() - before).pop()
+        self._socket = socket.socket(fileno=os.dup(self._fd))
 
-    def scan(self) -> list[SlaveIdentity]:
-        """Find the slaves and take them to PREOP; BusError if none answers."""
+    def scan(self, check_interrupt: Callable[[], None]) -> list[SlaveIdentity]:
+        """Find the slaves and take them to PREOP; BusError if none answers.
+
+        `check_interrupt` is called while waiting and may raise to give up.
+        """
         self._set_blocking(True)
-        if self._master.config_init() <= 0:
+        if self._config_init(check_interrupt) <= 0:
             raise BusError(
                 f"no EtherCAT slave answers on {self.ifname}: check the cable, that the sensor has power and "
                 "that this is the interface it is connected to"
             )
         self._slaves = list(self._master.slaves)
+        for slave in self._slaves:
+            slave.add_emergency_callback(_log_emergency)
         return [SlaveIdentity(s.man, s.id, s.rev, s.name) for s in self._slaves]
+
+    def _config_init(self, check_interrupt: Callable[[], None]) -> int:
+        # SOEM tries every byte of the SII for long if a slave goes away meanwhile, two minutes in all, and no
+        # signal is noticed before it returns. So it runs in a thread, which can be left behind.
+        counts: list[int] = []
+        thread = threading.Thread(
+            target=lambda: counts.append(self._master.config_init(release_gil=True)), daemon=True
+        )
+        thread.start()
+        deadline = time.monotonic() + _SCAN_TIMEOUT_S
+        self._abandoned = True
+        while thread.is_alive():
+            thread.join(0.05)
+            check_interrupt()
+            if time.monotonic() > deadline:
+                raise BusError(
+                    f"the scan of {self.ifname} does not end: a slave stopped answering in its middle; "
+                    "check cable and power, then start again"
+                )
+        self._abandoned = False
+        return counts[0] if counts else 0
 
     def check_preop(self) -> None:
         """Wait until every slave is in PREOP or above; BusError names one that is not."""
@@ -111,6 +159,11 @@ class Bus:
             slave.output = bytes(len(slave.output))
         return [len(slave.input) for slave in self._slaves]
 
+    def check_answers(self, slave: int) -> None:
+        """BusError if `slave` does not answer any more."""
+        if all(self.read_register(slave, 0, 1) is None for _ in range(_SDO_ATTEMPTS)):
+            raise BusError(f"sensor {slave} stopped answering while it was set up: check cable and power")
+
     def go_operational(self) -> None:
         """Take every slave to OP, exchanging process data all the while; BusError names one that refuses."""
         self._wait_state(pysoem.SAFEOP_STATE, "SAFEOP")
@@ -131,20 +184,37 @@ class Bus:
 
         -1 if the frame did not come back. Only after `go_operational`.
         """
-        if self._late_frame:
-            self._drop_late_frames()
         self._master.send_processdata()
+        self._index = (self._index + 1) % _FRAME_INDICES
         # SOEM's own wait ignores timeouts shorter than a jiffy, so wait here and let it only collect.
         select.select((self._fd,), (), (), timeout_s)
-        wkc: int = self._master.receive_processdata(100)
-        self._late_frame = wkc < 0
+        if self._careful:
+            self._drop_older_frames(timeout_s)
+        wkc: int = self._master.receive_processdata(_COLLECT_US)
+        self._careful = wkc < 0
         return wkc
 
-    def _drop_late_frames(self) -> None:
-        """A frame that came too late for its own exchange would end the next one's wait at once."""
+    def _drop_older_frames(self, timeout_s: float) -> None:
+        """Drop what is not this exchange's, and wait for that, at most `timeout_s` from now.
+
+        A frame that came too late for its own exchange would be taken for this one's, whose own would then
+        come too late for the next: every exchange would meet its predecessor's. Frames are told apart by
+        their index.
+        """
+        deadline = time.monotonic() + timeout_s
         with contextlib.suppress(OSError):  # nothing there any more, or the link is down
-            while os.read(self._fd, 2048):
-                pass
+            while True:
+                head = self._socket.recv(_INDEX_OFFSET + 1, socket.MSG_PEEK)
+                if len(head) > _INDEX_OFFSET:
+                    if not self._index_known:
+                        self._index, self._index_known = head[_INDEX_OFFSET], True
+                    if head[_INDEX_OFFSET] == self._index:
+                        return
+                self._socket.recv(1)
+                left = deadline - time.monotonic()
+                if left <= 0 or not select.select((self._fd,), (), (), left)[0]:
+                    self._index_known = False  # perhaps it was this side that was wrong
+                    return
 
     def working_counter(self, slave: int) -> int:
         """What `slave` adds to the working counter of an exchange: 2 for its outputs, 1 for its inputs."""
@@ -157,19 +227,21 @@ class Bus:
 
     def read_register(self, slave: int, address: int, size: int) -> bytes | None:
         """Read ESC registers or a mailbox of `slave` with one datagram; None if it did not do it."""
+        self._index = (self._index + 1) % _FRAME_INDICES
         try:
             data: bytes = self._slaves[slave]._fprd(address, size, _DATAGRAM_TIMEOUT_US)
         except pysoem.WkcError:
-            self._late_frame = True  # it may still come
+            self._careful = True  # it may still come
             return None
         return data
 
     def write_register(self, slave: int, address: int, data: bytes) -> bool:
         """Write ESC registers or a mailbox of `slave` with one datagram; False if it did not do it."""
+        self._index = (self._index + 1) % _FRAME_INDICES
         try:
             self._slaves[slave]._fpwr(address, data, _DATAGRAM_TIMEOUT_US)
         except pysoem.WkcError:
-            self._late_frame = True
+            self._careful = True
             return False
         return True
 
@@ -179,17 +251,19 @@ class Bus:
         True if the slave at that place now has it. SOEM checks vendor, product and revision; who the
         sensor is remains to be asked.
         """
+        self._careful, self._index_known = True, False
         return bool(self._slaves[slave].recover(_DATAGRAM_TIMEOUT_US) > 0)
 
     def close(self) -> None:
         """Take the slaves to INIT and close the socket. May be called at any time, any number of times."""
-        if not self._opened:
+        if not self._opened or self._abandoned:
             return
         self._opened = False
         with contextlib.suppress(*_PYSOEM_ERRORS):
             self._set_blocking(True)
             self._master.state = pysoem.INIT_STATE
             self._master.write_state()
+        self._socket.close()
         self._master.close()
 
     def _sdo(self, slave: int, index: int, subindex: int, what: str, data: bytes | None) -> Any:
@@ -214,7 +288,7 @@ class Bus:
         raise BusError(f"sensor {slave} did not answer {what}: {last}; check cable and power")
 
     def _wait_state(self, state: int, name: str) -> None:
-        for _ in range(40):
+        for _ in range(_STATE_ATTEMPTS[name]):
             if self._master.state_check(state, 50_000) == state:
                 return
             # state_check wants the state itself; a slave that is above it is fine as well.
@@ -243,6 +317,12 @@ class Bus:
         os.set_blocking(self._fd, blocking)
 
 
+def _log_emergency(emergency: Any) -> None:
+    log.warning(
+        "sensor %d reports an emergency: error code 0x%04X", emergency.slave_pos - 1, emergency.error_code
+    )
+
+
 def _packet_sockets() -> set[int]:
     """Descriptors of this process that are AF_PACKET sockets."""
     found = set()
@@ -260,6 +340,6 @@ def _packet_sockets() -> set[int]:
 
 
 def _texts(errors: list[Any]) -> str:
-    return "; ".join(
-        getattr(error, "desc", None) or str(error) or type(error).__name__ for error in errors
-    )  # fmt: skip
+    texts = [str(getattr(error, "desc", None) or error).strip() for error in errors]
+    meant = [text for text in texts if text and text != "No error"]
+    return "; ".join(dict.fromkeys(meant)) or "no answer"

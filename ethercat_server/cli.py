@@ -28,7 +28,7 @@ log = logging.getLogger("ethercat-server")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the server; returns its exit code."""
-    logging.basicConfig(format="%(name)s: %(message)s", level=logging.INFO, stream=sys.stderr)
+    logging.basicConfig(format="ethercat-server: %(message)s", level=logging.INFO, stream=sys.stderr)
     try:
         serve(parse_options(argv))
     except StopRequestedError:
@@ -65,8 +65,10 @@ def serve(options: ServerOptions) -> None:
                 sensor.pdo_size, sensor.rate_hz,
             )  # fmt: skip
         log.info("streaming %s on port %d", ifname, options.port)
-        cycle.run()
-        hub.broadcast(event(Event.SHUTTING_DOWN))
+        try:
+            cycle.run()
+        finally:
+            hub.broadcast(event(Event.SHUTTING_DOWN))
         log.info("stopping: the bus goes to INIT")
 
 

@@ -125,7 +125,8 @@ class Connection:
         if isinstance(message, dict):  # the server's decoder gives no DATA
             return message
         self.unread = False
-        if self.end_of_input:
+        # One that has subscribed may have nothing more to say and still listen; if not, sending will tell.
+        if self.end_of_input and self.subscription is None:
             self._finish()
         return None
 

@@ -62,16 +62,16 @@ class Cycle:
             if deadline > now or now > serve_by:
                 hub.serve(deadline - _SERVE_MARGIN_NS)
                 serve_by = now + _SERVE_EVERY_NS
-                if (left := deadline - monotonic_ns()) > 0:
-                    sleep(left * 1e-9)
-                sent = monotonic_ns()
+            slept = deadline > now
+            if slept and (left := deadline - monotonic_ns()) > 0:
+                sleep(left * 1e-9)
+            sent = monotonic_ns()
+            if slept:
                 late = sent - deadline
                 lead_ns += _LATENESS_GAIN * (min(late, _MAX_LEAD_NS) - lead_ns)
                 self._wake.record(late)
                 if late > shortest_ns:
                     self._missed_deadlines += int(late // shortest_ns)
-            else:
-                sent = now
             wkc = bus.exchange(timeout_s)
             back = monotonic_ns()
             complete = wkc >= recovery.alive_wkc
@@ -94,6 +94,7 @@ class Cycle:
         self._exchange.roll()
         for stream in self._streams:
             stream.age.roll()
+            stream.check_rate()
 
     def status(self) -> dict[str, Any]:
         """The cycle's part of the `status` reply."""

@@ -7,6 +7,7 @@ the bus.
 from __future__ import annotations
 
 import errno
+import logging
 import select
 import socket
 import time
@@ -24,6 +25,10 @@ _LAST_WORDS_S: Final = 1.0
 """How long a closing connection may take to accept its last reply."""
 
 _SWEEP_NS: Final = 50_000_000
+_ACCEPTS_AT_ONCE: Final = 8
+_BACKLOG: Final = 128
+
+log = logging.getLogger(__name__)
 
 Handler = Callable[[Connection, JsonObject], JsonObject]
 """Turns a request into its reply; RequestError refuses it."""
@@ -103,15 +108,16 @@ class Hub:
         listener = next((item for item in self._listeners if item.fileno() == fd), None)
         if listener is None:
             return
-        try:
-            sock, _ = listener.accept()
-        except OSError:
-            return
-        if len(self.connections) >= MAX_CLIENTS:
-            sock.close()
-            return
-        connection = Connection(sock)
-        self.connections[connection.fd] = connection
+        for _ in range(_ACCEPTS_AT_ONCE):
+            try:
+                sock, _ = listener.accept()
+            except OSError:
+                break
+            if len(self.connections) >= MAX_CLIENTS:
+                sock.close()
+                continue
+            connection = Connection(sock)
+            self.connections[connection.fd] = connection
         self._update_readers()
 
     def _read(self, fd: int) -> None:
@@ -148,6 +154,9 @@ class Hub:
             return self._handler(connection, message)
         except RequestError as error:
             return error_reply(message, error.code, str(error), **error.extra)
+        except Exception:  # no request, however odd, may end the acquisition
+            log.exception("a request failed: %.200r", message)
+            return error_reply(None, ErrorCode.INTERNAL, "the request failed in the server: see its log")
 
     def _sweep(self) -> None:
         """Close what is dead or has said its last words."""
@@ -188,7 +197,7 @@ def _listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((host, port))
-            listener.listen(16)
+            listener.listen(_BACKLOG)
         except OSError as error:
             listener.close()
             if error.errno == errno.EADDRNOTAVAIL and listeners:

@@ -15,6 +15,7 @@ MAX_NAME_LENGTH: Final = 15
 """Linux's limit; a longer name would overflow SOEM's buffer."""
 
 _SIOCGIFFLAGS: Final = 0x8913
+_ETHERCAT: Final = 0x88A4
 _IFF_UP: Final = 0x1
 _IFF_LOOPBACK: Final = 0x8
 _IFF_RUNNING: Final = 0x40
@@ -38,6 +39,7 @@ def check_interface(ifname: str) -> None:
             f"not allowed to open {ifname}: {' and '.join(missing)} missing; run with sudo, or "
             "give the service CAP_NET_RAW and CAP_NET_ADMIN"
         )
+    _check_free(ifname)
     if not flags & _IFF_UP:
         raise InterfaceError(f"{ifname} is down: bring it up with 'sudo ip link set {ifname} up'")
     # A link that was just brought up takes a moment, with a real network card up to some seconds.
@@ -49,6 +51,21 @@ def check_interface(ifname: str) -> None:
         raise InterfaceError(
             f"{ifname} has no carrier: check the cable, the PoE injector and its power supply"
         )
+
+
+def check_present(ifname: str, ifindex: int) -> None:
+    """Raise InterfaceError unless `ifname` is still the interface that was opened."""
+    if (ifindex, ifname) not in socket.if_nameindex():
+        raise InterfaceError(f"the interface {ifname} has disappeared: connect it and start the server again")
+
+
+def _check_free(ifname: str) -> None:
+    """Raise InterfaceError if another EtherCAT master has the interface open: two would wreck one another."""
+    index = socket.if_nametoindex(ifname)
+    for line in Path("/proc/self/net/packet").read_text(encoding="ascii").splitlines()[1:]:
+        _, _, _, protocol, its_index, *_ = line.split()
+        if int(protocol, 16) == _ETHERCAT and int(its_index) == index:
+            raise InterfaceError(f"{ifname} is in use by another EtherCAT master: stop that one first")
 
 
 def _flags(ifname: str) -> int:

@@ -66,7 +66,7 @@ class Ladder:
             if status is None:
                 if not self._bus.reclaim(self._place):
                     yield from pause(_ABSENT_PAUSE_S)
-            elif status.state is AlState.OP and not status.error:
+            elif status.is_op:
                 return left_op
             elif status.state is AlState.SAFEOP:
                 left_op = True

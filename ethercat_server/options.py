@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -111,6 +112,10 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
         common_settings={**common, **assigned},
         sensor_settings={place: {**settings, **assigned} for place, settings in by_sensor.items()},
     )
+    try:
+        shlex.split(options.virtual_arguments)
+    except ValueError as error:
+        raise UsageError(f"--virtual {options.virtual_arguments}: {str(error).lower()}") from None
     if options.virtual_arguments and not options.is_virtual:
         raise UsageError(f"--virtual goes with the interface 'virtual', not with {options.ifname}")
     try:

@@ -13,6 +13,7 @@ from typing import Final
 from ethercat_server.al import AlState
 from ethercat_server.bus import Bus
 from ethercat_server.errors import BusError
+from ethercat_server.interface import check_present
 from ethercat_server.ladder import DifferentSensorError, GoneError, Ladder
 from ethercat_server.sdo import Steps
 from ethercat_server.sensor import Identity, Sensor
@@ -61,10 +62,17 @@ class Recovery:
         return len(self._climbing) == len(self._sensors)
 
     def attend(self, wkc: int, now_ns: int) -> None:
-        """To be called after every exchange; almost always it has nothing to do."""
+        """To be called after every exchange; almost always it has nothing to do.
+
+        InterfaceError if the network interface is gone for good.
+        """
         if wkc < 0:
             # Without frames coming back there is nothing that could be done.
-            if now_ns - self._frame_ns > _SILENCE_NS and not self.all_lost:
+            if self.all_lost:
+                if now_ns >= self._watch_ns:
+                    self._watch_ns = now_ns + _WATCH_EVERY_NS
+                    check_present(self._bus.ifname, self._bus.ifindex)
+            elif now_ns - self._frame_ns > _SILENCE_NS:
                 for place in range(len(self._sensors)):
                     self._lose(place, "no frame comes back: check cable and power")
             return
@@ -72,23 +80,26 @@ class Recovery:
         self._short = self._short + 1 if wkc < self.alive_wkc else 0
         if self._short >= _SHORT_EXCHANGES:
             self._short = 0
-            self._look_for_lost(range(len(self._sensors)))
+            self._look_for_lost()
         if self._climbing:
             for place in list(self._climbing):
                 self._step(place)
         elif now_ns >= self._watch_ns:
             self._watch_ns = now_ns + _WATCH_EVERY_NS // len(self._sensors)
             self._watched = (self._watched + 1) % len(self._sensors)
-            self._look_for_lost((self._watched,))
+            status = self._ladders[self._watched].al_status()
+            # No answer is none: as long as the working counter is right, one datagram got lost.
+            if status is not None and not status.is_op:
+                self._lose(self._watched, f"it is in {status}")
 
-    def _look_for_lost(self, places: Sequence[int]) -> None:
-        for place in places:
+    def _look_for_lost(self) -> None:
+        for place in range(len(self._sensors)):
             if place in self._climbing:
                 continue
             status = self._ladders[place].al_status() or self._ladders[place].al_status()
             if status is None:
                 self._lose(place, "it does not answer")
-            elif status.state is not AlState.OP or status.error:
+            elif not status.is_op:
                 self._lose(place, f"it is in {status}")
 
     def _lose(self, place: int, reason: str) -> None:

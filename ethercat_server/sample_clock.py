@@ -22,7 +22,8 @@ _NARROW: Final = 0.4
 """A bracket narrower than this part of a period holds one instant for sure."""
 _UNDISTURBED: Final = 1.25
 """A bracket wider than this many periods comes from a stall."""
-_NEAR: Final = 0.08
+_NEAR_TO_LOCK: Final = 0.03
+_NEAR_TO_HOLD: Final = 0.08
 """A sample is as expected when it moves the estimate by less than this part of a period."""
 _SLACK_NS: Final = 500.0
 """How far a period may differ from the estimate: the expected bracket grows by this at each end."""
@@ -33,14 +34,21 @@ _AIM_NS: Final = 25_000.0
 _EARLY_NS: Final = 50_000.0
 """A poll this much before its aim was another sensor's, and is not counted as this one's first."""
 _FLIGHT_GAIN: Final = 1 / 64
+_CREEP_NS: Final = 150.0
+_MAX_CREEP: Final = 0.2
 _MIN_WIDTH_NS: Final = 10_000.0
 _PHASE_GAIN: Final = 0.5
 _PERIOD_GAIN: Final = 0.03
 _PERIOD_GAIN_LEAST: Final = 0.001
 _PERIOD_LEARNING: Final = 200
 """Samples after which the gain has come down by half."""
-_MAX_PULL: Final = 0.002
-"""The period may differ from the nominal one by this part: four times what an oscillator is off."""
+_MAX_PULL: Final = 0.12
+"""The period may differ from the nominal one by this part. Oscillators are off by 0.0005 at most, but a
+simulated sensor that sleeps between its samples is slower by much more."""
+PLAUSIBLE_PULL: Final = 0.002
+"""A real sensor's period differs from the nominal one by less than this part."""
+_MAX_ERROR: Final = 0.1
+"""The period learns nothing from what a phase is off by more than this part of it."""
 _LOCK_GAIN: Final = 1 / 32
 _LOCK_AT: Final = 0.85
 _UNLOCK_AT: Final = 0.6
@@ -53,8 +61,8 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_flight_ns", "_high", "_learned", "_low", "_nominal_ns", "_polled_ns", "_quality",
-        "instant_ns", "locked", "period_ns", "steps", "uncertain",
+        "_flight_ns", "_high", "_hits", "_learned", "_low", "_nominal_ns", "_polled_ns", "_quality",
+        "_tried_ns", "instant_ns", "locked", "period_ns", "steps", "uncertain",
     )  # fmt: skip
 
     def __init__(self, period_ns: float, start_ns: int = 0) -> None:
@@ -72,8 +80,12 @@ class SampleClock:
         late in a slow exchange. The samples after it tell, and their `steps` put it right."""
         self._quality = 0.0
         self._learned = 0
+        self._hits = 0
+        """Samples in a row that the first poll saw."""
         self._polled_ns = start_ns
-        """When the last exchange was sent."""
+        """When the last valid exchange was sent."""
+        self._tried_ns = start_ns
+        """When the last exchange was sent, valid or not."""
         self._flight_ns = 0.0
         """How long an exchange usually takes."""
         self._low = self._high = 0.0
@@ -83,6 +95,11 @@ class SampleClock:
     def uncertainty_ns(self) -> float:
         """Half the width of the bracket that the newest sample's instant was estimated from."""
         return (self._high - self._low) / 2 - _SLACK_NS
+
+    @property
+    def pull(self) -> float:
+        """By what part the period differs from the nominal one."""
+        return self.period_ns / self._nominal_ns - 1
 
     def describe(self) -> dict[str, Any]:
         """What `status` says of it."""
@@ -95,20 +112,24 @@ class SampleClock:
 
     def next_poll_ns(self) -> float:
         """When the next exchange should be sent, as far as this sensor is concerned."""
+        tried_ns = self._tried_ns
         if not self.locked:
-            return self._polled_ns + self.period_ns / _POLLS_UNLOCKED
+            return tried_ns + self.period_ns / _POLLS_UNLOCKED
         # So that the sensor, half-way through the exchange, looks at its data just after the instant.
-        first = (self._low + self._high - self._flight_ns) / 2 + _AIM_NS
-        if self._polled_ns < first - _EARLY_NS:
+        # Polls that only ever see the change do not say how late they are: with each in a row the next is
+        # aimed earlier by more, until one is early and bounds the instant from below again.
+        creep_ns = min(_CREEP_NS * self._hits * self._hits, _MAX_CREEP * self.period_ns)
+        first = (self._low + self._high - self._flight_ns) / 2 + _AIM_NS - creep_ns
+        if tried_ns < first - _EARLY_NS:
             return first
-        if self._polled_ns < self._high:
-            return self._polled_ns  # it was early: again, at once
-        overdue = self._polled_ns > self._high + self.period_ns
-        return self._polled_ns + self.period_ns / (_POLLS_UNLOCKED if overdue else _SEARCH_STEPS)
+        if tried_ns < self._high:
+            return tried_ns  # it was early: again, at once
+        overdue = tried_ns > self._high + self.period_ns
+        return tried_ns + self.period_ns / (_POLLS_UNLOCKED if overdue else _SEARCH_STEPS)
 
     def observe(self, sent_ns: int, received_ns: int, fresh: bool) -> None:
         """Learn from one valid exchange whether it brought a new sample (`fresh`)."""
-        after, self._polled_ns = self._polled_ns, sent_ns
+        after, self._polled_ns, self._tried_ns = self._polled_ns, sent_ns, sent_ns
         self._flight_ns += _FLIGHT_GAIN * (min(received_ns - sent_ns, self.period_ns) - self._flight_ns)
         if not fresh:
             if self.locked and sent_ns > self._high + _SILENT * self.period_ns:
@@ -124,6 +145,7 @@ class SampleClock:
             return
         self.uncertain = received_ns - after >= self.period_ns and received_ns - self._low >= self.period_ns
         narrow = received_ns - after < _NARROW * self.period_ns
+        self._hits = 0 if narrow else self._hits + 1
         self.steps = self._count_steps(after, sent_ns, received_ns, narrow)
         moved = (self.steps - 1) * self.period_ns
         low, high = self._low + moved, self._high + moved
@@ -139,8 +161,13 @@ class SampleClock:
         undisturbed = received_ns - after < _UNDISTURBED * self.period_ns
         if undisturbed:
             self._learn_period(error)
-        self._judge(undisturbed and abs(error) < _NEAR * self.period_ns)
+        near = _NEAR_TO_HOLD if self.locked else _NEAR_TO_LOCK
+        self._judge(undisturbed and abs(error) < near * self.period_ns)
         self._expect_next(received_ns)
+
+    def missed(self, sent_ns: int) -> None:
+        """An exchange brought nothing valid: it counts for when to poll next, and for nothing else."""
+        self._tried_ns = sent_ns
 
     def restart(self) -> None:
         """The sensor's clock starts again (its power was cut, say): keep only what is known of its rate."""
@@ -156,11 +183,11 @@ class SampleClock:
         return max(1, 1 + int(((sent + received) / 2 - expected) // self.period_ns))
 
     def _learn_period(self, error_ns: float) -> None:
-        pull = _MAX_PULL * self._nominal_ns
+        pull, most = _MAX_PULL * self._nominal_ns, _MAX_ERROR * self._nominal_ns
         # Quickly while little is known, then ever more steadily.
         self._learned += 1
         gain = max(_PERIOD_GAIN_LEAST, _PERIOD_GAIN / (1 + self._learned / _PERIOD_LEARNING))
-        period = self.period_ns + gain * max(-pull * 8, min(pull * 8, error_ns))
+        period = self.period_ns + gain * max(-most, min(most, error_ns))
         self.period_ns = max(self._nominal_ns - pull, min(self._nominal_ns + pull, period))
 
     def _judge(self, as_expected: bool) -> None:

@@ -23,7 +23,7 @@ def bring_up(bus: Bus, options: ServerOptions, check_interrupt: Callable[[], Non
     `check_interrupt` is called between the steps and may raise to give up. BusError says which sensor did
     not do what.
     """
-    slaves = bus.scan()
+    slaves = bus.scan(check_interrupt)
     for place, slave in enumerate(slaves):
         _check_vendor(bus.ifname, place, slave)
     bus.check_preop()
@@ -37,6 +37,7 @@ def bring_up(bus: Bus, options: ServerOptions, check_interrupt: Callable[[], Non
         try:
             sensor.pdo_size = layout_for(size).size
         except PdoSizeError as error:
+            bus.check_answers(sensor.place)
             raise BusError(f"sensor {sensor.place} ({sensor.identity.name}) maps {error}") from None
     check_interrupt()
     bus.go_operational()
@@ -73,6 +74,6 @@ def _check_places(sensors: list[Sensor], options: ServerOptions) -> None:
     absent = [place for place in options.sensor_settings if place >= len(sensors)]
     if absent:
         raise UsageError(
-            f"the configuration has settings for sensor {absent[0]}, but the bus has {len(sensors)}: "
-            "correct the table's number"
+            f"the configuration has settings for sensor {absent[0]}, but the bus has only {len(sensors)}, "
+            "counted from 0: correct the table's number"
         )

@@ -7,17 +7,20 @@ find the same data again only because the bus is read more often than the sensor
 
 from __future__ import annotations
 
+import logging
 import time
 from typing import Any, Final
 
 from ethercat_server.distribution import RecentDistribution
-from ethercat_server.sample_clock import SampleClock
+from ethercat_server.sample_clock import PLAUSIBLE_PULL, SampleClock
 from protocol.framing import DataFlag, encode_data
 
 DISCARDED_AT_START: Final = 3
 """Bota's own driver throws the first three frames after entering OP away."""
 _IDLE_PERIODS: Final = 3.0
 """A sensor that has given nothing new for this many periods is silent, not just late."""
+
+log = logging.getLogger(__name__)
 
 REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))
 
@@ -42,6 +45,7 @@ class SensorStream:
         """From the estimated instant of a sample to its hand-out, while locked."""
         self._discard = DISCARDED_AT_START
         self._gap = False
+        self._odd_rate_said = False
         self._idle_at_ns = 0.0
 
     def take(
@@ -56,16 +60,20 @@ class SensorStream:
         fresh = valid and data != self.process_data
         if valid:
             clock.observe(sent_ns, back_ns, fresh)
+        else:
+            clock.missed(sent_ns)
         if fresh:
             self.process_data = data
             if self._discard:
                 self._discard -= 1
+                self._idle_at_ns = back_ns + _IDLE_PERIODS * clock.period_ns
                 return None
             flags = self._new_sample(back_ns)
             if clock.locked:
                 moment_ns = int(clock.instant_ns)
                 self.age.record(back_ns - moment_ns)
-        elif back_ns >= self._idle_at_ns and self.sequence:
+        elif back_ns >= self._idle_at_ns and self.process_data:
+            self._discard = 0  # a sensor that is stuck from the start is to be seen too
             flags = self._nothing_new(valid, back_ns)
         else:
             return None
@@ -94,6 +102,16 @@ class SensorStream:
             return REPEATED
         self.invalid += 1
         return INVALID
+
+    def check_rate(self) -> None:
+        """Say once if the sensor does not sample at the rate that it is set to."""
+        pull = self.clock.pull
+        if self.clock.locked and abs(pull) > PLAUSIBLE_PULL and not self._odd_rate_said:
+            self._odd_rate_said = True
+            log.warning(
+                "sensor %d samples every %.1f µs, %+.1f %% off what it is set to: check its settings",
+                self.place, self.clock.period_ns / 1000, 100 * pull,
+            )  # fmt: skip
 
     def recover(self, period_ns: float | None) -> None:
         """The sensor is back after it was lost; `period_ns` if it entered OP anew, None if it never left."""

@@ -26,6 +26,7 @@ from ethercat_server.errors import ServerError
 _CLONE_NEWNET: Final = 0x40000000
 _START_TIMEOUT_S: Final = 20.0
 _GONE_TIMEOUT_S: Final = 3.0
+_USAGE_EXIT_CODE: Final = 2
 _FAR_END: Final = "sensor"
 
 
@@ -59,7 +60,8 @@ class VirtualBus:
             raise ServerError(
                 "the virtual sensor did not start"
                 + (f" (exit code {code})" if code is not None else "")
-                + ": see its message above; it needs CAP_NET_ADMIN and CAP_NET_RAW, as sudo gives"
+                + ": see its message above"
+                + ("" if code == _USAGE_EXIT_CODE else "; it needs root, or CAP_NET_ADMIN and CAP_NET_RAW")
             )
         return self
 

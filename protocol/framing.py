@@ -13,6 +13,7 @@ The rules it keeps:
 from __future__ import annotations
 
 import json
+import math
 import re
 import struct
 from collections.abc import Iterator
@@ -109,11 +110,13 @@ def parse_json_object(text: bytes) -> JsonObject:
     except UnicodeDecodeError as error:
         raise BadMessageError(f"the message is not UTF-8: {error.reason} at byte {error.start}") from None
     try:
-        value = json.loads(decoded, parse_constant=_no_constant)
+        value = json.loads(decoded, parse_constant=_no_constant, parse_float=_finite_float)
     except RecursionError:
         raise BadMessageError("the message is nested too deeply") from None
-    except ValueError as error:
+    except json.JSONDecodeError as error:
         raise BadMessageError(f"the message is not valid JSON: {error}") from None
+    except ValueError as error:
+        raise BadMessageError(f"the message has a number that cannot be used: {error}") from None
     if not isinstance(value, dict):
         raise BadMessageError(f"the message is a JSON {_json_kind(value)}: it must be an object")
     if decoded.count("[") + decoded.count("{") > MAX_JSON_DEPTH and _depth(value) > MAX_JSON_DEPTH:
@@ -123,6 +126,13 @@ def parse_json_object(text: bytes) -> JsonObject:
 
 def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no JSON number")
+
+
+def _finite_float(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:20]} is too large")
+    return value
 
 
 def _json_kind(value: object) -> str:

@@ -5,6 +5,7 @@ No sockets: bytes in, bytes out, with the time handed in.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from ethercat_server.virtual_sensor import wire
@@ -22,6 +23,7 @@ class Bus:
     Attributes:
         lose: so many frames more will be lost.
         deaf_until: no frame comes back before this time (ns); None for not at all deaf.
+        deaf_after: deaf for ever after so many frames more; None for never.
     """
 
     def __init__(self, options: BusOptions, now: int) -> None:
@@ -29,6 +31,7 @@ class Bus:
         self.sensors = [VirtualSensor(each, now) for each in options.sensors]
         self.lose = 0
         self.deaf_until: float | None = None
+        self.deaf_after: int | None = None
         self.frames = self.frames_lost = 0
         self._power_events: list[tuple[int, VirtualSensor]] = []
         self._alive: list[Firmware] = []
@@ -77,6 +80,10 @@ class Bus:
             return False
         self.set_time(now)
         self.frames += 1
+        if self.deaf_after is not None:
+            self.deaf_after -= 1
+            if self.deaf_after < 0:
+                self.deaf_after, self.deaf_until = None, math.inf
         if self.deaf_until is not None or self.lose or not self._alive:
             self.lose = max(self.lose - 1, 0)
             self.frames_lost += 1

@@ -86,8 +86,12 @@ def _deaf(call: _Call) -> None:
     call.bus.deaf_until = call.bus.now + seconds * 1e9
 
 
+def _deaf_after(call: _Call) -> None:
+    call.bus.deaf_after = whole(call.arguments[0], 0, 2**31)
+
+
 def _hear(call: _Call) -> None:
-    call.bus.deaf_until = None
+    call.bus.deaf_until = call.bus.deaf_after = None
     call.bus.lose = 0
 
 
@@ -163,7 +167,8 @@ def _quit(_call: _Call) -> None:
 COMMANDS: Final[tuple[FaultCommand, ...]] = (
     FaultCommand("lose", "lose N", (1,), "lose the next N frames", _lose),
     FaultCommand("deaf", "deaf [SECONDS]", (0, 1), "lose every frame, until `hear` or for a time", _deaf),
-    FaultCommand("hear", "hear", (0,), "end `deaf` and `lose`", _hear),
+    FaultCommand("deaf-after", "deaf-after N", (1,), "answer N frames more, then be `deaf`", _deaf_after),
+    FaultCommand("hear", "hear", (0,), "end `deaf`, `deaf-after` and `lose`", _hear),
     FaultCommand(
         "power", "power off|on|cycle SECONDS [@N]", (1, 2),
         "switch a sensor off or on; what was not saved is gone, and sensors behind it are cut off", _power,

@@ -145,6 +145,9 @@ def test_bare_json_connection_answers_then_closes_when_the_client_half_closes(se
         (b'{"action": "subscribe", "every": 0}', "'every' must be"),
         (b"\xff\xfe", "not UTF-8"),
         (b"[" * 5000, "nested"),
+        (b'{"action":"describe","id":1e999}', "too large"),
+        (b'{"action":"describe","id":NaN}', "NaN is no JSON number"),
+        (b'{"action":"describe","id":' + b"9" * 5000 + b"}", "a number that cannot be used"),
     ],
 )
 def test_bad_json_gets_an_error_and_the_connection_goes_on(
@@ -333,3 +336,19 @@ def test_a_flood_of_requests_does_not_hold_up_the_acquisition(served: Served) ->
         decoder = FrameDecoder()
         decoder.feed(other.recv(65536))
         assert list(decoder) == [{"reply": "describe", "id": 1, "ok": True}]
+
+
+def test_a_handler_that_fails_costs_one_reply_and_nothing_else(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_connection: Connection, _message: JsonObject) -> JsonObject:
+        raise ZeroDivisionError
+
+    with served.subscribe() as bystander, served.connect() as sock:
+        monkeypatch.setattr(served.hub, "_handler", broken)
+        sock.sendall(encode_json({"action": "describe"}))
+        (answer,) = served.read(sock)
+        assert isinstance(answer, dict)
+        assert answer["error"]["code"] == "internal"
+        served.publish()
+        assert [type(m) for m in served.read(bystander)] == [DataMessage]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -153,7 +154,7 @@ def test_a_single_lost_frame_costs_no_sensor_and_no_sample(bench: Bench) -> None
         bench.client.fresh(20)
         frames += bench.client.frames
     status = bench.client.ask("status")
-    assert status["lost_frames"] >= 10
+    assert status["lost_frames"] >= 8, "now and then it is a register access that gets lost"
     assert status["sensors"][0]["recoveries"] == 0
     # The kernel's own rounding of the timeout would make each cost 8 ms, six samples.
     assert status["sensors"][0]["lost_samples"] < 3 * 10
@@ -163,7 +164,9 @@ def test_a_single_lost_frame_costs_no_sensor_and_no_sample(bench: Bench) -> None
 
 def test_a_stuck_sensor_stays_visible_as_repeated(bench: Bench) -> None:
     bench.command("stick")
-    frames = bench.client.collect(30)[10:]
+    while not bench.client.collect(1)[0].flags & DataFlag.REPEATED:
+        pass
+    frames = bench.client.collect(20)
     assert all(f.flags & DataFlag.REPEATED for f in frames)
     assert len({f.process_data for f in frames}) == 1
     bench.command("unstick")
@@ -262,3 +265,57 @@ def test_twenty_times_out_of_twenty(bench: Bench, fault: str) -> None:
     print(f"{fault}: {min(took):.3f} to {max(took):.3f} s")
     assert len(took) == 20
     assert max(took) < 0.5
+
+
+def test_one_late_answer_does_not_put_every_exchange_one_frame_behind() -> None:
+    with virtual_sensor("--signal", "clock") as (veth, _), Veth() as other:
+        relay = Program("tests.server.slow_relay", [other.far, veth.near, "0.0005"])
+        try:
+            relay.wait_for("ready")
+            with server(other.near) as running, running.connect() as client:
+                client.ask("subscribe")
+                before = client.ask("status")
+                client.fresh(2500)  # with some hold-ups among them
+                after = client.ask("status")
+        finally:
+            relay.close()
+    cycles = after["cycles"] - before["cycles"]
+    lost = after["lost_frames"] - before["lost_frames"]
+    assert lost < 0.05 * cycles, f"{lost} of {cycles}"
+
+
+def test_a_sensor_that_is_stuck_from_the_start_is_seen() -> None:
+    with server("virtual", "--virtual", "--signal constant") as running, running.connect() as client:
+        client.ask("subscribe")
+        frames = client.collect(10)
+        assert all(f.flags & DataFlag.REPEATED for f in frames)
+
+
+def test_a_client_that_has_said_all_still_gets_its_samples(bench: Bench) -> None:
+    bench.client.sock.shutdown(socket.SHUT_WR)
+    assert len(bench.client.fresh(300)) == 300
+
+
+def test_an_interface_that_disappears_ends_the_server_with_a_sentence() -> None:
+    with Veth() as veth:
+        sensor = Program("ethercat_server.virtual_sensor", [veth.far])
+        try:
+            sensor.wait_for("ready")
+            with server(veth.near) as running:
+                veth.ip("link", "del", veth.near)
+                assert running.wait() == 1
+                assert f"the interface {veth.near} has disappeared" in running.said()
+                assert "Traceback" not in running.said()
+        finally:
+            sensor.close()
+
+
+def test_a_second_master_on_the_interface_is_kept_away(bench: Bench) -> None:
+    second = Server(bench.veth.near)
+    try:
+        assert second.wait() == 1
+        assert f"{bench.veth.near} is in use by another EtherCAT master" in second.said()
+    finally:
+        second.close()
+    assert len(bench.client.fresh(100)) == 100
+    assert not bench.client.events

@@ -151,3 +151,30 @@ def test_restart_forgets_the_phase_but_not_the_rate() -> None:
     clock.restart()
     assert not clock.locked
     assert clock.period_ns == learned
+
+
+@pytest.mark.parametrize("sleep_more_ns", [60_000, 100_000])
+def test_follows_a_simulated_sensor_that_sleeps_between_its_samples(sleep_more_ns: int) -> None:
+    """Such a one is some percent slow and its phase walks at random: no loss may be claimed that was none."""
+    noise = random.Random(5)
+    clock, now, shown, newest, lost, claimed, seen = SampleClock(NOMINAL_NS), 1.0, 0, 0, 0, 0, 0
+    change = NOMINAL_NS
+    while now < 5 * SECOND:
+        sent = max(clock.next_poll_ns() - 50_000, now) + noise.gammavariate(4, 8_000)
+        evaluated = sent + noise.gammavariate(4, 10_000)
+        received = evaluated + noise.gammavariate(4, 10_000)
+        while change < evaluated:
+            change += NOMINAL_NS + noise.gammavariate(4, sleep_more_ns / 4)
+            newest += 1
+        fresh = newest != shown
+        clock.observe(int(sent), int(received), fresh)
+        if fresh and shown:
+            lost += newest - shown - 1
+            claimed += max(0, clock.steps - 1)
+        seen += fresh
+        shown, now = newest, received + 20_000
+    assert seen > 3000
+    assert lost == 0
+    assert claimed <= 2, "while the rate is not yet known"
+    assert clock.locked
+    assert clock.pull == pytest.approx(sleep_more_ns / NOMINAL_NS, rel=0.1)

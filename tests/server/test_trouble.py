@@ -154,7 +154,7 @@ def test_wrong_arguments(arguments: tuple[str, ...], complaint: str) -> None:
 def test_settings_for_a_sensor_that_is_not_there(tmp_path_factory: pytest.TempPathFactory) -> None:
     config = tmp_path_factory.mktemp("config") / "c.toml"
     config.write_text("[sensor.3]\nfir = true\n")
-    assert "settings for sensor 3, but the bus has 1" in fails("virtual", "--config", str(config), code=2)
+    assert "sensor 3, but the bus has only 1" in fails("virtual", "--config", str(config), code=2)
 
 
 def test_an_object_that_aborts_is_named() -> None:
@@ -178,5 +178,20 @@ def test_stopped_while_starting() -> None:
             assert running.wait() in {0, -15}
             assert "Traceback" not in running.said()
             assert running.ifname not in interfaces()
+        finally:
+            running.close()
+
+
+def test_a_slave_that_vanishes_during_the_scan_does_not_hang_the_server() -> None:
+    with virtual_sensor() as (veth, sensor):
+        running = Server(veth.near)
+        try:
+            assert sensor.process.stdin is not None
+            # Deaf as soon as the scan has begun, which reads the SII for some tens of milliseconds.
+            sensor.process.stdin.write("deaf-after 40\n")
+            sensor.process.stdin.flush()
+            sensor.wait_for("ok")
+            assert running.wait() == 1
+            assert "Traceback" not in running.said()
         finally:
             running.close()
