@@ -189,32 +189,53 @@ class Bus:
         # SOEM's own wait ignores timeouts shorter than a jiffy, so wait here and let it only collect.
         select.select((self._fd,), (), (), timeout_s)
         if self._careful:
-            self._drop_older_frames(timeout_s)
+            return self._collect_carefully(timeout_s)
         wkc: int = self._master.receive_processdata(_COLLECT_US)
         self._careful = wkc < 0
         return wkc
 
-    def _drop_older_frames(self, timeout_s: float) -> None:
-        """Drop what is not this exchange's, and wait for that, at most `timeout_s` from now.
+    def _collect_carefully(self, timeout_s: float) -> int:
+        """Collect this exchange's frame when an older one may come before it.
 
-        A frame that came too late for its own exchange would be taken for this one's, whose own would then
-        come too late for the next: every exchange would meet its predecessor's. Frames are told apart by
-        their index.
+        Taken for this exchange's, an older one would make its own come too late for the next: every exchange
+        would meet its predecessor's. Frames are told apart by SOEM's index; while that is not known, a
+        failure waits until nothing is on its way any more.
+        """
+        found = self._find_frame(timeout_s)
+        wkc: int = self._master.receive_processdata(_COLLECT_US)
+        if wkc >= 0 and found is not None:
+            self._index, self._index_known, self._careful = found, True, False
+        elif wkc < 0 and (found is not None or not self._index_known):
+            self._index_known = False
+            self._drop_frames(timeout_s)
+        return wkc
+
+    def _find_frame(self, timeout_s: float) -> int | None:
+        """The index of the frame that is next to be received, others than this exchange's dropped if known.
+
+        Waits at most `timeout_s` for it; None if none comes.
         """
         deadline = time.monotonic() + timeout_s
         with contextlib.suppress(OSError):  # nothing there any more, or the link is down
             while True:
                 head = self._socket.recv(_INDEX_OFFSET + 1, socket.MSG_PEEK)
-                if len(head) > _INDEX_OFFSET:
-                    if not self._index_known:
-                        self._index, self._index_known = head[_INDEX_OFFSET], True
-                    if head[_INDEX_OFFSET] == self._index:
-                        return
+                if len(head) > _INDEX_OFFSET and (
+                    not self._index_known or head[_INDEX_OFFSET] == self._index
+                ):
+                    return head[_INDEX_OFFSET]
                 self._socket.recv(1)
                 left = deadline - time.monotonic()
                 if left <= 0 or not select.select((self._fd,), (), (), left)[0]:
-                    self._index_known = False  # perhaps it was this side that was wrong
-                    return
+                    break
+        return None
+
+    def _drop_frames(self, quiet_s: float) -> None:
+        """Drop everything that comes until nothing has come for `quiet_s`, within bounds."""
+        with contextlib.suppress(OSError):
+            for _ in range(_FRAME_INDICES):
+                if not select.select((self._fd,), (), (), quiet_s)[0]:
+                    break
+                self._socket.recv(1)
 
     def working_counter(self, slave: int) -> int:
         """What `slave` adds to the working counter of an exchange: 2 for its outputs, 1 for its inputs."""

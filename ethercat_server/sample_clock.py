@@ -34,6 +34,7 @@ _AIM_NS: Final = 25_000.0
 _EARLY_NS: Final = 50_000.0
 """A poll this much before its aim was another sensor's, and is not counted as this one's first."""
 _FLIGHT_GAIN: Final = 1 / 64
+_SURELY_AFTER: Final = 0.375
 _CREEP_NS: Final = 150.0
 _MAX_CREEP: Final = 0.2
 _MIN_WIDTH_NS: Final = 10_000.0
@@ -143,7 +144,9 @@ class SampleClock:
             self._low, self._high = max(after, received_ns - self.period_ns), float(received_ns)
             self._expect_next(received_ns)
             return
-        self.uncertain = received_ns - after >= self.period_ns and received_ns - self._low >= self.period_ns
+        # The sensor looks at its data about half-way through an exchange of the usual length.
+        latest = received_ns - _SURELY_AFTER * self._flight_ns
+        self.uncertain = received_ns - after >= self.period_ns and latest - self._low >= self.period_ns
         narrow = received_ns - after < _NARROW * self.period_ns
         self._hits = 0 if narrow else self._hits + 1
         self.steps = self._count_steps(after, sent_ns, received_ns, narrow)
