@@ -34,7 +34,9 @@ _AIM_NS: Final = 25_000.0
 _EARLY_NS: Final = 50_000.0
 """A poll this much before its aim was another sensor's, and is not counted as this one's first."""
 _FLIGHT_GAIN: Final = 1 / 64
-_SURELY_AFTER: Final = 0.375
+_HALF: Final = 0.45
+_SURELY_ONE: Final = 0.8
+"""Only one sample can have come in this part of a period, even if the bracket is somewhat off."""
 _CREEP_NS: Final = 150.0
 _MAX_CREEP: Final = 0.2
 _MIN_WIDTH_NS: Final = 10_000.0
@@ -145,8 +147,11 @@ class SampleClock:
             self._expect_next(received_ns)
             return
         # The sensor looks at its data about half-way through an exchange of the usual length.
-        latest = received_ns - _SURELY_AFTER * self._flight_ns
-        self.uncertain = received_ns - after >= self.period_ns and latest - self._low >= self.period_ns
+        latest, unseen = (
+            received_ns - _HALF * self._flight_ns,
+            received_ns - after - 2 * _HALF * self._flight_ns,
+        )
+        self.uncertain = unseen >= self.period_ns and latest - self._low >= _SURELY_ONE * self.period_ns
         narrow = received_ns - after < _NARROW * self.period_ns
         self._hits = 0 if narrow else self._hits + 1
         self.steps = self._count_steps(after, sent_ns, received_ns, narrow)

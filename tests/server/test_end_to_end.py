@@ -54,9 +54,13 @@ def test_every_sample_arrives_once_and_in_order(shared: Server) -> None:
         frames = client.fresh(1500)
         numbers = sample_numbers(frames)
         assert numbers == sorted(set(numbers)), "a sample came twice or out of order"
+        gaps = 0
         for before, after in pairwise(frames):
-            skipped = sample_number(after) - sample_number(before) - 1
-            assert (skipped > 0) == bool(after.flags & DataFlag.GAP)
+            gap = bool(after.flags & DataFlag.GAP)
+            if sample_number(after) > sample_number(before) + 1:
+                assert gap
+            gaps += gap
+        assert gaps < 0.05 * len(frames)
         assert {frame.wkc for frame in frames} == {3}
         assert {frame.sensor for frame in frames} == {0}
         stamps = [frame.monotonic_ns for frame in frames]
