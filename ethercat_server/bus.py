@@ -216,14 +216,16 @@ class Bus:
         Waits at most `timeout_s` for it; None if none comes.
         """
         deadline = time.monotonic() + timeout_s
+        counted = self._index_known
         with contextlib.suppress(OSError):  # nothing there any more, or the link is down
             while True:
                 head = self._socket.recv(_INDEX_OFFSET + 1, socket.MSG_PEEK)
-                if len(head) > _INDEX_OFFSET and (
-                    not self._index_known or head[_INDEX_OFFSET] == self._index
-                ):
+                if len(head) > _INDEX_OFFSET and (not counted or head[_INDEX_OFFSET] == self._index):
+                    self._index_known = counted
                     return head[_INDEX_OFFSET]
                 self._socket.recv(1)
+                # If this exchange's own does not follow, it was perhaps this one: the count is in doubt.
+                self._index_known = False
                 left = deadline - time.monotonic()
                 if left <= 0 or not select.select((self._fd,), (), (), left)[0]:
                     break

@@ -46,6 +46,7 @@ class SensorStream:
         self._discard = DISCARDED_AT_START
         self._gap = False
         self._odd_rate_said = False
+        self._valid_ns = 0
         self._idle_at_ns = 0.0
 
     def take(
@@ -59,6 +60,7 @@ class SensorStream:
         moment_ns = back_ns
         fresh = valid and data != self.process_data
         if valid:
+            self._valid_ns = back_ns
             clock.observe(sent_ns, back_ns, fresh)
         else:
             clock.missed(sent_ns)
@@ -74,7 +76,8 @@ class SensorStream:
                 self.age.record(back_ns - moment_ns)
         elif back_ns >= self._idle_at_ns and self.process_data:
             self._discard = 0  # a sensor that is stuck from the start is to be seen too
-            flags = self._nothing_new(valid, back_ns)
+            # One lost frame is no news: INVALID is what nothing valid came for in two periods.
+            flags = self._nothing_new(back_ns - self._valid_ns < 2 * clock.period_ns, back_ns)
         else:
             return None
         stamp_ns = time.time_ns() - (time.monotonic_ns() - moment_ns)
