@@ -29,6 +29,7 @@ _FRAME_INDICES: Final = 16
 """SOEM numbers its frames modulo this."""
 _INDEX_OFFSET: Final = 17
 """Where a frame has its number: behind the Ethernet header (14), the EtherCAT header (2) and the command."""
+_MOST_DOUBTS: Final = 4
 _COLLECT_US: Final = 100
 _SCAN_TIMEOUT_S: Final = 15.0
 _STATE_ATTEMPTS: Final = {"PREOP": 80, "SAFEOP": 200}
@@ -74,6 +75,7 @@ class Bus:
         self._index = 0
         """SOEM's number of the last frame sent; it counts every datagram it sends."""
         self._index_known = False
+        self._doubts = 0
 
     def open(self) -> None:
         """Open the raw socket. BusError if that fails; `interface.check_interface` says why beforehand."""
@@ -204,7 +206,7 @@ class Bus:
         found = self._find_frame(timeout_s)
         wkc: int = self._master.receive_processdata(_COLLECT_US)
         if wkc >= 0 and found is not None:
-            self._index, self._index_known, self._careful = found, True, False
+            self._index, self._index_known, self._careful, self._doubts = found, True, False, 0
         elif wkc < 0 and (found is not None or not self._index_known):
             self._index_known = False
             self._drop_frames(timeout_s)
@@ -216,18 +218,19 @@ class Bus:
         Waits at most `timeout_s` for it; None if none comes.
         """
         deadline = time.monotonic() + timeout_s
-        counted = self._index_known
         with contextlib.suppress(OSError):  # nothing there any more, or the link is down
             while True:
                 head = self._socket.recv(_INDEX_OFFSET + 1, socket.MSG_PEEK)
-                if len(head) > _INDEX_OFFSET and (not counted or head[_INDEX_OFFSET] == self._index):
-                    self._index_known = counted
+                if len(head) > _INDEX_OFFSET and (
+                    not self._index_known or head[_INDEX_OFFSET] == self._index
+                ):
                     return head[_INDEX_OFFSET]
                 self._socket.recv(1)
-                # If this exchange's own does not follow, it was perhaps this one: the count is in doubt.
-                self._index_known = False
                 left = deadline - time.monotonic()
                 if left <= 0 or not select.select((self._fd,), (), (), left)[0]:
+                    # Its own did not follow. Once it may be late itself; more often, the count is wrong.
+                    self._doubts += 1
+                    self._index_known = self._index_known and self._doubts < _MOST_DOUBTS
                     break
         return None
 

@@ -20,7 +20,7 @@ Steps = Generator[None, None, T]
 """Work in steps: yields when the loop should have its turn, returns the result."""
 
 _ANSWER_TIMEOUT_S: Final = 0.3
-_ATTEMPTS: Final = 3
+_ATTEMPTS: Final = 5
 
 SM_READ_STATUS: Final = 0x080D
 """Status of sync manager 1, the mailbox from the slave."""
@@ -48,6 +48,10 @@ class Sdo(Protocol):
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """Download an object; raises as `read`."""
         ...
+
+
+class _AnswerLostError(Exception):
+    """The answer was taken from the mailbox and lost on its way."""
 
 
 def finish(steps: Steps[T]) -> T:
@@ -119,7 +123,10 @@ class CyclicSdo:
                 deadline = time.monotonic() + _ANSWER_TIMEOUT_S
                 while time.monotonic() < deadline:
                     yield
-                    answer = self._answer(index, subindex)
+                    try:
+                        answer = self._answer(index, subindex)
+                    except _AnswerLostError:
+                        break  # ask again: reading and writing twice does no harm
                     if answer is None:
                         continue
                     code = int.from_bytes(answer[1][:4], "little")
@@ -149,7 +156,8 @@ class CyclicSdo:
             return None
         message = self._bus.read_register(self._slave, self._in, self._in_size)
         if message is None:
-            return None
+            # The datagram that took the answer out of the mailbox did not come back in time.
+            raise _AnswerLostError
         length, _, _, kind = _MAILBOX_HEADER.unpack_from(message)
         body = message[_MAILBOX_HEADER.size : _MAILBOX_HEADER.size + length]
         if kind & 0x0F != _TYPE_COE or len(body) < _SDO_HEADER.size + 4:
