@@ -93,6 +93,10 @@ class Bus:
         self.ifindex = socket.if_nametoindex(self.ifname)
         self._fd = (_packet_sockets() - before).pop()
         self._socket = socket.socket(fileno=os.dup(self._fd))
+        # Until SOEM had bound it to the interface, it took in the EtherCAT frames of all others.
+        self._set_blocking(False)
+        self._drop_frames(0)
+        self._set_blocking(True)
 
     def scan(self, check_interrupt: Callable[[], None]) -> list[SlaveIdentity]:
         """Find the slaves and take them to PREOP; BusError if none answers.

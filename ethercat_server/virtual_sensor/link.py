@@ -42,7 +42,8 @@ def open_interface(ifname: str) -> socket.socket:
     except OSError:
         raise LinkError(f"no network interface {ifname!r}: `ip link` lists those there are") from None
     try:
-        raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE))
+        # No protocol yet: with one, it would take in the frames of all interfaces until it is bound to its own.
+        raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     except PermissionError:
         raise LinkError(
             f"not allowed to open a raw socket on {ifname}: it needs CAP_NET_RAW, so run it as root"

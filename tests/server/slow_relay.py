@@ -15,7 +15,7 @@ ETHERCAT = 0x88A4
 
 
 def open_raw(ifname: str) -> socket.socket:
-    raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERCAT))
+    raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     raw.bind((ifname, ETHERCAT))
     raw.setblocking(False)
     return raw

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import socket
 import subprocess
@@ -107,16 +108,20 @@ def test_the_control_socket(veth: tuple[str, str], start: Start, tmp_path: Path)
     path = tmp_path / "control"
     sensor = start(veth[0], "--control", str(path))
     assert sensor.command("lose 1") == "ok"
-    with socket.socket(socket.AF_UNIX) as one, socket.socket(socket.AF_UNIX) as other:
+    with (
+        socket.socket(socket.AF_UNIX) as one,
+        socket.socket(socket.AF_UNIX) as other,
+        contextlib.ExitStack() as stack,
+    ):
         for peer in (one, other):
             peer.connect(str(path))
         other.sendall(b"sta")
         one.sendall(b"nonsense\nhear\n")
-        answers = one.makefile()
+        answers = stack.enter_context(one.makefile())
         assert answers.readline().startswith("error: ")
         assert answers.readline() == "ok\n"
         other.sendall(b"ts\n")
-        answer = other.makefile().readline()
+        answer = stack.enter_context(other.makefile()).readline()
         assert json.loads(answer.removeprefix("ok "))["frames"] == 0
         one.sendall(b"quit\n")
         assert answers.readline() == "ok\n"
