@@ -42,7 +42,7 @@ def open_interface(ifname: str) -> socket.socket:
     except OSError:
         raise LinkError(f"no network interface {ifname!r}: `ip link` lists those there are") from None
     try:
-        # No protocol yet: with one, it would take in the frames of all interfaces until it is bound to its own.
+        # No protocol yet: with one, it would take in the frames of all interfaces until it is bound.
         raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     except PermissionError:
         raise LinkError(
