@@ -69,6 +69,11 @@ class AlStatus(NamedTuple):
     def parse(cls, data: bytes) -> AlStatus:
         """From the six bytes at 0x0130."""
         status, _, code = struct.unpack("<HHH", data)
+        return cls.of(status, code)
+
+    @classmethod
+    def of(cls, status: int, code: int) -> AlStatus:
+        """From the two registers."""
         return cls(status & _STATE_MASK, bool(status & _ERROR), code)
 
     @property

@@ -22,6 +22,8 @@ _SERVE_EVERY_NS: Final = 10_000_000
 """The sockets' turn comes this often even if the deadlines leave no time."""
 _RECOVERY_STEP_NS: Final = 500_000
 """Time between two exchanges while no sensor is left to be read."""
+_RECOVERY_TIMEOUT_S: Final = 0.02
+"""How long a frame may take meanwhile."""
 _LATENESS_GAIN: Final = 1 / 64
 _MAX_LEAD_NS: Final = 200_000.0
 
@@ -57,8 +59,9 @@ class Cycle:
         while not self.stopping:
             now = monotonic_ns()
             deadline = int(min([stream.clock.next_poll_ns() for stream in streams]) - lead_ns)
+            wait_s = timeout_s
             if recovery.all_lost:
-                deadline = now + _RECOVERY_STEP_NS
+                deadline, wait_s = now + _RECOVERY_STEP_NS, _RECOVERY_TIMEOUT_S
             if deadline > now or now > serve_by:
                 hub.serve(deadline - _SERVE_MARGIN_NS)
                 serve_by = now + _SERVE_EVERY_NS
@@ -72,7 +75,7 @@ class Cycle:
                 self._wake.record(late)
                 if late > shortest_ns:
                     self._missed_deadlines += int(late // shortest_ns)
-            wkc = bus.exchange(timeout_s)
+            wkc = bus.exchange(wait_s)
             back = monotonic_ns()
             complete = wkc >= recovery.alive_wkc
             for stream in streams:

@@ -53,13 +53,11 @@ class Recovery:
         self._frame_ns = time.monotonic_ns()
         self._watch_ns = 0
         self._watched = 0
-        self.alive_wkc = bus.expected_wkc
+        self.alive_wkc: int
         """The working counter of all sensors that are not lost."""
-
-    @property
-    def all_lost(self) -> bool:
+        self.all_lost: bool
         """Whether no sensor is left to be read."""
-        return len(self._climbing) == len(self._sensors)
+        self._count_alive()
 
     def attend(self, wkc: int, now_ns: int) -> None:
         """To be called after every exchange; almost always it has nothing to do.
@@ -119,6 +117,8 @@ class Recovery:
     def _count_alive(self) -> None:
         alive = [place for place in range(len(self._sensors)) if place not in self._climbing]
         self.alive_wkc = sum(self._bus.working_counter(place) for place in alive)
+        self.all_lost = not alive
+        self._bus.be_patient(self.all_lost)
 
     def _step(self, place: int) -> None:
         try:
