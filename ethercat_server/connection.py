@@ -31,6 +31,8 @@ _SEND_BUFFER: Final = 65536
 """Small, so that a client that stalls finds fresh data soon after, not seconds of old."""
 _IDLE_FRAME_NS: Final = 10_000_000
 """A `fresh_only` client gets a REPEATED frame only when it has had nothing for this long."""
+_REPEATED: Final = int(DataFlag.REPEATED)
+_GAP: Final = int(DataFlag.GAP)
 
 
 class Subscription:
@@ -149,9 +151,9 @@ class Connection:
         wants = self.subscription
         if wants is None or not wants.wanted[place]:
             return
-        if flags & DataFlag.REPEATED and wants.fresh_only and now_ns - wants.last_ns[place] < _IDLE_FRAME_NS:
+        if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[place] < _IDLE_FRAME_NS:
             return
-        if flags & DataFlag.GAP:
+        if flags & _GAP:
             wants.gap[place] = True
         if wants.skipped[place] < wants.every - 1:
             wants.skipped[place] += 1
@@ -160,7 +162,7 @@ class Connection:
         wants.last_ns[place] = now_ns
         if wants.gap[place]:
             wants.gap[place] = False
-            if not flags & DataFlag.GAP:
+            if not flags & _GAP:
                 frame = with_gap(frame)
         self._send(frame, place)
 
@@ -241,7 +243,7 @@ class Connection:
 
 def with_gap(frame: bytes) -> bytes:
     """A copy of an encoded DATA frame with the GAP flag set."""
-    flags = frame[DATA_FLAGS_OFFSET] | DataFlag.GAP
+    flags = frame[DATA_FLAGS_OFFSET] | _GAP
     return frame[:DATA_FLAGS_OFFSET] + bytes((flags,)) + frame[DATA_FLAGS_OFFSET + 1 :]
 
 

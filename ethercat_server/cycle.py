@@ -83,6 +83,8 @@ class Cycle:
                 made = stream.take(bus.process_data(stream.place), wkc, valid, sent, back)
                 if made:
                     hub.publish(made[0], stream.place, made[1], back)
+            for stream in streams:
+                stream.learn()
             recovery.attend(wkc, back)
             if back >= roll_at:
                 roll_at = back + SLOT_NS

@@ -60,7 +60,8 @@ _UNLOCK_AT: Final = 0.6
 class SampleClock:
     """The sampling clock of one sensor, as far as the exchanges have shown it. Times are CLOCK_MONOTONIC ns.
 
-    Call `observe` after every valid exchange; ask `next_poll_ns` when the next one is wanted.
+    Call `observe` after every valid exchange, before it `predict` if the sample is to be handed out first;
+    ask `next_poll_ns` when the next exchange is wanted.
     """
 
     __slots__ = (
@@ -74,7 +75,7 @@ class SampleClock:
         self.period_ns = period_ns
         self.locked = False
         self.instant_ns = 0.0
-        """Estimated instant of the newest sample."""
+        """Estimated instant of the newest sample, from those before it."""
         self.steps = 1
         """How many samples the newest one is after the one handed out before it: more than 1, some were
         lost; 0, one was counted as lost that was not."""
@@ -130,31 +131,52 @@ class SampleClock:
         overdue = tried_ns > self._high + self.period_ns
         return tried_ns + self.period_ns / (_POLLS_UNLOCKED if overdue else _SEARCH_STEPS)
 
+    def predict(self, sent_ns: int, received_ns: int) -> None:
+        """Say of the new sample that an exchange brought what can be said before learning from it.
+
+        Sets `steps`, `uncertain` and `instant_ns`, and nothing else.
+        """
+        after, period = self._polled_ns, self.period_ns
+        unwatched = received_ns - after
+        if self._begins_anew(after):
+            # Only what fell into the time the sensor was not watched can have been lost.
+            self.steps = 1 + int(unwatched // period)
+            self.uncertain = unwatched >= period
+            self.instant_ns = received_ns - min(unwatched, period) / 2
+            return
+        expected = (self._low + self._high) / 2
+        if unwatched < _NARROW * period:
+            self.steps = max(0, 1 + round(((after + received_ns) / 2 - expected) / period))
+        else:
+            # Several samples may lie in a wide bracket: the newest is the last one due before the exchange.
+            self.steps = max(1, 1 + int(((sent_ns + received_ns) / 2 - expected) // period))
+        # The sensor looks at its data about half-way through an exchange of the usual length.
+        looking = _HALF * self._flight_ns
+        self.uncertain = (
+            unwatched - 2 * looking >= period and received_ns - looking - self._low >= _SURELY_ONE * period
+        )
+        self.instant_ns = min(max(expected + (self.steps - 1) * period, after), received_ns)
+
+    def _begins_anew(self, after: int) -> bool:
+        """Whether nothing was expected, or the sensor was watched and silent for longer than a period."""
+        return self._high == 0.0 or after > self._high + self.period_ns
+
     def observe(self, sent_ns: int, received_ns: int, fresh: bool) -> None:
         """Learn from one valid exchange whether it brought a new sample (`fresh`)."""
-        after, self._polled_ns, self._tried_ns = self._polled_ns, sent_ns, sent_ns
+        if fresh:
+            self.predict(sent_ns, received_ns)
         self._flight_ns += _FLIGHT_GAIN * (min(received_ns - sent_ns, self.period_ns) - self._flight_ns)
         if not fresh:
+            self._polled_ns = self._tried_ns = sent_ns
             if self.locked and sent_ns > self._high + _SILENT * self.period_ns:
                 self.restart()
             return
-        if self._high == 0.0 or after > self._high + self.period_ns:
-            # Nothing was expected, or the sensor was watched and silent for longer than a period: its
-            # clock begins anew. Only what fell into the time it was not watched can have been lost.
-            self.steps = 1 + int((received_ns - after) // self.period_ns)
-            self.uncertain = received_ns - after >= self.period_ns
+        after, self._polled_ns, self._tried_ns = self._polled_ns, sent_ns, sent_ns
+        if self._begins_anew(after):
             self._low, self._high = max(after, received_ns - self.period_ns), float(received_ns)
-            self._expect_next(received_ns)
+            self._expect_next()
             return
-        # The sensor looks at its data about half-way through an exchange of the usual length.
-        latest, unseen = (
-            received_ns - _HALF * self._flight_ns,
-            received_ns - after - 2 * _HALF * self._flight_ns,
-        )
-        self.uncertain = unseen >= self.period_ns and latest - self._low >= _SURELY_ONE * self.period_ns
-        narrow = received_ns - after < _NARROW * self.period_ns
-        self._hits = 0 if narrow else self._hits + 1
-        self.steps = self._count_steps(after, sent_ns, received_ns, narrow)
+        self._hits = 0 if received_ns - after < _NARROW * self.period_ns else self._hits + 1
         moved = (self.steps - 1) * self.period_ns
         low, high = self._low + moved, self._high + moved
         believed = (low + high) / 2
@@ -171,7 +193,7 @@ class SampleClock:
             self._learn_period(error)
         near = _NEAR_TO_HOLD if self.locked else _NEAR_TO_LOCK
         self._judge(undisturbed and abs(error) < near * self.period_ns)
-        self._expect_next(received_ns)
+        self._expect_next()
 
     def missed(self, sent_ns: int) -> None:
         """An exchange brought nothing valid: it counts for when to poll next, and for nothing else."""
@@ -182,13 +204,6 @@ class SampleClock:
         self.locked = False
         self._quality = 0.0
         self._low = self._high = 0.0
-
-    def _count_steps(self, after: int, sent: int, received: int, narrow: bool) -> int:
-        expected = (self._low + self._high) / 2
-        if narrow:
-            return max(0, 1 + round(((after + received) / 2 - expected) / self.period_ns))
-        # Several samples may lie in a wide bracket: the newest is the last one due before the exchange.
-        return max(1, 1 + int(((sent + received) / 2 - expected) // self.period_ns))
 
     def _learn_period(self, error_ns: float) -> None:
         pull, most = _MAX_PULL * self._nominal_ns, _MAX_ERROR * self._nominal_ns
@@ -205,9 +220,8 @@ class SampleClock:
         else:
             self.locked = self._quality > _LOCK_AT
 
-    def _expect_next(self, received_ns: int) -> None:
+    def _expect_next(self) -> None:
         middle, half = (self._low + self._high) / 2, (self._high - self._low) / 2
-        self.instant_ns = min(middle, float(received_ns))
         half = max(half, _MIN_WIDTH_NS / 2) + _SLACK_NS
         self._low = middle + self.period_ns - half
         self._high = middle + self.period_ns + half

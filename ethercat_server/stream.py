@@ -45,6 +45,8 @@ class SensorStream:
         """From the estimated instant of a sample to its hand-out, while locked."""
         self._discard = DISCARDED_AT_START
         self._gap = False
+        self._seen = (0, 0, False, False)
+        """The last exchange, as `learn` needs it: sent, back, valid, fresh."""
         self._odd_rate_said = False
         self._valid_ns = 0
         self._idle_at_ns = 0.0
@@ -52,28 +54,26 @@ class SensorStream:
     def take(
         self, data: bytes, wkc: int, valid: bool, sent_ns: int, back_ns: int
     ) -> tuple[bytes, int] | None:
-        """The frame that an exchange gives, and its flags; None if it gives none.
+        """The frame that an exchange gives, and its flags; None if it gives none. `learn` must follow.
 
         `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the exchange.
         """
         clock = self.clock
         moment_ns = back_ns
         fresh = valid and data != self.process_data
+        self._seen = sent_ns, back_ns, valid, fresh
         if valid:
             self._valid_ns = back_ns
-            clock.observe(sent_ns, back_ns, fresh)
-        else:
-            clock.missed(sent_ns)
         if fresh:
             self.process_data = data
             if self._discard:
                 self._discard -= 1
                 self._idle_at_ns = back_ns + _IDLE_PERIODS * clock.period_ns
                 return None
+            clock.predict(sent_ns, back_ns)
             flags = self._new_sample(back_ns)
             if clock.locked:
                 moment_ns = int(clock.instant_ns)
-                self.age.record(back_ns - moment_ns)
         elif back_ns >= self._idle_at_ns and self.process_data:
             self._discard = 0  # a sensor that is stuck from the start is to be seen too
             # One lost frame is no news: INVALID is what nothing valid came for in two periods.
@@ -86,6 +86,17 @@ class SensorStream:
         return encode_data(
             sequence, stamp_ns, moment_ns, self.place, flags, max(wkc, 0), self.process_data
         ), flags  # fmt: skip
+
+    def learn(self) -> None:
+        """What the last exchange teaches, which can wait until its frame is on its way."""
+        sent_ns, back_ns, valid, fresh = self._seen
+        if not valid:
+            self.clock.missed(sent_ns)
+            return
+        locked = self.clock.locked
+        self.clock.observe(sent_ns, back_ns, fresh)
+        if fresh and locked:
+            self.age.record(back_ns - int(self.clock.instant_ns))
 
     def _new_sample(self, now_ns: int) -> int:
         self._idle_at_ns = now_ns + _IDLE_PERIODS * self.clock.period_ns

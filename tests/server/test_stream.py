@@ -23,6 +23,7 @@ class Feeder:
         self.sample += new
         data = self.sample.to_bytes(61, "little")
         made = self.stream.take(data, 3 if valid else -1, valid, self.now - 50_000, self.now)
+        self.stream.learn()
         if made is None:
             return None
         decoder = FrameDecoder()
