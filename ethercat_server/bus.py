@@ -187,12 +187,15 @@ class Bus:
                 return
         raise BusError(self._state_complaint(AlState.OP))
 
-    def exchange(self, timeout_s: float) -> int:
-        """Send the process data, wait at most `timeout_s` for it to come back; returns the working counter.
-
-        -1 if the frame did not come back. Only after `go_operational`.
-        """
+    def send(self) -> None:
+        """Send the process data; `receive` must follow. Only after `go_operational`."""
         self._master.send_processdata()
+
+    def receive(self, timeout_s: float) -> int:
+        """Wait at most `timeout_s` for the process data to come back; returns the working counter.
+
+        -1 if the frame did not come back.
+        """
         # SOEM's own wait ignores timeouts shorter than a jiffy, so wait here and let it only collect.
         self._socket.wait(timeout_s)
         if self._careful:

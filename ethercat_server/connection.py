@@ -151,6 +151,10 @@ class Connection:
         wants = self.subscription
         if wants is None or not wants.wanted[place]:
             return
+        if not flags and wants.every == 1 and not wants.gap[place]:
+            self._send(frame, place)
+            wants.last_ns[place] = now_ns
+            return
         if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[place] < _IDLE_FRAME_NS:
             return
         if flags & _GAP:

@@ -75,7 +75,10 @@ class Cycle:
                 self._wake.record(late)
                 if late > shortest_ns:
                     self._missed_deadlines += int(late // shortest_ns)
-            wkc = bus.exchange(wait_s)
+            bus.send()
+            for stream in streams:
+                stream.prepare(sent, recovery.alive_wkc)
+            wkc = bus.receive(wait_s)
             back = monotonic_ns()
             complete = wkc >= recovery.alive_wkc
             for stream in streams:

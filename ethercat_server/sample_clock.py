@@ -35,6 +35,7 @@ _EARLY_NS: Final = 50_000.0
 """A poll this much before its aim was another sensor's, and is not counted as this one's first."""
 _FLIGHT_GAIN: Final = 1 / 64
 _HALF: Final = 0.45
+_QUARTER: Final = 0.25
 _SURELY_ONE: Final = 0.8
 """Only one sample can have come in this part of a period, even if the bracket is somewhat off."""
 _CREEP_NS: Final = 150.0
@@ -156,6 +157,20 @@ class SampleClock:
             unwatched - 2 * looking >= period and received_ns - looking - self._low >= _SURELY_ONE * period
         )
         self.instant_ns = min(max(expected + (self.steps - 1) * period, after), received_ns)
+
+    def foresee(self, sent_ns: int) -> float:
+        """Until when the exchange just sent, if it is back by then, can only bring the very next sample.
+
+        0 if that cannot be said. Sets `instant_ns`; an exchange that is back before that is another matter.
+        """
+        after, period, low = self._polled_ns, self.period_ns, self._low
+        expected = (low + self._high) / 2
+        if not self.locked or after > expected + _QUARTER * period:
+            return 0.0
+        self.instant_ns = max(expected, after)
+        looking = _HALF * self._flight_ns
+        certain = max(after + period + 2 * looking, low + looking + _SURELY_ONE * period)
+        return min(certain, 2 * (expected + period) - sent_ns)
 
     def _begins_anew(self, after: int) -> bool:
         """Whether nothing was expected, or the sensor was watched and silent for longer than a period."""

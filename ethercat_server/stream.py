@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from ethercat_server.distribution import RecentDistribution
 from ethercat_server.sample_clock import PLAUSIBLE_PULL, SampleClock
-from protocol.framing import DataFlag, encode_data
+from protocol.framing import DataFlag, encode_data, encode_data_head
 
 DISCARDED_AT_START: Final = 3
 """Bota's own driver throws the first three frames after entering OP away."""
@@ -45,11 +45,34 @@ class SensorStream:
         """From the estimated instant of a sample to its hand-out, while locked."""
         self._discard = DISCARDED_AT_START
         self._gap = False
+        self._head = b""
+        self._head_wkc = self._head_from_ns = 0
+        self._head_until_ns = 0.0
         self._seen = (0, 0, False, False)
         """The last exchange, as `learn` needs it: sent, back, valid, fresh."""
         self._odd_rate_said = False
         self._valid_ns = 0
         self._idle_at_ns = 0.0
+
+    def prepare(self, sent_ns: int, wkc: int) -> None:
+        """While an exchange is on its way: the head of its frame, if all will be as usual.
+
+        That is: complete with the working counter `wkc`, and with the sample that is due.
+        """
+        clock = self.clock
+        until = self._head_until_ns = 0.0 if self._discard or self._gap else clock.foresee(sent_ns)
+        if until > sent_ns:
+            moment_ns = int(clock.instant_ns)
+            self._head_wkc, self._head_from_ns = wkc, moment_ns
+            stamp_ns = time.time_ns() - (time.monotonic_ns() - moment_ns)
+            self._head = encode_data_head(
+                self.sequence, stamp_ns, moment_ns, self.place, 0, wkc, len(self.process_data)
+            )
+
+    @property
+    def frame_was_prepared(self) -> bool:
+        """Whether the last exchange gave the frame that was prepared."""
+        return bool(self._head_until_ns)
 
     def take(
         self, data: bytes, wkc: int, valid: bool, sent_ns: int, back_ns: int
@@ -64,6 +87,11 @@ class SensorStream:
         self._seen = sent_ns, back_ns, valid, fresh
         if valid:
             self._valid_ns = back_ns
+        if fresh and wkc == self._head_wkc and self._head_from_ns <= back_ns < self._head_until_ns:
+            self.process_data = data
+            self.sequence += 1
+            return self._head + data, 0
+        self._head_until_ns = 0.0
         if fresh:
             self.process_data = data
             if self._discard:
@@ -95,6 +123,8 @@ class SensorStream:
             return
         locked = self.clock.locked
         self.clock.observe(sent_ns, back_ns, fresh)
+        if self.frame_was_prepared:
+            self._new_sample(back_ns)
         if fresh and locked:
             self.age.record(back_ns - int(self.clock.instant_ns))
 

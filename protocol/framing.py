@@ -66,6 +66,7 @@ _LENGTH: Final = struct.Struct(">I")
 _PREFIX: Final = struct.Struct(">IB")
 _DATA_HEADER: Final = struct.Struct(">QQQBBH")
 _DATA_MESSAGE: Final = struct.Struct(">IBQQQBBH")
+_DATA: Final = int(MessageType.DATA)
 _TYPE_SIZE: Final = 1
 _BODY_OFFSET: Final = _PREFIX.size
 DATA_FLAGS_OFFSET: Final = _PREFIX.size + struct.calcsize(">QQQB")
@@ -78,13 +79,16 @@ def encode_data(
     sequence: int, stamp_ns: int, monotonic_ns: int, sensor: int, flags: int, wkc: int, process_data: bytes
 ) -> bytes:
     """A whole DATA message, ready to send. struct.error if a number does not fit its field."""
-    length = _TYPE_SIZE + _DATA_HEADER.size + len(process_data)
-    return (
-        _DATA_MESSAGE.pack(
-            length, MessageType.DATA, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc
-        )
-        + process_data
-    )  # fmt: skip
+    size = len(process_data)
+    return encode_data_head(sequence, stamp_ns, monotonic_ns, sensor, flags, wkc, size) + process_data
+
+
+def encode_data_head(
+    sequence: int, stamp_ns: int, monotonic_ns: int, sensor: int, flags: int, wkc: int, size: int
+) -> bytes:
+    """A DATA message up to its process data, which is `size` bytes and must follow."""
+    length = _TYPE_SIZE + _DATA_HEADER.size + size
+    return _DATA_MESSAGE.pack(length, _DATA, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc)
 
 
 def encode_json_text(message: JsonObject) -> bytes:

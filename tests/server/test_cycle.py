@@ -28,8 +28,10 @@ class ScriptedBus:
         self.exchanges: list[int] = []
         self.lose: set[int] = set()
 
-    def exchange(self, _timeout_s: float) -> int:
+    def send(self) -> None:
         self.exchanges.append(time.monotonic_ns())
+
+    def receive(self, _timeout_s: float) -> int:
         return -1 if len(self.exchanges) in self.lose else 3
 
     def process_data(self, _slave: int) -> bytes:
@@ -117,13 +119,13 @@ def test_the_sockets_have_their_turn_even_if_every_deadline_has_passed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bus = ScriptedBus()
-    slow_exchange = bus.exchange
+    receive = bus.receive
 
-    def exchange(timeout_s: float) -> int:
+    def receive_slowly(timeout_s: float) -> int:
         time.sleep(2 * PERIOD_NS / 1e9)
-        return slow_exchange(timeout_s)
+        return receive(timeout_s)
 
-    monkeypatch.setattr(bus, "exchange", exchange)
+    monkeypatch.setattr(bus, "receive", receive_slowly)
     _, hub = run(10, lambda _: None, bus)
     assert hub.turns == 10
 
