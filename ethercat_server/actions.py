@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 
 from ethercat_server import __version__
-from ethercat_server.authority import may_control
 from ethercat_server.connection import Connection, Subscription
 from ethercat_server.cycle import Cycle
 from ethercat_server.hub import Hub
@@ -13,6 +13,8 @@ from ethercat_server.sensor import Sensor
 from protocol.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
 from protocol.errors import RequestError
 from protocol.framing import JsonObject
+
+log = logging.getLogger(__name__)
 
 
 class Actions:
@@ -39,12 +41,9 @@ class Actions:
                 ErrorCode.BAD_REQUEST,
                 f"{request.action} works on framed connections only: a bare JSON connection carries no DATA",
             )
-        if action.controls and not may_control(connection.sock):
-            raise RequestError(
-                ErrorCode.DENIED,
-                f"{request.action} is for root, the server's own user and the user who ran sudo: "
-                "run the client as one of them",
-            )
+        if action.controls and not self._hub.may_control(connection):
+            log.warning("%s: %s denied", connection, request.action)
+            raise RequestError(ErrorCode.DENIED, _denial(request.action, connection.uid))
         return self._handlers[request.action](connection, request)
 
     def _describe(self, _: Connection, request: Request) -> JsonObject:
@@ -84,3 +83,15 @@ class Actions:
     def _shutdown(self, _: Connection, request: Request) -> JsonObject:
         self._cycle.stop()
         return reply(request)
+
+
+def _denial(action: str, uid: int | None) -> str:
+    if uid is None:
+        return (
+            f"{action} is refused because the kernel does not say which user of this machine you are: ask "
+            "from this machine and keep the connection open until the reply is there"
+        )
+    return (
+        f"{action} is not for uid {uid}, but for root, the server's own user, the one who ran sudo and those "
+        "named with --control-user or --control-group: run the client as one of them"
+    )

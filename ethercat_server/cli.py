@@ -16,8 +16,11 @@ from ethercat_server.cycle import Cycle
 from ethercat_server.errors import ServerError, StopRequestedError
 from ethercat_server.hub import Hub
 from ethercat_server.interface import check_interface
-from ethercat_server.options import ServerOptions, parse_options
+from ethercat_server.logs import set_up_logging
+from ethercat_server.notify import Notifier
+from ethercat_server.options import parse_options
 from ethercat_server.recovery import Recovery
+from ethercat_server.service import Policy, Service
 from ethercat_server.start_up import bring_up
 from ethercat_server.stream import SensorStream
 from ethercat_server.virtual_bus import VirtualBus
@@ -28,9 +31,9 @@ log = logging.getLogger("ethercat-server")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the server; returns its exit code."""
-    logging.basicConfig(format="ethercat-server: %(message)s", level=logging.INFO, stream=sys.stderr)
+    set_up_logging()
     try:
-        serve(parse_options(argv))
+        serve(argv)
     except StopRequestedError:
         log.info("stopped before it was up")
     except ServerError as error:
@@ -39,24 +42,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def serve(options: ServerOptions) -> None:
+def serve(argv: Sequence[str] | None) -> None:
     """Bring everything up, stream until asked to stop, take everything down; ServerError says what failed."""
-    signals = _StopSignals()
+    options = parse_options(argv)
+    policy, notifier = Policy(options), Notifier()
+    signals = _Signals()
     with contextlib.ExitStack() as cleanup:
-        hub = Hub(options.hosts, options.port)
+        hub = Hub(options.server["hosts"], options.port)
         cleanup.callback(hub.close)
-        ifname = options.ifname
+        policy.apply(hub)
+        ifname, priority = options.ifname, options.server["rt_priority"]
         if options.is_virtual:
-            ifname = cleanup.enter_context(VirtualBus(options.virtual_arguments, options.rt_priority)).ifname
+            ifname = cleanup.enter_context(VirtualBus(options.virtual_arguments, priority)).ifname
         check_interface(ifname)
         bus = Bus(ifname)
         bus.open()
         cleanup.callback(bus.close)
         sensors = bring_up(bus, options, signals.check)
-        realtime.prepare(options.rt_priority, options.cpu)
+        realtime.prepare(priority, options.server["cpu"])
         streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]
-        cycle = Cycle(bus, streams, hub, Recovery(bus, sensors, streams, hub.broadcast))
-        signals.call(cycle.stop)
+        cycle = Cycle(bus, streams, hub, Recovery(bus, sensors, streams, hub.broadcast), notifier)
+        service = Service(argv, policy, hub, sensors, notifier)
+        cycle.every_second = service.every_second
+        signals.call(cycle.stop, service.reload)
         hub.start(Actions(hub, cycle, sensors).handle)
         for sensor in sensors:
             log.info(
@@ -65,34 +73,38 @@ def serve(options: ServerOptions) -> None:
                 sensor.pdo_size, sensor.rate_hz,
             )  # fmt: skip
         log.info("streaming %s on port %d", ifname, options.port)
+        service.ready()
         try:
             cycle.run()
         finally:
+            notifier.stopping()
             hub.broadcast(event(Event.SHUTTING_DOWN))
         log.info("stopping: the bus goes to INIT")
 
 
-class _StopSignals:
-    """SIGINT and SIGTERM: noticed between start-up's steps, then passed on to the loop."""
+class _Signals:
+    """SIGINT and SIGTERM stop, SIGHUP reloads: noticed between start-up's steps, then passed on."""
 
     def __init__(self) -> None:
         self._stop: Callable[[], None] | None = None
         self._received = False
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
+            signal.signal(number, self._on_stop)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until there is something to reload for
 
     def check(self) -> None:
         """StopRequestedError if a signal has come."""
         if self._received:
             raise StopRequestedError("asked to stop while starting")
 
-    def call(self, stop: Callable[[], None]) -> None:
-        """From now on a signal calls `stop`."""
+    def call(self, stop: Callable[[], None], reload: Callable[[], None]) -> None:
+        """From now on a signal calls `stop` or `reload`."""
         self._stop = stop
+        signal.signal(signal.SIGHUP, lambda *_: reload())
         if self._received:
             stop()
 
-    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+    def _on_stop(self, _number: int, _frame: FrameType | None) -> None:
         self._received = True
         if self._stop is not None:
             self._stop()

@@ -1,4 +1,4 @@
-"""One client's connection: what it sent so far, what waits to be sent to it, what it subscribed to.
+"""One client's connection: who it is, what it sent so far, what waits to be sent to it, what it wants.
 
 It never blocks. What cannot be sent at once waits in a bounded queue of whole frames; when that is full the
 oldest DATA goes, never part of a frame and never a reply.
@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import time
 from collections import deque
-from typing import Final
+from typing import Final, NamedTuple
 
 from protocol.errors import BadMessageError, RemoteProtocolError
 from protocol.framing import (
@@ -35,6 +36,22 @@ _REPEATED: Final = int(DataFlag.REPEATED)
 _GAP: Final = int(DataFlag.GAP)
 
 
+_UNFINISHED_NS: Final = 10_000_000_000
+"""A message that has begun must end within this."""
+_COST_NS: Final = 2_000_000
+_MOST_CREDIT_NS: Final = 100 * _COST_NS
+"""A client may ask 500 times a second, and 100 times at once after a pause; what is more waits its turn."""
+
+
+class Limits(NamedTuple):
+    """What a client may take its time for."""
+
+    stall_ns: float = 10e9
+    """Without taking anything of what waits for it."""
+    idle_ns: float = 300e9
+    """Without a request while it is not subscribed."""
+
+
 class Subscription:
     """Which DATA a client wants. Lists are by sensor place."""
 
@@ -54,13 +71,15 @@ class Subscription:
 class Connection:
     """A client's socket and everything that belongs to it."""
 
-    def __init__(self, sock: socket.socket) -> None:
+    def __init__(self, sock: socket.socket, uid: int | None = None) -> None:
+        """`uid` is the user who owns the other end, None if that is not known."""
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         self.sock = sock
         self.fd = sock.fileno()
         self.peer = _address_text(sock)
+        self.uid = uid
         self.framed: FrameDecoder | None = None
         self.bare: BareJsonDecoder | None = None
         self.subscription: Subscription | None = None
@@ -76,10 +95,22 @@ class Connection:
         """Whole messages may be waiting to be taken by `next_message`."""
         self.end_of_input = False
         """The peer has closed its side."""
+        self.busy = False
+        """Its last request is not answered yet; what it sent behind it waits."""
+        self._heard_ns = time.monotonic_ns()
+        self._begun_ns = 0
+        """Since when a message of which only a part has come is waited for; 0 if there is none."""
+        self._took_ns = 0
+        self._credit_ns = _MOST_CREDIT_NS
+        self._credited_ns = self._heard_ns
         self._queue: deque[tuple[bytes, int]] = deque()  # frame, sensor place or -1 for JSON
         self._queued_data = 0
         self._head_sent = 0
         self.needs_writing = False
+
+    def __str__(self) -> str:
+        """For the log. The user by number: names may have to be asked for over the network."""
+        return f"client {self.peer} (uid {'unknown' if self.uid is None else self.uid})"
 
     # -- receiving
 
@@ -108,6 +139,26 @@ class Connection:
             decoder.feed(data)
         self.unread = True
 
+    def may_ask(self, now_ns: int) -> bool:
+        """Whether it is this client's turn to be answered once more: none may ask without pause."""
+        self._credit_ns = min(_MOST_CREDIT_NS, self._credit_ns + now_ns - self._credited_ns)
+        self._credited_ns = now_ns
+        if self._credit_ns < _COST_NS:
+            return False
+        self._credit_ns -= _COST_NS
+        return True
+
+    def complaint(self, now_ns: int, limits: Limits) -> str | None:
+        """Why this client is to be closed, if it is."""
+        if self.needs_writing:
+            if now_ns - self._took_ns > limits.stall_ns:
+                return f"it has taken nothing of what waits for it for {limits.stall_ns / 1e9:g} s"
+        elif self._begun_ns and now_ns - self._begun_ns > _UNFINISHED_NS:
+            return f"it has not finished its message for {_UNFINISHED_NS / 1e9:g} s"
+        elif self.subscription is None and not self.busy and now_ns - self._heard_ns > limits.idle_ns:
+            return f"it has asked nothing for {limits.idle_ns / 1e9:g} s"
+        return None
+
     def next_message(self) -> JsonObject | BadMessageError | RemoteProtocolError | None:
         """The next whole message received, or the error in the place of a bad one; None if there is none.
 
@@ -120,19 +171,24 @@ class Connection:
             try:
                 message = decoder.next_message()
             except BadMessageError as error:
+                self._begun_ns = 0
                 return error
             except RemoteProtocolError as error:
-                self._finish()
+                self.finish()
                 return error
         if isinstance(message, dict):  # the server's decoder gives no DATA
+            self._heard_ns, self._begun_ns = time.monotonic_ns(), 0
             return message
         self.unread = False
+        if decoder is not None and decoder.pending and not self._begun_ns:
+            self._begun_ns = time.monotonic_ns()
         # One that has subscribed may have nothing more to say and still listen; if not, sending will tell.
         if self.end_of_input and self.subscription is None:
-            self._finish()
+            self.finish()
         return None
 
-    def _finish(self) -> None:
+    def finish(self) -> None:
+        """Take nothing more from the peer; the connection is closed once everything is sent."""
         self.closing = True
         self.unread = False
         self.subscription = None
@@ -185,6 +241,7 @@ class Connection:
                 return
             self._head_sent = sent
             self.needs_writing = True
+            self._took_ns = time.monotonic_ns()
         self._queue.append((frame, place))
         if place >= 0:
             self._queued_data += 1
@@ -203,6 +260,7 @@ class Connection:
                 self.dead = True
                 return
             self._head_sent += sent
+            self._took_ns = time.monotonic_ns()
             if self._head_sent < len(frame):
                 return
             self._queue.popleft()

@@ -7,12 +7,13 @@ everything, and `run` is all of the hot path outside `SensorStream.take` and `Co
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from ethercat_server.bus import Bus
 from ethercat_server.distribution import SLOT_NS, RecentDistribution
 from ethercat_server.hub import Hub
+from ethercat_server.notify import Notifier
 from ethercat_server.recovery import Recovery
 from ethercat_server.stream import SensorStream
 
@@ -31,8 +32,13 @@ _MAX_LEAD_NS: Final = 200_000.0
 class Cycle:
     """Reads the sensors and hands their samples to the hub until told to stop."""
 
-    def __init__(self, bus: Bus, streams: Sequence[SensorStream], hub: Hub, recovery: Recovery) -> None:
+    def __init__(
+        self, bus: Bus, streams: Sequence[SensorStream], hub: Hub, recovery: Recovery, notifier: Notifier
+    ) -> None:
         self.stopping = False
+        self.every_second: Callable[[], None] = lambda: None
+        """Called once a second."""
+        self._notifier = notifier
         self._bus = bus
         self._streams = streams
         self._hub = hub
@@ -51,11 +57,12 @@ class Cycle:
     def run(self) -> None:
         """The loop."""
         bus, hub, streams, recovery = self._bus, self._hub, self._streams, self._recovery
+        notifier = self._notifier
         monotonic_ns, sleep = time.monotonic_ns, time.sleep
         shortest_ns = min(stream.clock.period_ns for stream in streams)
         timeout_s = max(300e-6, 0.75e-9 * shortest_ns)
         lead_ns = 0.0  # how late this thread usually wakes: deadlines are brought forward by it
-        serve_by = roll_at = 0
+        serve_by = roll_at = feed_at = 0
         while not self.stopping:
             now = monotonic_ns()
             deadline = int(min([stream.clock.next_poll_ns() for stream in streams]) - lead_ns)
@@ -92,6 +99,9 @@ class Cycle:
             if back >= roll_at:
                 roll_at = back + SLOT_NS
                 self._roll()
+            if back >= feed_at:
+                feed_at = back + notifier.feed_every_ns
+                notifier.feed()
             self._cycles += 1
             self._lost_frames += wkc < 0
             self._exchange.record(back - sent)
@@ -103,6 +113,7 @@ class Cycle:
         for stream in self._streams:
             stream.age.roll()
             stream.check_rate()
+        self.every_second()
 
     def status(self) -> dict[str, Any]:
         """The cycle's part of the `status` reply."""

@@ -14,13 +14,16 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from ethercat_server.connection import Connection
+from ethercat_server.connection import Connection, Limits
 from ethercat_server.errors import ServerError
+from ethercat_server.socket_owner import open_diagnostics, peer_uid
 from protocol.control import ErrorCode, error_reply
 from protocol.errors import BadMessageError, RemoteProtocolError, RequestError
 from protocol.framing import JsonObject
 
 MAX_CLIENTS: Final = 64
+RESERVED: Final = 16
+"""So many of them are for users who may control: strangers cannot take all."""
 _LAST_WORDS_S: Final = 1.0
 """How long a closing connection may take to accept its last reply."""
 
@@ -30,8 +33,8 @@ _BACKLOG: Final = 128
 
 log = logging.getLogger(__name__)
 
-Handler = Callable[[Connection, JsonObject], JsonObject]
-"""Turns a request into its reply; RequestError refuses it."""
+Handler = Callable[[Connection, JsonObject], JsonObject | None]
+"""Turns a request into its reply, or None if it comes later through `Hub.answer`; RequestError refuses it."""
 
 
 class Hub:
@@ -47,6 +50,12 @@ class Hub:
         self._listeners = _listen(hosts, port)
         self._readers: list[int] = []
         self._unread: list[Connection] = []
+        self._hasty: list[Connection] = []
+        """They have asked too much lately and wait for their turn."""
+        self._diagnostics = open_diagnostics()
+        self.control_uids: frozenset[int] = frozenset({0})
+        """Users who may change something."""
+        self.limits = Limits()
         self._sweep_at_ns = 0
 
     def start(self, handler: Handler) -> None:
@@ -65,12 +74,31 @@ class Hub:
             if connection.framed is not None and not connection.closing:
                 connection.send_json(message)
 
+    def answer(self, connection: Connection, reply: JsonObject) -> None:
+        """Send the reply that a handler left for later; what the client sent behind it comes next."""
+        if self.connections.get(connection.fd) is not connection:
+            return
+        connection.busy = False
+        connection.send_json(reply)
+        if connection.unread:
+            self._unread.append(connection)
+        self._update_readers()
+
+    def may_control(self, connection: Connection) -> bool:
+        """Whether the user at the other end may change something. What is not known is refused."""
+        if connection.uid is None:
+            connection.uid = peer_uid(self._diagnostics, connection.sock)
+        return connection.uid in self.control_uids
+
     def subscriptions_changed(self) -> None:
         """A connection's subscription was made or ended."""
         self._subscribers = [c for c in self.connections.values() if c.subscription is not None]
 
     def serve(self, until_ns: int) -> None:
         """Serve the sockets until CLOCK_MONOTONIC is `until_ns`; one look at each if that is past."""
+        if self._hasty:
+            self._unread += [c for c in self._hasty if self.connections.get(c.fd) is c]
+            self._hasty = []
         while True:
             left = 0 if self._unread else max(0, until_ns - time.monotonic_ns())
             writers = [c.fd for c in self.connections.values() if c.needs_writing]
@@ -103,6 +131,7 @@ class Hub:
         for connection in self.connections.values():
             connection.close()
         self.connections.clear()
+        self._diagnostics.close()
 
     def _accept(self, fd: int) -> None:
         listener = next((item for item in self._listeners if item.fileno() == fd), None)
@@ -113,10 +142,12 @@ class Hub:
                 sock, _ = listener.accept()
             except OSError:
                 break
-            if len(self.connections) >= MAX_CLIENTS:
-                sock.close()
+            uid = peer_uid(self._diagnostics, sock)
+            connection = Connection(sock, uid)
+            if len(self.connections) >= MAX_CLIENTS - RESERVED * (uid not in self.control_uids):
+                log.warning("%s refused: there are %d clients already", connection, len(self.connections))
+                connection.close()
                 continue
-            connection = Connection(sock)
             self.connections[connection.fd] = connection
         self._update_readers()
 
@@ -135,12 +166,18 @@ class Hub:
         """Answer one message of each connection that has some: none makes the others wait for all of its."""
         waiting, self._unread = self._unread, []
         for connection in waiting:
+            if not connection.may_ask(time.monotonic_ns()):
+                self._hasty.append(connection)
+                continue
             message = connection.next_message()
             if isinstance(message, RemoteProtocolError | BadMessageError):
                 connection.send_json(error_reply(None, ErrorCode.BAD_REQUEST, str(message)))
             elif message is not None:
-                connection.send_json(self._answer(connection, message))
-            if connection.unread and not connection.dead:
+                answer = self._answer(connection, message)
+                connection.busy = answer is None
+                if answer is not None:
+                    connection.send_json(answer)
+            if connection.unread and not connection.busy and not connection.dead:
                 self._unread.append(connection)
                 continue
             self._update_readers()
@@ -148,7 +185,7 @@ class Hub:
                 self._sweep_at_ns = 0
                 self.subscriptions_changed()
 
-    def _answer(self, connection: Connection, message: JsonObject) -> JsonObject:
+    def _answer(self, connection: Connection, message: JsonObject) -> JsonObject | None:
         assert self._handler is not None
         try:
             return self._handler(connection, message)
@@ -159,10 +196,16 @@ class Hub:
             return error_reply(None, ErrorCode.INTERNAL, "the request failed in the server: see its log")
 
     def _sweep(self) -> None:
-        """Close what is dead or has said its last words."""
-        self._sweep_at_ns = time.monotonic_ns() + _SWEEP_NS
+        """Close what is dead, has said its last words or takes too long."""
+        now_ns = time.monotonic_ns()
+        self._sweep_at_ns = now_ns + _SWEEP_NS
         gone = []
         for connection in self.connections.values():
+            if not connection.closing and (complaint := connection.complaint(now_ns, self.limits)):
+                log.warning("%s closed: %s", connection, complaint)
+                connection.dead = connection.needs_writing
+                connection.send_json(error_reply(None, ErrorCode.BAD_REQUEST, complaint))
+                connection.finish()
             if connection.closing and not connection.dead:
                 since = self._closing_since.setdefault(connection.fd, time.monotonic())
                 connection.dead = time.monotonic() - since > _LAST_WORDS_S
@@ -182,7 +225,7 @@ class Hub:
     def _update_readers(self) -> None:
         self._readers = [listener.fileno() for listener in self._listeners]
         self._readers += [
-            fd for fd, c in self.connections.items() if not (c.end_of_input or c.unread or c.dead)
+            fd for fd, c in self.connections.items() if not (c.end_of_input or c.unread or c.busy or c.dead)
         ]
 
 
@@ -195,6 +238,8 @@ def _listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
         except OSError:
             continue  # no IPv6 on this machine
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:  # IPv4 has a listener of its own
+            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
         try:
             listener.bind((host, port))
             listener.listen(_BACKLOG)

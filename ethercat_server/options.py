@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import shlex
-import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from ethercat_server import __version__
+from ethercat_server.config_file import EMPTY, read_config
 from ethercat_server.errors import UsageError
+from ethercat_server.server_settings import SERVER_SETTINGS, ServerSetting
 from protocol.errors import SettingError
-from protocol.settings import SETTINGS, SettingValue, check_combination, check_settings, start_up_defaults
+from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
 
 VIRTUAL_INTERFACE: Final = "virtual"
 """The interface name that stands for a virtual bus with a virtual sensor on it."""
-
-
-DEFAULT_RT_PRIORITY: Final = 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +28,11 @@ class ServerOptions:
     ifname: str
     port: int
     sensor_name: str | None = None
-    hosts: tuple[str, ...] = ("127.0.0.1", "::1")
     virtual_arguments: str = ""
-    rt_priority: int = 0
-    """Of SCHED_FIFO; 0 is ordinary scheduling."""
-    cpu: int | None = None
+    server: Mapping[str, Any] = field(
+        default_factory=lambda: {name: setting.default for name, setting in SERVER_SETTINGS.items()}
+    )
+    """The server's own settings, by the names of SERVER_SETTINGS."""
     common_settings: dict[str, SettingValue] = field(default_factory=dict)
     """Asked for every sensor."""
     sensor_settings: dict[int, dict[str, SettingValue]] = field(default_factory=dict)
@@ -55,6 +54,7 @@ class ServerOptions:
         return wanted
 
 
+@functools.cache
 def build_parser() -> argparse.ArgumentParser:
     """The command line of `ethercat-server`."""
     parser = argparse.ArgumentParser(
@@ -73,17 +73,20 @@ def build_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument(
         "--config", type=Path, metavar="FILE.toml",
-        help="settings from a file: table [sensor], or [sensor.0], [sensor.1] for a chain",
+        help="settings from a file: [server] for those below, [sensor] or [sensor.0], [sensor.1] for sensors",
     )  # fmt: skip
     parser.add_argument(
         "--virtual", default="", metavar="ARGUMENTS",
         help="arguments for the virtual sensor, such as '--pdo 77 --sensors 2' (see ethercat-virtual-sensor)",
     )  # fmt: skip
-    parser.add_argument(
-        "--rt-priority", type=_priority, default=DEFAULT_RT_PRIORITY, metavar="N",
-        help="SCHED_FIFO priority, used when allowed; 0 for ordinary scheduling (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument("--cpu", type=int, metavar="N", help="the only CPU to run on, used when allowed")
+    for setting in SERVER_SETTINGS.values():
+        text = setting.meaning + ("; may be given more than once" if setting.many else "")
+        if not setting.many and setting.default is not None:
+            text += f" (default {setting.default:g})"
+        parser.add_argument(
+            setting.flag, dest=setting.name, metavar=setting.metavar, help=text,
+            type=_parse_with(setting), action="append" if setting.many else "store",
+        )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
@@ -100,17 +103,19 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
             f"{len(arguments)} arguments given: it takes IFACE [SENSOR_NAME] PORT, "
             "for example 'ethercat-server ens5 12001'"
         )
-    common, by_sensor = read_config(parsed.config) if parsed.config else ({}, {})
+    config = read_config(parsed.config) if parsed.config else EMPTY
     assigned = parse_assignments(parsed.assignments)
     options = ServerOptions(
         ifname=arguments[0],
         port=_port(arguments[-1]),
         sensor_name=arguments[1] if len(arguments) == 3 else None,
         virtual_arguments=parsed.virtual,
-        rt_priority=parsed.rt_priority,
-        cpu=parsed.cpu,
-        common_settings={**common, **assigned},
-        sensor_settings={place: {**settings, **assigned} for place, settings in by_sensor.items()},
+        server={
+            name: _first_given(getattr(parsed, name), config.server.get(name), setting)
+            for name, setting in SERVER_SETTINGS.items()
+        },
+        common_settings={**config.common, **assigned},
+        sensor_settings={place: {**settings, **assigned} for place, settings in config.by_place.items()},
     )
     try:
         shlex.split(options.virtual_arguments)
@@ -143,36 +148,20 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, SettingValue]:
     return values
 
 
-def read_config(path: Path) -> tuple[dict[str, SettingValue], dict[int, dict[str, SettingValue]]]:
-    """Settings for every sensor, and for single ones by place; UsageError names file and key."""
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"cannot read the configuration {path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"the configuration {path} is not valid TOML: {error}") from None
-    unknown = content.keys() - {"sensor"}
-    table: Any = content.get("sensor", {})
-    if unknown or not isinstance(table, dict):
-        key = sorted(unknown)[0] if unknown else "sensor"
-        raise UsageError(f"the configuration {path} has an unexpected {key!r}: it takes a table [sensor]")
-    common = {key: value for key, value in table.items() if not isinstance(value, dict)}
-    single = {key: value for key, value in table.items() if isinstance(value, dict)}
-    try:
-        by_sensor = {}
-        for key, values in single.items():
-            if not key.isdecimal() or int(key) > 255:
-                raise SettingError(f"[sensor.{key}]: the table must be named by a place, such as sensor.0")
-            by_sensor[int(key)] = check_settings({**common, **values})
-        return check_settings(common), by_sensor
-    except SettingError as error:
-        raise UsageError(f"the configuration {path}: {error}") from None
+def _parse_with(setting: ServerSetting) -> Callable[[str], Any]:
+    def parse(text: str) -> Any:
+        try:
+            return setting.parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(f"{text!r} must be {error}") from None
+
+    return parse
 
 
-def _priority(text: str) -> int:
-    if not text.isdecimal() or int(text) > 99:
-        raise argparse.ArgumentTypeError(f"{text!r} must be from 0 to 99")
-    return int(text)
+def _first_given(on_command_line: Any, in_file: Any, setting: ServerSetting) -> Any:
+    if on_command_line is not None:
+        return tuple(on_command_line) if setting.many else on_command_line
+    return setting.default if in_file is None else in_file
 
 
 def _port(text: str) -> int:

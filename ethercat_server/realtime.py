@@ -9,12 +9,15 @@ import ctypes
 import gc
 import logging
 import os
+import sys
 from pathlib import Path
 from typing import Final
 
 _MLOCK: Final = 1 | 2 | 4
 """MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT: what is in use stays in memory, without filling what is not."""
 _TIMER_SLACK_NS: Final = "1000"
+_SWITCH_S: Final = 0.0002
+"""The longest that the loop waits for another thread of this process; Python's default would cost samples."""
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +45,7 @@ def prepare(priority: int, cpu: int | None) -> None:
         refused.append("locked memory (CAP_IPC_LOCK)")
     if refused:
         log.warning("not granted: %s; the cycle will be less steady", ", ".join(refused))
+    sys.setswitchinterval(_SWITCH_S)
     # Nothing the loop makes needs the collector: what start-up left is set aside, and cycles are not made.
     gc.collect()
     gc.freeze()

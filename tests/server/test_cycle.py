@@ -12,6 +12,7 @@ import pytest
 from ethercat_server.bus import Bus
 from ethercat_server.cycle import Cycle
 from ethercat_server.hub import Hub
+from ethercat_server.notify import Notifier
 from ethercat_server.recovery import Recovery
 from ethercat_server.stream import SensorStream
 from protocol.framing import DataMessage, FrameDecoder
@@ -77,7 +78,7 @@ def run(turns: int, on_serve: Callable[[int], None], bus: ScriptedBus) -> tuple[
 
     hub = ScriptedHub(stop_at_the_end)
     stream = SensorStream(0, PERIOD_NS)
-    cycle = Cycle(cast(Bus, bus), [stream], cast(Hub, hub), cast(Recovery, NoTrouble()))
+    cycle = Cycle(cast(Bus, bus), [stream], cast(Hub, hub), cast(Recovery, NoTrouble()), Notifier())
     cycle.run()
     return cycle.status(), hub
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import socket
 import struct
 import time
@@ -12,8 +13,15 @@ from itertools import pairwise
 
 import pytest
 
+from ethercat_server import connection as connection_module
 from ethercat_server import hub as hub_module
-from ethercat_server.connection import MAX_QUEUED_DATA, MAX_REQUEST_LENGTH, Connection, Subscription
+from ethercat_server.connection import (
+    MAX_QUEUED_DATA,
+    MAX_REQUEST_LENGTH,
+    Connection,
+    Limits,
+    Subscription,
+)
 from ethercat_server.errors import ServerError
 from ethercat_server.hub import Hub
 from protocol.control import parse_request, reply
@@ -33,6 +41,7 @@ class Served:
     def __init__(self) -> None:
         self.hub = Hub(("127.0.0.1",), free_port())
         self.hub.start(self.handle)
+        self.clients: list[socket.socket] = []
         self.sequence = 0
 
     def handle(self, connection: Connection, message: JsonObject) -> JsonObject:
@@ -52,6 +61,7 @@ class Served:
 
     def connect(self) -> socket.socket:
         sock = socket.create_connection(("127.0.0.1", self.hub.port), timeout=5)
+        self.clients.append(sock)
         self.serve()
         return sock
 
@@ -100,6 +110,8 @@ class Served:
 def served() -> Iterator[Served]:
     server = Served()
     yield server
+    for sock in server.clients:
+        sock.close()
     server.hub.close()
 
 
@@ -352,3 +364,122 @@ def test_a_handler_that_fails_costs_one_reply_and_nothing_else(
         assert answer["error"]["code"] == "internal"
         served.publish()
         assert [type(m) for m in served.read(bystander)] == [DataMessage]
+
+
+def closed(served: Served, sock: socket.socket) -> bool:
+    served.serve(0.1)
+    sock.settimeout(5)
+    with contextlib.suppress(ConnectionError):
+        while sock.recv(65536):
+            pass
+    return True
+
+
+def test_a_client_that_takes_nothing_is_closed_after_a_while(served: Served) -> None:
+    served.hub.limits = Limits(stall_ns=0.3e9)
+    sock, other = served.subscribe(), served.subscribe()
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    for _ in range(3000):
+        served.publish()
+        if _ % 100 == 0:
+            other.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                while other.recv(65536):
+                    pass
+    served.serve(0.5)
+    assert len(served.hub.connections) == 1, "the one that reads stays"
+    assert closed(served, sock)
+
+
+def test_one_that_takes_a_little_now_and_then_stays(served: Served) -> None:
+    served.hub.limits = Limits(stall_ns=0.3e9)
+    sock = served.subscribe()
+    for _ in range(10):
+        for _ in range(600):
+            served.publish()
+        sock.recv(60000)
+        served.serve(0.1)
+    assert len(served.hub.connections) == 1
+
+
+def test_idle_and_unfinished_connections_are_closed_with_a_reason(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection_module, "_UNFINISHED_NS", int(0.2e9))
+    served.hub.limits = Limits(idle_ns=0.6e9)
+    subscriber = served.subscribe()
+    unfinished, idle = served.connect(), served.connect()
+    unfinished.sendall(b"\0\0\1\0\2{")
+    idle.sendall(b'{"action":"describe"}\n')
+    served.serve(0.4)
+    message = json.loads(unfinished.recv(4096)[5:])
+    assert message["error"]["code"] == "bad_request"
+    assert "has not finished its message" in message["error"]["message"]
+    assert b'"reply":"describe"' in idle.recv(4096)
+    served.serve(0.8)
+    assert b"asked nothing for 0.6 s" in idle.recv(4096)
+    for sock in (unfinished, idle):
+        assert sock.recv(1) == b""
+        sock.close()
+    served.serve(0.1)
+    assert len(served.hub.connections) == 1, "who has subscribed need not say anything more"
+    assert subscriber.fileno() >= 0
+
+
+def test_a_client_that_asks_without_pause_waits_and_gets_all_answers_in_order(served: Served) -> None:
+    hasty, other = served.connect(), served.connect()
+    hasty.sendall(b"".join(encode_json({"action": "describe", "id": n}) for n in range(400)))
+    served.serve(0.1)
+    answered_soon = [m["id"] for m in served.read(hasty) if isinstance(m, dict)]
+    assert 100 <= len(answered_soon) < 300
+    other.sendall(encode_json({"action": "describe", "id": 1}))
+    assert served.read(other), "others need not wait for it"
+    answers = answered_soon
+    deadline = time.monotonic() + 10
+    while len(answers) < 400 and time.monotonic() < deadline:
+        answers += [m["id"] for m in served.read(hasty) if isinstance(m, dict)]
+    assert answers == list(range(400))
+
+
+def test_strangers_cannot_take_all_places(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    served.hub.control_uids = frozenset()
+    strangers = [served.connect() for _ in range(hub_module.MAX_CLIENTS)]
+    places = hub_module.MAX_CLIENTS - hub_module.RESERVED
+    assert len(served.hub.connections) == places
+    served.hub.control_uids = frozenset({os.geteuid()})
+    friends = [served.connect() for _ in range(hub_module.RESERVED + 3)]
+    assert len(served.hub.connections) == hub_module.MAX_CLIENTS
+    for sock in strangers + friends:
+        sock.close()
+
+
+def test_an_answer_may_come_later_and_what_follows_waits_for_it(served: Served) -> None:
+    waiting: list[tuple[Connection, JsonObject]] = []
+
+    def later(connection: Connection, message: JsonObject) -> JsonObject | None:
+        if message["action"] == "status":
+            waiting.append((connection, message))
+            return None
+        return {"reply": message["action"], "id": message["id"]}
+
+    served.hub.start(later)
+    sock, other = served.connect(), served.connect()
+    for number, action in enumerate(("status", "describe", "status", "describe")):
+        sock.sendall(encode_json({"action": action, "id": number}))
+    other.sendall(encode_json({"action": "describe", "id": 9}))
+    assert served.read(sock) == []
+    assert served.read(other), "others need not wait for it"
+    for number in (0, 2):
+        assert len(waiting) == 1
+        served.hub.answer(waiting[0][0], {"reply": "status", "id": number})
+        waiting.clear()
+        assert [m["id"] for m in served.read(sock) if isinstance(m, dict)] == [number, number + 1]
+    sock.sendall(encode_json({"action": "status", "id": 4}))
+    served.serve()
+    gone, _ = waiting.pop()
+    sock.close()
+    other.close()
+    gone.dead = True
+    served.serve(0.1)
+    served.hub.answer(gone, {"reply": "status", "id": 4})
+    assert served.hub.connections.get(gone.fd) is not gone

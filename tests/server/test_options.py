@@ -8,6 +8,7 @@ import pytest
 
 from ethercat_server.errors import UsageError
 from ethercat_server.options import parse_options
+from ethercat_server.server_settings import SERVER_SETTINGS
 
 
 def test_both_forms_of_the_command() -> None:
@@ -77,7 +78,14 @@ def test_configuration_file(tmp_path: Path) -> None:
     [
         ("[sensor]\nfir = 1\n", "fir is 1"),
         ("[sensor]\ncolour = 1\n", "no setting 'colour'"),
-        ("[server]\n", "unexpected 'server'"),
+        ("[other]\n", "unexpected 'other'"),
+        ("server = 1\n", "unexpected 'server'"),
+        ("[server]\ncolour = 1\n", "no 'colour'"),
+        ("[server]\nrt_priority = 100\n", "from 0 to 99"),
+        ("[server]\nrt_priority = true\n", "a number"),
+        ("[server]\ncontrol_users = 'anna'\n", "a list of texts"),
+        ("[server]\nhosts = ['localhost']\n", "an IP address"),
+        ("[server]\nidle_timeout_s = 0\n", "seconds"),
         ("sensor = 3\n", "unexpected 'sensor'"),
         ("[sensor.first]\nfir = true\n", "named by a place"),
         ("[sensor\n", "not valid TOML"),
@@ -88,6 +96,31 @@ def test_wrong_configuration_is_refused_by_name(tmp_path: Path, text: str, compl
     file.write_text(text)
     with pytest.raises(UsageError, match=complaint):
         parse_options(["ens5", "1", "--config", str(file)])
+
+
+def test_the_servers_own_settings_from_file_and_command_line(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text('[server]\ncontrol_users = ["anna", "ben"]\nrt_priority = 50\nstall_timeout_s = 2.5\n')
+    plain = parse_options(["ens5", "1"]).server
+    assert plain == {name: setting.default for name, setting in SERVER_SETTINGS.items()}
+    from_file = parse_options(["ens5", "1", "--config", str(file)]).server
+    assert (from_file["control_users"], from_file["rt_priority"]) == (("anna", "ben"), 50)
+    assert from_file["stall_timeout_s"] == 2.5
+    both = ["ens5", "1", "--config", str(file), "--rt-priority", "0", "--control-user", "carl"]
+    assert parse_options(both).server["rt_priority"] == 0, "the command line wins"
+    assert parse_options(both).server["control_users"] == ("carl",)
+    assert parse_options(["ens5", "1", "--host", "10.0.0.1", "--host", "::1"]).server["hosts"] == (
+        "10.0.0.1",
+        "::1",
+    )
+
+
+def test_every_server_setting_is_on_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parse_options(["--help"])
+    text = capsys.readouterr().out
+    for setting in SERVER_SETTINGS.values():
+        assert f"{setting.flag} {setting.metavar}" in text
 
 
 def test_missing_configuration_file(tmp_path: Path) -> None:

@@ -1,0 +1,71 @@
+"""The configuration file, TOML: the server's settings in [server], the sensors' in [sensor], [sensor.0]."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ethercat_server.errors import UsageError
+from ethercat_server.server_settings import SERVER_SETTINGS
+from protocol.errors import SettingError
+from protocol.settings import SettingValue, check_settings
+
+
+class ConfigFile(NamedTuple):
+    """What a file says, checked."""
+
+    server: dict[str, Any]
+    """By the names of SERVER_SETTINGS."""
+    common: dict[str, SettingValue]
+    """Settings for every sensor."""
+    by_place: dict[int, dict[str, SettingValue]]
+    """Settings for single sensors, the common ones included."""
+
+
+EMPTY = ConfigFile({}, {}, {})
+
+
+def read_config(path: Path) -> ConfigFile:
+    """Read a configuration file; UsageError names file and key."""
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"cannot read the configuration {path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"the configuration {path} is not valid TOML: {error}") from None
+    for key, value in content.items():
+        if key not in {"server", "sensor"} or not isinstance(value, dict):
+            raise UsageError(
+                f"the configuration {path} has an unexpected {key!r}: it takes tables [server] and [sensor]"
+            )
+    try:
+        return ConfigFile(_server(content.get("server", {})), *_sensors(content.get("sensor", {})))
+    except (SettingError, UsageError) as error:
+        raise UsageError(f"the configuration {path}: {error}") from None
+
+
+def _server(table: dict[str, Any]) -> dict[str, Any]:
+    values = {}
+    for key, value in table.items():
+        setting = SERVER_SETTINGS.get(key)
+        if setting is None:
+            raise UsageError(f"[server] has no {key!r}: it takes {', '.join(SERVER_SETTINGS)}")
+        try:
+            values[key] = setting.check(value)
+        except ValueError as error:
+            raise UsageError(f"[server] {key} = {value!r} must be {error}") from None
+    return values
+
+
+def _sensors(
+    table: dict[str, Any],
+) -> tuple[dict[str, SettingValue], dict[int, dict[str, SettingValue]]]:
+    common = {key: value for key, value in table.items() if not isinstance(value, dict)}
+    single = {key: value for key, value in table.items() if isinstance(value, dict)}
+    by_place = {}
+    for key, values in single.items():
+        if not key.isdecimal() or int(key) > 255:
+            raise SettingError(f"[sensor.{key}]: the table must be named by a place, such as sensor.0")
+        by_place[int(key)] = check_settings({**common, **values})
+    return check_settings(common), by_place

@@ -1,0 +1,113 @@
+"""What a service needs beside its loop: readiness, a status line, its configuration read again.
+
+SIGHUP reads command line and file again in a thread of its own, because names of users may have to be asked
+for over the network; the loop takes the result over within a second.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Sequence
+from typing import Final
+
+from ethercat_server.authority import controlling_uids
+from ethercat_server.connection import Limits
+from ethercat_server.errors import UsageError
+from ethercat_server.hub import Hub
+from ethercat_server.notify import Notifier
+from ethercat_server.options import ServerOptions, parse_options
+from ethercat_server.sensor import Sensor
+from ethercat_server.server_settings import SERVER_SETTINGS
+
+log = logging.getLogger(__name__)
+
+_NANO: Final = 1e9
+
+
+class Policy:
+    """What of the options is in force at once, names looked up; UsageError if there is no such name."""
+
+    def __init__(self, options: ServerOptions) -> None:
+        server = options.server
+        self.options = options
+        self.control_uids = controlling_uids(server["control_users"], server["control_groups"])
+        self.limits = Limits(server["stall_timeout_s"] * _NANO, server["idle_timeout_s"] * _NANO)
+
+    def apply(self, hub: Hub) -> None:
+        """Put it in force."""
+        hub.control_uids = self.control_uids
+        hub.limits = self.limits
+
+
+class Service:
+    """One running server, as systemd and its administrator see it."""
+
+    def __init__(
+        self,
+        argv: Sequence[str] | None,
+        policy: Policy,
+        hub: Hub,
+        sensors: Sequence[Sensor],
+        notifier: Notifier,
+    ) -> None:
+        self._argv = argv
+        self._policy = policy
+        self._hub = hub
+        self._sensors = sensors
+        self._notifier = notifier
+        self._fresh: Policy | UsageError | None = None
+        self._reading: threading.Thread | None = None
+        self._again = False
+
+    def ready(self) -> None:
+        """The server streams."""
+        self._notifier.ready()
+        self._tell_status()
+
+    def reload(self) -> None:
+        """SIGHUP: read the configuration again."""
+        self._again = True
+
+    def every_second(self) -> None:
+        """The loop's spare moment: take over what was read, tell how things are."""
+        if self._again and self._reading is None:
+            self._again = False
+            self._reading = threading.Thread(target=self._read, daemon=True)
+            self._reading.start()
+        elif self._reading is not None and not self._reading.is_alive():
+            self._reading = None
+            self._take_over()
+        self._tell_status()
+
+    def _read(self) -> None:
+        try:
+            self._fresh = Policy(parse_options(self._argv))
+        except UsageError as error:
+            self._fresh = error
+
+    def _take_over(self) -> None:
+        fresh, self._fresh = self._fresh, None
+        if not isinstance(fresh, Policy):
+            log.error("the configuration stays as it was: %s", fresh or "it could not be read")
+            return
+        was, now = self._policy.options, fresh.options
+        fresh.apply(self._hub)
+        self._policy = fresh
+        changed = [name for name in SERVER_SETTINGS if was.server[name] != now.server[name]]
+        later = [f"[server] {name}" for name in changed if not SERVER_SETTINGS[name].at_once]
+        if (was.common_settings, was.sensor_settings) != (now.common_settings, now.sensor_settings):
+            later.append("[sensor]")
+        at_once = [name for name in changed if SERVER_SETTINGS[name].at_once]
+        log.info(
+            "configuration read again: %s", f"changed {', '.join(at_once)}" if at_once else "nothing new"
+        )
+        if later:
+            log.warning("a change of %s takes effect at the next start", ", ".join(later))
+
+    def _tell_status(self) -> None:
+        lost = [sensor.place for sensor in self._sensors if sensor.state != "OP"]
+        text = f"streaming {len(self._sensors) - len(lost)} of {len(self._sensors)} sensors"
+        if lost:
+            text += f", lost: {', '.join(map(str, lost))}"
+        self._notifier.status(f"{text}; {len(self._hub.connections)} clients")
