@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from ethercat_server import __version__
 from ethercat_server.connection import Connection, Subscription
 from ethercat_server.cycle import Cycle
 from ethercat_server.hub import Hub
-from ethercat_server.sensor import Sensor
+from ethercat_server.sensor_actions import SensorActions
 from protocol.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
 from protocol.errors import RequestError
 from protocol.framing import JsonObject
@@ -20,10 +20,11 @@ log = logging.getLogger(__name__)
 class Actions:
     """Answers requests. One method an action, found by its name."""
 
-    def __init__(self, hub: Hub, cycle: Cycle, sensors: Sequence[Sensor]) -> None:
+    def __init__(self, hub: Hub, cycle: Cycle, on_sensors: SensorActions) -> None:
         self._hub = hub
         self._cycle = cycle
-        self._sensors = sensors
+        self._on_sensors = on_sensors
+        self._sensors = on_sensors.sensors
         self._handlers: dict[str, Callable[[Connection, Request], JsonObject]] = {
             "describe": self._describe,
             "subscribe": self._subscribe,
@@ -32,8 +33,8 @@ class Actions:
             "shutdown": self._shutdown,
         }
 
-    def handle(self, connection: Connection, message: JsonObject) -> JsonObject:
-        """The reply to `message`; RequestError refuses it."""
+    def handle(self, connection: Connection, message: JsonObject) -> JsonObject | None:
+        """The reply to `message`, None if it comes later; RequestError refuses it."""
         request = parse_request(message)
         action = ACTIONS[request.action]
         if action.framed_only and connection.framed is None:
@@ -44,6 +45,9 @@ class Actions:
         if action.controls and not self._hub.may_control(connection):
             log.warning("%s: %s denied", connection, request.action)
             raise RequestError(ErrorCode.DENIED, _denial(request.action, connection.uid))
+        if request.action in self._on_sensors.handlers:
+            self._on_sensors.handle(connection, request)
+            return None
         return self._handlers[request.action](connection, request)
 
     def _describe(self, _: Connection, request: Request) -> JsonObject:

@@ -14,7 +14,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Final, NamedTuple
 
 import pysoem
@@ -27,6 +27,7 @@ _SDO_ATTEMPTS: Final = 3
 _OP_TIMEOUT_S: Final = 10.0
 _DATAGRAM_TIMEOUT_S: Final = 0.002
 _PATIENT_TIMEOUT_S: Final = 0.02
+_LEAST_TIMEOUT_S: Final = 0.0003
 _STATION_ADDRESS: Final = 0x0010
 _MOST_DOUBTS: Final = 4
 _COLLECT_US: Final = 100
@@ -259,6 +260,16 @@ class Bus:
             self._careful = True  # it may still come
             return -1, b""
         return answer
+
+    @contextlib.contextmanager
+    def in_time(self, until_ns: int) -> Iterator[None]:
+        """Within it, single datagrams wait no longer than until then: an exchange is due."""
+        usual, left_s = self._datagram_timeout_s, (until_ns - time.monotonic_ns()) * 1e-9
+        self._datagram_timeout_s = min(usual, max(_LEAST_TIMEOUT_S, left_s))
+        try:
+            yield
+        finally:
+            self._datagram_timeout_s = usual
 
     def reclaim(self, slave: int) -> bool:
         """Give a slave that lost its station address (its power was cut) the address back.

@@ -16,10 +16,12 @@ from ethercat_server.cycle import Cycle
 from ethercat_server.errors import ServerError, StopRequestedError
 from ethercat_server.hub import Hub
 from ethercat_server.interface import check_interface
+from ethercat_server.jobs import Jobs
 from ethercat_server.logs import set_up_logging
 from ethercat_server.notify import Notifier
 from ethercat_server.options import parse_options
 from ethercat_server.recovery import Recovery
+from ethercat_server.sensor_actions import SensorActions
 from ethercat_server.service import Policy, Service
 from ethercat_server.start_up import bring_up
 from ethercat_server.stream import SensorStream
@@ -61,11 +63,12 @@ def serve(argv: Sequence[str] | None) -> None:
         sensors = bring_up(bus, options, signals.check)
         realtime.prepare(priority, options.server["cpu"])
         streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]
-        cycle = Cycle(bus, streams, hub, Recovery(bus, sensors, streams, hub.broadcast), notifier)
+        recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast), Jobs(bus, streams)
+        cycle = Cycle(bus, streams, hub, recovery, jobs, notifier)
         service = Service(argv, policy, hub, sensors, notifier)
         cycle.every_second = service.every_second
         signals.call(cycle.stop, service.reload)
-        hub.start(Actions(hub, cycle, sensors).handle)
+        hub.start(Actions(hub, cycle, SensorActions(hub, recovery, jobs, sensors, streams)).handle)
         for sensor in sensors:
             log.info(
                 "sensor %d: %s, serial %d, firmware %s, %d bytes at %d Hz",

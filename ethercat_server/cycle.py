@@ -13,6 +13,7 @@ from typing import Any, Final
 from ethercat_server.bus import Bus
 from ethercat_server.distribution import SLOT_NS, RecentDistribution
 from ethercat_server.hub import Hub
+from ethercat_server.jobs import Jobs
 from ethercat_server.notify import Notifier
 from ethercat_server.recovery import Recovery
 from ethercat_server.stream import SensorStream
@@ -33,11 +34,18 @@ class Cycle:
     """Reads the sensors and hands their samples to the hub until told to stop."""
 
     def __init__(
-        self, bus: Bus, streams: Sequence[SensorStream], hub: Hub, recovery: Recovery, notifier: Notifier
+        self,
+        bus: Bus,
+        streams: Sequence[SensorStream],
+        hub: Hub,
+        recovery: Recovery,
+        jobs: Jobs,
+        notifier: Notifier,
     ) -> None:
         self.stopping = False
         self.every_second: Callable[[], None] = lambda: None
         """Called once a second."""
+        self._jobs = jobs
         self._notifier = notifier
         self._bus = bus
         self._streams = streams
@@ -57,7 +65,7 @@ class Cycle:
     def run(self) -> None:
         """The loop."""
         bus, hub, streams, recovery = self._bus, self._hub, self._streams, self._recovery
-        notifier = self._notifier
+        jobs, notifier = self._jobs, self._notifier
         monotonic_ns, sleep = time.monotonic_ns, time.sleep
         shortest_ns = min(stream.clock.period_ns for stream in streams)
         timeout_s = max(300e-6, 0.75e-9 * shortest_ns)
@@ -69,6 +77,8 @@ class Cycle:
             wait_s = timeout_s
             if recovery.all_lost:
                 deadline, wait_s = now + _RECOVERY_STEP_NS, _RECOVERY_TIMEOUT_S
+            if jobs.waiting:
+                jobs.step(deadline)
             if deadline > now or now > serve_by:
                 hub.serve(deadline - _SERVE_MARGIN_NS)
                 serve_by = now + _SERVE_EVERY_NS

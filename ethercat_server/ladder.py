@@ -52,7 +52,13 @@ class Ladder:
         self._place = sensor.place
         fmmus, sync_managers = self._remember(_COUNTS, 2)
         self._fmmus = self._remember(_FMMU, fmmus * _FMMU_SIZE)
-        self._sync_managers = self._remember(_SM, sync_managers * _SM_SIZE)
+        self._sync_managers = rows = self._remember(_SM, sync_managers * _SM_SIZE)
+        out, back = (
+            (int.from_bytes(row[0:2], "little"), int.from_bytes(row[2:4], "little"))
+            for row in (rows[:_SM_SIZE], rows[_SM_SIZE:])
+        )
+        self.sdo = CyclicSdo(bus, sensor.place, (out, back))
+        """SDO transfers in steps. One for all: the sensor takes two messages with one number for one."""
 
     def climb(self, pause_s: float = 0.0) -> Steps[bool]:
         """Returns once the sensor is in OP: True if it had left it, False if it had only been out of reach.
@@ -82,6 +88,13 @@ class Ladder:
             yield from pause(_REFUSED_PAUSE_S)
         return (yield from self.climb())
 
+    def reconfigure(self) -> Steps[bool]:
+        """Take the sensor to PREOP, write what is wanted, and back to OP; raises as `climb`."""
+        yield from self._go(AlState.PREOP)
+        yield from set_up(self.sdo, self._sensor)
+        yield from self._go_op()
+        return True
+
     def al_status(self) -> AlStatus | None:
         """The sensor's AL status; None if it does not answer."""
         data = self._bus.read_register(self._place, AL_STATUS, AL_STATUS_SIZE)
@@ -93,17 +106,16 @@ class Ladder:
         self._write(_SII_OWNER, b"\x01")  # the sensor reads its SII on the way to PREOP
         self._write(_SM, rows[:_MAILBOXES_END])
         yield from self._go(AlState.PREOP)
-        mailboxes = [
-            (int.from_bytes(row[0:2], "little"), int.from_bytes(row[2:4], "little"))
-            for row in (rows[:_SM_SIZE], rows[_SM_SIZE:])
-        ]
-        sdo = CyclicSdo(self._bus, self._place, (mailboxes[0], mailboxes[1]))
-        found = yield from identify(sdo, sensor.identity.name)
+        found = yield from identify(self.sdo, sensor.identity.name)
         if (found.name, found.serial) != (sensor.identity.name, sensor.identity.serial):
             yield from self._go(AlState.INIT)
             raise DifferentSensorError(found)
-        yield from set_up(sdo, sensor)
-        self._write(_SM + _MAILBOXES_END, rows[_MAILBOXES_END:])
+        yield from set_up(self.sdo, sensor)
+        yield from self._go_op()
+
+    def _go_op(self) -> Steps[None]:
+        """From PREOP: the process data's sync managers and FMMUs as they were, then SAFEOP and OP."""
+        self._write(_SM + _MAILBOXES_END, self._sync_managers[_MAILBOXES_END:])
         self._write(_FMMU, self._fmmus)
         yield from self._go(AlState.SAFEOP)
         yield from self._go(AlState.OP)

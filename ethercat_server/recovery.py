@@ -8,18 +8,20 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 from ethercat_server.al import AlState
 from ethercat_server.bus import Bus
+from ethercat_server.configuration import Change
 from ethercat_server.errors import BusError
 from ethercat_server.interface import check_present
 from ethercat_server.ladder import DifferentSensorError, GoneError, Ladder
-from ethercat_server.sdo import Steps
+from ethercat_server.sdo import CyclicSdo, Steps
 from ethercat_server.sensor import Identity, Sensor
 from ethercat_server.stream import SensorStream
 from protocol.control import Event, event
 from protocol.framing import JsonObject
+from protocol.settings import SettingValue
 
 _SHORT_EXCHANGES: Final = 2
 """So many exchanges in a row with a short working counter are looked into."""
@@ -30,6 +32,15 @@ _WATCH_EVERY_NS: Final = 100_000_000
 _FAILED_PAUSE_S: Final = 0.25
 
 log = logging.getLogger(__name__)
+
+
+class _Reconfiguration(NamedTuple):
+    """A change of settings under way: what to go back to, whom to tell, why it failed if it did."""
+
+    wanted: dict[str, SettingValue]
+    asked: frozenset[str]
+    done: Callable[[BusError | None], None]
+    failed: BusError | None = None
 
 
 class Recovery:
@@ -49,6 +60,7 @@ class Recovery:
         self._ladders = [Ladder(bus, sensor) for sensor in sensors]
         self._climbing: dict[int, Steps[bool]] = {}
         self._lost_at: dict[int, float] = {}
+        self._changing: dict[int, _Reconfiguration] = {}
         self._short = 0
         self._frame_ns = time.monotonic_ns()
         self._watch_ns = 0
@@ -58,6 +70,21 @@ class Recovery:
         self.all_lost: bool
         """Whether no sensor is left to be read."""
         self._count_alive()
+
+    def reconfigure(self, place: int, change: Change, done: Callable[[BusError | None], None]) -> None:
+        """Take a sensor out of OP to change its settings. `done` is called once it gives samples again.
+
+        If it fails the former settings come back into force, and `done` gets the reason.
+        """
+        sensor = self._sensors[place]
+        self._changing[place] = _Reconfiguration(sensor.wanted, sensor.asked, done)
+        sensor.wanted, sensor.asked = change.wanted, sensor.asked | set(change.names)
+        sensor.state = AlState.PREOP.name
+        self._take_out(place, self._ladders[place].reconfigure())
+
+    def sdo(self, place: int) -> CyclicSdo:
+        """SDO transfers to a sensor that is not lost, in steps."""
+        return self._ladders[place].sdo
 
     def attend(self, wkc: int, now_ns: int) -> None:
         """To be called after every exchange; almost always it has nothing to do.
@@ -105,14 +132,17 @@ class Recovery:
             return
         sensor = self._sensors[place]
         sensor.state = "LOST"
-        self._streams[place].alive = False
         self._lost_at[place] = time.monotonic()
-        self._climbing[place] = self._ladders[place].climb()
-        self._count_alive()
+        self._take_out(place, self._ladders[place].climb())
         log.warning("sensor %d (%s) is lost: %s", place, sensor.identity, reason)
         self._announce(
             event(Event.SENSOR_LOST, sensor=place, reason=reason, message=f"sensor {place} is lost: {reason}")
         )
+
+    def _take_out(self, place: int, steps: Steps[bool]) -> None:
+        self._streams[place].alive = False
+        self._climbing[place] = steps
+        self._count_alive()
 
     def _count_alive(self) -> None:
         alive = [place for place in range(len(self._sensors)) if place not in self._climbing]
@@ -125,20 +155,39 @@ class Recovery:
             next(self._climbing[place])
         except StopIteration as stop:
             self._bring_back(place, left_op=stop.value)
-        except GoneError:
+        except (GoneError, BusError) as error:
+            if place in self._changing and self._changing[place].failed is None:
+                self._give_up_change(place, error)
+                return
+            if isinstance(error, BusError):
+                log.warning("sensor %d is not back yet: %s", place, error)
+                self._climbing[place] = self._ladders[place].climb(_FAILED_PAUSE_S)
+                return
             self._climbing[place] = self._ladders[place].climb()
         except DifferentSensorError as error:
             self._refuse(place, error.found)
-        except BusError as error:
-            log.warning("sensor %d is not back yet: %s", place, error)
-            self._climbing[place] = self._ladders[place].climb(_FAILED_PAUSE_S)
+
+    def _give_up_change(self, place: int, error: GoneError | BusError) -> None:
+        sensor, change = self._sensors[place], self._changing[place]
+        if isinstance(error, GoneError):
+            error = BusError(f"sensor {place} stopped answering while its settings were changed")
+        log.warning("sensor %d keeps its former settings: %s", place, error)
+        self._changing[place] = change._replace(failed=error)
+        sensor.wanted, sensor.asked = change.wanted, change.asked
+        self._climbing[place] = self._ladders[place].climb()
 
     def _bring_back(self, place: int, *, left_op: bool) -> None:
         sensor, stream = self._sensors[place], self._streams[place]
         del self._climbing[place]
         self._count_alive()
         sensor.state = AlState.OP.name
-        stream.recover(sensor.period_ns if left_op else None)
+        stream.recover(sensor.period_ns if left_op else None, lost=place in self._lost_at)
+        if (change := self._changing.pop(place, None)) is not None:
+            if change.failed is None:
+                self._announce(event(Event.RECONFIGURED, sensor=place, settings=dict(sensor.settings)))
+            change.done(change.failed)
+        if place not in self._lost_at:
+            return
         lost_s = round(time.monotonic() - self._lost_at.pop(place), 3)
         log.info("sensor %d (%s) is back after %.3f s", place, sensor.identity, lost_s)
         self._announce(event(Event.SENSOR_BACK, sensor=place, lost_s=lost_s, settings=dict(sensor.settings)))
@@ -146,6 +195,8 @@ class Recovery:
     def _refuse(self, place: int, found: Identity) -> None:
         sensor = self._sensors[place]
         sensor.state = "REFUSED"
+        if (change := self._changing.pop(place, None)) is not None:
+            change.done(BusError(f"sensor {place} was replaced by a {found} meanwhile"))
         message = (
             f"sensor {place} is now a {found}, not the {sensor.identity}: connect that one again, "
             "or restart the server to use the new one"

@@ -34,6 +34,7 @@ _COE_SDO_RESPONSE: Final = 3
 _UPLOAD: Final = 0x40
 _DOWNLOAD: Final = 0x20
 _EXPEDITED: Final = 0x03
+_SIZE_GIVEN: Final = 0x01
 _ABORT: Final = 0x80
 _LONGEST_EXPEDITED: Final = 4
 
@@ -101,18 +102,21 @@ class CyclicSdo:
             return rest[: 4 - (command >> 2 & 3)] if command & 0x01 else rest[:4]
         size = int.from_bytes(rest[:4], "little")
         if size > len(rest) - 4:
-            raise BusError(self._unanswered("reading", index, subindex, f"{size} bytes need segments"))
+            raise BusError(
+                self._unanswered("reading", index, subindex, f"its {size} bytes do not fit the mailbox")
+            )
         return rest[4 : 4 + size]
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
-        """See `Sdo`; at most four bytes, which all settings have."""
-        if len(data) > _LONGEST_EXPEDITED:
-            raise ValueError(f"{len(data)} bytes do not fit an expedited download")
-        command = _DOWNLOAD | _EXPEDITED | (_LONGEST_EXPEDITED - len(data)) << 2
+        """See `Sdo`; at most what fits the mailbox in one piece."""
+        if len(data) <= _LONGEST_EXPEDITED:
+            command = _DOWNLOAD | _EXPEDITED | (_LONGEST_EXPEDITED - len(data)) << 2
+        else:
+            command, data = _DOWNLOAD | _SIZE_GIVEN, struct.pack("<I", len(data)) + data
         yield from self._transfer(index, subindex, command, data)
 
     def _transfer(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
-        doing = "reading" if command == _UPLOAD else f"writing {data.hex()} to"
+        doing = "reading" if command == _UPLOAD else "writing"
         for _ in range(_ATTEMPTS):
             yield from self._drain()
             self._counter = self._counter % 7 + 1

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import re
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -20,6 +21,8 @@ from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue
 _MODEL_NAME: Final = re.compile(r"BFT-[A-Z]{4}-ECAT-M8")
 _SETTLE_S: Final = 0.5
 """How long Bota's own driver waits for new filter settings to take."""
+
+_OFFSETS: Final = tuple((objects.FORCE_TORQUE_OFFSET, sub) for sub in range(1, 7))
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +55,8 @@ class Sensor:
     state: str = "PREOP"
     settings: dict[str, SettingValue] = field(default_factory=dict)
     """The settings in force."""
+    offset: tuple[float, ...] | None = None
+    """The force/torque offset that was set while streaming; written again when the sensor has lost it."""
 
     @property
     def period_ns(self) -> float:
@@ -94,13 +99,16 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     """
     for name in objects.SETTING_WRITE_ORDER:
         if name in sensor.wanted:
-            yield from _write_setting(sdo, sensor, name)
+            yield from write_setting(sdo, sensor, name)
     yield from _check_rate(sdo, sensor)
-    yield from _read_settings(sdo, sensor)
+    yield from read_settings(sdo, sensor)
+    if sensor.offset is not None:
+        yield from write_offset(sdo, sensor.offset)
 
 
-def _write_setting(sdo: Sdo, sensor: Sensor, name: str) -> Steps[None]:
-    entry, value = objects.BY_SETTING[name], sensor.wanted[name]
+def write_setting(sdo: Sdo, sensor: Sensor, name: str, value: SettingValue | None = None) -> Steps[None]:
+    """Write one setting, to what is wanted if no value is given; BusError if it did not take."""
+    entry, value = objects.BY_SETTING[name], sensor.wanted[name] if value is None else value
     data = entry.encode_setting(value)
     try:
         yield from sdo.write(*entry.address, data)
@@ -112,12 +120,29 @@ def _write_setting(sdo: Sdo, sensor: Sensor, name: str) -> Steps[None]:
                 "sensor %d (%s) has no setting %s; left out", sensor.place, sensor.identity.name, name
             )
             return
-        raise BusError(f"the setting {name} = {value} did not take: {error}") from None
+        raise SdoAbortError(f"the setting {name} = {value} did not take: {error}", error.abort_code) from None
     if held != data:
         raise BusError(
             f"the setting {name} = {value} did not take: sensor {sensor.place} holds {held.hex()} after "
             f"{data.hex()} was written; power it off and on, then start again"
         )
+
+
+def read_offset(sdo: Sdo) -> Steps[tuple[float, ...]]:
+    """The six force/torque offsets in force."""
+    found = []
+    for address in _OFFSETS:
+        found.append(float(objects.BY_ADDRESS[address].type.unpack((yield from sdo.read(*address)))))
+    return tuple(found)
+
+
+def write_offset(sdo: Sdo, offset: Sequence[float]) -> Steps[None]:
+    """Write the six offsets and verify them; BusError if one does not take."""
+    for address, value in zip(_OFFSETS, offset, strict=True):
+        data = objects.BY_ADDRESS[address].type.pack(value)
+        yield from sdo.write(*address, data)
+        if (yield from sdo.read(*address)) != data:
+            raise BusError(f"the offset {objects.BY_ADDRESS[address].name} = {value:g} did not take")
 
 
 def _check_rate(sdo: Sdo, sensor: Sensor) -> Steps[None]:
@@ -137,7 +162,8 @@ def _check_rate(sdo: Sdo, sensor: Sensor) -> Steps[None]:
         yield
 
 
-def _read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+    """Find out what is in force."""
     held: dict[str, SettingValue] = {}
     for name, setting in SETTINGS.items():
         data = yield from _read(sdo, objects.BY_SETTING[name].address)

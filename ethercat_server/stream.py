@@ -157,9 +157,9 @@ class SensorStream:
                 self.place, self.clock.period_ns / 1000, 100 * pull,
             )  # fmt: skip
 
-    def recover(self, period_ns: float | None) -> None:
-        """The sensor is back after it was lost; `period_ns` if it entered OP anew, None if it never left."""
-        self.recoveries += 1
+    def recover(self, period_ns: float | None, *, lost: bool = True) -> None:
+        """The sensor is back after it was out; `period_ns` if it entered OP anew, None if it never left."""
+        self.recoveries += lost
         self.alive = True
         if period_ns is not None:
             self.clock = SampleClock(period_ns, time.monotonic_ns())

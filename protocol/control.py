@@ -12,10 +12,15 @@ from collections.abc import Callable, Mapping
 from enum import StrEnum
 from typing import Any, Final, NamedTuple
 
-from protocol.errors import RequestError
+from protocol.errors import RequestError, SettingError
 from protocol.framing import JsonObject
+from protocol.sdo_types import sdo_type
+from protocol.settings import check_settings
 
 PROTOCOL_VERSION: Final = 1
+MAX_SDO_BYTES: Final = 112
+"""What fits a mailbox of 128 bytes in one piece."""
+MAX_TARE_SAMPLES: Final = 20_000
 
 
 class ErrorCode(StrEnum):
@@ -41,7 +46,7 @@ class Event(StrEnum):
 
 
 Check = Callable[[object], Any]
-"""Returns the checked value, or raises ValueError whose text says what it must be."""
+"""Returns the checked value; raises ValueError whose text says what it must be, or SettingError."""
 
 
 class Parameter(NamedTuple):
@@ -109,6 +114,47 @@ def six_numbers(value: object) -> tuple[float, ...]:
     raise ValueError("a list of six finite numbers")
 
 
+def _settings(value: object) -> Mapping[str, Any]:
+    if not isinstance(value, dict) or not value:
+        raise ValueError('an object with settings by name, such as {"sinc_length": 64}')
+    return check_settings(value)
+
+
+def _anything(value: object) -> object:
+    return value
+
+
+def _object_number(high: int) -> Check:
+    """A check for an index or sub-index: a whole number, or a text such as "0x8010"."""
+
+    def check(value: object) -> int:
+        if isinstance(value, str):
+            with contextlib.suppress(ValueError):
+                value = int(value, 16) if value.lower().startswith("0x") else int(value)
+        if isinstance(value, int) and _is_int(value) and 0 <= value <= high:
+            return value
+        raise ValueError(f'a number from 0 to {high}, or a text such as "0x{high:X}"')
+
+    return check
+
+
+def _hex_bytes(value: object) -> bytes:
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            data = bytes.fromhex(value)
+            if 0 < len(data) <= MAX_SDO_BYTES:
+                return data
+    raise ValueError(f"1 to {MAX_SDO_BYTES} bytes as hexadecimal digits, two each")
+
+
+_SENSOR: Final = Parameter(whole_number(0, 255), default=0)
+_ENTRY: Final = {
+    "sensor": _SENSOR,
+    "index": Parameter(_object_number(0xFFFF), required=True),
+    "subindex": Parameter(_object_number(0xFF), default=0),
+    "type": Parameter(sdo_type),
+}
+
 ACTIONS: Final[Mapping[str, Action]] = {
     "describe": Action({}),
     "subscribe": Action(
@@ -121,6 +167,26 @@ ACTIONS: Final[Mapping[str, Action]] = {
     ),
     "unsubscribe": Action({}, framed_only=True),
     "status": Action({}),
+    "configure": Action(
+        {
+            "sensor": _SENSOR,
+            "settings": Parameter(_settings, required=True),
+            "save": Parameter(_boolean, default=False),
+        },
+        controls=True,
+    ),
+    "tare": Action(
+        {
+            "sensor": _SENSOR,
+            "samples": Parameter(whole_number(1, MAX_TARE_SAMPLES), default=400),
+            "target": Parameter(six_numbers, default=(0.0,) * 6),
+        },
+        controls=True,
+    ),
+    "sdo_read": Action(_ENTRY),
+    "sdo_write": Action(
+        {**_ENTRY, "value": Parameter(_anything), "hex": Parameter(_hex_bytes)}, controls=True
+    ),
     "shutdown": Action({}, controls=True),
 }
 
@@ -156,6 +222,8 @@ def parse_request(message: JsonObject) -> Request:
             values[key] = parameter.check(message[key])
         except ValueError as error:
             raise RequestError(ErrorCode.BAD_REQUEST, f"the key {key!r} must be {error}") from None
+        except SettingError as error:
+            raise RequestError(ErrorCode.BAD_REQUEST, f"the key {key!r} is refused: {error}") from None
     return Request(name, message.get("id"), "id" in message, values)
 
 

@@ -12,6 +12,7 @@ import pytest
 from ethercat_server.bus import Bus
 from ethercat_server.cycle import Cycle
 from ethercat_server.hub import Hub
+from ethercat_server.jobs import Jobs
 from ethercat_server.notify import Notifier
 from ethercat_server.recovery import Recovery
 from ethercat_server.stream import SensorStream
@@ -78,7 +79,14 @@ def run(turns: int, on_serve: Callable[[int], None], bus: ScriptedBus) -> tuple[
 
     hub = ScriptedHub(stop_at_the_end)
     stream = SensorStream(0, PERIOD_NS)
-    cycle = Cycle(cast(Bus, bus), [stream], cast(Hub, hub), cast(Recovery, NoTrouble()), Notifier())
+    cycle = Cycle(
+        cast(Bus, bus),
+        [stream],
+        cast(Hub, hub),
+        cast(Recovery, NoTrouble()),
+        Jobs(cast(Bus, bus), []),
+        Notifier(),
+    )
     cycle.run()
     return cycle.status(), hub
 

@@ -1,0 +1,70 @@
+"""Applies settings to a sensor that streams: in OP what can be, by way of PREOP what must; saves them.
+
+Whatever fails, the former settings are in force again afterwards.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Final
+
+from ethercat_server import objects
+from ethercat_server.errors import BusError
+from ethercat_server.sdo import Sdo, Steps
+from ethercat_server.sensor import Sensor, read_settings, write_setting
+from protocol.settings import SETTINGS, SettingValue, check_combination
+
+_SAVE_TIMEOUT_S: Final = 5.0
+
+
+class Change:
+    """What the wanted `settings` would change of a sensor; SettingError if they contradict others."""
+
+    def __init__(self, sensor: Sensor, settings: Mapping[str, SettingValue]) -> None:
+        self.wanted = {**sensor.wanted, **settings}
+        check_combination(self.wanted)
+        changed = {name for name in settings if sensor.settings.get(name) != settings[name]}
+        self.names = [name for name in objects.SETTING_WRITE_ORDER if name in changed]
+        """In the order in which they are to be written."""
+
+    @property
+    def needs_preop(self) -> bool:
+        """Whether the sensor takes one of them in PREOP only."""
+        return any(SETTINGS[name].preop_only for name in self.names)
+
+
+def apply_in_op(sdo: Sdo, sensor: Sensor, change: Change) -> Steps[None]:
+    """Write what has changed; on failure write back what there was, then raise BusError or SdoAbortError."""
+    before, asked = sensor.wanted, sensor.asked
+    sensor.wanted, sensor.asked = change.wanted, asked | set(change.names)
+    written = []
+    try:
+        for name in change.names:
+            written.append(name)
+            yield from write_setting(sdo, sensor, name)
+    except BusError:
+        held = dict(sensor.settings)
+        sensor.wanted, sensor.asked = before, asked
+        for name in written:
+            if name in held:
+                yield from write_setting(sdo, sensor, name, held[name])
+        raise
+    yield from read_settings(sdo, sensor)
+
+
+def save(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+    """Have the sensor write what it holds to its flash; BusError if it does not report success."""
+    command, status = objects.CONTROL_COMMAND, objects.CONTROL_STATUS
+    yield from sdo.write(*command, bytes((objects.SAVE_PARAMETERS,)))
+    deadline = time.monotonic() + _SAVE_TIMEOUT_S
+    while True:
+        answer = int.from_bytes((yield from sdo.read(*status)), "little")
+        if answer == 0:
+            return
+        if time.monotonic() > deadline:
+            raise BusError(
+                f"sensor {sensor.place} did not save its settings (status {answer}): they are in force until "
+                "its power goes; save again"
+            )
+        yield

@@ -1,0 +1,90 @@
+"""Work on the sensors that clients asked for, in steps between two exchanges, so that no sample waits for it.
+
+A step is one or two datagrams. It is taken when there is time for it before the next exchange is due. Each
+sensor does one job at a time, in the order asked.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from ethercat_server.bus import Bus
+from ethercat_server.errors import BusError, SdoAbortError
+from ethercat_server.sdo import Steps
+from ethercat_server.stream import SensorStream
+from protocol.control import ErrorCode
+from protocol.errors import RequestError
+
+_STEP_NS: Final = 300_000
+"""A step is begun only if so much time is left: an exchange and some."""
+_AT_LEAST_EVERY_NS: Final = 20_000_000
+"""On a bus that leaves no time, a step is taken all the same now and then."""
+_MOST_WAITING: Final = 32
+
+Done = Callable[[Any, RequestError | None], None]
+"""Called with the job's result, or with why there is none."""
+
+
+class Jobs:
+    """The jobs of all sensors of the bus."""
+
+    def __init__(self, bus: Bus, streams: Sequence[SensorStream]) -> None:
+        self._bus = bus
+        self._streams = streams
+        self._queues: list[deque[tuple[Steps[Any], Done]]] = [deque() for _ in streams]
+        self._turn = 0
+        self._stepped_ns = 0
+        self.waiting = 0
+        """Jobs that are not done."""
+
+    def start(self, place: int, steps: Steps[Any], done: Done) -> None:
+        """Have `steps` done on the sensor at `place`; RequestError if it is lost or too much waits for it."""
+        self.check_present(place)
+        if len(self._queues[place]) >= _MOST_WAITING:
+            raise RequestError(
+                ErrorCode.BUSY, f"sensor {place} has {_MOST_WAITING} requests to do already: ask again later"
+            )
+        self._queues[place].append((steps, done))
+        self.waiting += 1
+
+    def check_present(self, place: int) -> None:
+        """RequestError if the sensor at `place` cannot be talked to."""
+        if not self._streams[place].alive:
+            raise RequestError(ErrorCode.NOT_READY, f"sensor {place} is lost: ask again when it is back")
+
+    def step(self, until_ns: int) -> None:
+        """Take a step if there is time for one before `until_ns`. To be called only while jobs wait."""
+        now = time.monotonic_ns()
+        if until_ns - now < _STEP_NS and now - self._stepped_ns < _AT_LEAST_EVERY_NS:
+            return
+        self._stepped_ns = now
+        for _ in self._queues:
+            self._turn = (self._turn + 1) % len(self._queues)
+            if self._queues[self._turn]:
+                self._step(self._turn, until_ns)
+                return
+
+    def _step(self, place: int, until_ns: int) -> None:
+        steps, done = self._queues[place][0]
+        result: Any = None
+        error: RequestError | None = None
+        try:
+            self.check_present(place)
+            with self._bus.in_time(until_ns):
+                next(steps)
+            return
+        except StopIteration as stop:
+            result = stop.value
+        except RequestError as refused:
+            error = refused
+        except SdoAbortError as abort:
+            error = RequestError(ErrorCode.SENSOR, str(abort), abort_code=abort.abort_code)
+        except BusError as failed:
+            error = RequestError(ErrorCode.NOT_READY, str(failed))
+        steps.close()
+        self._queues[place].popleft()
+        self.waiting -= 1
+        done(result, error)

@@ -1,0 +1,216 @@
+"""The actions that talk to a sensor: SDO access, settings, tare. They reply when the sensor has answered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ethercat_server import objects
+from ethercat_server.configuration import Change, apply_in_op, save
+from ethercat_server.connection import Connection
+from ethercat_server.errors import BusError, SdoAbortError
+from ethercat_server.hub import Hub
+from ethercat_server.jobs import Jobs
+from ethercat_server.recovery import Recovery
+from ethercat_server.sdo import Sdo, Steps
+from ethercat_server.sensor import Sensor, read_offset
+from ethercat_server.stream import SensorStream
+from ethercat_server.tare import tare
+from protocol.control import ErrorCode, Event, Request, error_reply, event, reply
+from protocol.errors import RequestError, SettingError
+from protocol.framing import JsonObject
+from protocol.sdo_types import SdoType
+from protocol.settings import SETTINGS
+
+
+class SensorActions:
+    """One method an action; each starts work between the exchanges and answers through the hub."""
+
+    def __init__(
+        self,
+        hub: Hub,
+        recovery: Recovery,
+        jobs: Jobs,
+        sensors: Sequence[Sensor],
+        streams: Sequence[SensorStream],
+    ) -> None:
+        self.sensors = sensors
+        self._hub = hub
+        self._recovery = recovery
+        self._jobs = jobs
+        self._streams = streams
+        self._changing: set[int] = set()
+        """Sensors that are being configured or tared: one at a time each."""
+        self.handlers: Mapping[str, Callable[[Connection, Request], None]] = {
+            "sdo_read": self._sdo_read,
+            "sdo_write": self._sdo_write,
+            "configure": self._configure,
+            "tare": self._tare,
+        }
+
+    def handle(self, connection: Connection, request: Request) -> None:
+        """Start what `request` asks for; RequestError refuses it."""
+        place = request.values["sensor"]
+        if place >= len(self.sensors):
+            raise RequestError(
+                ErrorCode.BAD_REQUEST,
+                f"the key 'sensor' is {place}, but the bus has {len(self.sensors)}, counted from 0",
+            )
+        self._jobs.check_present(place)
+        self.handlers[request.action](connection, request)
+
+    def _start(self, connection: Connection, request: Request, steps: Steps[Mapping[str, Any]]) -> None:
+        def done(values: Mapping[str, Any], error: RequestError | None) -> None:
+            self._hub.answer(connection, _answer(request, values, error))
+
+        self._jobs.start(request.values["sensor"], steps, done)
+
+    def _start_change(
+        self, connection: Connection, request: Request, steps: Steps[Mapping[str, Any]]
+    ) -> None:
+        place = request.values["sensor"]
+        self._begin_change(place)
+
+        def done(values: Mapping[str, Any], error: RequestError | None) -> None:
+            self._changing.discard(place)
+            self._hub.answer(connection, _answer(request, values, error))
+
+        try:
+            self._jobs.start(place, steps, done)
+        except RequestError:
+            self._changing.discard(place)
+            raise
+
+    def _begin_change(self, place: int) -> None:
+        if place in self._changing:
+            raise RequestError(
+                ErrorCode.BUSY, f"sensor {place} is being configured or tared: ask again when that is done"
+            )
+        self._changing.add(place)
+
+    def _sdo_read(self, connection: Connection, request: Request) -> None:
+        values = request.values
+        sdo = self._recovery.sdo(values["sensor"])
+        self._start(connection, request, _read(sdo, values["index"], values["subindex"], values["type"]))
+
+    def _sdo_write(self, connection: Connection, request: Request) -> None:
+        values = request.values
+        if values["index"] == objects.FACTORY_CALIBRATION:
+            raise RequestError(
+                ErrorCode.DENIED, "object 0x2000 holds the factory calibration, which is never written"
+            )
+        sensor = self.sensors[values["sensor"]]
+        sdo = self._recovery.sdo(sensor.place)
+        data = _bytes_to_write(values)
+        self._start(connection, request, _write(sdo, sensor, values["index"], values["subindex"], data))
+
+    def _tare(self, connection: Connection, request: Request) -> None:
+        values = request.values
+        sensor = self.sensors[values["sensor"]]
+        stream, sdo = self._streams[sensor.place], self._recovery.sdo(sensor.place)
+        steps = tare(sdo, sensor, stream, values["samples"], values["target"])
+        self._start_change(connection, request, steps)
+
+    def _configure(self, connection: Connection, request: Request) -> None:
+        sensor = self.sensors[request.values["sensor"]]
+        try:
+            change = Change(sensor, request.values["settings"])
+        except SettingError as error:
+            raise RequestError(ErrorCode.BAD_REQUEST, f"the key 'settings' is refused: {error}") from None
+        if not change.needs_preop:
+            self._start_change(connection, request, self._change_in_op(sensor, change, request))
+            return
+        self._begin_change(sensor.place)
+
+        def changed(error: BusError | None) -> None:
+            self._changing.discard(sensor.place)
+            if error is not None:
+                self._hub.answer(connection, _answer(request, {}, _refusal(error)))
+                return
+            try:
+                self._start_change(connection, request, self._finish_change(sensor, request))
+            except RequestError as refused:
+                self._hub.answer(connection, _answer(request, {}, refused))
+
+        self._recovery.reconfigure(sensor.place, change, changed)
+
+    def _change_in_op(self, sensor: Sensor, change: Change, request: Request) -> Steps[Mapping[str, Any]]:
+        sdo = self._recovery.sdo(sensor.place)
+        yield from apply_in_op(sdo, sensor, change)
+        if change.names:
+            self._hub.broadcast(
+                event(Event.RECONFIGURED, sensor=sensor.place, settings=dict(sensor.settings))
+            )
+        return (yield from self._finish_change(sensor, request))
+
+    def _finish_change(self, sensor: Sensor, request: Request) -> Steps[Mapping[str, Any]]:
+        if request.values["save"]:
+            yield from save(self._recovery.sdo(sensor.place), sensor)
+        return {
+            "sensor": sensor.place,
+            "settings": dict(sensor.settings),
+            "rate_hz": sensor.rate_hz,
+            "saved": request.values["save"],
+        }
+
+
+def _answer(request: Request, values: Mapping[str, Any], error: RequestError | None) -> JsonObject:
+    if error is None:
+        return reply(request, **values)
+    message: JsonObject = {"action": request.action}
+    if request.has_id:
+        message["id"] = request.id
+    return error_reply(message, error.code, str(error), **error.extra)
+
+
+def _refusal(error: BusError) -> RequestError:
+    text = f"{error}; the former settings are in force"
+    if isinstance(error, SdoAbortError):
+        return RequestError(ErrorCode.SENSOR, text, abort_code=error.abort_code)
+    return RequestError(ErrorCode.NOT_READY, text)
+
+
+def _read(sdo: Sdo, index: int, subindex: int, kind: SdoType | None) -> Steps[Mapping[str, Any]]:
+    data = yield from sdo.read(index, subindex)
+    values: dict[str, Any] = {"index": index, "subindex": subindex, "hex": data.hex()}
+    if kind is not None:
+        try:
+            values |= {"type": kind.name, "value": kind.unpack(data)}
+        except ValueError as error:
+            raise RequestError(
+                ErrorCode.BAD_REQUEST, f"the key 'type' does not fit object 0x{index:04X}:{subindex}: {error}"
+            ) from None
+    return values
+
+
+def _bytes_to_write(values: Mapping[str, Any]) -> bytes:
+    kind: SdoType | None = values["type"]
+    data: bytes | None = values["hex"]
+    if (kind is None) == (data is None) or (kind is None) != (values["value"] is None):
+        raise RequestError(
+            ErrorCode.BAD_REQUEST, "sdo_write needs either the keys 'type' and 'value' or the key 'hex'"
+        )
+    if data is not None:
+        return data
+    assert kind is not None
+    try:
+        return kind.pack(values["value"])
+    except ValueError as error:
+        raise RequestError(ErrorCode.BAD_REQUEST, f"the key 'value' must be {error}") from None
+
+
+def _write(sdo: Sdo, sensor: Sensor, index: int, subindex: int, data: bytes) -> Steps[Mapping[str, Any]]:
+    yield from sdo.write(index, subindex, data)
+    # What was written is to be in force after a power cut too, if it is one of what the server looks after.
+    entry = objects.BY_ADDRESS.get((index, subindex))
+    if entry is not None and entry.setting is not None:
+        try:
+            value = entry.decode_setting(data, SETTINGS[entry.setting].is_bool)
+        except ValueError:
+            value = None
+        if value is not None:
+            sensor.wanted = {**sensor.wanted, entry.setting: value}
+            sensor.settings[entry.setting] = value
+    if index == objects.FORCE_TORQUE_OFFSET:
+        sensor.offset = yield from read_offset(sdo)
+    return {"index": index, "subindex": subindex, "hex": data.hex()}

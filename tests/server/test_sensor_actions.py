@@ -1,0 +1,282 @@
+"""Settings, SDO access and tare through the control channel while the sensor streams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from protocol.framing import DataFlag, encode_json
+from tests.server.running import Client, Server, needs_bus, server, virtual_sensor
+from tests.server.test_end_to_end import sample_number
+from tests.server.test_recovery import Bench
+
+pytestmark = [pytest.mark.bus, needs_bus]
+
+RATE, FILTERS, OFFSET, CALIBRATION = 0x8011, 0x8006, 0x8000, 0x2000
+
+
+@pytest.fixture
+def streaming() -> Iterator[tuple[Server, Client, Client]]:
+    with (
+        server("virtual", "--virtual", "--signal clock --ppm 150") as running,
+        running.connect() as listener,
+        running.connect() as asking,
+    ):
+        listener.ask("subscribe")
+        yield running, listener, asking
+
+
+@pytest.fixture
+def bench() -> Iterator[tuple[Bench, Client]]:
+    """A virtual sensor that takes commands, and two clients: one that listens, one that asks."""
+    with (
+        virtual_sensor("--signal", "scene") as (veth, sensor),
+        server(veth.near) as running,
+        running.connect() as listener,
+        running.connect() as asking,
+    ):
+        yield Bench(veth, sensor, running, listener), asking
+
+
+def error(reply: dict[str, Any]) -> dict[str, Any]:
+    assert reply["ok"] is False, reply
+    found: dict[str, Any] = reply["error"]
+    return found
+
+
+def test_objects_are_read_by_index_in_any_notation(streaming: tuple[Server, Client, Client]) -> None:
+    _, _, asking = streaming
+    assert asking.ask("sdo_read", index=RATE, type="u16")["value"] == 800
+    assert asking.ask("sdo_read", index="0x8011", subindex=0, sensor=0)["hex"] == "2003"
+    assert asking.ask("sdo_read", index="0x1008", type="string")["value"] == "BFT-SENS-ECAT-M8"
+    refused = error(asking.ask("sdo_read", index=0x8003))
+    assert (refused["code"], refused["abort_code"]) == ("sensor", 0x06020000)
+    assert error(asking.ask("sdo_read", index=RATE, type="f32"))["code"] == "bad_request"
+    assert error(asking.ask("sdo_read", index=RATE, sensor=3))["code"] == "bad_request"
+
+
+def test_objects_are_written_but_never_the_factory_calibration(
+    streaming: tuple[Server, Client, Client],
+) -> None:
+    _, _, asking = streaming
+    assert asking.ask("sdo_write", index=OFFSET, subindex=2, type="f32", value=1.5)["ok"]
+    assert asking.ask("sdo_read", index=OFFSET, subindex=2, type="f32")["value"] == 1.5
+    assert asking.ask("sdo_write", index=OFFSET, subindex=2, hex="00000000")["ok"]
+    assert asking.ask("sdo_read", index=OFFSET, subindex=2, type="f32")["value"] == 0
+    before = asking.ask("sdo_read", index=CALIBRATION, subindex=1)["hex"]
+    for notation in (CALIBRATION, "0x2000", "8192"):
+        refused = error(asking.ask("sdo_write", index=notation, subindex=1, type="f32", value=2.5))
+        assert refused["code"] == "denied"
+    assert asking.ask("sdo_read", index=CALIBRATION, subindex=1)["hex"] == before
+    refused = error(asking.ask("sdo_write", index=FILTERS, subindex=1, type="u16", value=128))
+    assert (refused["code"], refused["abort_code"]) == ("sensor", 0x08000022), "in PREOP only"
+
+
+@pytest.mark.parametrize(
+    ("keys", "named"),
+    [
+        ({"index": OFFSET}, "either the keys 'type' and 'value' or the key 'hex'"),
+        ({"index": OFFSET, "type": "f32"}, "either"),
+        ({"index": OFFSET, "type": "f32", "value": 1, "hex": "00"}, "either"),
+        ({"index": OFFSET, "type": "u8", "value": 256}, "'value' must be a number that is a u8"),
+        ({"index": OFFSET, "type": "u8", "value": "1"}, "'value'"),
+        ({"index": OFFSET, "type": "quaternion", "value": 1}, "'type' must be one of bool, i8"),
+        ({"index": OFFSET, "hex": "0"}, "'hex'"),
+        ({"index": OFFSET, "hex": "00" * 113}, "'hex' must be 1 to 112 bytes"),
+        ({"index": 65536, "hex": "00"}, "'index'"),
+        ({"index": OFFSET, "subindex": -1, "hex": "00"}, "'subindex'"),
+        ({"hex": "00"}, "needs the key 'index'"),
+    ],
+)
+def test_a_bad_request_names_the_key(
+    streaming: tuple[Server, Client, Client], keys: dict[str, object], named: str
+) -> None:
+    refused = error(streaming[2].ask("sdo_write", **keys))
+    assert refused["code"] == "bad_request"
+    assert named in refused["message"]
+
+
+def test_requests_behind_a_slow_one_are_answered_in_order(streaming: tuple[Server, Client, Client]) -> None:
+    _, _, asking = streaming
+    requests = [{"action": "sdo_read", "index": "0x1008", "id": 0}, {"action": "describe", "id": 1}]
+    requests += [{"action": "sdo_read", "index": RATE, "id": n} for n in range(2, 40)]
+    asking.sock.sendall(b"".join(encode_json(request) for request in requests))
+    answers: list[Any] = []
+    while len(answers) < len(requests):
+        reply = asking.receive()
+        if reply is not None:
+            answers.append(reply["id"])
+    assert answers == list(range(40))
+
+
+def test_a_setting_that_any_state_takes_is_changed_without_a_pause(
+    streaming: tuple[Server, Client, Client],
+) -> None:
+    _, listener, asking = streaming
+    listener.fresh(100)
+    invalid = asking.ask("status")["sensors"][0]["invalid"]
+    changed = asking.ask("configure", settings={"temperature_compensation": True, "imu_active": 3})
+    assert changed["ok"]
+    assert changed["settings"]["temperature_compensation"] is True
+    assert changed["settings"]["imu_active"] == 3
+    assert asking.ask("describe")["sensors"][0]["settings"] == changed["settings"]
+    while not listener.events:
+        listener.receive()
+    assert listener.events[0]["event"] == "reconfigured"
+    assert listener.events[0]["settings"] == changed["settings"]
+    assert asking.ask("status")["sensors"][0]["invalid"] == invalid
+
+
+def test_filters_are_changed_by_way_of_preop_and_the_stream_goes_on(
+    streaming: tuple[Server, Client, Client],
+) -> None:
+    _, listener, asking = streaming
+    listener.fresh(100)
+    changed = asking.ask("configure", settings={"sinc_length": 128, "fir": True})
+    assert changed["ok"], changed
+    assert (changed["rate_hz"], changed["settings"]["fir"]) == (400, True)
+    while not listener.events:
+        listener.receive()
+    frames = listener.collect(400)
+    assert [f.sequence for f in frames] == list(range(frames[0].sequence, frames[0].sequence + 400))
+    last = [f for f in frames if not f.flags & (DataFlag.INVALID | DataFlag.REPEATED)][-100:]
+    assert (last[-1].monotonic_ns - last[0].monotonic_ns) / 99 == pytest.approx(2.5e6, rel=0.02)
+    described = asking.ask("describe")["sensors"][0]
+    assert (described["state"], described["rate_hz"]) == ("OP", 400)
+    assert asking.ask("status")["sensors"][0]["recoveries"] == 0, "it was not lost"
+    assert [event["event"] for event in listener.events] == ["reconfigured"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({}, "an object with settings"),
+        ({"sinc_length": 0}, "sinc_length is 0"),
+        ({"colour": 1}, "no setting 'colour'"),
+        ({"fast": True}, "fast is true but fir is false"),
+        ({"fir": 1}, "fir is 1"),
+        ({"sinc_length": 128, "acceleration_range_g": 3}, "acceleration_range_g is 3"),
+    ],
+)
+def test_wrong_settings_are_refused_whole(
+    streaming: tuple[Server, Client, Client], settings: dict[str, object], named: str
+) -> None:
+    _, _, asking = streaming
+    before = asking.ask("describe")["sensors"]
+    refused = error(asking.ask("configure", settings=settings))
+    assert refused["code"] == "bad_request"
+    assert named in refused["message"]
+    assert asking.ask("describe")["sensors"] == before
+
+
+def test_a_change_that_fails_half_way_is_taken_back(bench: tuple[Bench, Client]) -> None:
+    sensor, asking = bench
+    before = asking.ask("describe")["sensors"][0]["settings"]
+    # Both in OP: the second write is refused.
+    sensor.command("abort 0x8010 3 0x08000021")
+    refused = error(asking.ask("configure", settings={"temperature_compensation": True, "imu_active": 3}))
+    assert (refused["code"], refused["abort_code"]) == ("sensor", 0x08000021)
+    assert "imu_active" in refused["message"]
+    # By way of PREOP: the sensor is brought back with what was in force.
+    sensor.command("abort 0x8006 1 0x08000021")
+    refused = error(asking.ask("configure", settings={"chop": True, "sinc_length": 128}))
+    assert refused["code"] == "sensor"
+    assert "the former settings are in force" in refused["message"]
+    described = asking.ask("describe")["sensors"][0]
+    assert (described["settings"], described["state"]) == (before, "OP")
+    assert asking.ask("sdo_read", index=0x8010, subindex=2, type="u8")["value"] == 0
+    assert asking.ask("sdo_read", index=0x8006, subindex=4, type="u8")["value"] == 0
+    assert len(sensor.client.fresh(100)) == 100
+
+
+def test_what_was_configured_and_tared_outlives_a_power_cut(bench: tuple[Bench, Client]) -> None:
+    sensor, asking = bench
+    assert asking.ask("configure", settings={"sinc_length": 128})["ok"]
+    offset = asking.ask("tare", samples=50)["new_offset"]
+    sensor.client.fresh(50)
+    sensor.client.events.clear()
+    sensor.command("power cycle 0.2")
+    sensor.wait_event("sensor_lost")
+    assert error(asking.ask("sdo_read", index=RATE))["code"] == "not_ready"
+    sensor.wait_event("sensor_back")
+    assert asking.ask("describe")["sensors"][0]["settings"]["sinc_length"] == 128
+    for place, value in enumerate(offset, 1):
+        held = asking.ask("sdo_read", index=OFFSET, subindex=place, type="f32")["value"]
+        assert held == pytest.approx(value)
+
+
+def test_saved_settings_are_in_the_flash(bench: tuple[Bench, Client]) -> None:
+    sensor, asking = bench
+    assert asking.ask("configure", settings={"acceleration_range_g": 8}, save=True)["saved"] is True
+    assert asking.ask("configure", settings={"acceleration_range_g": 8})["saved"] is False
+    written = [
+        (row["index"], row["subindex"], row["hex"]) for row in sensor.stats()["sensors"][0]["sdo_writes"]
+    ]
+    assert written.count(("0x8030", 1, "01")) == 1
+    assert written.index(("0x8004", 0, "02")) < written.index(("0x8030", 1, "01"))
+
+
+def test_tare_makes_the_mean_the_target(bench: tuple[Bench, Client]) -> None:
+    sensor, asking = bench
+    target = [1.0, -2.0, 3.0, 0.1, 0.2, -0.3]
+    tared = asking.ask("tare", samples=200, target=target)
+    assert tared["ok"], tared
+    assert tared["old_offset"] == [0.0] * 6
+    for place, (residual, limit) in enumerate(zip(tared["residual"], [1.5] * 3 + [0.1] * 3, strict=True)):
+        assert abs(residual) < limit, place
+    again = asking.ask("tare", samples=200)
+    assert again["old_offset"] == pytest.approx(tared["new_offset"], rel=1e-6)
+    for before, after, wanted in zip(tared["new_offset"], again["new_offset"], target, strict=True):
+        assert after == pytest.approx(before - wanted, abs=1.5)
+    assert len(sensor.client.fresh(50)) == 50
+
+
+def test_a_sensor_that_moves_is_not_tared(streaming: tuple[Server, Client, Client]) -> None:
+    _, _, asking = streaming
+    refused = error(asking.ask("tare", samples=50))
+    assert refused["code"] == "not_ready"
+    assert "not at rest" in refused["message"]
+    assert asking.ask("sdo_read", index=OFFSET, subindex=1, type="f32")["value"] == 0
+
+
+def test_a_sensor_does_one_change_at_a_time(streaming: tuple[Server, Client, Client]) -> None:
+    running, _, asking = streaming
+    with running.connect() as other:
+        asking.sock.sendall(encode_json({"action": "tare", "samples": 2000, "id": 1}))
+        other.ask("describe")
+        assert error(other.ask("configure", settings={"fir": True}))["code"] == "busy"
+        assert error(other.ask("tare"))["code"] == "busy"
+        assert other.ask("sdo_read", index=RATE)["ok"], "reading is no change"
+
+
+def test_a_client_that_leaves_while_its_request_is_done_leaves_nothing_behind(
+    streaming: tuple[Server, Client, Client],
+) -> None:
+    running, _, asking = streaming
+    for request in ({"action": "sdo_read", "index": "0x1008"}, {"action": "tare", "samples": 20}):
+        with running.connect() as other:
+            other.sock.sendall(encode_json(request))
+    changed = asking.ask("configure", settings={"imu_active": 3})
+    while not changed["ok"]:
+        assert changed["error"]["code"] == "busy"
+        changed = asking.ask("configure", settings={"imu_active": 3})
+    assert "Traceback" not in running.said()
+
+
+def test_sdo_traffic_costs_no_sample(streaming: tuple[Server, Client, Client]) -> None:
+    _, listener, asking = streaming
+    listener.fresh(200)
+    before = asking.ask("status")["sensors"][0]
+    for _ in range(50):
+        assert asking.ask("sdo_read", index=RATE)["ok"]
+    after = asking.ask("status")["sensors"][0]
+    frames = listener.fresh(after["fresh"] - before["fresh"])
+    unflagged = sum(
+        sample_number(two) != sample_number(one) + 1 and not two.flags & DataFlag.GAP
+        for one, two in pairwise(frames)
+    )
+    assert unflagged == 0
+    assert after["lost_samples"] - before["lost_samples"] <= len(frames) * 0.02
