@@ -22,6 +22,8 @@ _MODEL_NAME: Final = re.compile(r"BFT-[A-Z]{4}-ECAT-M8")
 _SETTLE_S: Final = 0.5
 """How long Bota's own driver waits for new filter settings to take."""
 
+_LAST: Final = objects.SETTING_WRITE_ORDER[-1]
+"""sinc_length."""
 _OFFSETS: Final = tuple((objects.FORCE_TORQUE_OFFSET, sub) for sub in range(1, 7))
 
 log = logging.getLogger(__name__)
@@ -93,14 +95,23 @@ def identify(sdo: Sdo, sii_name: str) -> Steps[Identity]:
 
 
 def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
-    """Write the wanted settings in the device's order and verify them; BusError says which did not take.
+    """Write those of the wanted settings that do not hold yet, in the device's order, and verify them.
 
-    The sensor must be in PREOP. Afterwards `settings` and `rate_hz` are what is in force.
+    The sensor must be in PREOP. Afterwards `settings` and `rate_hz` are what is in force. BusError says which
+    setting did not take.
     """
+    changed = False
     for name in objects.SETTING_WRITE_ORDER:
-        if name in sensor.wanted:
+        if name not in sensor.wanted or name == _LAST:
+            continue
+        entry = objects.BY_SETTING[name]
+        if (yield from _read(sdo, entry.address)) != entry.encode_setting(sensor.wanted[name]):
             yield from write_setting(sdo, sensor, name)
-    yield from _check_rate(sdo, sensor)
+            changed = True
+    # What SINC may be follows from the filters before it, and only the rate tells what it is.
+    if changed or not (yield from _rate_is_right(sdo, sensor)):
+        yield from write_setting(sdo, sensor, _LAST)
+        yield from _check_rate(sdo, sensor)
     yield from read_settings(sdo, sensor)
     if sensor.offset is not None:
         yield from write_offset(sdo, sensor.offset)
@@ -145,19 +156,20 @@ def write_offset(sdo: Sdo, offset: Sequence[float]) -> Steps[None]:
             raise BusError(f"the offset {objects.BY_ADDRESS[address].name} = {value:g} did not take")
 
 
+def _rate_is_right(sdo: Sdo, sensor: Sensor) -> Steps[bool]:
+    sensor.rate_hz = int.from_bytes((yield from sdo.read(*objects.SAMPLING_RATE)), "little")
+    # Table III.4 rounds some rates up and some down.
+    return abs(sensor.rate_hz - BASE_SAMPLING_RATE_HZ / sensor.wanted[_LAST]) <= 1.0
+
+
 def _check_rate(sdo: Sdo, sensor: Sensor) -> Steps[None]:
-    length = sensor.wanted["sinc_length"]
-    expected = BASE_SAMPLING_RATE_HZ / length
     deadline = time.monotonic() + _SETTLE_S
-    while True:
-        sensor.rate_hz = int.from_bytes((yield from sdo.read(*objects.SAMPLING_RATE)), "little")
-        # Table III.4 rounds some rates up and some down.
-        if abs(sensor.rate_hz - expected) <= 1.0:
-            return
+    while not (yield from _rate_is_right(sdo, sensor)):
         if time.monotonic() > deadline:
+            length = sensor.wanted[_LAST]
             raise BusError(
                 f"sensor {sensor.place} samples at {sensor.rate_hz} Hz, but sinc_length {length} implies "
-                f"{expected:.0f} Hz: power it off and on, or choose another sinc_length"
+                f"{BASE_SAMPLING_RATE_HZ / length:.0f} Hz: power it off and on, or choose another sinc_length"
             )
         yield
 

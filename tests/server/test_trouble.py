@@ -163,8 +163,8 @@ def test_an_object_that_aborts_is_named() -> None:
         sensor.process.stdin.write("abort 0x8006 1 0x06090030\n")
         sensor.process.stdin.flush()
         sensor.wait_for("ok")
-        said = fails(veth.near)
-        assert "sinc_length = 64 did not take" in said
+        said = fails(veth.near, "--set", "sinc_length=128")
+        assert "sinc_length = 128 did not take" in said
         assert "0x06090030" in said
 
 
