@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from ethercat_server.config_file import EMPTY, read_config
 from ethercat_server.options import parse_options
+from ethercat_server.server_settings import SERVER_SETTINGS
 from protocol.settings import check_settings, start_up_defaults
 from tests.systemd.staging import (
     BRIDGE_UNIT,
@@ -93,9 +95,12 @@ def test_the_default_configuration_says_nothing_new() -> None:
         line.removeprefix("# ") for line in text.splitlines() if line.startswith("# ") and " = " in line
     ]
     servers, sensors = "\n".join(taken_out).split("calibration_matrix")
-    assert tomllib.loads(servers).keys() == {
-        "control_users", "control_groups", "hosts", "stall_timeout_s", "idle_timeout_s", "rt_priority", "cpu",
-    }  # fmt: skip
+    assert tomllib.loads(servers).keys() == SERVER_SETTINGS.keys()
+    for name, value in tomllib.loads(servers).items():
+        setting = SERVER_SETTINGS[name]
+        checked = setting.check(value)
+        assert checked == setting.default or name in {"control_users", "control_groups", "cpu"}, name
+    assert read_config(UNITS / "default.toml") == EMPTY
     common = tomllib.loads("calibration_matrix" + sensors.rpartition("\n")[0])
     assert check_settings(common) == start_up_defaults()
 
