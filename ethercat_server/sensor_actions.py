@@ -20,6 +20,7 @@ from protocol.control import ErrorCode, Event, Request, error_reply, event, repl
 from protocol.errors import RequestError, SettingError
 from protocol.framing import JsonObject
 from protocol.sdo_types import SdoType
+from protocol.sensor_choice import SensorChoice
 from protocol.settings import SETTINGS, SettingValue
 
 
@@ -50,14 +51,25 @@ class SensorActions:
 
     def handle(self, connection: Connection, request: Request) -> None:
         """Start what `request` asks for; RequestError refuses it."""
-        place = request.values["sensor"]
-        if place >= len(self.sensors):
+        place = self._place(request.values["sensor"])
+        self._jobs.check_present(place)
+        values = {**request.values, "sensor": place}
+        self.handlers[request.action](connection, request._replace(values=values))
+
+    def _place(self, choice: SensorChoice) -> int:
+        found = [
+            sensor.place
+            for sensor in self.sensors
+            if choice.matches(sensor.place, sensor.identity.name, sensor.identity.serial)
+        ]
+        if len(found) != 1:
+            there = "; ".join(f"{sensor.place}: {sensor.identity}" for sensor in self.sensors)
+            many = f"{len(found)} sensors" if found else "no sensor"
             raise RequestError(
                 ErrorCode.BAD_REQUEST,
-                f"the key 'sensor' is {place}, but the bus has {len(self.sensors)}, counted from 0",
+                f"the key 'sensor' is {choice}, which is {many} of those here ({there})",
             )
-        self._jobs.check_present(place)
-        self.handlers[request.action](connection, request)
+        return found[0]
 
     def _start(self, connection: Connection, request: Request, steps: Steps[Mapping[str, Any]]) -> None:
         self._jobs.start(request.values["sensor"], steps, self._answering(connection, request))

@@ -17,6 +17,7 @@ from ethercat_server.errors import UsageError
 from ethercat_server.hub import Hub
 from ethercat_server.notify import Notifier
 from ethercat_server.options import ServerOptions, parse_options
+from ethercat_server.sensor import Sensor
 from ethercat_server.sensor_actions import SensorActions
 from ethercat_server.server_settings import SERVER_SETTINGS
 from protocol.errors import RequestError
@@ -104,11 +105,13 @@ class Service:
         if later:
             log.warning("a change of %s takes effect at the next start", ", ".join(later))
         for sensor in self._on_sensors.sensors:
-            self._configure(sensor.place, was, now)
+            self._configure(sensor, was, now)
 
-    def _configure(self, place: int, was: ServerOptions, now: ServerOptions) -> None:
-        before = was.wanted_settings(place)
-        changed = {n: value for n, value in now.wanted_settings(place).items() if before.get(n) != value}
+    def _configure(self, sensor: Sensor, was: ServerOptions, now: ServerOptions) -> None:
+        place = sensor.place
+        who = (place, sensor.identity.name, sensor.identity.serial)
+        before = was.wanted_settings(*who)
+        changed = {n: value for n, value in now.wanted_settings(*who).items() if before.get(n) != value}
         if not changed:
             return
         names = ", ".join(f"{name} = {value}" for name, value in changed.items())

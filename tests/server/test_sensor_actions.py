@@ -289,3 +289,21 @@ def test_sdo_traffic_costs_no_sample(streaming: tuple[Server, Client, Client]) -
     )
     assert unflagged == 0
     assert after["lost_samples"] - before["lost_samples"] <= len(frames) * 0.02
+
+
+def test_a_sensor_of_a_chain_is_named_by_place_serial_number_or_name() -> None:
+    chain = "--model BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8,BFT-ROKS-ECAT-M8 --serial 11,22,33"
+    with server("virtual", "--virtual", chain) as running, running.connect() as asking:
+        for choice, place in ((1, 1), ("2", 2), ("serial:22", 1), ("BFT-SENS-ECAT-M8", 0)):
+            assert asking.ask("tare", sensor=choice, samples=1, target=[float(place)] * 6)["ok"]
+            value = asking.ask("sdo_read", sensor=place, index=0x1018, subindex=4, type="u32")["value"]
+            assert (
+                asking.ask("sdo_read", sensor=choice, index=0x1018, subindex=4, type="u32")["value"] == value
+            )
+            assert asking.ask("configure", sensor=choice, settings={"imu_active": 3})["sensor"] == place
+        for choice in ("BFT-ROKS-ECAT-M8", "serial:44", 3, "BFT-MEGS-ECAT-M8"):
+            refused = error(asking.ask("sdo_read", sensor=choice, index=RATE))
+            assert refused["code"] == "bad_request"
+            assert "2: BFT-ROKS-ECAT-M8 with serial 33" in refused["message"], "it lists those there are"
+        for wrong in (-1, 256, "", None, 1.5, "serial:x", ["0"]):
+            assert error(asking.ask("sdo_read", sensor=wrong, index=RATE))["code"] == "bad_request"
