@@ -19,7 +19,7 @@ from protocol.framing import (
     encode_json,
 )
 
-MAX_REQUEST_LENGTH: Final = 16384
+MAX_REQUEST_LENGTH: Final = 4096
 _SEND_BUFFER: Final = 65536
 """Small, so that a client that stalls finds fresh data soon after, not seconds of old."""
 _IDLE_FRAME_NS: Final = 10_000_000
@@ -30,6 +30,9 @@ _GAP: Final = int(DataFlag.GAP)
 
 _UNFINISHED_NS: Final = 10_000_000_000
 """A message that has begun must end within this."""
+_EFFORT_NS: Final = 30_000
+_EFFORT_PER_BYTE_NS: Final = 250
+"""What it takes to read and answer a message, at the worst: one made up of many small values."""
 _COST_NS: Final = 2_000_000
 _MOST_CREDIT_NS: Final = 100 * _COST_NS
 """A client may ask 500 times a second, and 100 times at once after a pause; what is more waits its turn."""
@@ -42,6 +45,12 @@ class Limits(NamedTuple):
     """Without taking anything of what waits for it."""
     idle_ns: float = 300e9
     """Without a request while it is not subscribed."""
+
+
+class Unreadable(NamedTuple):
+    """A message that could not be read. No exception: one that is kept in a variable keeps itself alive."""
+
+    reason: str
 
 
 class Subscription:
@@ -128,6 +137,12 @@ class Connection:
             decoder.feed(data)
         self.unread = True
 
+    @property
+    def effort_ns(self) -> int:
+        """How long it may take to answer what has come."""
+        decoder = self.framed or self.bare
+        return _EFFORT_NS + _EFFORT_PER_BYTE_NS * (min(decoder.pending, MAX_REQUEST_LENGTH) if decoder else 0)
+
     def may_ask(self, now_ns: int) -> bool:
         """Whether it is this client's turn to be answered once more: none may ask without pause."""
         self._credit_ns = min(_MOST_CREDIT_NS, self._credit_ns + now_ns - self._credited_ns)
@@ -148,11 +163,11 @@ class Connection:
             return f"it has asked nothing for {limits.idle_ns / 1e9:g} s"
         return None
 
-    def next_message(self) -> JsonObject | BadMessageError | RemoteProtocolError | None:
-        """The next whole message received, or the error in the place of a bad one; None if there is none.
+    def next_message(self) -> JsonObject | Unreadable | None:
+        """The next whole message received, or why the next one cannot be read; None if there is none.
 
-        After a RemoteProtocolError, or once the peer has closed its side and everything it sent is read,
-        `closing` is set.
+        `closing` is set if nothing after it can be read either, and once the peer has closed its side and
+        everything it sent is read.
         """
         decoder = self.framed or self.bare
         message = None
@@ -161,10 +176,10 @@ class Connection:
                 message = decoder.next_message()
             except BadMessageError as error:
                 self._begun_ns = 0
-                return error
+                return Unreadable(str(error))
             except RemoteProtocolError as error:
                 self.finish()
-                return error
+                return Unreadable(str(error))
         if isinstance(message, dict):  # the server's decoder gives no DATA
             self._heard_ns, self._begun_ns = time.monotonic_ns(), 0
             return message

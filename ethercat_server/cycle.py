@@ -26,6 +26,8 @@ _RECOVERY_STEP_NS: Final = 500_000
 """Time between two exchanges while no sensor is left to be read."""
 _RECOVERY_TIMEOUT_S: Final = 0.02
 """How long a frame may take meanwhile."""
+_SUMMARY_S: Final = 0.2
+"""Summaries of distributions take some 100 µs each, so they are made anew only so often."""
 _LATENESS_GAIN: Final = 1 / 64
 _MAX_LEAD_NS: Final = 200_000.0
 
@@ -57,6 +59,8 @@ class Cycle:
         self._wake = RecentDistribution()
         self._exchange = RecentDistribution()
         self._started = time.monotonic()
+        self._summarise_at = 0.0
+        self._summaries: list[tuple[dict[str, float], dict[str, float]]] = []
 
     def stop(self) -> None:
         """End `run` after the current cycle."""
@@ -127,17 +131,25 @@ class Cycle:
 
     def status(self) -> dict[str, Any]:
         """The cycle's part of the `status` reply."""
+        if time.monotonic() >= self._summarise_at:
+            self._summarise_at = time.monotonic() + _SUMMARY_S
+            everyone = (self._wake, self._exchange, *(stream.age for stream in self._streams))
+            self._summaries = [distribution.summaries_us() for distribution in everyone]
+        (wake, recent_wake), (exchange, recent_exchange), *ages = self._summaries
         return {
             "cycles": self._cycles,
             "missed_deadlines": self._missed_deadlines,
             "lost_frames": self._lost_frames,
-            "wake_us": self._wake.everything().summary_us(),
-            "exchange_us": self._exchange.everything().summary_us(),
+            "wake_us": wake,
+            "exchange_us": exchange,
             "last_10s": {
-                "wake_us": self._wake.last_10s().summary_us(),
-                "exchange_us": self._exchange.last_10s().summary_us(),
-                "age_us": [stream.age.last_10s().summary_us() for stream in self._streams],
+                "wake_us": recent_wake,
+                "exchange_us": recent_exchange,
+                "age_us": [recent for _, recent in ages],
             },
-            "sensors": [stream.status() for stream in self._streams],
+            "sensors": [
+                {**stream.status(), "age_us": age}
+                for stream, (age, _) in zip(self._streams, ages, strict=True)
+            ],
             "uptime_s": round(time.monotonic() - self._started, 3),
         }

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Sequence
 from typing import Final
 
 _STEPS_BITS: Final = 5
 _STEPS: Final = 1 << _STEPS_BITS
 _OCTAVES: Final = 36
+_LAST_BUCKET: Final = _OCTAVES * _STEPS - 1
+_POINTS: Final = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
 _WINDOW_SLOTS: Final = 10
 SLOT_NS: Final = 1_000_000_000
 """A recent distribution covers the last ten slots of this length."""
@@ -15,13 +19,14 @@ SLOT_NS: Final = 1_000_000_000
 class Distribution:
     """Counts durations in buckets whose width grows with the value: 32 buckets an octave.
 
-    Recording is one list increment. Durations are whole nanoseconds; negative ones count as 0.
+    Only buckets that something fell into are there, about a hundred as a rule, so that reading is quick too:
+    it happens between two exchanges. Durations are whole nanoseconds; negative ones count as 0.
     """
 
     __slots__ = ("_counts", "_max", "count")
 
     def __init__(self) -> None:
-        self._counts = [0] * (_OCTAVES * _STEPS)
+        self._counts: defaultdict[int, int] = defaultdict(int)
         self._max = 0
         self.count = 0
 
@@ -37,28 +42,30 @@ class Distribution:
             self._counts[duration_ns] += 1
         else:
             # The leading bit is implied: what is left of the top six bits numbers the step.
-            self._counts[min((shift << _STEPS_BITS) + (duration_ns >> shift), len(self._counts) - 1)] += 1
+            self._counts[min((shift << _STEPS_BITS) + (duration_ns >> shift), _LAST_BUCKET)] += 1
 
     def add(self, other: Distribution) -> None:
         """Count everything that `other` has counted."""
-        self._counts = list(map(int.__add__, self._counts, other._counts))
+        counts = self._counts
+        for bucket, count in other._counts.items():
+            counts[bucket] += count
         self._max = max(self._max, other._max)
         self.count += other.count
 
-    def percentile_ns(self, fraction: float) -> int:
-        """The duration that `fraction` (0 to 1) of all are at most; 0 if there is none."""
-        wanted = fraction * self.count
+    def percentiles_ns(self, fractions: Sequence[float]) -> list[int]:
+        """The durations that these parts (0 to 1, ascending) of all are at most; 0 if there is none."""
+        found: list[int] = []
         seen = 0
-        for bucket, count in enumerate(self._counts):
-            seen += count
-            if count and seen >= wanted:
-                return min(_upper_edge(bucket), self._max)
-        return self._max
+        for bucket in sorted(self._counts):
+            seen += self._counts[bucket]
+            while len(found) < len(fractions) and seen >= fractions[len(found)] * self.count:
+                found.append(min(_upper_edge(bucket), self._max))
+        return found + [self._max] * (len(fractions) - len(found))
 
     def summary_us(self) -> dict[str, float]:
         """p50, p99, p999 and max in microseconds, as `status` gives them."""
-        points = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-        summary = {name: self.percentile_ns(fraction) / 1000 for name, fraction in points.items()}
+        found = self.percentiles_ns(tuple(_POINTS.values()))
+        summary = {name: value / 1000 for name, value in zip(_POINTS, found, strict=True)}
         return {**summary, "max": self._max / 1000}
 
 
@@ -83,18 +90,14 @@ class RecentDistribution:
         if len(self._slots) > _WINDOW_SLOTS:
             self._before.add(self._slots.pop(0))
 
-    def everything(self) -> Distribution:
-        """All durations since the start."""
-        total = self.last_10s()
-        total.add(self._before)
-        return total
-
-    def last_10s(self) -> Distribution:
-        """Those of the last ten seconds."""
+    def summaries_us(self) -> tuple[dict[str, float], dict[str, float]]:
+        """Summaries of all durations since the start, and of those of the last ten seconds."""
         total = Distribution()
         for slot in self._slots:
             total.add(slot)
-        return total
+        recent = total.summary_us()
+        total.add(self._before)
+        return total.summary_us(), recent
 
 
 def _upper_edge(bucket: int) -> int:

@@ -6,19 +6,18 @@ the bus.
 
 from __future__ import annotations
 
-import errno
 import logging
 import select
-import socket
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from ethercat_server.connection import Connection, Limits
-from ethercat_server.errors import ServerError
+from ethercat_server.connection import Connection, Limits, Unreadable
+from ethercat_server.listeners import listen
 from ethercat_server.socket_owner import open_diagnostics, peer_uid
 from protocol.control import ErrorCode, error_reply
-from protocol.errors import BadMessageError, RemoteProtocolError, RequestError
+from protocol.errors import RequestError
 from protocol.framing import JsonObject
 
 MAX_CLIENTS: Final = 64
@@ -28,8 +27,10 @@ _LAST_WORDS_S: Final = 1.0
 """How long a closing connection may take to accept its last reply."""
 
 _SWEEP_NS: Final = 50_000_000
-_ACCEPTS_AT_ONCE: Final = 8
-_BACKLOG: Final = 128
+_ACCEPTS_AT_ONCE: Final = 2
+_LEAST_TURN_NS: Final = 200_000
+"""So long a turn takes at least, even if the deadline has passed: nobody is shut out for ever."""
+_FORCE_EVERY_NS: Final = 20_000_000
 
 log = logging.getLogger(__name__)
 
@@ -47,9 +48,13 @@ class Hub:
         self._subscribers: list[Connection] = []
         self._closing_since: dict[int, float] = {}
         self._handler: Handler | None = None
-        self._listeners = _listen(hosts, port)
+        self._listeners = listen(hosts, port)
         self._readers: list[int] = []
-        self._unread: list[Connection] = []
+        self._readers_changed = True
+        self._first = 0
+        """Where among the readable sockets a turn begins: another one each time."""
+        self._unread: deque[Connection] = deque()
+        self._force_at_ns = 0
         self._hasty: list[Connection] = []
         """They have asked too much lately and wait for their turn."""
         self._diagnostics = open_diagnostics()
@@ -61,7 +66,7 @@ class Hub:
     def start(self, handler: Handler) -> None:
         """Begin to accept; until now clients waited in the kernel's queue."""
         self._handler = handler
-        self._update_readers()
+        self._readers_changed = True
 
     def publish(self, frame: bytes, place: int, flags: int, now_ns: int) -> None:
         """Hand a DATA frame of the sensor at `place` to every subscriber that wants it."""
@@ -82,7 +87,7 @@ class Hub:
         connection.send_json(reply)
         if connection.unread:
             self._unread.append(connection)
-        self._update_readers()
+        self._readers_changed = True
 
     def may_control(self, connection: Connection) -> bool:
         """Whether the user at the other end may change something. What is not known is refused."""
@@ -95,32 +100,64 @@ class Hub:
         self._subscribers = [c for c in self.connections.values() if c.subscription is not None]
 
     def serve(self, until_ns: int) -> None:
-        """Serve the sockets until CLOCK_MONOTONIC is `until_ns`; one look at each if that is past."""
+        """Serve the sockets until CLOCK_MONOTONIC is `until_ns`, and a little if that is past.
+
+        Each socket and each message takes a fraction of a millisecond; what there is no time for has its turn
+        the next time, so that no crowd of clients keeps the loop from its deadline.
+        """
+        until_ns = max(until_ns, time.monotonic_ns() + _LEAST_TURN_NS)
         if self._hasty:
-            self._unread += [c for c in self._hasty if self.connections.get(c.fd) is c]
+            self._unread.extend(c for c in self._hasty if self.connections.get(c.fd) is c)
             self._hasty = []
-        while True:
-            left = 0 if self._unread else max(0, until_ns - time.monotonic_ns())
-            writers = [c.fd for c in self.connections.values() if c.outbox.waiting]
-            readable, writable, _ = select.select(self._readers, writers, (), left * 1e-9)
-            if not readable and not writable and not self._unread:
-                break
-            for fd in writable:
-                self.connections[fd].outbox.flush()
-            for fd in readable:
-                self._read(fd)
-            self._answer_one_each()
-            if time.monotonic_ns() >= until_ns:
-                break
+        while self._serve_once(until_ns) and time.monotonic_ns() < until_ns:
+            pass
         if time.monotonic_ns() >= self._sweep_at_ns:
             self._sweep()
+
+    def _serve_once(self, until_ns: int) -> bool:
+        """Wait for something to do and do it; False if there was nothing."""
+        if self._readers_changed:
+            self._update_readers()
+        left = 0 if self._unread else max(0, until_ns - time.monotonic_ns())
+        writers = [c.fd for c in self.connections.values() if c.outbox.waiting]
+        readable, writable, _ = select.select(self._readers, writers, (), left * 1e-9)
+        if not readable and not writable and not self._unread:
+            return False
+        for fd in writable:
+            self.connections[fd].outbox.flush()
+        # Where time is short, the two take turns in who is first.
+        self._first += 1
+        if self._first % 2:
+            self._read_some(readable, until_ns)
+        # One message of each connection at most: none makes the others wait for all of its own.
+        for _ in range(len(self._unread)):
+            now_ns = time.monotonic_ns()
+            if now_ns >= until_ns:
+                return True
+            connection = self._unread.popleft()
+            # A long message waits until there is time for it; now and then one is taken all the same.
+            if now_ns + connection.effort_ns > until_ns:
+                if now_ns < self._force_at_ns:
+                    self._unread.append(connection)
+                    continue
+                self._force_at_ns = now_ns + _FORCE_EVERY_NS
+            self._take_message(connection)
+        if not self._first % 2:
+            self._read_some(readable, until_ns)
+        return True
+
+    def _read_some(self, readable: list[int], until_ns: int) -> None:
+        for turn in range(len(readable)):
+            if time.monotonic_ns() >= until_ns:
+                break
+            self._read(readable[(self._first + turn) % len(readable)])
 
     def close(self) -> None:
         """Send what waits, for a bounded time, then close everything."""
         for listener in self._listeners:
             listener.close()
         self._listeners = []
-        self._update_readers()
+        self._readers_changed = True
         deadline = time.monotonic() + _LAST_WORDS_S
         for connection in self.connections.values():
             connection.subscription = None
@@ -149,7 +186,7 @@ class Hub:
                 connection.close()
                 continue
             self.connections[connection.fd] = connection
-        self._update_readers()
+        self._readers_changed = True
 
     def _read(self, fd: int) -> None:
         connection = self.connections.get(fd)
@@ -160,30 +197,27 @@ class Hub:
         if connection.unread:
             # What it sends further stays in the kernel until this is answered: a flood waits its turn.
             self._unread.append(connection)
-        self._update_readers()
+        self._readers_changed = True
 
-    def _answer_one_each(self) -> None:
-        """Answer one message of each connection that has some: none makes the others wait for all of its."""
-        waiting, self._unread = self._unread, []
-        for connection in waiting:
-            if not connection.may_ask(time.monotonic_ns()):
-                self._hasty.append(connection)
-                continue
-            message = connection.next_message()
-            if isinstance(message, RemoteProtocolError | BadMessageError):
-                connection.send_json(error_reply(None, ErrorCode.BAD_REQUEST, str(message)))
-            elif message is not None:
-                answer = self._answer(connection, message)
-                connection.busy = answer is None
-                if answer is not None:
-                    connection.send_json(answer)
-            if connection.unread and not connection.busy and not connection.dead:
-                self._unread.append(connection)
-                continue
-            self._update_readers()
-            if connection.closing or connection.dead:
-                self._sweep_at_ns = 0
-                self.subscriptions_changed()
+    def _take_message(self, connection: Connection) -> None:
+        if not connection.may_ask(time.monotonic_ns()):
+            self._hasty.append(connection)
+            return
+        message = connection.next_message()
+        if isinstance(message, Unreadable):
+            connection.send_json(error_reply(None, ErrorCode.BAD_REQUEST, message.reason))
+        elif message is not None:
+            answer = self._answer(connection, message)
+            connection.busy = answer is None
+            if answer is not None:
+                connection.send_json(answer)
+        if connection.unread and not connection.busy and not connection.dead:
+            self._unread.append(connection)
+            return
+        self._readers_changed = True
+        if connection.closing or connection.dead:
+            self._sweep_at_ns = 0
+            self.subscriptions_changed()
 
     def _answer(self, connection: Connection, message: JsonObject) -> JsonObject | None:
         assert self._handler is not None
@@ -220,43 +254,11 @@ class Hub:
             connection.close()
         if gone:
             self.subscriptions_changed()
-            self._update_readers()
+            self._readers_changed = True
 
     def _update_readers(self) -> None:
+        self._readers_changed = False
         self._readers = [listener.fileno() for listener in self._listeners]
         self._readers += [
             fd for fd, c in self.connections.items() if not (c.end_of_input or c.unread or c.busy or c.dead)
         ]
-
-
-def _listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
-    listeners: list[socket.socket] = []
-    for host in hosts:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        try:
-            listener = socket.socket(family, socket.SOCK_STREAM)
-        except OSError:
-            continue  # no IPv6 on this machine
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if family == socket.AF_INET6:  # IPv4 has a listener of its own
-            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        try:
-            listener.bind((host, port))
-            listener.listen(_BACKLOG)
-        except OSError as error:
-            listener.close()
-            if error.errno == errno.EADDRNOTAVAIL and listeners:
-                continue  # no address ::1 on this machine
-            for other in listeners:
-                other.close()
-            reason = (
-                "is taken by another program"
-                if error.errno == errno.EADDRINUSE
-                else f"cannot be used: {error.strerror}"
-            )
-            raise ServerError(
-                f"port {port} on {host} {reason}; stop that program or choose another port"
-            ) from None
-        listener.setblocking(False)
-        listeners.append(listener)
-    return listeners

@@ -79,7 +79,8 @@ class Jobs:
         except StopIteration as stop:
             result = stop.value
         except RequestError as refused:
-            error = refused
+            # A new one: in a variable of this frame, the one that was raised would keep itself alive.
+            error = RequestError(refused.code, str(refused), **refused.extra)
         except SdoAbortError as abort:
             error = RequestError(ErrorCode.SENSOR, str(abort), abort_code=abort.abort_code)
         except BusError as failed:

@@ -167,7 +167,7 @@ class SensorStream:
             self._gap = True
 
     def status(self) -> dict[str, Any]:
-        """The sensor's part of the `status` reply."""
+        """The sensor's part of the `status` reply, but for the age."""
         return {
             "sensor": self.place,
             "fresh": self.fresh,
@@ -176,5 +176,4 @@ class SensorStream:
             "lost_samples": self.lost_samples,
             "recoveries": self.recoveries,
             "clock": self.clock.describe(),
-            "age_us": self.age.everything().summary_us(),
         }
