@@ -4,7 +4,7 @@ The rules it keeps:
 
 - A framed message is `length` u32 big-endian, `type` u8, body; length counts type and body.
 - Hostile lengths are refused as soon as the length is there: nothing is buffered for them.
-- RemoteProtocolError is final: the decoder raises it again on every later call.
+- RemoteProtocolError is final: the decoder raises it again on every later call and keeps nothing more.
 - BadMessageError concerns one message: it has been consumed, and the next call goes on after it.
 - On a bare JSON connection a message ends with its closing brace or with a newline, whichever is first,
   so a client that sends no newline is understood and a broken line costs only itself.
@@ -28,6 +28,8 @@ MAX_JSON_LENGTH: Final = 65536
 MAX_JSON_DEPTH: Final = 32
 BARE_JSON_FIRST_BYTE: Final = b"{"
 """A connection that starts with this byte is a bare JSON connection."""
+
+_NEWLINE: Final = ord("\n")
 
 JsonObject = dict[str, Any]
 
@@ -184,10 +186,13 @@ class FrameDecoder:
 
     def received(self, count: int) -> None:
         """`count` bytes were written to the start of `get_buffer()`."""
-        self._end += count
+        if self._broken is None:
+            self._end += count
 
     def feed(self, data: bytes | bytearray | memoryview) -> None:
         """Add received bytes."""
+        if self._broken is not None:
+            return
         self._make_room(len(data))
         self._buffer[self._end : self._end + len(data)] = data
         self._end += len(data)
@@ -280,7 +285,8 @@ class BareJsonDecoder:
 
     def feed(self, data: bytes | bytearray | memoryview) -> None:
         """Add received bytes."""
-        self._buffer += data
+        if self._broken is None:
+            self._buffer += data
 
     def end_of_input(self) -> None:
         """No more bytes will come."""
@@ -323,7 +329,7 @@ class BareJsonDecoder:
             pattern = self._STRING_STRUCTURE if self._in_string else self._STRUCTURE
             match = pattern.search(self._buffer, position)
             if match is None:
-                self._scanned = max(position, len(self._buffer))
+                self._scanned = len(self._buffer)
                 return None
             position = match.end()
             byte = match.group()
@@ -332,8 +338,11 @@ class BareJsonDecoder:
             if byte == b'"':
                 self._in_string = not self._in_string
             elif byte == b"\\":
-                # Skip the escaped byte, which may not have arrived yet; a newline is never escaped.
-                if self._buffer[position : position + 1] != b"\n":
+                # Skip the escaped byte, once it is there: a newline is never escaped.
+                if position == len(self._buffer):
+                    self._scanned = position - 1
+                    return None
+                if self._buffer[position] != _NEWLINE:
                     position += 1
             elif byte == b"{":
                 self._depth += 1

@@ -67,6 +67,15 @@ def test_a_broken_line_costs_only_itself() -> None:
         assert decoder.next_message() is None
 
 
+def test_a_newline_after_a_backslash_ends_the_line_even_if_it_comes_later() -> None:
+    decoder = feed(b'{"a": "x\\')
+    assert decoder.next_message() is None
+    decoder.feed(b"\n" + LINE)
+    with pytest.raises(BadMessageError):
+        decoder.next_message()
+    assert decoder.next_message() == OBJECT
+
+
 def test_end_of_input_reports_half_an_object() -> None:
     decoder = feed(LINE + b'{"action": "shu')
     assert list(decoder) == [OBJECT]
