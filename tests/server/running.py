@@ -109,12 +109,17 @@ class Program:
 
 
 class Server(Program):
-    """A running server on a free port."""
+    """A running server, on a free port unless it is told which."""
 
     def __init__(
-        self, ifname: str, *arguments: str, name: str | None = None, under: Sequence[str] = ()
+        self,
+        ifname: str,
+        *arguments: str,
+        name: str | None = None,
+        port: int = 0,
+        under: Sequence[str] = (),
     ) -> None:
-        self.port = free_port()
+        self.port = port or free_port()
         names = [name] if name else []
         super().__init__("ethercat_server.cli", [ifname, *names, str(self.port), *arguments], under)
 
