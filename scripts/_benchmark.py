@@ -24,6 +24,7 @@ from rich.console import Console
 from ethercat_server.errors import ServerError
 from scripts import _benchmark_chains as chains
 from scripts._benchmark_chain import OVERSAMPLING_HZ, Setup, virtual_bus
+from scripts._benchmark_clients import measure_clients
 from scripts._benchmark_plot import Curves, draw
 from scripts._benchmark_records import may_be_real_time
 from scripts._benchmark_report import print_configuration
@@ -106,6 +107,11 @@ def run(options: argparse.Namespace, console: Console) -> None:
         write_json(options.json, options, priority, soak=result)
         print(f"written: {options.json}")
         return
+    if options.clients:
+        result = measure_clients(setup(options.rates[0], options.sensors[0]), console)
+        write_json(options.json, options, priority, clients=result)
+        print(f"written: {options.json}")
+        return
     wanted = [setup(rate, sensors) for rate in options.rates for sensors in options.sensors]
     ways = 2 if options.ros else 1
     progress = Progress(console, sum(1 + ways * (2 if one.sensors == 1 else 1) for one in wanted))
@@ -161,12 +167,13 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--sensors", type=_counts, metavar="N,...", help="sensors on the bus (1,2)")
     parser.add_argument("--ppm", type=float, default=150.0, help="the sensors' clock error (%(default)g)")
     parser.add_argument("--soak", type=float, metavar="MINUTES", help="only the server, for so long")
+    parser.add_argument("--clients", action="store_true", help="only the server, eight clients against one")
     parser.add_argument("--no-ros", dest="ros", action="store_false", help="TCP only")
     parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
                         help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip
     options = parser.parse_args(argv)
     options.json, options.plot = here / options.json, here / options.plot
-    only_one = options.quick or options.soak
+    only_one = options.quick or options.soak or options.clients
     options.rates = options.rates or ([800] if only_one else [800, 1600])
     options.sensors = options.sensors or ([1] if only_one else [1, 2])
     return options
