@@ -2,13 +2,15 @@
 
 `ask` sends the requests in ARGUMENT, a JSON list, and prints the replies. `stream` subscribes and prints how
 many frames it has got once there are ARGUMENT. `hit` sends the request ARGUMENT and is gone at once, in all
-the ways there are, over and over.
+the ways there are, over and over. `press` sends it on many connections at once, again and again, until its
+input ends.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import select
 import socket
 import struct
 import sys
@@ -19,6 +21,7 @@ from protocol.framing import DataMessage, FrameDecoder, encode_bare_json, encode
 from tests.server.as_another_user import become_nobody
 
 HITS = 200
+CONNECTIONS = 40
 _RESET = struct.pack("ii", 1, 0)
 
 
@@ -74,10 +77,21 @@ GOING: Sequence[Callable[[socket.socket], None]] = (
 def hit(host: str, port: int, message: dict[str, object]) -> None:
     for number in range(HITS):
         encode = encode_bare_json if number % 3 == 0 else encode_json
-        with contextlib.suppress(ConnectionError):
+        with contextlib.suppress(OSError):  # the server may be rid of it already
             sock = socket.create_connection((host, port), timeout=20)
             sock.sendall(encode(message))
             GOING[number % len(GOING)](sock)
+
+
+def press(host: str, port: int, message: dict[str, object]) -> None:
+    wire = encode_json(message)
+    socks = [socket.create_connection((host, port), timeout=20) for _ in range(CONNECTIONS)]
+    for sock in socks:
+        sock.sendall(wire * 20)
+    print(flush=True)
+    while not select.select((sys.stdin,), (), (), 0)[0]:
+        for sock in select.select(socks, (), (), 0.1)[0]:
+            sock.sendall(wire * sock.recv(65536).count(b'"reply"'))
 
 
 def main() -> None:
@@ -85,8 +99,8 @@ def main() -> None:
     host, port, what = sys.argv[1], int(sys.argv[2]), sys.argv[3]
     argument = json.loads(sys.argv[4])
     become_nobody()
-    if what == "hit":
-        hit(host, port, argument)
+    if what in {"hit", "press"}:
+        (hit if what == "hit" else press)(host, port, argument)
         return
     with socket.create_connection((host, port), timeout=20) as sock:
         (ask if what == "ask" else stream)(sock, argument)

@@ -115,6 +115,24 @@ def test_asking_and_being_gone_at_once_changes_nothing(shared: Server, action: s
         watcher.fresh(100)
 
 
+def test_their_reading_does_not_keep_root_from_its_work(shared: Server) -> None:
+    if "sdo_read" not in ACTIONS:
+        pytest.skip("the server has no sdo_read")
+    command = [sys.executable, "-m", "tests.server.stranger", "127.0.0.1", str(shared.port), "press"]
+    message = json.dumps(request("sdo_read", index=0x1008))
+    pressing = subprocess.Popen([*command, message], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert pressing.stdout is not None
+        assert pressing.stdout.readline(), "they did not get in"
+        with shared.connect() as client:
+            replies = [client.ask("configure", settings={"fir": False}) for _ in range(20)]
+            assert all(reply["ok"] for reply in replies), [reply.get("error") for reply in replies]
+        assert pressing.poll() is None
+    finally:
+        pressing.communicate("\n", timeout=30)
+    assert pressing.returncode == 0
+
+
 def test_root_may_still_touch() -> None:
     with server("virtual") as running:
         as_nobody(running.port, "hit", request("shutdown"))
