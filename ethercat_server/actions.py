@@ -43,7 +43,8 @@ class Actions:
                 f"{request.action} works on framed connections only: a bare JSON connection carries no DATA",
             )
         if action.controls and not self._hub.may_control(connection):
-            log.warning("%s: %s denied", connection, request.action)
+            kind = f"{connection.uid} {request.action}"
+            log.warning("%s: %s denied", connection, request.action, extra={"kind": kind})
             raise RequestError(ErrorCode.DENIED, _denial(request.action, connection.uid))
         if request.action in self._on_sensors.handlers:
             self._on_sensors.handle(connection, request)

@@ -43,12 +43,16 @@ def apply_in_op(sdo: Sdo, sensor: Sensor, change: Change) -> Steps[None]:
         for name in change.names:
             written.append(name)
             yield from write_setting(sdo, sensor, name)
-    except BusError:
-        held = dict(sensor.settings)
+    except BusError as error:
         sensor.wanted, sensor.asked = before, asked
-        for name in written:
-            if name in held:
-                yield from write_setting(sdo, sensor, name, held[name])
+        try:
+            for name in written:
+                if name in sensor.settings:
+                    yield from write_setting(sdo, sensor, name, sensor.settings[name])
+        except BusError as worse:
+            raise BusError(
+                f"{error}; putting back what was in force failed too: {worse}; configure it again"
+            ) from None
         raise
     yield from read_settings(sdo, sensor)
 

@@ -7,7 +7,7 @@ import socket
 import time
 from typing import Final, NamedTuple
 
-from ethercat_server.outbox import MAX_QUEUED_JSON, Outbox, with_gap
+from ethercat_server.outbox import Outbox, with_gap
 from protocol.errors import BadMessageError, RemoteProtocolError
 from protocol.framing import (
     BARE_JSON_FIRST_BYTE,
@@ -140,8 +140,8 @@ class Connection:
     @property
     def effort_ns(self) -> int:
         """How long it may take to answer what has come."""
-        decoder = self.framed or self.bare
-        return _EFFORT_NS + _EFFORT_PER_BYTE_NS * (min(decoder.pending, MAX_REQUEST_LENGTH) if decoder else 0)
+        size = self.framed.next_size if self.framed else self.bare.pending if self.bare else 0
+        return _EFFORT_NS + _EFFORT_PER_BYTE_NS * min(size, MAX_REQUEST_LENGTH)
 
     def may_ask(self, now_ns: int) -> bool:
         """Whether it is this client's turn to be answered once more: none may ask without pause."""
@@ -201,7 +201,7 @@ class Connection:
 
     def send_json(self, message: JsonObject) -> None:
         """Send a reply or an event in this connection's own form."""
-        if self.outbox.replies_waiting >= MAX_QUEUED_JSON:
+        if self.outbox.full:
             self.failed = True
             return
         self.outbox.send(encode_bare_json(message) if self.bare is not None else encode_json(message))

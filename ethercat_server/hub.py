@@ -23,6 +23,8 @@ from protocol.framing import JsonObject
 MAX_CLIENTS: Final = 64
 RESERVED: Final = 16
 """So many of them are for users who may control: strangers cannot take all."""
+MOST_OF_A_STRANGER: Final = 16
+"""So many one user who may not control can have."""
 _LAST_WORDS_S: Final = 1.0
 """How long a closing connection may take to accept its last reply."""
 
@@ -181,12 +183,18 @@ class Hub:
                 break
             uid = peer_uid(self._diagnostics, sock)
             connection = Connection(sock, uid)
-            if len(self.connections) >= MAX_CLIENTS - RESERVED * (uid not in self.control_uids):
+            if not self._has_room_for(uid):
                 log.warning("%s refused: there are %d clients already", connection, len(self.connections))
                 connection.close()
                 continue
             self.connections[connection.fd] = connection
         self._readers_changed = True
+
+    def _has_room_for(self, uid: int | None) -> bool:
+        if uid in self.control_uids:
+            return len(self.connections) < MAX_CLIENTS
+        of_this_user = sum(connection.uid == uid for connection in self.connections.values())
+        return of_this_user < MOST_OF_A_STRANGER and len(self.connections) < MAX_CLIENTS - RESERVED
 
     def _read(self, fd: int) -> None:
         connection = self.connections.get(fd)

@@ -40,12 +40,15 @@ class Jobs:
         self.waiting = 0
         """Jobs that are not done."""
 
-    def start(self, place: int, steps: Steps[Any], done: Done) -> None:
-        """Have `steps` done on the sensor at `place`; RequestError if it is lost or too much waits for it."""
+    def start(self, place: int, steps: Steps[Any], done: Done, most: int = _MOST_WAITING) -> None:
+        """Have `steps` done on the sensor at `place`.
+
+        RequestError if it is lost, or if `most` jobs wait for it already.
+        """
         self.check_present(place)
-        if len(self._queues[place]) >= _MOST_WAITING:
+        if len(self._queues[place]) >= most:
             raise RequestError(
-                ErrorCode.BUSY, f"sensor {place} has {_MOST_WAITING} requests to do already: ask again later"
+                ErrorCode.BUSY, f"sensor {place} has {most} requests to do already: ask again later"
             )
         self._queues[place].append((steps, done))
         self.waiting += 1

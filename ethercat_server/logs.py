@@ -10,6 +10,7 @@ from typing import Final
 
 _MOST_AT_ONCE: Final = 5
 _WINDOW_S: Final = 10.0
+_MOST_KINDS: Final = 1000
 _PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.DEBUG, 7))
 """Levels of `logging` and the ones of syslog that they are, as in sd-daemon(3)."""
 
@@ -54,17 +55,18 @@ class JournalFormatter(PlainFormatter):
 
 
 class Repetitions(logging.Filter):
-    """Lets an event through a few times in a while; the next one after that says how many there were."""
+    """Lets an event through a few times in a while; the next one later says how many were left out."""
 
     def __init__(self) -> None:
         super().__init__()
         self._seen: dict[object, tuple[float, int]] = {}
-
-    """Lets an event through a few times in a while; the next one later says how many were left out."""
+        """Start of the window and events in it, by the message's template and the `kind` it was given."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether `record` is to be logged."""
-        now, key = time.monotonic(), record.msg
+        now, key = time.monotonic(), (record.msg, getattr(record, "kind", ""))
+        if len(self._seen) > _MOST_KINDS:
+            self._seen.clear()
         began, count = self._seen.get(key, (now, 0))
         if now - began > _WINDOW_S:
             if count > _MOST_AT_ONCE:

@@ -15,7 +15,8 @@ from protocol.framing import DATA_FLAGS_OFFSET, DataFlag
 
 MAX_QUEUED_DATA: Final = 256
 MAX_QUEUED_JSON: Final = 64
-"""Replies and events that may wait; a client that asks and never reads is closed at this many."""
+MAX_QUEUED_JSON_BYTES: Final = 262_144
+"""Replies and events that may wait; a client that asks and never reads is closed at so many."""
 
 NO_PLACE: Final = -1
 _GAP: Final = int(DataFlag.GAP)
@@ -38,12 +39,14 @@ class Outbox:
         """CLOCK_MONOTONIC when the socket last took something, while something waits."""
         self._queue: deque[tuple[bytes, int]] = deque()  # message, sensor place or NO_PLACE for JSON
         self._queued_data = 0
+        self._queued_json_bytes = 0
         self._head_sent = 0
 
     @property
-    def replies_waiting(self) -> int:
-        """How many messages other than DATA wait."""
-        return len(self._queue) - self._queued_data
+    def full(self) -> bool:
+        """Whether more replies and events wait than may."""
+        replies = len(self._queue) - self._queued_data
+        return replies >= MAX_QUEUED_JSON or self._queued_json_bytes > MAX_QUEUED_JSON_BYTES
 
     def send(self, message: bytes, place: int = NO_PLACE) -> int:
         """Send a message, or have it wait; `place` is the sensor's if it is a DATA frame.
@@ -66,7 +69,9 @@ class Outbox:
             self.waiting = True
             self.took_ns = time.monotonic_ns()
         self._queue.append((message, place))
-        if place >= 0:
+        if place < 0:
+            self._queued_json_bytes += len(message)
+        else:
             self._queued_data += 1
             if self._queued_data > MAX_QUEUED_DATA:
                 return self._drop_oldest_data()
@@ -92,6 +97,8 @@ class Outbox:
             if place >= 0:
                 self.sent += 1
                 self._queued_data -= 1
+            else:
+                self._queued_json_bytes -= len(message)
         self.waiting = False
 
     def _drop_oldest_data(self) -> int:

@@ -20,7 +20,8 @@ Steps = Generator[None, None, T]
 """Work in steps: yields when the loop should have its turn, returns the result."""
 
 _ANSWER_TIMEOUT_S: Final = 0.3
-_ATTEMPTS: Final = 5
+_GIVE_UP_S: Final = 1.5
+"""So long a transfer is tried again: a bus that is deaf for a moment is no refusal."""
 
 SM_READ_STATUS: Final = 0x080D
 """Status of sync manager 1, the mailbox from the slave."""
@@ -117,7 +118,8 @@ class CyclicSdo:
 
     def _transfer(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
         doing = "reading" if command == _UPLOAD else "writing"
-        for _ in range(_ATTEMPTS):
+        give_up = time.monotonic() + _GIVE_UP_S
+        while time.monotonic() < give_up:
             yield from self._drain()
             self._counter = self._counter % 7 + 1
             body = _SDO_HEADER.pack(_COE_SDO_REQUEST << 12, command, index, subindex) + data.ljust(4, b"\0")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 from ethercat_server import objects
 from ethercat_server.configuration import Change, apply_in_op, save
@@ -22,6 +22,9 @@ from protocol.framing import JsonObject
 from protocol.sdo_types import SdoType
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import SETTINGS, SettingValue
+
+_MOST_READS: Final = 8
+"""Everyone may read objects: with so many jobs waiting no more reads, so that changes have their turn."""
 
 
 class SensorActions:
@@ -103,7 +106,9 @@ class SensorActions:
     def _sdo_read(self, connection: Connection, request: Request) -> None:
         values = request.values
         sdo = self._recovery.sdo(values["sensor"])
-        self._start(connection, request, _read(sdo, values["index"], values["subindex"], values["type"]))
+        steps = _read(sdo, values["index"], values["subindex"], values["type"])
+        done = self._answering(connection, request)
+        self._jobs.start(values["sensor"], steps, done, most=_MOST_READS)
 
     def _sdo_write(self, connection: Connection, request: Request) -> None:
         values = request.values

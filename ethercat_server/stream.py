@@ -17,6 +17,8 @@ from protocol.framing import DataFlag, encode_data, encode_data_head
 
 DISCARDED_AT_START: Final = 3
 """Bota's own driver throws the first three frames after entering OP away."""
+_ODD_SECONDS: Final = 10
+"""A rate is odd when it has been for so long: a busy machine makes it seem so for a moment."""
 _IDLE_PERIODS: Final = 3.0
 """A sensor that has given nothing new for this many periods is silent, not just late."""
 
@@ -51,6 +53,7 @@ class SensorStream:
         self._seen = (0, 0, False, False)
         """The last exchange, as `learn` needs it: sent, back, valid, fresh."""
         self._odd_rate_said = False
+        self._odd_seconds = 0
         self._valid_ns = 0
         self._idle_at_ns = 0.0
 
@@ -148,9 +151,11 @@ class SensorStream:
         return INVALID
 
     def check_rate(self) -> None:
-        """Say once if the sensor does not sample at the rate that it is set to."""
+        """To be called once a second: say once if the sensor samples at another rate than it is set to."""
         pull = self.clock.pull
-        if self.clock.locked and abs(pull) > PLAUSIBLE_PULL and not self._odd_rate_said:
+        odd = self.clock.locked and abs(pull) > PLAUSIBLE_PULL
+        self._odd_seconds = self._odd_seconds + 1 if odd else 0
+        if self._odd_seconds == _ODD_SECONDS and not self._odd_rate_said:
             self._odd_rate_said = True
             log.warning(
                 "sensor %d samples every %.1f µs, %+.1f %% off what it is set to: check its settings",

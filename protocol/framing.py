@@ -202,6 +202,15 @@ class FrameDecoder:
         """Bytes of an unfinished message that are waiting for the rest."""
         return self._end - self._start
 
+    @property
+    def next_size(self) -> int:
+        """Bytes of the message that is next, as far as they have come."""
+        available = self._end - self._start
+        if available < _LENGTH.size:
+            return available
+        (length,) = _LENGTH.unpack_from(self._buffer, self._start)
+        return int(min(available, _LENGTH.size + length))
+
     def next_message(self) -> DataMessage | JsonObject | None:
         """The next whole message, or None if more bytes are needed.
 

@@ -21,7 +21,7 @@ from protocol.framing import DataMessage, FrameDecoder, encode_bare_json, encode
 from tests.server.as_another_user import become_nobody
 
 HITS = 200
-CONNECTIONS = 40
+CONNECTIONS = 12
 _RESET = struct.pack("ii", 1, 0)
 
 

@@ -64,6 +64,9 @@ def test_repetitions_are_counted_and_told_with_the_next(monkeypatch: pytest.Monk
     late = record("denied %d", 20)
     assert repetitions.filter(late)
     assert late.getMessage() == "denied 20 (and 15 more like it before)"
+    other = record("denied %d", 99)
+    other.kind = "another user"
+    assert repetitions.filter(other), "what one user does hides nothing of another"
     now += 11
     alone = record("denied %d", 21)
     assert repetitions.filter(alone)
