@@ -1,4 +1,4 @@
-"""Every object that the note lists, also those that the firmware seen does not have: what a person may look at.
+"""Every object that the note lists, also those that the firmware seen does not have: what one may look at.
 
 `objects` has those that a sensor is configured by.
 """
