@@ -39,10 +39,10 @@ class Block:
             invalid = bool(frame.flags & DataFlag.INVALID)
             self._invalid += invalid
             self._repeated += not invalid
+            if not invalid and self._newest is None:
+                self._newest = self._decode(frame)  # of a sensor that is stuck there is nothing newer
             return False
-        size = len(frame.process_data)
-        decoder = self._decoders.setdefault(size, SampleDecoder(size))
-        sample = self._newest = decoder.decode(frame.process_data)
+        sample = self._newest = self._decode(frame)
         self._warnings |= sample.warnings
         row = sample.array
         self._first = self._first or row
@@ -55,6 +55,10 @@ class Block:
         self._count += 1
         return True
 
+    def _decode(self, frame: DataMessage) -> Sample:
+        size = len(frame.process_data)
+        return self._decoders.setdefault(size, SampleDecoder(size)).decode(frame.process_data)
+
     def finish(self) -> dict[str, Any]:
         """What there is to say, in SI units, as plain data."""
         found: dict[str, Any] = {
@@ -65,12 +69,12 @@ class Block:
             "gaps": self._gaps,
         }
         if self._newest is not None:
-            means = [s / self._count for s in self._sums]
+            count, first = max(1, self._count), self._first or self._newest.array
+            means = [s / count for s in self._sums]
             deviations = [
-                math.sqrt(max(0.0, q / self._count - m * m))
-                for q, m in zip(self._squares, means, strict=True)
+                math.sqrt(max(0.0, q / count - m * m)) for q, m in zip(self._squares, means, strict=True)
             ]
-            means = [m + f for m, f in zip(means, self._first, strict=True)]
+            means = [m + f for m, f in zip(means, first, strict=True)]
             found |= {name: means[3 * n : 3 * n + 3] for n, name in enumerate(_VECTORS)}
             found["deviation"] = {name: deviations[3 * n : 3 * n + 3] for n, name in enumerate(_VECTORS)}
             found["temperature"] = self._newest.temperature

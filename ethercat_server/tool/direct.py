@@ -71,6 +71,7 @@ class DirectLink(Link):
     def configure(self, place: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """See `Link`."""
         sdo, sensor = self.sdo(place), self.in_force(self.sensors[place])
+        _check_rate_known(sensor)
         try:
             change = Change(sensor, settings)
         except SettingError as error:
@@ -97,8 +98,7 @@ class DirectLink(Link):
     def _operational(self) -> list[Sensor]:
         sensors = [self.in_force(found) for found in self.sensors]
         for sensor in sensors:
-            if "sinc_length" not in sensor.wanted:
-                raise BusError(f"sensor {sensor.place} does not tell its sampling rate: power it off and on")
+            _check_rate_known(sensor)
         enter_op(self._bus, sensors, _no_check)
         return sensors
 
@@ -201,6 +201,11 @@ def _change(sdo: Sdo, sensor: Sensor, change: Change, and_save: bool) -> Steps[N
         raise failed_change(error) from None
     if and_save:
         yield from save(sdo, sensor)
+
+
+def _check_rate_known(sensor: Sensor) -> None:
+    if "sinc_length" not in sensor.wanted:
+        raise BusError(f"sensor {sensor.place} does not tell its sampling rate: power it off and on")
 
 
 def _no_check() -> None:

@@ -25,8 +25,11 @@ def open_link(ifname: str | None, server: str | None) -> Link:
     if holder is None:
         return DirectLink(ifname)
     if holder.address is None:
-        hint = "run as root, or name it with --server HOST:PORT" if holder.pid is None else "stop it first"
-        raise InterfaceError(f"{ifname} is in use by {holder}: if it is an ethercat-server, {hint}")
+        if holder.pid is None:
+            hint = "run as root, or name its server with --server HOST:PORT"
+        else:
+            hint = "it serves no port that the tool could use, so stop it first"
+        raise InterfaceError(f"{ifname} is in use by {holder}: {hint}")
     host, port = holder.address
     used = f"the server at {host}:{port}, {holder}, which holds {ifname}"
     sys.stderr.write(f"ethercat-sensor: going through {used}\n")

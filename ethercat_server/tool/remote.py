@@ -46,7 +46,7 @@ class ServerLink(Link):
         self._decoder = FrameDecoder()
         self._asked = 0
         try:
-            described = self.ask("describe")
+            described = self.ask("describe", _CONNECT_TIMEOUT_S)
             if described.get("protocol") != PROTOCOL_VERSION:
                 raise ServerError(
                     f"{self.used} does not speak version {PROTOCOL_VERSION}: update it or the tool"

@@ -88,7 +88,7 @@ def _counts(row: dict[str, Any]) -> str:
     text = f"{row['samples']:5d} samples {rate}"
     for key in ("invalid", "repeated", "gaps"):
         if row[key]:
-            text += f"  {row[key]} {key}"
+            text += f"  {key} {row[key]}"
     return text
 
 
@@ -98,7 +98,7 @@ def _warnings(row: dict[str, Any]) -> list[str]:
 
 def _line(row: dict[str, Any]) -> str:
     parts = [_counts(row)]
-    if row["samples"]:
+    if "force" in row:
         for (name, unit, digits), letter in zip(_VECTORS, "FMAR", strict=True):
             parts.append(f"{letter} " + " ".join(f"{v:+.{digits}f}" for v in row[name]) + f" {unit}")
         parts.append(f"{row['temperature']:.1f} °C")
@@ -107,7 +107,7 @@ def _line(row: dict[str, Any]) -> str:
 
 def _table(row: dict[str, Any]) -> str:
     rows: list[tuple[str, ...]] = [("", "x", "y", "z", "", "standard deviation")]
-    for name, unit, digits in _VECTORS if row["samples"] else ():
+    for name, unit, digits in _VECTORS if "force" in row else ():
         means = [f"{v:+{digits + 6}.{digits}f}" for v in row[name]]
         rows.append(
             (
@@ -118,7 +118,7 @@ def _table(row: dict[str, Any]) -> str:
             )
         )
     lines = [f"  {_counts(row)}", columns(rows, indent=2)]
-    if row["samples"]:
+    if "force" in row:
         lines.append(f"  temperature {row['temperature']:.1f} °C")
     return "\n".join([*lines, *(f"  {text}" for text in _warnings(row) or ["no warnings"])])
 
