@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import socket
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
@@ -21,6 +22,8 @@ _ANSWER_TIMEOUT_S: Final = 30.0
 _SLOWEST_SAMPLE_S: Final = 0.2
 """No sampling rate is below 25 Hz; a tare looks at its samples twice."""
 _IDLE_S: Final = 0.05
+_READ_ATTEMPTS: Final = 3
+_READ_PAUSE_S: Final = 0.1
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -140,8 +143,15 @@ class _ServerSdo:
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """See `Sdo`."""
         yield from ()
-        reply = self._link.ask("sdo_read", sensor=self._place, index=index, subindex=subindex)
-        return bytes.fromhex(reply["hex"])
+        keys = {"sensor": self._place, "index": index, "subindex": subindex}
+        for _ in range(_READ_ATTEMPTS - 1):
+            try:
+                return bytes.fromhex(self._link.ask("sdo_read", **keys)["hex"])
+            except SdoAbortError:
+                raise
+            except BusError:
+                time.sleep(_READ_PAUSE_S)  # the sensor may be out for a moment
+        return bytes.fromhex(self._link.ask("sdo_read", **keys)["hex"])
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """See `Sdo`."""
