@@ -80,7 +80,8 @@ class Actions:
 
     def _status(self, _: Connection, request: Request) -> JsonObject:
         clients = [
-            {"peer": c.peer, "sent": c.sent, "withheld": c.withheld} for c in self._hub.connections.values()
+            {"peer": c.peer, "sent": c.outbox.sent, "withheld": c.outbox.withheld}
+            for c in self._hub.connections.values()
         ]
         return reply(request, **self._cycle.status(), clients=clients)
 

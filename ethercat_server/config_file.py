@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from ethercat_server.errors import UsageError
 from ethercat_server.server_settings import SERVER_SETTINGS
 from protocol.errors import SettingError
+from protocol.sensor_choice import SensorChoice
 from protocol.settings import SettingValue, check_settings
 
 
@@ -19,8 +20,8 @@ class ConfigFile(NamedTuple):
     """By the names of SERVER_SETTINGS."""
     common: dict[str, SettingValue]
     """Settings for every sensor."""
-    by_place: dict[int, dict[str, SettingValue]]
-    """Settings for single sensors, the common ones included."""
+    by_sensor: dict[SensorChoice, dict[str, SettingValue]]
+    """Settings for single sensors."""
 
 
 EMPTY = ConfigFile({}, {}, {})
@@ -60,12 +61,14 @@ def _server(table: dict[str, Any]) -> dict[str, Any]:
 
 def _sensors(
     table: dict[str, Any],
-) -> tuple[dict[str, SettingValue], dict[int, dict[str, SettingValue]]]:
+) -> tuple[dict[str, SettingValue], dict[SensorChoice, dict[str, SettingValue]]]:
     common = {key: value for key, value in table.items() if not isinstance(value, dict)}
     single = {key: value for key, value in table.items() if isinstance(value, dict)}
-    by_place = {}
+    by_sensor = {}
     for key, values in single.items():
-        if not key.isdecimal() or int(key) > 255:
-            raise SettingError(f"[sensor.{key}]: the table must be named by a place, such as sensor.0")
-        by_place[int(key)] = check_settings({**common, **values})
-    return check_settings(common), by_place
+        try:
+            choice = SensorChoice.parse(key)
+        except ValueError as error:
+            raise SettingError(f"[sensor.{key}]: the table must be named by {error}") from None
+        by_sensor[choice] = check_settings(values)
+    return check_settings(common), by_sensor

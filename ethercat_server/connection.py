@@ -1,21 +1,16 @@
-"""One client's connection: who it is, what it sent so far, what waits to be sent to it, what it wants.
-
-It never blocks. What cannot be sent at once waits in a bounded queue of whole frames; when that is full the
-oldest DATA goes, never part of a frame and never a reply.
-"""
+"""One client's connection: who it is, what it sent so far, which DATA it wants. It never blocks."""
 
 from __future__ import annotations
 
 import contextlib
 import socket
 import time
-from collections import deque
 from typing import Final, NamedTuple
 
+from ethercat_server.outbox import MAX_QUEUED_JSON, Outbox, with_gap
 from protocol.errors import BadMessageError, RemoteProtocolError
 from protocol.framing import (
     BARE_JSON_FIRST_BYTE,
-    DATA_FLAGS_OFFSET,
     BareJsonDecoder,
     DataFlag,
     FrameDecoder,
@@ -25,9 +20,6 @@ from protocol.framing import (
 )
 
 MAX_REQUEST_LENGTH: Final = 16384
-MAX_QUEUED_DATA: Final = 256
-MAX_QUEUED_JSON: Final = 64
-"""Replies and events that may wait; a client that asks and never reads is closed at this many."""
 _SEND_BUFFER: Final = 65536
 """Small, so that a client that stalls finds fresh data soon after, not seconds of old."""
 _IDLE_FRAME_NS: Final = 10_000_000
@@ -83,12 +75,9 @@ class Connection:
         self.framed: FrameDecoder | None = None
         self.bare: BareJsonDecoder | None = None
         self.subscription: Subscription | None = None
-        self.sent = 0
-        """DATA frames sent."""
-        self.withheld = 0
-        """DATA frames dropped because the client did not read."""
-        self.dead = False
-        """Close it without more ado."""
+        self.outbox = Outbox(sock)
+        self.failed = False
+        """Close it without more ado: reading failed, or it broke a bound."""
         self.closing = False
         """What it still sends is thrown away; close it once everything is sent."""
         self.unread = False
@@ -100,13 +89,13 @@ class Connection:
         self._heard_ns = time.monotonic_ns()
         self._begun_ns = 0
         """Since when a message of which only a part has come is waited for; 0 if there is none."""
-        self._took_ns = 0
         self._credit_ns = _MOST_CREDIT_NS
         self._credited_ns = self._heard_ns
-        self._queue: deque[tuple[bytes, int]] = deque()  # frame, sensor place or -1 for JSON
-        self._queued_data = 0
-        self._head_sent = 0
-        self.needs_writing = False
+
+    @property
+    def dead(self) -> bool:
+        """Whether there is nothing left but to close it."""
+        return self.failed or self.outbox.broken
 
     def __str__(self) -> str:
         """For the log. The user by number: names may have to be asked for over the network."""
@@ -121,7 +110,7 @@ class Connection:
         except BlockingIOError:
             return
         except OSError:
-            self.dead = True
+            self.failed = True
             return
         if not data:
             self.end_of_input = True
@@ -150,8 +139,8 @@ class Connection:
 
     def complaint(self, now_ns: int, limits: Limits) -> str | None:
         """Why this client is to be closed, if it is."""
-        if self.needs_writing:
-            if now_ns - self._took_ns > limits.stall_ns:
+        if self.outbox.waiting:
+            if now_ns - self.outbox.took_ns > limits.stall_ns:
                 return f"it has taken nothing of what waits for it for {limits.stall_ns / 1e9:g} s"
         elif self._begun_ns and now_ns - self._begun_ns > _UNFINISHED_NS:
             return f"it has not finished its message for {_UNFINISHED_NS / 1e9:g} s"
@@ -197,10 +186,10 @@ class Connection:
 
     def send_json(self, message: JsonObject) -> None:
         """Send a reply or an event in this connection's own form."""
-        if len(self._queue) - self._queued_data >= MAX_QUEUED_JSON:
-            self.dead = True
+        if self.outbox.replies_waiting >= MAX_QUEUED_JSON:
+            self.failed = True
             return
-        self._send(encode_bare_json(message) if self.bare is not None else encode_json(message), -1)
+        self.outbox.send(encode_bare_json(message) if self.bare is not None else encode_json(message))
 
     def offer(self, frame: bytes, place: int, flags: int, now_ns: int) -> None:
         """Send a DATA frame if the subscription wants it."""
@@ -208,8 +197,10 @@ class Connection:
         if wants is None or not wants.wanted[place]:
             return
         if not flags and wants.every == 1 and not wants.gap[place]:
-            self._send(frame, place)
+            withheld = self.outbox.send(frame, place)
             wants.last_ns[place] = now_ns
+            if withheld >= 0:
+                wants.gap[withheld] = True
             return
         if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[place] < _IDLE_FRAME_NS:
             return
@@ -224,74 +215,9 @@ class Connection:
             wants.gap[place] = False
             if not flags & _GAP:
                 frame = with_gap(frame)
-        self._send(frame, place)
-
-    def _send(self, frame: bytes, place: int) -> None:
-        if not self._queue:
-            try:
-                sent = self.sock.send(frame)
-            except BlockingIOError:
-                sent = 0
-            except OSError:
-                self.dead = True
-                return
-            if sent == len(frame):
-                if place >= 0:
-                    self.sent += 1
-                return
-            self._head_sent = sent
-            self.needs_writing = True
-            self._took_ns = time.monotonic_ns()
-        self._queue.append((frame, place))
-        if place >= 0:
-            self._queued_data += 1
-            if self._queued_data > MAX_QUEUED_DATA:
-                self._drop_oldest_data()
-
-    def flush(self) -> None:
-        """Send what waits, as far as the socket takes it."""
-        while self._queue:
-            frame, place = self._queue[0]
-            try:
-                sent = self.sock.send(memoryview(frame)[self._head_sent :])
-            except BlockingIOError:
-                return
-            except OSError:
-                self.dead = True
-                return
-            self._head_sent += sent
-            self._took_ns = time.monotonic_ns()
-            if self._head_sent < len(frame):
-                return
-            self._queue.popleft()
-            self._head_sent = 0
-            if place >= 0:
-                self.sent += 1
-                self._queued_data -= 1
-        self.needs_writing = False
-
-    def _drop_oldest_data(self) -> None:
-        first = 1 if self._head_sent else 0  # a frame that is partly sent must go out whole
-        for position in range(first, len(self._queue)):
-            place = self._queue[position][1]
-            if place < 0:
-                continue
-            del self._queue[position]
-            self._queued_data -= 1
-            self.withheld += 1
-            for later in range(position, len(self._queue)):
-                frame, its_place = self._queue[later]
-                if its_place == place:
-                    self._queue[later] = (with_gap(frame), place)
-                    return
-            if self.subscription is not None:
-                self.subscription.gap[place] = True
-            return
-
-    @property
-    def all_sent(self) -> bool:
-        """Whether nothing waits to be sent."""
-        return not self._queue
+        withheld = self.outbox.send(frame, place)
+        if withheld >= 0:
+            wants.gap[withheld] = True
 
     def end_sending(self) -> None:
         """Tell the peer that nothing more comes; what it still sends is read and thrown away."""
@@ -301,12 +227,6 @@ class Connection:
     def close(self) -> None:
         """Close the socket."""
         self.sock.close()
-
-
-def with_gap(frame: bytes) -> bytes:
-    """A copy of an encoded DATA frame with the GAP flag set."""
-    flags = frame[DATA_FLAGS_OFFSET] | _GAP
-    return frame[:DATA_FLAGS_OFFSET] + bytes((flags,)) + frame[DATA_FLAGS_OFFSET + 1 :]
 
 
 def _address_text(sock: socket.socket) -> str:

@@ -101,12 +101,12 @@ class Hub:
             self._hasty = []
         while True:
             left = 0 if self._unread else max(0, until_ns - time.monotonic_ns())
-            writers = [c.fd for c in self.connections.values() if c.needs_writing]
+            writers = [c.fd for c in self.connections.values() if c.outbox.waiting]
             readable, writable, _ = select.select(self._readers, writers, (), left * 1e-9)
             if not readable and not writable and not self._unread:
                 break
             for fd in writable:
-                self.connections[fd].flush()
+                self.connections[fd].outbox.flush()
             for fd in readable:
                 self._read(fd)
             self._answer_one_each()
@@ -203,15 +203,15 @@ class Hub:
         for connection in self.connections.values():
             if not connection.closing and (complaint := connection.complaint(now_ns, self.limits)):
                 log.warning("%s closed: %s", connection, complaint)
-                connection.dead = connection.needs_writing
+                connection.failed = connection.outbox.waiting
                 connection.send_json(error_reply(None, ErrorCode.BAD_REQUEST, complaint))
                 connection.finish()
             if connection.closing and not connection.dead:
                 since = self._closing_since.setdefault(connection.fd, time.monotonic())
-                connection.dead = time.monotonic() - since > _LAST_WORDS_S
-                if connection.all_sent:
+                connection.failed = time.monotonic() - since > _LAST_WORDS_S
+                if not connection.outbox.waiting:
                     connection.end_sending()
-                    connection.dead = connection.dead or connection.end_of_input
+                    connection.failed = connection.failed or connection.end_of_input
             if connection.dead:
                 gone.append(connection)
         for connection in gone:

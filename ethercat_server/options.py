@@ -15,6 +15,7 @@ from ethercat_server.config_file import EMPTY, read_config
 from ethercat_server.errors import UsageError
 from ethercat_server.server_settings import SERVER_SETTINGS, ServerSetting
 from protocol.errors import SettingError
+from protocol.sensor_choice import SensorChoice
 from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
 
 VIRTUAL_INTERFACE: Final = "virtual"
@@ -34,24 +35,37 @@ class ServerOptions:
     )
     """The server's own settings, by the names of SERVER_SETTINGS."""
     common_settings: dict[str, SettingValue] = field(default_factory=dict)
-    """Asked for every sensor."""
-    sensor_settings: dict[int, dict[str, SettingValue]] = field(default_factory=dict)
-    """Asked for one sensor, by place; these win over the file's common ones."""
+    """The file's for every sensor."""
+    sensor_settings: dict[SensorChoice, dict[str, SettingValue]] = field(default_factory=dict)
+    """The file's for single sensors; these win."""
+    assigned_settings: dict[str, SettingValue] = field(default_factory=dict)
+    """The command line's; these win over both."""
 
     @property
     def is_virtual(self) -> bool:
         """Whether to bring up a virtual bus."""
         return self.ifname == VIRTUAL_INTERFACE
 
-    def asked_settings(self, place: int) -> dict[str, SettingValue]:
-        """The settings a person asked for, for the sensor at `place`."""
-        return {**self.common_settings, **self.sensor_settings.get(place, {})}
+    def asked_settings(self, place: int, name: str, serial: int) -> dict[str, SettingValue]:
+        """The settings a person asked for, for the sensor at `place` with this name and serial number."""
+        asked = dict(self.common_settings)
+        for choice in sorted(self.sensor_settings, key=lambda choice: choice.precedence):
+            if choice.matches(place, name, serial):
+                asked |= self.sensor_settings[choice]
+        return asked | self.assigned_settings
 
-    def wanted_settings(self, place: int) -> dict[str, SettingValue]:
+    def wanted_settings(self, place: int, name: str, serial: int) -> dict[str, SettingValue]:
         """The same over the start-up defaults; SettingError if they contradict one another."""
-        wanted = {**start_up_defaults(), **self.asked_settings(place)}
+        wanted = {**start_up_defaults(), **self.asked_settings(place, name, serial)}
         check_combination(wanted)
         return wanted
+
+    def check(self) -> None:
+        """SettingError if what is asked of any one sensor contradicts itself."""
+        for own in ({}, *self.sensor_settings.values()):
+            check_combination(
+                {**start_up_defaults(), **self.common_settings, **own, **self.assigned_settings}
+            )
 
 
 @functools.cache
@@ -114,8 +128,9 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
             name: _first_given(getattr(parsed, name), config.server.get(name), setting)
             for name, setting in SERVER_SETTINGS.items()
         },
-        common_settings={**config.common, **assigned},
-        sensor_settings={place: {**settings, **assigned} for place, settings in config.by_place.items()},
+        common_settings=config.common,
+        sensor_settings=config.by_sensor,
+        assigned_settings=assigned,
     )
     try:
         shlex.split(options.virtual_arguments)
@@ -124,8 +139,7 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
     if options.virtual_arguments and not options.is_virtual:
         raise UsageError(f"--virtual goes with the interface 'virtual', not with {options.ifname}")
     try:
-        for place in (-1, *options.sensor_settings):
-            options.wanted_settings(place)
+        options.check()
     except SettingError as error:
         raise UsageError(str(error)) from None
     return options

@@ -100,18 +100,22 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     The sensor must be in PREOP. Afterwards `settings` and `rate_hz` are what is in force. BusError says which
     setting did not take.
     """
-    changed = False
+    written = []
     for name in objects.SETTING_WRITE_ORDER:
         if name not in sensor.wanted or name == _LAST:
             continue
         entry = objects.BY_SETTING[name]
         if (yield from _read(sdo, entry.address)) != entry.encode_setting(sensor.wanted[name]):
             yield from write_setting(sdo, sensor, name)
-            changed = True
+            written.append(name)
     # What SINC may be follows from the filters before it, and only the rate tells what it is.
-    if changed or not (yield from _rate_is_right(sdo, sensor)):
+    if written or not (yield from _rate_is_right(sdo, sensor)):
         yield from write_setting(sdo, sensor, _LAST)
         yield from _check_rate(sdo, sensor)
+        log.info(
+            "sensor %d did not hold what is wanted; written and verified: %s", sensor.place,
+            ", ".join(f"{name} = {sensor.wanted[name]}" for name in (*written, _LAST)),
+        )  # fmt: skip
     yield from read_settings(sdo, sensor)
     if sensor.offset is not None:
         yield from write_offset(sdo, sensor.offset)

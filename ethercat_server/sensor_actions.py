@@ -10,7 +10,7 @@ from ethercat_server.configuration import Change, apply_in_op, save
 from ethercat_server.connection import Connection
 from ethercat_server.errors import BusError, SdoAbortError
 from ethercat_server.hub import Hub
-from ethercat_server.jobs import Jobs
+from ethercat_server.jobs import Done, Jobs
 from ethercat_server.recovery import Recovery
 from ethercat_server.sdo import Sdo, Steps
 from ethercat_server.sensor import Sensor, read_offset
@@ -20,7 +20,8 @@ from protocol.control import ErrorCode, Event, Request, error_reply, event, repl
 from protocol.errors import RequestError, SettingError
 from protocol.framing import JsonObject
 from protocol.sdo_types import SdoType
-from protocol.settings import SETTINGS
+from protocol.sensor_choice import SensorChoice
+from protocol.settings import SETTINGS, SettingValue
 
 
 class SensorActions:
@@ -50,33 +51,44 @@ class SensorActions:
 
     def handle(self, connection: Connection, request: Request) -> None:
         """Start what `request` asks for; RequestError refuses it."""
-        place = request.values["sensor"]
-        if place >= len(self.sensors):
+        place = self._place(request.values["sensor"])
+        self._jobs.check_present(place)
+        values = {**request.values, "sensor": place}
+        self.handlers[request.action](connection, request._replace(values=values))
+
+    def _place(self, choice: SensorChoice) -> int:
+        found = [
+            sensor.place
+            for sensor in self.sensors
+            if choice.matches(sensor.place, sensor.identity.name, sensor.identity.serial)
+        ]
+        if len(found) != 1:
+            there = "; ".join(f"{sensor.place}: {sensor.identity}" for sensor in self.sensors)
+            many = f"{len(found)} sensors" if found else "no sensor"
             raise RequestError(
                 ErrorCode.BAD_REQUEST,
-                f"the key 'sensor' is {place}, but the bus has {len(self.sensors)}, counted from 0",
+                f"the key 'sensor' is {choice}, which is {many} of those here ({there})",
             )
-        self._jobs.check_present(place)
-        self.handlers[request.action](connection, request)
+        return found[0]
 
     def _start(self, connection: Connection, request: Request, steps: Steps[Mapping[str, Any]]) -> None:
+        self._jobs.start(request.values["sensor"], steps, self._answering(connection, request))
+
+    def _answering(self, connection: Connection, request: Request) -> Done:
         def done(values: Mapping[str, Any], error: RequestError | None) -> None:
             self._hub.answer(connection, _answer(request, values, error))
 
-        self._jobs.start(request.values["sensor"], steps, done)
+        return done
 
-    def _start_change(
-        self, connection: Connection, request: Request, steps: Steps[Mapping[str, Any]]
-    ) -> None:
-        place = request.values["sensor"]
+    def _start_change(self, place: int, steps: Steps[Mapping[str, Any]], done: Done) -> None:
         self._begin_change(place)
 
-        def done(values: Mapping[str, Any], error: RequestError | None) -> None:
+        def ended(values: Mapping[str, Any], error: RequestError | None) -> None:
             self._changing.discard(place)
-            self._hub.answer(connection, _answer(request, values, error))
+            done(values, error)
 
         try:
-            self._jobs.start(place, steps, done)
+            self._jobs.start(place, steps, ended)
         except RequestError:
             self._changing.discard(place)
             raise
@@ -109,48 +121,59 @@ class SensorActions:
         sensor = self.sensors[values["sensor"]]
         stream, sdo = self._streams[sensor.place], self._recovery.sdo(sensor.place)
         steps = tare(sdo, sensor, stream, values["samples"], values["target"])
-        self._start_change(connection, request, steps)
+        self._start_change(sensor.place, steps, self._answering(connection, request))
 
     def _configure(self, connection: Connection, request: Request) -> None:
-        sensor = self.sensors[request.values["sensor"]]
+        values, done = request.values, self._answering(connection, request)
+        self.configure(values["sensor"], values["settings"], save_too=values["save"], done=done)
+
+    def configure(
+        self, place: int, settings: Mapping[str, SettingValue], *, save_too: bool, done: Done
+    ) -> None:
+        """Change settings of the sensor at `place` and save them if `save_too`; `done` gets the outcome.
+
+        RequestError refuses it at once.
+        """
+        self._jobs.check_present(place)
+        sensor = self.sensors[place]
         try:
-            change = Change(sensor, request.values["settings"])
+            change = Change(sensor, settings)
         except SettingError as error:
             raise RequestError(ErrorCode.BAD_REQUEST, f"the key 'settings' is refused: {error}") from None
         if not change.needs_preop:
-            self._start_change(connection, request, self._change_in_op(sensor, change, request))
+            self._start_change(place, self._change_in_op(sensor, change, save_too), done)
             return
-        self._begin_change(sensor.place)
+        self._begin_change(place)
 
         def changed(error: BusError | None) -> None:
-            self._changing.discard(sensor.place)
+            self._changing.discard(place)
             if error is not None:
-                self._hub.answer(connection, _answer(request, {}, _refusal(error)))
+                done({}, _refusal(error))
                 return
             try:
-                self._start_change(connection, request, self._finish_change(sensor, request))
+                self._start_change(place, self._finish_change(sensor, save_too), done)
             except RequestError as refused:
-                self._hub.answer(connection, _answer(request, {}, refused))
+                done({}, refused)
 
-        self._recovery.reconfigure(sensor.place, change, changed)
+        self._recovery.reconfigure(place, change, changed)
 
-    def _change_in_op(self, sensor: Sensor, change: Change, request: Request) -> Steps[Mapping[str, Any]]:
+    def _change_in_op(self, sensor: Sensor, change: Change, save_too: bool) -> Steps[Mapping[str, Any]]:
         sdo = self._recovery.sdo(sensor.place)
         yield from apply_in_op(sdo, sensor, change)
         if change.names:
             self._hub.broadcast(
                 event(Event.RECONFIGURED, sensor=sensor.place, settings=dict(sensor.settings))
             )
-        return (yield from self._finish_change(sensor, request))
+        return (yield from self._finish_change(sensor, save_too))
 
-    def _finish_change(self, sensor: Sensor, request: Request) -> Steps[Mapping[str, Any]]:
-        if request.values["save"]:
+    def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
+        if save_too:
             yield from save(self._recovery.sdo(sensor.place), sensor)
         return {
             "sensor": sensor.place,
             "settings": dict(sensor.settings),
             "rate_hz": sensor.rate_hz,
-            "saved": request.values["save"],
+            "saved": save_too,
         }
 
 

@@ -48,10 +48,11 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]
         recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast), Jobs(bus, streams)
         cycle = Cycle(bus, streams, hub, recovery, jobs, notifier)
-        service = Service(argv, policy, hub, sensors, notifier)
+        on_sensors = SensorActions(hub, recovery, jobs, sensors, streams)
+        service = Service(argv, policy, hub, on_sensors, notifier)
         cycle.every_second = service.every_second
         signals.call(cycle.stop, service.reload)
-        hub.start(Actions(hub, cycle, SensorActions(hub, recovery, jobs, sensors, streams)).handle)
+        hub.start(Actions(hub, cycle, on_sensors).handle)
         for sensor in sensors:
             log.info(
                 "sensor %d: %s, serial %d, firmware %s, %d bytes at %d Hz",

@@ -18,7 +18,9 @@ from ethercat_server.hub import Hub
 from ethercat_server.notify import Notifier
 from ethercat_server.options import ServerOptions, parse_options
 from ethercat_server.sensor import Sensor
+from ethercat_server.sensor_actions import SensorActions
 from ethercat_server.server_settings import SERVER_SETTINGS
+from protocol.errors import RequestError
 
 log = logging.getLogger(__name__)
 
@@ -48,13 +50,13 @@ class Service:
         argv: Sequence[str] | None,
         policy: Policy,
         hub: Hub,
-        sensors: Sequence[Sensor],
+        on_sensors: SensorActions,
         notifier: Notifier,
     ) -> None:
         self._argv = argv
         self._policy = policy
         self._hub = hub
-        self._sensors = sensors
+        self._on_sensors = on_sensors
         self._notifier = notifier
         self._fresh: Policy | UsageError | None = None
         self._reading: threading.Thread | None = None
@@ -96,18 +98,39 @@ class Service:
         self._policy = fresh
         changed = [name for name in SERVER_SETTINGS if was.server[name] != now.server[name]]
         later = [f"[server] {name}" for name in changed if not SERVER_SETTINGS[name].at_once]
-        if (was.common_settings, was.sensor_settings) != (now.common_settings, now.sensor_settings):
-            later.append("[sensor]")
         at_once = [name for name in changed if SERVER_SETTINGS[name].at_once]
         log.info(
             "configuration read again: %s", f"changed {', '.join(at_once)}" if at_once else "nothing new"
         )
         if later:
             log.warning("a change of %s takes effect at the next start", ", ".join(later))
+        for sensor in self._on_sensors.sensors:
+            self._configure(sensor, was, now)
+
+    def _configure(self, sensor: Sensor, was: ServerOptions, now: ServerOptions) -> None:
+        place = sensor.place
+        who = (place, sensor.identity.name, sensor.identity.serial)
+        before = was.wanted_settings(*who)
+        changed = {n: value for n, value in now.wanted_settings(*who).items() if before.get(n) != value}
+        if not changed:
+            return
+        names = ", ".join(f"{name} = {value}" for name, value in changed.items())
+
+        def done(_: object, error: RequestError | None) -> None:
+            if error is None:
+                log.info("sensor %d now has %s", place, names)
+            else:
+                log.error("sensor %d: %s", place, error)
+
+        try:
+            self._on_sensors.configure(place, changed, save_too=False, done=done)
+        except RequestError as error:
+            done(None, error)
 
     def _tell_status(self) -> None:
-        lost = [sensor.place for sensor in self._sensors if sensor.state != "OP"]
-        text = f"streaming {len(self._sensors) - len(lost)} of {len(self._sensors)} sensors"
+        sensors = self._on_sensors.sensors
+        lost = [sensor.place for sensor in sensors if sensor.state != "OP"]
+        text = f"streaming {len(sensors) - len(lost)} of {len(sensors)} sensors"
         if lost:
             text += f", lost: {', '.join(map(str, lost))}"
         self._notifier.status(f"{text}; {len(self._hub.connections)} clients")

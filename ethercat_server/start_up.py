@@ -73,7 +73,8 @@ def _find(bus: Bus, place: int, slave: SlaveIdentity, options: ServerOptions) ->
             f"sensor {place} on {bus.ifname} is a {identity.name!r}, a model this server does not know: "
             f"it knows the Gen-0 models {', '.join(objects.MODELS)}"
         )
-    return Sensor(place, identity, options.wanted_settings(place), frozenset(options.asked_settings(place)))
+    who = (place, identity.name, identity.serial)
+    return Sensor(place, identity, options.wanted_settings(*who), frozenset(options.asked_settings(*who)))
 
 
 def _check_places(sensors: list[Sensor], options: ServerOptions) -> None:
@@ -82,9 +83,10 @@ def _check_places(sensors: list[Sensor], options: ServerOptions) -> None:
             f"the sensor on {options.ifname} is a {sensors[0].identity.name}, not a {options.sensor_name}: "
             "correct the name on the command line or leave it out"
         )
-    absent = [place for place in options.sensor_settings if place >= len(sensors)]
-    if absent:
-        raise UsageError(
-            f"the configuration has settings for sensor {absent[0]}, but the bus has only {len(sensors)}, "
-            "counted from 0: correct the table's number"
-        )
+    for choice in options.sensor_settings:
+        if not any(choice.matches(s.place, s.identity.name, s.identity.serial) for s in sensors):
+            found = "; ".join(f"{sensor.place}: {sensor.identity}" for sensor in sensors)
+            raise UsageError(
+                f"the configuration has settings for sensor {choice}, but the bus has only {found}: "
+                "correct the table's name"
+            )

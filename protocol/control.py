@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 from protocol.errors import RequestError, SettingError
 from protocol.framing import JsonObject
 from protocol.sdo_types import sdo_type
+from protocol.sensor_choice import SensorChoice
 from protocol.settings import check_settings
 
 PROTOCOL_VERSION: Final = 1
@@ -147,7 +148,7 @@ def _hex_bytes(value: object) -> bytes:
     raise ValueError(f"1 to {MAX_SDO_BYTES} bytes as hexadecimal digits, two each")
 
 
-_SENSOR: Final = Parameter(whole_number(0, 255), default=0)
+_SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(place=0))
 _ENTRY: Final = {
     "sensor": _SENSOR,
     "index": Parameter(_object_number(0xFFFF), required=True),

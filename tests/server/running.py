@@ -63,11 +63,12 @@ def wait_until(condition: Callable[[], bool], what: str, seconds: float = PATIEN
 class Program:
     """A program of ours running as a process, its standard error in a file."""
 
-    def __init__(self, module: str, arguments: Sequence[str]) -> None:
+    def __init__(self, module: str, arguments: Sequence[str], under: Sequence[str] = ()) -> None:
+        """`under` is a command that becomes the program given behind it, such as `setpriv ...`."""
         self.log = Path(tempfile.mkstemp(prefix="ethercat-test-")[1])
         with self.log.open("w") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", module, *arguments],
+                [*under, sys.executable, "-m", module, *arguments],
                 stdin=subprocess.PIPE,
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -110,10 +111,12 @@ class Program:
 class Server(Program):
     """A running server on a free port."""
 
-    def __init__(self, ifname: str, *arguments: str, name: str | None = None) -> None:
+    def __init__(
+        self, ifname: str, *arguments: str, name: str | None = None, under: Sequence[str] = ()
+    ) -> None:
         self.port = free_port()
         names = [name] if name else []
-        super().__init__("ethercat_server.cli", [ifname, *names, str(self.port), *arguments])
+        super().__init__("ethercat_server.cli", [ifname, *names, str(self.port), *arguments], under)
 
     @property
     def ifname(self) -> str:

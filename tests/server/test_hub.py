@@ -16,7 +16,6 @@ import pytest
 from ethercat_server import connection as connection_module
 from ethercat_server import hub as hub_module
 from ethercat_server.connection import (
-    MAX_QUEUED_DATA,
     MAX_REQUEST_LENGTH,
     Connection,
     Limits,
@@ -24,6 +23,7 @@ from ethercat_server.connection import (
 )
 from ethercat_server.errors import ServerError
 from ethercat_server.hub import Hub
+from ethercat_server.outbox import MAX_QUEUED_DATA
 from protocol.control import parse_request, reply
 from protocol.framing import DataFlag, DataMessage, FrameDecoder, JsonObject, encode_data, encode_json
 
@@ -260,7 +260,7 @@ def test_a_client_that_does_not_read_loses_the_oldest_whole_frames_and_is_told(s
         (slow_connection, quick_connection) = served.hub.connections.values()
         received_quick: list[DataMessage | JsonObject] = []
         total = 0
-        while slow_connection.withheld < 500:
+        while slow_connection.outbox.withheld < 500:
             for _ in range(50):
                 served.publish()
             total += 50
@@ -270,16 +270,16 @@ def test_a_client_that_does_not_read_loses_the_oldest_whole_frames_and_is_told(s
         while more := served.read(slow):
             received_slow += more
         frames = [m for m in received_slow if isinstance(m, DataMessage)]
-        assert len(frames) == total - slow_connection.withheld
+        assert len(frames) == total - slow_connection.outbox.withheld
         assert frames[-1].sequence == total - 1
         jumps = [
             (after.flags & DataFlag.GAP, after.sequence - before.sequence)
             for before, after in pairwise(frames)
         ]
         assert all(bool(gap) == (step > 1) for gap, step in jumps)
-        assert sum(step - 1 for _, step in jumps) == slow_connection.withheld
+        assert sum(step - 1 for _, step in jumps) == slow_connection.outbox.withheld
         assert len([m for m in received_quick if isinstance(m, DataMessage)]) == total
-        assert quick_connection.withheld == 0
+        assert quick_connection.outbox.withheld == 0
 
 
 def test_queue_is_bounded(served: Served) -> None:
@@ -287,7 +287,7 @@ def test_queue_is_bounded(served: Served) -> None:
         (connection,) = served.hub.connections.values()
         for _ in range(20_000):
             served.publish()
-        assert len(connection._queue) <= MAX_QUEUED_DATA
+        assert len(connection.outbox._queue) <= MAX_QUEUED_DATA
 
 
 def test_a_client_that_asks_and_never_reads_is_closed(served: Served) -> None:
@@ -338,7 +338,7 @@ def test_a_flood_of_requests_does_not_hold_up_the_acquisition(served: Served) ->
         other.sendall(encode_json({"action": "describe", "id": 1}))
         # No time left: each connection still has one message answered, and no more.
         served.hub.serve(time.monotonic_ns() - 1)
-        answered = [len(list(served.hub.connections.values())[n]._queue) for n in range(2)]
+        answered = [len(list(served.hub.connections.values())[n].outbox._queue) for n in range(2)]
         assert answered == [0, 0], "replies go out at once"
         sock.setblocking(False)
         decoder = FrameDecoder()
@@ -479,7 +479,7 @@ def test_an_answer_may_come_later_and_what_follows_waits_for_it(served: Served) 
     gone, _ = waiting.pop()
     sock.close()
     other.close()
-    gone.dead = True
+    gone.failed = True
     served.serve(0.1)
     served.hub.answer(gone, {"reply": "status", "id": 4})
     assert served.hub.connections.get(gone.fd) is not gone

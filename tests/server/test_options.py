@@ -20,11 +20,11 @@ def test_both_forms_of_the_command() -> None:
 
 def test_options_may_stand_anywhere() -> None:
     options = parse_options(["--set", "sinc_length=128", "ens5", "--set", "fir=yes", "12001"])
-    assert options.asked_settings(0) == {"sinc_length": 128, "fir": True}
+    assert options.asked_settings(0, "BFT-SENS-ECAT-M8", 1) == {"sinc_length": 128, "fir": True}
 
 
 def test_defaults_are_the_notes() -> None:
-    wanted = parse_options(["ens5", "1"]).wanted_settings(0)
+    wanted = parse_options(["ens5", "1"]).wanted_settings(0, "BFT-SENS-ECAT-M8", 1)
     assert wanted == {
         "calibration_matrix": True,
         "temperature_compensation": False,
@@ -69,8 +69,26 @@ def test_configuration_file(tmp_path: Path) -> None:
     file = tmp_path / "c.toml"
     file.write_text("[sensor]\nsinc_length = 128\nfir = true\n[sensor.1]\nsinc_length = 256\n")
     options = parse_options(["ens5", "1", "--config", str(file), "--set", "fir=off"])
-    assert options.asked_settings(0) == {"sinc_length": 128, "fir": False}
-    assert options.asked_settings(1) == {"sinc_length": 256, "fir": False}
+    assert options.asked_settings(0, "BFT-SENS-ECAT-M8", 1) == {"sinc_length": 128, "fir": False}
+    assert options.asked_settings(1, "BFT-SENS-ECAT-M8", 2) == {"sinc_length": 256, "fir": False}
+
+
+def test_single_sensors_have_tables_by_place_serial_number_and_name(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text(
+        "[sensor]\nsinc_length = 128\n[sensor.BFT-ROKS-ECAT-M8]\nsinc_length = 205\nimu_active = 2\n"
+        '[sensor."serial:77"]\nsinc_length = 256\nimu_active = 3\n[sensor.1]\nsinc_length = 341\n'
+    )
+    options = parse_options(["ens5", "1", "--config", str(file)])
+
+    def asked(place: int, name: str, serial: int) -> tuple[object, object]:
+        found = options.asked_settings(place, name, serial)
+        return found["sinc_length"], found.get("imu_active")
+
+    assert asked(0, "BFT-SENS-ECAT-M8", 1) == (128, None)
+    assert asked(0, "BFT-ROKS-ECAT-M8", 1) == (205, 2)
+    assert asked(0, "BFT-ROKS-ECAT-M8", 77) == (256, 3)
+    assert asked(1, "BFT-ROKS-ECAT-M8", 77) == (341, 3)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +105,8 @@ def test_configuration_file(tmp_path: Path) -> None:
         ("[server]\nhosts = ['localhost']\n", "an IP address"),
         ("[server]\nidle_timeout_s = 0\n", "seconds"),
         ("sensor = 3\n", "unexpected 'sensor'"),
-        ("[sensor.first]\nfir = true\n", "named by a place"),
+        ('[sensor."serial:x"]\nfir = true\n', "named by a place"),
+        ("[sensor.0]\nfast = true\n", "fast is true but fir is false"),
         ("[sensor\n", "not valid TOML"),
     ],
 )

@@ -154,7 +154,9 @@ def test_wrong_arguments(arguments: tuple[str, ...], complaint: str) -> None:
 def test_settings_for_a_sensor_that_is_not_there(tmp_path_factory: pytest.TempPathFactory) -> None:
     config = tmp_path_factory.mktemp("config") / "c.toml"
     config.write_text("[sensor.3]\nfir = true\n")
-    assert "sensor 3, but the bus has only 1" in fails("virtual", "--config", str(config), code=2)
+    assert "sensor 3, but the bus has only 0: BFT-SENS-ECAT-M8" in fails(
+        "virtual", "--config", str(config), code=2
+    )
 
 
 def test_an_object_that_aborts_is_named() -> None:

@@ -1,0 +1,1 @@
+"""Tests of the service: units, installation, and the server under exactly the rights its unit gives."""

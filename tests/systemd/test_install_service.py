@@ -1,0 +1,229 @@
+"""scripts/install-service below a temporary root: installs, is repeatable, keeps what was edited, leaves."""
+
+from __future__ import annotations
+
+import configparser
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from tests.systemd.staging import ROOT, Stage, install_service, need_systemd, stage
+
+__all__ = ["stage"]
+
+CONFIGURATION = "/etc/ethercat-server/default.toml"
+
+
+def test_everything_gets_its_place(stage: Stage) -> None:
+    said = stage.install("--bridge", "ens5", "13000")
+    files = stage.files()
+    assert set(files) == {
+        CONFIGURATION,
+        "/etc/ethercat-server/bridge.yaml",
+        "/etc/ethercat-server/ens5.env",
+        "/etc/NetworkManager/conf.d/90-ethercat-server-ens5.conf",
+        "/etc/systemd/network/05-ethercat-server-ens5.network",
+        "/etc/systemd/system/ethercat-bridge.service",
+        "/etc/systemd/system/ethercat-server@.service",
+        "/etc/sysusers.d/ethercat-server.conf",
+        "/var/lib/ethercat-server/installed",
+    }
+    assert "\nPORT=13000\n" in files["/etc/ethercat-server/ens5.env"]
+    for path in set(files) - {"/var/lib/ethercat-server/installed"}:
+        assert f"wrote {path}\n" in said
+
+
+def test_network_managers_leave_the_interface_alone(stage: Stage) -> None:
+    stage.install("enp3s0")
+    files = stage.files()
+    manager, networkd = configparser.ConfigParser(), configparser.ConfigParser()
+    manager.read_string(files["/etc/NetworkManager/conf.d/90-ethercat-server-enp3s0.conf"])
+    section = manager["device-ethercat-enp3s0"]
+    assert (section["match-device"], section["managed"]) == ("interface-name:enp3s0", "0")
+    networkd.read_string(files["/etc/systemd/network/05-ethercat-server-enp3s0.network"])
+    assert (networkd["Match"]["Name"], networkd["Link"]["Unmanaged"]) == ("enp3s0", "yes")
+
+
+def test_a_virtual_sensor_needs_no_network_manager_told(stage: Stage) -> None:
+    stage.install("virtual")
+    assert not [path for path in stage.files() if "etwork" in path]
+
+
+def test_a_name_with_a_dash_is_escaped_for_systemd_only(stage: Stage) -> None:
+    stage.install("--bridge", "enp3s0-1")
+    files = stage.files()
+    unit = files["/etc/systemd/system/ethercat-bridge.service"]
+    assert "Wants=ethercat-server@enp3s0\\x2d1.service\n" in unit
+    assert "/etc/ethercat-server/enp3s0-1.env" in files
+
+
+def test_units_name_the_folder_they_are_installed_in(stage: Stage) -> None:
+    stage.prefix.rename(stage.path / "opt" / "elsewhere")
+    stage.install("--prefix", "/opt/elsewhere", "--bridge", "ens5")
+    for path, text in stage.files().items():
+        assert not path.endswith(".service") or "/opt/ethercat-server" not in text, path
+
+
+def test_a_second_time_changes_nothing(stage: Stage) -> None:
+    stage.install("--bridge", "ens5", "13000")
+    before = stage.files()
+    said = stage.install("--bridge", "ens5")
+    after = stage.files()
+    record = "/var/lib/ethercat-server/installed"
+    assert sorted(before.pop(record).splitlines()) == sorted(after.pop(record).splitlines())
+    assert before == after
+    assert "wrote" not in said
+
+
+def test_a_second_interface_joins_the_first(stage: Stage) -> None:
+    stage.install("ens5", "13000")
+    stage.install("ens6", "13001")
+    files = stage.files()
+    assert "\nPORT=13000\n" in files["/etc/ethercat-server/ens5.env"]
+    assert "\nPORT=13001\n" in files["/etc/ethercat-server/ens6.env"]
+
+
+def test_another_port_is_taken_over(stage: Stage) -> None:
+    stage.install("ens5", "13000")
+    stage.install("ens5", "13001")
+    assert "\nPORT=13001\n" in stage.files()["/etc/ethercat-server/ens5.env"]
+
+
+def test_edited_configuration_is_kept_and_an_old_unit_is_not(stage: Stage) -> None:
+    stage.install("ens5")
+    edited = stage.path / CONFIGURATION[1:]
+    edited.write_text("[sensor]\nfir = true\n")
+    unit = stage.path / "etc/systemd/system/ethercat-server@.service"
+    new_unit = unit.read_text()
+    unit.write_text("[Service]\n")
+    assert f"{CONFIGURATION} was edited and is kept" in stage.install("ens5")
+    assert edited.read_text() == "[sensor]\nfir = true\n"
+    assert unit.read_text() == new_unit
+
+
+def test_uninstall_leaves_only_what_was_edited(stage: Stage) -> None:
+    stage.install("--bridge", "ens5")
+    stage.install("ens6")
+    (stage.prefix / "pyvenv.cfg").touch()
+    edited = stage.path / CONFIGURATION[1:]
+    edited.write_text(edited.read_text() + "# mine\n")
+    said = stage.run("--uninstall")
+    assert set(stage.files()) == {CONFIGURATION}
+    assert f"left {CONFIGURATION}, which was edited" in said
+    assert not stage.prefix.exists()
+    assert "nothing is installed" in stage.run("--uninstall")
+
+
+def test_uninstall_leaves_nothing_if_nothing_was_edited(stage: Stage) -> None:
+    stage.install("ens5")
+    stage.run("--uninstall")
+    assert not stage.files()
+    assert not (stage.path / "etc/ethercat-server").exists()
+
+
+def test_a_folder_that_is_something_else_is_not_touched(stage: Stage) -> None:
+    (stage.prefix / "precious").touch()
+    stage.install("ens5")
+    stage.run("--uninstall")
+    assert (stage.prefix / "precious").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ([], "0 arguments given"),
+        (["ens5", "12001", "more"], "3 arguments given"),
+        (["en/s5"], "'en/s5' is no name of a network interface"),
+        (["a-name-too-long-for-linux"], "is no name of a network interface"),
+        (["lo"], "'lo' is no name of a network interface"),
+        (["ens5", "port"], "port 'port' must be from 1024 to 65535"),
+        (["ens5", "80"], "port '80' must be from 1024 to 65535"),
+        (["ens5", "65536"], "port '65536' must be from 1024 to 65535"),
+        (["--prefix", "relative", "ens5"], "--prefix takes an absolute path"),
+        (["--prefix", "/usr", "ens5"], "must be a folder of its own"),
+        (["--prefix"], "--prefix takes an absolute path"),
+        (["--prefix", "/opt/a b", "ens5"], "only letters, digits"),
+        (["--quick", "ens5"], "no option --quick"),
+        (["--uninstall", "ens5"], "--uninstall takes away everything"),
+    ],
+)
+def test_wrong_arguments_are_answered_with_one_sentence(arguments: list[str], complaint: str) -> None:
+    need_systemd()
+    done = install_service(*arguments)
+    assert done.returncode == 2
+    assert complaint in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_it_needs_root() -> None:
+    need_systemd()
+    with tempfile.TemporaryDirectory() as folder:  # one that anybody can read, unlike tmp_path
+        scripts = Path(shutil.copytree(ROOT / "scripts", Path(folder) / "scripts"))
+        Path(folder).chmod(0o755)
+        done = subprocess.run(
+            ["setpriv", "--reuid=nobody", "--clear-groups", scripts / "install-service", "ens5"],
+            check=False, capture_output=True, text=True,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert "needs root: sudo " in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+IN_A_MACHINE_OF_ITS_OWN = """
+set -e
+mount -t tmpfs tmpfs "$1"
+mkdir "$1/etc" "$1/opt" "$1/lib"
+cp -a /etc/. "$1/etc"
+rm -rf "$1/etc/ethercat-server"
+for place in etc opt; do mount --bind "$1/$place" "/$place"; done
+mount --bind "$1/lib" /var/lib
+mount -t tmpfs tmpfs /run
+mkdir -p /opt/ethercat-server/bin
+cp /bin/true /opt/ethercat-server/bin/ethercat-server
+touch /opt/ethercat-server/pyvenv.cfg
+cd "$2"
+scripts/install-service --keep-environment virtual
+getent passwd ethercat ethercat-bridge
+echo "installed $(find /etc/ethercat-server /opt /var/lib -type f | wc -l)"
+scripts/install-service --uninstall
+echo "left $(find /etc/ethercat-server /opt /var/lib -type f 2>/dev/null | wc -l)"
+"""
+"""The real thing, without --root: in a mount namespace with an /etc, /opt, /var/lib and /run of its own."""
+
+
+@pytest.mark.skipif(ROOT.parts[1] in {"etc", "opt", "run"}, reason="the checkout would be hidden")
+def test_without_a_staging_root_it_makes_users_and_cleans_up(tmp_path: Path) -> None:
+    need_systemd()
+    enter = ["unshare", "--mount"]
+    if subprocess.run([*enter, "mount", "-t", "tmpfs", "tmpfs", tmp_path], check=False).returncode:
+        pytest.skip("no mount namespaces here: run as root")
+    done = subprocess.run(
+        [*enter, "bash", "-c", IN_A_MACHINE_OF_ITS_OWN, "bash", tmp_path, ROOT],
+        check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    users, files = done.stdout.splitlines()[:2], done.stdout.splitlines()[2:]
+    assert [line.split(":")[0] for line in users] == ["ethercat", "ethercat-bridge"]
+    assert all(line.endswith("nologin") for line in users)
+    assert files == ["installed 5", "left 0"]
+    assert "next: systemctl enable --now 'ethercat-server@virtual'" in done.stderr
+
+
+@pytest.mark.long
+def test_the_program_finds_its_environment(tmp_path: Path) -> None:
+    need_systemd()
+    done = install_service("--root", str(tmp_path), "ens5")
+    assert done.returncode == 0, done.stderr
+    programs = tmp_path / "opt/ethercat-server/bin"
+    shebang, *_ = (programs / "ethercat-server").read_text().splitlines()
+    assert shebang == "#!/opt/ethercat-server/bin/python"
+    version = subprocess.run(
+        [programs / "python", "-I", "-m", "ethercat_server.cli", "--version"],
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert version.stdout.startswith("ethercat-server ")

@@ -1,0 +1,86 @@
+"""The server as an ordinary user with the capabilities that its unit gives, and with one of them missing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from protocol.framing import DataFlag
+from tests.server.running import Server, needs_bus, virtual_sensor
+from tests.systemd.confined import NOBODY, readable_for_all, with_capabilities
+from tests.systemd.staging import CAPABILITIES, SERVER_UNIT, values
+
+pytestmark = [pytest.mark.bus, needs_bus]
+
+BITS = {"CAP_NET_ADMIN": 12, "CAP_NET_RAW": 13, "CAP_IPC_LOCK": 14, "CAP_SYS_NICE": 23}
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Path:
+    """Where directories are mounted; skips where the server cannot be started as another user at all."""
+    command = [*readable_for_all(tmp_path / "try"), *with_capabilities(CAPABILITIES), "true"]
+    tried = subprocess.run(command, check=False, capture_output=True, text=True)
+    if tried.returncode:
+        pytest.skip(f"nothing can be started as another user here: {tried.stderr.strip()}")
+    return tmp_path / "stage"
+
+
+def of_process(pid: int) -> dict[str, str]:
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return {key: value.strip() for key, _, value in (line.partition(":") for line in lines)}
+
+
+def test_the_units_capabilities_are_enough_for_everything(stage: Path) -> None:
+    (ambient,) = values(SERVER_UNIT, "AmbientCapabilities")
+    given = ambient.split()
+    expected = sum(1 << BITS[name] for name in given)
+    under = [*readable_for_all(stage), *with_capabilities(given)]
+    with virtual_sensor() as (veth, _):
+        server = Server(veth.near, under=under)
+        try:
+            server.wait_streaming()
+            process = of_process(server.process.pid)
+            assert process["Uid"].split() == [str(NOBODY)] * 4
+            for kind in ("CapEff", "CapPrm", "CapBnd", "CapAmb"):
+                assert int(process[kind], 16) == expected, kind
+            assert process["NoNewPrivs"] == "1"
+            assert os.sched_getscheduler(server.process.pid) == os.SCHED_FIFO
+            assert int(process["VmLck"].split()[0]) > 0
+            assert "not granted" not in server.said()
+            with server.connect() as client:
+                assert client.ask("subscribe")["ok"]
+                frames = client.fresh(100)
+                assert not any(frame.flags & DataFlag.INVALID for frame in frames)
+                server.signal(signal.SIGTERM)
+                client.receive_all()
+                assert [event["event"] for event in client.events] == ["shutting_down"]
+            assert server.wait() == 0
+        finally:
+            server.close()
+
+
+@pytest.mark.parametrize(
+    ("missing", "complaint", "exit_code"),
+    [
+        ("CAP_NET_RAW", "CAP_NET_RAW missing", 1),
+        ("CAP_NET_ADMIN", "CAP_NET_ADMIN missing", 1),
+        ("CAP_SYS_NICE", "not granted: real-time priority 80 (CAP_SYS_NICE); ", 0),
+        ("CAP_IPC_LOCK", "not granted: locked memory (CAP_IPC_LOCK); ", 0),
+    ],
+)
+def test_none_of_them_can_be_done_without(stage: Path, missing: str, complaint: str, exit_code: int) -> None:
+    rest = [name for name in CAPABILITIES if name != missing]
+    with virtual_sensor() as (veth, _):
+        server = Server(veth.near, under=[*readable_for_all(stage), *with_capabilities(rest)])
+        try:
+            if exit_code == 0:
+                server.wait_streaming()
+                server.signal(signal.SIGTERM)
+            assert server.wait() == exit_code
+            assert complaint in server.said()
+        finally:
+            server.close()

@@ -1,0 +1,119 @@
+"""The server as a real service of a running systemd, under everything that its unit forbids.
+
+A copy of the unit goes into /run/systemd/system for the time of a test. It starts the server of this checkout
+as nobody. The checkout is shown to it, wherever it is; nothing else is different.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.server.running import Client, Veth, free_port, needs_bus, virtual_sensor, wait_until
+from tests.systemd.confined import needed
+from tests.systemd.staging import ROOT, SERVER_UNIT
+
+pytestmark = [
+    pytest.mark.bus,
+    needs_bus,
+    pytest.mark.skipif(not Path("/run/systemd/system").is_dir(), reason="systemd does not run here"),
+]
+RUNTIME = Path("/run/systemd/system")
+USER = "nobody"
+WATCHDOG_PATIENCE_S = 60.0
+
+
+def systemctl(*arguments: str) -> str:
+    done = subprocess.run(["systemctl", *arguments], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, f"{arguments}: {done.stdout} {done.stderr}"
+    return done.stdout.strip()
+
+
+class Service:
+    """An instance of the unit, on one interface."""
+
+    def __init__(self, template: str, ifname: str, port: int) -> None:
+        self.name = f"{template}@{ifname}.service"
+        self.port = port
+
+    def show(self, name: str) -> str:
+        return systemctl("show", "--property", name, "--value", self.name)
+
+
+@contextlib.contextmanager
+def service(veth: Veth, config: str = "", *, starts: bool = True) -> Iterator[Service]:
+    """The unit, started on the near end of `veth`; stopped and removed afterwards."""
+    template = f"ethercat-test-{os.getpid()}"
+    running = Service(template, veth.near, free_port())
+    text = SERVER_UNIT.read_text()
+    program = f"{sys.executable} -m ethercat_server.cli"
+    text = text.replace("/opt/ethercat-server/bin/ethercat-server", program)
+    # ProtectHome=yes shows nothing below home directories, not even what is bound there.
+    text = text.replace("ProtectHome=yes", "ProtectHome=tmpfs").replace("User=ethercat", f"User={USER}")
+    text = text.replace("Group=ethercat\n", "")
+    unit, settings = RUNTIME / f"{template}@.service", RUNTIME / f"{template}.toml"
+    settings.write_text(config)
+    shown = " ".join(str(path) for path in needed() if not path.is_relative_to("/usr"))
+    drop_in = f"""
+[Service]
+Environment=PORT={running.port} CONFIG={settings} PYTHONPATH={ROOT} PYTHONDONTWRITEBYTECODE=1
+BindReadOnlyPaths={shown}
+"""
+    unit.write_text(text + drop_in)
+    try:
+        systemctl("daemon-reload")
+        started = subprocess.run(["systemctl", "start", running.name], check=False)
+        assert (started.returncode == 0) is starts, systemctl("show", running.name)
+        yield running
+    finally:
+        for action in ("stop", "reset-failed"):
+            subprocess.run(["systemctl", action, running.name], check=False, capture_output=True)
+        unit.unlink()
+        settings.unlink()
+        systemctl("daemon-reload")
+
+
+def test_it_streams_and_shuts_down_as_a_service() -> None:
+    with virtual_sensor() as (veth, _), service(veth) as running:
+        assert running.show("ActiveState") == "active"
+        assert running.show("NRestarts") == "0"
+        with Client(running.port) as client:
+            assert client.ask("subscribe")["ok"]
+            client.fresh(100)
+            assert client.ask("shutdown")["ok"]
+        wait_until(lambda: running.show("ActiveState") == "inactive", "the service's end")
+        assert running.show("Result") == "success"
+        assert running.show("ExecMainStatus") == "0"
+
+
+def test_it_has_real_time_priority_and_locked_memory() -> None:
+    with virtual_sensor() as (veth, _), service(veth) as running:
+        process = int(running.show("MainPID"))
+        assert os.sched_getscheduler(process) == os.SCHED_FIFO
+        status = Path(f"/proc/{process}/status").read_text().splitlines()
+        locked = next(line for line in status if line.startswith("VmLck"))
+        assert int(locked.split()[1]) > 0
+
+
+def test_a_wrong_configuration_is_not_tried_again() -> None:
+    with virtual_sensor() as (veth, _), service(veth, "nonsense = 1\n", starts=False) as running:
+        assert running.show("ExecMainStatus") == "2"
+        assert running.show("ActiveState") == "failed"
+        assert running.show("NRestarts") == "0"
+
+
+def test_a_server_that_hangs_is_started_again() -> None:
+    with virtual_sensor() as (veth, _), service(veth) as running:
+        os.kill(int(running.show("MainPID")), signal.SIGSTOP)
+        wait_until(lambda: running.show("NRestarts") == "1", "the watchdog", WATCHDOG_PATIENCE_S)
+        wait_until(lambda: running.show("ActiveState") == "active", "the second start")
+        with Client(running.port) as client:
+            assert client.ask("subscribe")["ok"]
+            client.fresh(100)

@@ -1,0 +1,120 @@
+"""The unit files: what systemd makes of them, and that they leave the server no more than it needs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from ethercat_server.config_file import EMPTY, read_config
+from ethercat_server.options import parse_options
+from ethercat_server.server_settings import SERVER_SETTINGS
+from protocol.settings import check_settings, start_up_defaults
+from tests.systemd.staging import (
+    BRIDGE_UNIT,
+    CAPABILITIES,
+    SERVER_UNIT,
+    UNITS,
+    Stage,
+    need_systemd,
+    stage,
+    values,
+)
+
+__all__ = ["stage"]
+MOST_EXPOSURE = 2.5
+
+
+def analyze(*arguments: str, units: Path | None = None) -> subprocess.CompletedProcess[str]:
+    # The colon adds the system's own units, of which ours need some targets.
+    path = {"SYSTEMD_UNIT_PATH": f"{units}:"} if units else {}
+    return subprocess.run(
+        ["systemd-analyze", *arguments],
+        check=False, capture_output=True, text=True, env={**os.environ, **path, "LC_ALL": "C"},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("iface", ["ens5", "enp3s0-1"])
+def test_the_installed_units_are_without_fault(stage: Stage, iface: str) -> None:
+    stage.install("--bridge", iface)
+    folder = stage.path / "etc/systemd/system"
+    units = [folder / SERVER_UNIT.name, folder / BRIDGE_UNIT.name]
+    for unit in units:
+        unit.write_text(unit.read_text().replace("/opt/ethercat-server", str(stage.prefix)))
+    checked = analyze("verify", "--man=no", "--recursive-errors=no", *map(str, units), units=folder)
+    ours = [line for line in checked.stderr.splitlines() if "ethercat" in line]
+    assert not ours
+    assert checked.returncode == 0, checked.stderr
+
+
+@pytest.mark.parametrize("unit", [SERVER_UNIT, BRIDGE_UNIT], ids=lambda unit: unit.name)
+def test_little_is_exposed(unit: Path) -> None:
+    need_systemd()
+    checked = analyze("security", "--offline=true", f"--threshold={MOST_EXPOSURE * 10:.0f}", str(unit))
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+
+
+def test_the_server_has_exactly_four_capabilities() -> None:
+    for key in ("AmbientCapabilities", "CapabilityBoundingSet"):
+        assert [entry.split() for entry in values(SERVER_UNIT, key)] == [list(CAPABILITIES)]
+    assert values(BRIDGE_UNIT, "CapabilityBoundingSet") == [""]
+    assert not values(BRIDGE_UNIT, "AmbientCapabilities")
+
+
+def test_the_server_may_have_real_time_priority_and_locked_memory() -> None:
+    assert not values(SERVER_UNIT, "RestrictRealtime")
+    assert values(SERVER_UNIT, "LimitRTPRIO") == ["99"]
+    assert values(SERVER_UNIT, "LimitMEMLOCK") == ["infinity"]
+
+
+def test_a_usage_error_is_not_tried_again() -> None:
+    for unit in (SERVER_UNIT, BRIDGE_UNIT):
+        assert values(unit, "Restart") == ["on-failure"]
+        assert values(unit, "RestartPreventExitStatus") == ["2"]
+
+
+def test_the_node_does_not_depend_on_the_server() -> None:
+    for key in ("Requires", "BindsTo", "PartOf", "Requisite"):
+        assert not values(BRIDGE_UNIT, key)
+
+
+def test_each_service_has_a_user_of_its_own() -> None:
+    users = [
+        line.split()[1] for line in (UNITS / "ethercat-server.sysusers.conf").read_text().splitlines()[1:]
+    ]
+    assert users == values(SERVER_UNIT, "User") + values(BRIDGE_UNIT, "User")
+
+
+def test_the_default_configuration_says_nothing_new() -> None:
+    text = (UNITS / "default.toml").read_text()
+    assert tomllib.loads(text) == {"server": {}, "sensor": {}}
+    taken_out = [
+        line.removeprefix("# ") for line in text.splitlines() if line.startswith("# ") and " = " in line
+    ]
+    servers, sensors = "\n".join(taken_out).split("calibration_matrix")
+    assert tomllib.loads(servers).keys() == SERVER_SETTINGS.keys()
+    for name, value in tomllib.loads(servers).items():
+        setting = SERVER_SETTINGS[name]
+        checked = setting.check(value)
+        assert checked == setting.default or name in {"control_users", "control_groups", "cpu"}, name
+    assert read_config(UNITS / "default.toml") == EMPTY
+    common = tomllib.loads("calibration_matrix" + sensors.rpartition("\n")[0])
+    assert check_settings(common) == start_up_defaults()
+
+
+def test_the_unit_starts_the_server_as_it_wants_to_be_started(tmp_path: Path) -> None:
+    (command,) = values(SERVER_UNIT, "ExecStart")
+    (settings,) = values(SERVER_UNIT, "Environment")
+    variables = dict(word.split("=", 1) for word in settings.split())
+    variables["CONFIG"] = str(tmp_path / "empty.toml")
+    Path(variables["CONFIG"]).touch()
+    for model in ("", "BFT-SENS-ECAT-M8"):
+        variables["SENSOR_NAME"] = model
+        words = command.replace("%I", "ens5")
+        for name, value in variables.items():
+            words = words.replace(f"${{{name}}}", value).replace(f"${name}", value)
+        options = parse_options(words.split()[1:])
+        assert (options.ifname, options.port, options.sensor_name) == ("ens5", 12001, model or None)
