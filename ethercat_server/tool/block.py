@@ -10,6 +10,8 @@ from protocol.pdo import Sample, SampleDecoder
 from protocol.warnings_register import explain
 
 _VECTORS: Final = ("force", "torque", "acceleration", "angular_rate")
+_LEAST_INTERVALS: Final = 10
+"""For a rate that means something."""
 
 
 class Block:
@@ -87,6 +89,7 @@ class Block:
         return found
 
     def _rate_hz(self) -> float | None:
-        if self._first_ns is None or self._last_ns is None or self._last_ns <= self._first_ns:
+        intervals = self._count - self._begin_count
+        if self._first_ns is None or self._last_ns is None or intervals < _LEAST_INTERVALS:
             return None
-        return (self._count - self._begin_count) * 1e9 / (self._last_ns - self._first_ns)
+        return intervals * 1e9 / (self._last_ns - self._first_ns)

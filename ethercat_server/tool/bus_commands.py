@@ -57,7 +57,7 @@ def _adapters(args: argparse.Namespace) -> int:
 def _eeprom_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("iface", metavar="IFACE", help="interface the sensors are connected to")
     parser.add_argument(
-        "--sensor", metavar="WHICH", help="place on the bus from 0, serial number or name (default: all)"
+        "--sensor", metavar="WHICH", help="place on the bus from 0, serial:1234, or name (default: all)"
     )
 
 

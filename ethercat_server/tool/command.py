@@ -37,7 +37,7 @@ def add_link_arguments(parser: argparse.ArgumentParser, *, all_if_none: bool = F
     parser.add_argument(
         "--sensor",
         metavar="WHICH",
-        help=f"place on the bus from 0, serial number or name (default: {default})",
+        help=f"place on the bus from 0, serial:1234, or name (default: {default})",
     )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import FrameType
 from typing import Any, TypeVar
 
+from ethercat_server import realtime
 from ethercat_server.bus import Bus, SlaveIdentity
 from ethercat_server.configuration import Change, save
 from ethercat_server.cycle import Cycle
@@ -19,6 +20,7 @@ from ethercat_server.options import VIRTUAL_INTERFACE, ServerOptions
 from ethercat_server.recovery import Recovery
 from ethercat_server.sdo import BlockingSdo, Sdo, Steps, finish
 from ethercat_server.sensor import Sensor, set_up
+from ethercat_server.server_settings import DEFAULT_RT_PRIORITY
 from ethercat_server.start_up import enter_op, find_sensors
 from ethercat_server.stream import SensorStream
 from ethercat_server.tare import tare
@@ -107,6 +109,7 @@ class _Running:
     """The server's loop in this process, with the tool in place of the clients (an `Outlet`)."""
 
     def __init__(self, bus: Bus, sensors: list[Sensor], on_frame: OnFrame) -> None:
+        realtime.prepare(DEFAULT_RT_PRIORITY, None)
         self.sensors = sensors
         self.streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]
         self.recovery = Recovery(bus, sensors, self.streams, lambda _: None)

@@ -14,6 +14,7 @@ from ethercat_server.sdo import Sdo, Steps, finish
 from ethercat_server.sensor import Identity, Sensor, read_settings
 from protocol.filters import FORCE_TORQUE_FILTERS
 from protocol.framing import DataMessage
+from protocol.sensor_choice import SensorChoice
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue
 
 
@@ -102,20 +103,28 @@ class Link(ABC):
 
 
 def choose(sensors: Sequence[Found], wanted: str | None) -> Found:
-    """The sensor with that place, serial number or name, the only one if None; UsageError if unclear."""
+    """The sensor that `wanted` names, the only one if None; UsageError if that is unclear.
+
+    A number that is no place on the bus is taken for a serial number.
+    """
     if wanted is None and len(sensors) == 1:
         return sensors[0]
     there = "; ".join(map(str, sensors))
     if wanted is None:
         raise UsageError(f"there are {len(sensors)} sensors: choose one with --sensor ({there})")
-    for key in ("place", "serial", "name"):
-        fields = [{"place": s.place, "serial": s.identity.serial, "name": s.identity.name} for s in sensors]
-        matching = [sensor for sensor, row in zip(sensors, fields, strict=True) if str(row[key]) == wanted]
-        if len(matching) == 1:
-            return matching[0]
-        if matching:
-            raise UsageError(f"{len(matching)} sensors have the {key} {wanted}: choose by place ({there})")
-    raise UsageError(f"no sensor has the place, serial number or name {wanted!r}: there is {there}")
+    try:
+        choice = SensorChoice.parse(wanted)
+    except ValueError as error:
+        if not wanted.isdecimal():
+            raise UsageError(f"--sensor {wanted}: it must be {error}") from None
+        choice = SensorChoice(serial=int(wanted))
+    if choice.place is not None and choice.place >= len(sensors):
+        choice = SensorChoice(serial=choice.place)
+    found = [s for s in sensors if choice.matches(s.place, s.identity.name, s.identity.serial)]
+    if len(found) != 1:
+        many = f"{len(found)} sensors" if found else "no sensor"
+        raise UsageError(f"--sensor {wanted} is {many} of those here ({there}): choose another")
+    return found[0]
 
 
 def read_in_force(sdo: Sdo, sensor: Sensor) -> Steps[None]:

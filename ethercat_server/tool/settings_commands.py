@@ -89,23 +89,26 @@ def _asked(args: argparse.Namespace) -> ServerOptions:
     assigned = parse_assignments(args.assignments)
     return ServerOptions(
         args.iface or "", 0,
-        common_settings={**config.common, **assigned},
-        sensor_settings={place: {**values, **assigned} for place, values in config.by_place.items()},
+        common_settings=config.common, sensor_settings=config.by_sensor, assigned_settings=assigned,
     )  # fmt: skip
 
 
 def _look(
-    args: argparse.Namespace, opened: Link, asked: ServerOptions
-) -> tuple[Found, list[dict[str, Any]], Sensor]:
+    args: argparse.Namespace, opened: Link, options: ServerOptions
+) -> tuple[Found, dict[str, SettingValue], Sensor]:
+    """The chosen sensor, what is asked of it, and what it holds."""
     found = opened.choose(args.sensor)
-    sensor = opened.in_force(found)
-    return found, changes(sensor, asked.asked_settings(found.place)), sensor
+    asked = options.asked_settings(found.place, found.identity.name, found.identity.serial)
+    if not asked:
+        raise UsageError(f"{args.config} asks for nothing of {found}: correct its tables, or give --set")
+    return found, asked, opened.in_force(found)
 
 
 def _plan(args: argparse.Namespace) -> int:
     asked = _asked(args)
     with link(args) as opened:
-        found, changed, sensor = _look(args, opened, asked)
+        found, settings, sensor = _look(args, opened, asked)
+    changed = changes(sensor, settings)
     now = meaning(sensor.settings)
     then = meaning({**sensor.settings, **{row["name"]: row["then"] for row in changed}})
     if args.json:
@@ -130,8 +133,8 @@ def _plan(args: argparse.Namespace) -> int:
 def _apply(args: argparse.Namespace) -> int:
     asked = _asked(args)
     with link(args) as opened:
-        found, changed, before = _look(args, opened, asked)
-        settings = asked.asked_settings(found.place)
+        found, settings, before = _look(args, opened, asked)
+        changed = changes(before, settings)
         if changed or args.save:
             opened.configure(found.place, settings, args.save)
         after = opened.in_force(found) if changed else before

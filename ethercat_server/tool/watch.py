@@ -52,10 +52,12 @@ class _Watch:
     def idle(self) -> bool:
         """Show what is due; whether to go on."""
         now = time.monotonic()
+        if self._end_at is not None and now >= self._end_at:
+            return False
         if now >= self._show_at:
             self._show_at = now + self._interval_s
             self.show()
-        return self._end_at is None or now < self._end_at
+        return True
 
     def show(self) -> None:
         """Show all blocks and begin new ones."""

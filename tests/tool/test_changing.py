@@ -97,7 +97,9 @@ def test_a_chain_wants_a_choice(chain: Bench) -> None:
     said = one_sentence(tool("apply", near, "--set", "fir=on", code=2))
     assert "choose one with --sensor" in said
     assert "serial 20" in said
-    assert "choose by place" in one_sentence(tool("save", near, "--sensor", "BFT-SENS-ECAT-M8", code=2))
+    assert "is 2 sensors of those here" in one_sentence(
+        tool("save", near, "--sensor", "BFT-SENS-ECAT-M8", code=2)
+    )
     assert written(chain[1]) == []
 
 

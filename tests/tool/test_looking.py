@@ -99,11 +99,11 @@ def test_objects_that_cannot_be_read_have_a_line_with_the_reason(bench: Bench) -
 
 def test_objects_of_a_chain_by_place_serial_and_name(chain: Bench) -> None:
     assert len(tool("objects", chain[0].near, "--json").json["sensors"]) == 2
-    for which in ("1", "20", "BFT-ROKS-ECAT-M8"):
+    for which in ("1", "20", "serial:20", "BFT-ROKS-ECAT-M8"):
         sensors = tool("objects", chain[0].near, "--sensor", which, "--json").json["sensors"]
         assert [row["serial"] for row in sensors] == [20]
         assert not [row for row in sensors[0]["objects"] if row["index"] == "0x6000" and "error" in row]
-    assert "there is sensor 0" in one_sentence(tool("objects", chain[0].near, "--sensor", "7", code=2))
+    assert "is no sensor" in one_sentence(tool("objects", chain[0].near, "--sensor", "7", code=2))
 
 
 def test_watch_shows_each_block_and_writes_nothing(bench: Bench) -> None:
