@@ -47,7 +47,9 @@ def find_holder(ifname: str) -> Holder | None:
         return None
     for process in Path("/proc").iterdir():
         if process.name.isdecimal() and (sockets := set(_sockets(process))) & inodes:
-            name = (process / "comm").read_text().strip()
+            name = ""
+            with contextlib.suppress(OSError):  # it has just ended
+                name = (process / "comm").read_text().strip()
             return Holder(int(process.name), name, _listening(process, sockets))
     return Holder(None, "", None)
 

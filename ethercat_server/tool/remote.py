@@ -12,7 +12,8 @@ from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageEr
 from ethercat_server.sdo import Steps
 from ethercat_server.sensor import Identity
 from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, signals_held_back
-from protocol.control import PROTOCOL_VERSION, ErrorCode, request
+from ethercat_server.tool.show import note
+from protocol.control import PROTOCOL_VERSION, ErrorCode, Event, request
 from protocol.errors import ProtocolError
 from protocol.framing import DataMessage, FrameDecoder, JsonObject, encode_json
 from protocol.settings import SettingValue
@@ -38,7 +39,8 @@ class ServerLink(Link):
     """One framed connection to the server."""
 
     def __init__(self, host: str, port: int, used: str | None = None) -> None:
-        self.used = used or f"the server at {host}:{port}"
+        self._name = f"the server at {host}:{port}"
+        self.used = used or self._name
         try:
             self._socket = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT_S)
         except OSError as error:
@@ -78,11 +80,11 @@ class ServerLink(Link):
                 if "event" not in message and message.get("id") in (self._asked, None):
                     break
         except TimeoutError:
-            raise BusError(f"{self.used} did not answer {action} in {timeout_s:.0f} s: ask again") from None
+            raise BusError(f"{self._name} did not answer {action} in {timeout_s:.0f} s: ask again") from None
         except OSError as error:
-            raise ServerError(f"{self.used} is gone ({error.strerror or error}): see its log") from None
+            raise ServerError(f"{self._name} is gone ({error.strerror or error}): see its log") from None
         except ProtocolError as error:
-            raise ServerError(f"{self.used} is no ethercat-server ({error}): check the port") from None
+            raise ServerError(f"{self._name} is no ethercat-server ({error}): check the port") from None
         if message.get("ok"):
             return message
         refused = message.get("error", {})
@@ -125,12 +127,14 @@ class ServerLink(Link):
                 if isinstance(message, DataMessage):
                     if not on_frame(message):
                         return
-                elif message.get("event") == "shutting_down":
-                    raise ServerError(f"{self.used} is shutting down")
+                elif message.get("event") == Event.SHUTTING_DOWN:
+                    raise ServerError(f"{self._name} is shutting down")
+                elif message.get("sensor") in places:
+                    _tell(message)
             if select.select((self._socket,), (), (), _IDLE_S)[0]:
                 data = self._socket.recv(65536)
                 if not data:
-                    raise ServerError(f"{self.used} closed the connection: see its log")
+                    raise ServerError(f"{self._name} closed the connection: see its log")
                 self._decoder.feed(data)
 
 
@@ -157,6 +161,17 @@ class _ServerSdo:
         """See `Sdo`."""
         yield from ()
         self._link.ask("sdo_write", sensor=self._place, index=index, subindex=subindex, hex=data.hex())
+
+
+def _tell(event: JsonObject) -> None:
+    """Events of the sensors that are watched."""
+    place = event["sensor"]
+    if event.get("event") == Event.SENSOR_LOST:
+        note(str(event.get("message", f"sensor {place} is lost")))
+    elif event.get("event") == Event.SENSOR_BACK:
+        note(f"sensor {place} is back after {event.get('lost_s')} s")
+    elif event.get("event") == Event.RECONFIGURED:
+        note(f"sensor {place} has other settings now")
 
 
 def _found(row: Mapping[str, Any]) -> Found:

@@ -24,10 +24,9 @@ def settings_table() -> list[str]:
             values = [True, False] if setting.is_bool else list(setting.choices or ())
         default = "left alone" if setting.default is None else str(setting.default).lower()
         meanings = "<br>".join(f"{str(value).lower()}: {value_meaning(name, value)}" for value in values)
+        address = f"0x{entry.index:04X}:{entry.subindex}"
         states = ", ".join(entry.access.write_states)
-        rows.append(
-            f"| `{name}` | 0x{entry.index:04X}:{entry.subindex} | {states} | {default} | {meanings} |"
-        )
+        rows.append(f"| `{name}` | {address} | {states} | {default} | {meanings} |")
     return rows
 
 
