@@ -66,6 +66,9 @@ def _objects(args: argparse.Namespace) -> int:
 
 
 def _row_as_json(row: ObjectEntry) -> dict[str, Any]:
+    allowed: Any = row.allowed
+    if isinstance(allowed, range):
+        allowed = {"from": allowed[0], "to": allowed[-1]}
     return {
         "index": f"0x{row.index:04X}",
         "subindex": row.subindex,
@@ -74,6 +77,7 @@ def _row_as_json(row: ObjectEntry) -> dict[str, Any]:
         "access": row.access.value,
         "write_states": row.access.write_states,
         "unit": row.unit,
+        "allowed": allowed,
         "default": row.default,
     }
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from protocol.filters import FORCE_TORQUE_FILTERS
-from tests.server.running import Program, Veth, needs_bus, virtual_sensor
+from tests.server.running import Program, Veth, needs_bus, virtual_sensor, wait_until
 from tests.tool.running import command, one_sentence, stats, tool, written
 
 pytestmark = [pytest.mark.bus, needs_bus]
@@ -160,6 +164,21 @@ def test_tare_makes_the_mean_the_target(bench: Bench) -> None:
 def test_a_sensor_that_moves_is_not_tared() -> None:
     with virtual_sensor("--signal", "sine") as (veth, sensor):
         assert "not at rest" in one_sentence(tool("tare", veth.near, "--samples", 50, code=1))
+        assert written(sensor) == []
+
+
+def test_a_tare_that_is_stopped_changes_nothing() -> None:
+    with virtual_sensor("--signal", "sine") as (veth, sensor):
+        taring = subprocess.Popen(
+            [sys.executable, "-m", "ethercat_server.tool.cli", "tare", veth.near, "--samples", "20000"],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        wait_until(lambda: stats(sensor)["al_state"] == "OP", "OP")
+        time.sleep(0.1)
+        taring.send_signal(signal.SIGTERM)
+        _, err = taring.communicate(timeout=10)
+        assert (taring.returncode, err) == (1, "ethercat-sensor: stopped before it was done\n")
         assert written(sensor) == []
 
 
