@@ -152,6 +152,16 @@ class Bus:
         """Download an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
         self._sdo(slave, index, subindex, f"writing {data.hex()} to object 0x{index:04X}:{subindex}", data)
 
+    def sii_words(self, slave: int, word: int) -> bytes:
+        """The two words of the SII at `word` and after it, four bytes; BusError if it cannot be read."""
+        try:
+            data: bytes = self._slaves[slave].eeprom_read(word)
+        except _PYSOEM_ERRORS as error:
+            raise BusError(
+                f"the SII of slave {slave} cannot be read at word 0x{word:04x}: {_texts([error])}"
+            ) from None
+        return data
+
     def map_process_data(self) -> list[int]:
         """Map the process data and take the slaves to SAFEOP; returns each slave's input size in bytes."""
         try:

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from ethercat_server.bus import Bus
 from ethercat_server.distribution import SLOT_NS, RecentDistribution
-from ethercat_server.hub import Hub
 from ethercat_server.jobs import Jobs
 from ethercat_server.notify import Notifier
 from ethercat_server.recovery import Recovery
@@ -32,6 +31,18 @@ _LATENESS_GAIN: Final = 1 / 64
 _MAX_LEAD_NS: Final = 200_000.0
 
 
+class Outlet(Protocol):
+    """Where the samples go: the server's `Hub`, or a tool that wants them in its own process."""
+
+    def publish(self, frame: bytes, place: int, flags: int, now_ns: int) -> None:
+        """Take a DATA frame of the sensor at `place`; `now_ns` is when its exchange was back."""
+        ...
+
+    def serve(self, until_ns: int) -> None:
+        """Do what else there is to do until CLOCK_MONOTONIC is `until_ns`."""
+        ...
+
+
 class Cycle:
     """Reads the sensors and hands their samples to the hub until told to stop."""
 
@@ -39,7 +50,7 @@ class Cycle:
         self,
         bus: Bus,
         streams: Sequence[SensorStream],
-        hub: Hub,
+        hub: Outlet,
         recovery: Recovery,
         jobs: Jobs,
         notifier: Notifier,

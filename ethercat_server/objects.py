@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+from protocol.meaning import value_meaning
 from protocol.pdo import INPUT_OBJECT, PDO_FIELDS, PdoType
-from protocol.settings import SettingValue
+from protocol.settings import SETTINGS, SettingValue
 
 VENDOR_ID: Final = 0x0000B07A
 PRODUCT_CODE: Final = 1
@@ -40,6 +41,8 @@ class ObjectType(Enum):
     U32 = (0x0007, "<I")
     REAL32 = (0x0008, "<f")
     STRING = (0x0009, "")
+    OCTETS = (0x000A, "")
+    """Bytes whose meaning is not known; the value is their hexadecimal digits."""
 
     def __init__(self, coe_code: int, struct_format: str) -> None:
         self.coe_code = coe_code
@@ -47,19 +50,21 @@ class ObjectType(Enum):
 
     @property
     def size(self) -> int:
-        """Bytes on the wire; 0 for strings, whose length varies."""
+        """Bytes on the wire; 0 for strings and octets, whose length varies."""
         return struct.calcsize(self.format) if self.format else 0
 
     def pack(self, value: float | str) -> bytes:
         """Wire bytes of `value`; struct.error if it does not fit."""
         if isinstance(value, str):
-            return value.encode("ascii")
+            return bytes.fromhex(value) if self is ObjectType.OCTETS else value.encode("ascii")
         return struct.pack(self.format, value)
 
     def unpack(self, data: bytes) -> float | int | str:
         """The value in `data`; struct.error if the length is wrong."""
         if self is ObjectType.STRING:
             return data.rstrip(b"\0").decode("ascii", errors="replace")
+        if self is ObjectType.OCTETS:
+            return data.hex()
         value: float | int = struct.unpack(self.format, data)[0]
         return value
 
@@ -70,6 +75,13 @@ class Access(Enum):
     RO = "ro"
     RW = "rw"
     RW_PREOP = "rw in PREOP only"
+
+    @property
+    def write_states(self) -> tuple[str, ...]:
+        """The AL states in which it may be written."""
+        if self is Access.RO:
+            return ()
+        return ("PREOP",) if self is Access.RW_PREOP else ("PREOP", "SAFEOP", "OP")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +100,28 @@ class ObjectEntry:
     """The setting of `protocol.settings` that this entry holds."""
     codes: Mapping[SettingValue, int] | None = None
     """Wire value of each setting value, where they differ."""
+    values: Mapping[int, str] | None = None
+    """Wire values that mean something, for what is no setting."""
 
     @property
     def address(self) -> tuple[int, int]:
         """Index and sub-index."""
         return self.index, self.subindex
+
+    @property
+    def allowed(self) -> Mapping[int, str] | range | None:
+        """Wire values that it may have with their meaning; a range of many; None if any value may be."""
+        if self.setting is None:
+            return self.values
+        setting = SETTINGS[self.setting]
+        if isinstance(setting.choices, range) and len(setting.choices) > 16:
+            return setting.choices
+        choices: tuple[SettingValue, ...] = (False, True) if setting.is_bool else tuple(setting.choices or ())
+        meanings = {
+            self.codes[value] if self.codes else int(value): value_meaning(self.setting, value)
+            for value in choices
+        }
+        return dict(sorted(meanings.items()))
 
     def encode_setting(self, value: SettingValue) -> bytes:
         """Wire bytes of a checked setting value."""
@@ -109,7 +138,7 @@ class ObjectEntry:
         return bool(raw) if is_bool else int(raw)
 
 
-U8, U16, U32, REAL32, STRING = ObjectType
+U8, U16, U32, REAL32, STRING, OCTETS = ObjectType
 RO, RW, RW_PREOP = Access
 
 _PDO_TYPES = {PdoType.USINT: U8, PdoType.UINT: U16, PdoType.UDINT: U32, PdoType.REAL: REAL32}
@@ -160,7 +189,6 @@ OBJECTS: Final[tuple[ObjectEntry, ...]] = (
         ObjectEntry(0x8002, sub, f"Angular rate offset {sub}", REAL32, RW, 0, "deg/s" if sub <= 3 else "")
         for sub in range(1, 7)
     ),
-    # 0x8003 (force/torque range) is in Table III.1, but the firmware seen has none.
     ObjectEntry(
         0x8004, 0, "Acceleration range", U8, RW_PREOP, 0, "g",
         "acceleration_range_g", {2: 0, 4: 1, 8: 2, 16: 3},
@@ -182,9 +210,10 @@ OBJECTS: Final[tuple[ObjectEntry, ...]] = (
     ObjectEntry(0x8010, 5, "Inertia and gravity compensation", U8, RW, 0, "", "inertia_compensation"),
     ObjectEntry(0x8010, 6, "Orientation estimation", U8, RW, 0, "", "orientation_estimation"),
     ObjectEntry(0x8011, 0, "Sampling rate", U16, RO, 800, "Hz"),
-    ObjectEntry(0x8030, 1, "Command", U8, RW),
-    ObjectEntry(0x8030, 2, "Status", U8, RO),
+    ObjectEntry(0x8030, 1, "Command", U8, RW, values={SAVE_PARAMETERS: "save the parameters"}),
+    ObjectEntry(0x8030, 2, "Status", U8, RO, values={0: "success"}),
 )  # fmt: skip
+"""Those that the firmware seen has."""
 
 BY_ADDRESS: Final[Mapping[tuple[int, int], ObjectEntry]] = {row.address: row for row in OBJECTS}
 BY_SETTING: Final[Mapping[str, ObjectEntry]] = {row.setting: row for row in OBJECTS if row.setting}

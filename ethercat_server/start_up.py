@@ -23,16 +23,28 @@ def bring_up(bus: Bus, options: ServerOptions, check_interrupt: Callable[[], Non
     `check_interrupt` is called between the steps and may raise to give up. BusError says which sensor did
     not do what.
     """
+    sensors = find_sensors(bus, options, check_interrupt)
+    for sensor in sensors:
+        check_interrupt()
+        finish(set_up(BlockingSdo(bus, sensor.place), sensor))
+    check_interrupt()
+    enter_op(bus, sensors, check_interrupt)
+    return sensors
+
+
+def find_sensors(bus: Bus, options: ServerOptions, check_interrupt: Callable[[], None]) -> list[Sensor]:
+    """Find the sensors on the open `bus`, in PREOP, and ask them who they are; nothing is written."""
     slaves = bus.scan(check_interrupt)
     for place, slave in enumerate(slaves):
         _check_vendor(bus.ifname, place, slave)
     bus.check_preop()
     sensors = [_find(bus, place, slave, options) for place, slave in enumerate(slaves)]
     _check_places(sensors, options)
-    for sensor in sensors:
-        check_interrupt()
-        finish(set_up(BlockingSdo(bus, sensor.place), sensor))
-    check_interrupt()
+    return sensors
+
+
+def enter_op(bus: Bus, sensors: list[Sensor], check_interrupt: Callable[[], None]) -> None:
+    """Map the process data of all `sensors` and take them from PREOP to OP, set as they are."""
     for sensor, size in zip(sensors, bus.map_process_data(), strict=True):
         try:
             sensor.pdo_size = layout_for(size).size
@@ -43,7 +55,6 @@ def bring_up(bus: Bus, options: ServerOptions, check_interrupt: Callable[[], Non
     bus.go_operational()
     for sensor in sensors:
         sensor.state = "OP"
-    return sensors
 
 
 def _check_vendor(ifname: str, place: int, slave: SlaveIdentity) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from protocol.errors import SettingError
+from protocol.filters import FORCE_TORQUE_FILTERS
 
 SettingValue = bool | int
 
@@ -89,8 +90,8 @@ BASE_SAMPLING_RATE_HZ: Final = 51200
 """The ADC's rate: sampling rate = 51200 / SINC length."""
 
 PUBLISHED_RATES_HZ: Final[Mapping[int, int]] = {
-    32: 1600, 51: 1003, 64: 800, 128: 400, 205: 250, 256: 200, 341: 150,
-}  # fmt: skip
+    length: row.rate_hz for length, row in FORCE_TORQUE_FILTERS.items()
+}
 """SINC length to the rate in object 0x8011, as Table III.4 has it (51 is rounded down, 205 up)."""
 
 

@@ -8,9 +8,13 @@ from __future__ import annotations
 import dataclasses
 import struct
 import sys
+from typing import TYPE_CHECKING
 
 from ethercat_server import objects
 from protocol import pdo, settings
+
+if TYPE_CHECKING:
+    from ethercat_server.virtual_sensor.al import AlState
 
 
 def change_default(address: tuple[int, int], value: int) -> None:
@@ -44,7 +48,41 @@ def other_product() -> None:
     change_default((0x1018, 2), 7)
 
 
-WAYS = {"size": odd_size, "rate": wrong_rate, "vendor": other_vendor, "product": other_product}
+def fewer_objects() -> None:
+    """No coordinate system and no inertia compensation."""
+    missing = {"coordinate_system", "inertia_compensation"}
+    objects.OBJECTS = tuple(row for row in objects.OBJECTS if row.setting not in missing)  # type: ignore[misc]
+    for name in missing:
+        row = objects.BY_SETTING.pop(name)  # type: ignore[attr-defined]
+        objects.BY_ADDRESS.pop(row.address)  # type: ignore[attr-defined]
+
+
+def refusing() -> None:
+    """Refuses the SINC length 128, which is written last, and one offset."""
+    from ethercat_server.virtual_sensor import dictionary
+    from ethercat_server.virtual_sensor.sdo_abort import Abort, SdoAbortError
+
+    check = dictionary.Dictionary.check_write
+    write = dictionary.Dictionary.write
+    refused = {(0x8006, 1): b"\x80\0", (0x8000, 5): struct.pack("<f", 0.5)}
+
+    def refuse(self: dictionary.Dictionary, index: int, subindex: int, data: bytes, state: AlState) -> None:
+        check(self, self.entry(index, subindex), len(data), state)
+        if refused.get((index, subindex)) == data:
+            raise SdoAbortError(Abort.INVALID_VALUE)
+        write(self, index, subindex, data, state)
+
+    dictionary.Dictionary.write = refuse  # type: ignore[method-assign]
+
+
+WAYS = {
+    "size": odd_size,
+    "rate": wrong_rate,
+    "vendor": other_vendor,
+    "product": other_product,
+    "fewer": fewer_objects,
+    "refusing": refusing,
+}
 
 if __name__ == "__main__":
     WAYS[sys.argv[1]]()

@@ -1,0 +1,215 @@
+"""The link on the interface itself: the tool is the EtherCAT master. Needs what the server needs."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import FrameType
+from typing import Any, TypeVar
+
+from ethercat_server import realtime
+from ethercat_server.bus import Bus, SlaveIdentity
+from ethercat_server.configuration import Change, save
+from ethercat_server.cycle import Cycle
+from ethercat_server.errors import BusError, UsageError
+from ethercat_server.interface import check_interface
+from ethercat_server.jobs import Jobs
+from ethercat_server.notify import Notifier
+from ethercat_server.options import VIRTUAL_INTERFACE, ServerOptions
+from ethercat_server.recovery import Recovery
+from ethercat_server.sdo import BlockingSdo, Sdo, Steps, finish
+from ethercat_server.sensor import Sensor, set_up
+from ethercat_server.server_settings import DEFAULT_RT_PRIORITY
+from ethercat_server.start_up import enter_op, find_sensors
+from ethercat_server.stream import SensorStream
+from ethercat_server.tare import tare
+from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, failed_change, signals_held_back
+from ethercat_server.virtual_bus import VirtualBus
+from protocol.errors import RequestError, SettingError
+from protocol.framing import DataMessage, FrameDecoder
+from protocol.settings import SettingValue
+
+T = TypeVar("T")
+
+
+def open_bus(ifname: str, cleanup: contextlib.ExitStack) -> Bus:
+    """The open bus on `ifname`; `virtual` brings up a virtual one. `cleanup` takes all down."""
+    if ifname == VIRTUAL_INTERFACE:
+        ifname = cleanup.enter_context(VirtualBus()).ifname
+    check_interface(ifname)
+    bus = Bus(ifname)
+    cleanup.callback(bus.close)
+    bus.open()
+    return bus
+
+
+def scan_only(ifname: str, cleanup: contextlib.ExitStack) -> tuple[Bus, list[SlaveIdentity]]:
+    """The bus and all its slaves, whatever they are."""
+    bus = open_bus(ifname, cleanup)
+    return bus, bus.scan(_no_check)
+
+
+class DirectLink(Link):
+    """All sensors in PREOP; `watch` and `tare` take them to OP, set as they are."""
+
+    def __init__(self, ifname: str) -> None:
+        with contextlib.ExitStack() as cleanup:
+            self._bus = open_bus(ifname, cleanup)
+            self._options = ServerOptions(ifname, port=0)
+            self._found = find_sensors(self._bus, self._options, _no_check)
+            self._cleanup = cleanup.pop_all()
+        self.used = f"the interface {ifname}"
+        self.sensors = [Found(sensor.place, sensor.identity) for sensor in self._found]
+
+    def close(self) -> None:
+        """Take the bus to INIT and let the interface go."""
+        self._cleanup.close()
+
+    def sdo(self, place: int) -> GuardedSdo:
+        """See `Link`."""
+        return GuardedSdo(BlockingSdo(self._bus, place))
+
+    def configure(self, place: int, settings: Mapping[str, SettingValue], save: bool) -> None:
+        """See `Link`."""
+        sdo, sensor = self.sdo(place), self.in_force(self.sensors[place])
+        _check_rate_known(sensor)
+        try:
+            change = Change(sensor, settings)
+        except SettingError as error:
+            raise UsageError(str(error)) from None
+        with signals_held_back():
+            finish(_change(sdo, sensor, change, save))
+
+    def tare(self, place: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
+        """See `Link`."""
+        running = _Running(self._bus, self._operational(), lambda _: True)
+        sdo = GuardedSdo(running.recovery.sdo(place))
+        return running.do(place, tare(sdo, running.sensors[place], running.streams[place], samples, target))
+
+    def watch(self, places: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
+        """See `Link`."""
+
+        def wanted(frame: DataMessage) -> bool:
+            return frame.sensor not in places or on_frame(frame)
+
+        running = _Running(self._bus, self._operational(), wanted)
+        running.on_idle = on_idle
+        running.run()
+
+    def _operational(self) -> list[Sensor]:
+        sensors = [self.in_force(found) for found in self.sensors]
+        for sensor in sensors:
+            _check_rate_known(sensor)
+        enter_op(self._bus, sensors, _no_check)
+        return sensors
+
+
+class _Running:
+    """The server's loop in this process, with the tool in place of the clients (an `Outlet`)."""
+
+    def __init__(self, bus: Bus, sensors: list[Sensor], on_frame: OnFrame) -> None:
+        realtime.prepare(DEFAULT_RT_PRIORITY, None)
+        self.sensors = sensors
+        self.streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]
+        self.recovery = Recovery(bus, sensors, self.streams, lambda _: None)
+        self.on_idle: Callable[[], bool] = lambda: True
+        self._jobs = Jobs(bus, self.streams)
+        self._cycle = Cycle(bus, self.streams, self, self.recovery, self._jobs, Notifier())
+        self._on_frame = on_frame
+        self._decoder = FrameDecoder()
+        self._stopped = False
+
+    def publish(self, frame: bytes, place: int, flags: int, now_ns: int) -> None:  # noqa: ARG002
+        """See `Outlet`."""
+        self._decoder.feed(frame)
+        for message in self._decoder:
+            if isinstance(message, DataMessage) and not self._on_frame(message):
+                self._cycle.stop()
+
+    def serve(self, until_ns: int) -> None:  # noqa: ARG002
+        """See `Outlet`."""
+        if not self.on_idle():
+            self._cycle.stop()
+
+    def run(self) -> None:
+        """Until it is told to stop; KeyboardInterrupt if by a signal."""
+        with self._hear_signals(self._cycle.stop):
+            self._cycle.run()
+        if self._stopped:
+            raise KeyboardInterrupt
+
+    def do(self, place: int, steps: Steps[T]) -> T:
+        """Run until `steps` are done; returns their result. A signal has them take back what is half done."""
+        results: list[T] = []
+        errors: list[RequestError] = []
+
+        def done(result: T, error: RequestError | None) -> None:
+            if error is None:
+                results.append(result)
+            else:
+                errors.append(error)
+            self._cycle.stop()
+
+        self._jobs.start(place, self._stoppable(steps), done)
+        with self._hear_signals(lambda: None):
+            self._cycle.run()
+        if errors:
+            raise BusError(str(errors[0]))
+        return results[0]
+
+    def _stoppable(self, steps: Steps[T]) -> Steps[T]:
+        told = False
+        while True:
+            try:
+                if self._stopped and not told:
+                    told = True
+                    steps.throw(BusError("stopped before it was done"))
+                else:
+                    next(steps)
+            except StopIteration as stop:
+                result: T = stop.value
+                return result
+            yield
+
+    @contextlib.contextmanager
+    def _hear_signals(self, stop: Callable[[], None]) -> Iterator[None]:
+        def hear(_number: int, _frame: FrameType | None) -> None:
+            self._stopped = True
+            stop()
+
+        before = {number: signal.signal(number, hear) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def _change(sdo: Sdo, sensor: Sensor, change: Change, and_save: bool) -> Steps[None]:
+    """Put a change in force in PREOP; BusError after everything is as before if it does not take."""
+    before = dict(sensor.settings)
+    try:
+        if change.names:
+            sensor.wanted, sensor.asked = change.wanted, frozenset(change.names)
+            yield from set_up(sdo, sensor)
+    except BusError as error:
+        sensor.wanted, sensor.asked = before, frozenset()
+        try:
+            yield from set_up(sdo, sensor)
+        except BusError as again:
+            raise BusError(
+                f"{error}; and the former settings could not be put back ({again}): power it off and on"
+            ) from None
+        raise failed_change(error) from None
+    if and_save:
+        yield from save(sdo, sensor)
+
+
+def _check_rate_known(sensor: Sensor) -> None:
+    if "sinc_length" not in sensor.wanted:
+        raise BusError(f"sensor {sensor.place} does not tell its sampling rate: power it off and on")
+
+
+def _no_check() -> None:
+    """Ctrl-C is an exception here, so nothing has to be asked for."""

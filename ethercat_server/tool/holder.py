@@ -1,0 +1,91 @@
+"""Who holds a network interface as an EtherCAT master, and on which port that process serves.
+
+The kernel lists packet sockets with their inode; a process's descriptors name the inodes of its sockets; and
+the kernel's table of TCP sockets tells which of them listens. Only root sees other users' descriptors.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import socket
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+_ETHERCAT: Final = 0x88A4
+_LISTEN: Final = 0x0A
+
+
+class Holder(NamedTuple):
+    """Who holds an interface."""
+
+    pid: int | None
+    """None if it may not be seen."""
+    name: str
+    address: tuple[str, int] | None
+    """Where on this machine it serves TCP; None if nowhere, or it may not be seen."""
+
+    def __str__(self) -> str:
+        """As a person names it."""
+        return "another EtherCAT master" if self.pid is None else f"process {self.pid} ({self.name})"
+
+
+def find_holder(ifname: str) -> Holder | None:
+    """Who has the EtherCAT socket on `ifname`; None if nobody has, or there is no such interface."""
+    try:
+        index = socket.if_nametoindex(ifname)
+    except OSError:
+        return None
+    inodes = {
+        int(columns[-1])
+        for columns in _table("/proc/self/net/packet")
+        if int(columns[3], 16) == _ETHERCAT and int(columns[4]) == index
+    }
+    if not inodes:
+        return None
+    for process in Path("/proc").iterdir():
+        if process.name.isdecimal() and (sockets := set(_sockets(process))) & inodes:
+            name = ""
+            with contextlib.suppress(OSError):  # it has just ended
+                name = (process / "comm").read_text().strip()
+            return Holder(int(process.name), name, _listening(process, sockets))
+    return Holder(None, "", None)
+
+
+def _table(path: str | Path) -> Iterator[list[str]]:
+    for line in Path(path).read_text(encoding="ascii").splitlines()[1:]:
+        yield line.split()
+
+
+def _sockets(process: Path) -> Iterator[int]:
+    with contextlib.suppress(OSError):  # it has ended, or is another user's
+        for descriptor in (process / "fd").iterdir():
+            with contextlib.suppress(OSError):
+                target = str(descriptor.readlink())
+                if target.startswith("socket:["):
+                    yield int(target[8:-1])
+
+
+def _listening(process: Path, sockets: set[int]) -> tuple[str, int] | None:
+    found = []
+    for table in ("tcp", "tcp6"):
+        with contextlib.suppress(OSError):
+            for columns in _table(process / "net" / table):
+                if int(columns[3], 16) == _LISTEN and int(columns[9]) in sockets:
+                    host, _, port = columns[1].partition(":")
+                    found.append((_address(host), int(port, 16)))
+    # Whoever comes by loopback may control the server if its user may.
+    return min(found, key=lambda row: not ipaddress.ip_address(row[0]).is_loopback, default=None)
+
+
+def _address(text: str) -> str:
+    """The address in one of the kernel's tables: words in the machine's byte order."""
+    raw = bytes.fromhex(text)
+    words = struct.unpack(f">{len(raw) // 4}I", raw)
+    packed = struct.pack(f"={len(words)}I", *words)
+    address = ipaddress.ip_address(packed)
+    if address.is_unspecified:
+        return "127.0.0.1" if address.version == 4 else "::1"
+    return str(address)

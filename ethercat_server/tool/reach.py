@@ -1,0 +1,36 @@
+"""Opens the link that the command line asks for, or that the machine's state calls for."""
+
+from __future__ import annotations
+
+import sys
+
+from ethercat_server.errors import InterfaceError, UsageError
+from ethercat_server.tool.direct import DirectLink
+from ethercat_server.tool.holder import find_holder
+from ethercat_server.tool.link import Link
+from ethercat_server.tool.remote import ServerLink, parse_address
+
+
+def open_link(ifname: str | None, server: str | None) -> Link:
+    """The link to the sensors on `ifname`, or behind `server`; UsageError unless exactly one is given.
+
+    If a server holds the interface it goes through that, and says so.
+    """
+    if (ifname is None) == (server is None):
+        raise UsageError("name either an interface, such as ens5, or a server with --server HOST:PORT")
+    if server is not None:
+        return ServerLink(*parse_address(server))
+    assert ifname is not None
+    holder = find_holder(ifname)
+    if holder is None:
+        return DirectLink(ifname)
+    if holder.address is None:
+        if holder.pid is None:
+            hint = "run as root, or name its server with --server HOST:PORT"
+        else:
+            hint = "it serves no port that the tool could use, so stop it first"
+        raise InterfaceError(f"{ifname} is in use by {holder}: {hint}")
+    host, port = holder.address
+    used = f"the server at {host}:{port}, {holder}, which holds {ifname}"
+    sys.stderr.write(f"ethercat-sensor: going through {used}\n")
+    return ServerLink(host, port, used)

@@ -1,0 +1,188 @@
+"""`snapshot` and `restore`: a sensor's objects to a file, and what of it can be written back."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ethercat_server.errors import BusError, SdoAbortError, ServerError
+from ethercat_server.known_objects import BY_ADDRESS, KNOWN_OBJECTS
+from ethercat_server.sdo import Sdo, Steps, finish
+from ethercat_server.sensor import Identity, Sensor
+from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
+from ethercat_server.tool.link import Found, Link, failed_change, signals_held_back
+from ethercat_server.tool.objects_command import read_object
+from ethercat_server.tool.settings_commands import UNSAVED, add_save, change_lines, changes, save_now, verify
+from ethercat_server.tool.show import columns, note, say, say_json, value_text
+from ethercat_server.tool.snapshot_file import RESTORABLE, Snapshot, read_snapshot, write_snapshot
+from protocol.settings import SettingValue
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add_link_arguments(parser)
+    parser.add_argument("file", type=Path, metavar="FILE", help="JSON file")
+
+
+def _restore_arguments(parser: argparse.ArgumentParser) -> None:
+    _arguments(parser)
+    add_save(parser)
+    parser.add_argument("--force", action="store_true", help="take another sensor's file")
+
+
+def _snapshot(args: argparse.Namespace) -> int:
+    with link(args) as opened:
+        found = opened.choose(args.sensor)
+        sensor, sdo = opened.in_force(found), opened.sdo(found.place)
+        read = [(row, finish(read_object(sdo, row))) for row in KNOWN_OBJECTS]
+    identity = found.identity
+    content = {
+        "taken": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "model": identity.name,
+        "serial": identity.serial,
+        "hardware": identity.hardware,
+        "firmware": identity.firmware,
+        "settings": sensor.settings,
+        "objects": [_as_json(row.address, row.name, values) for row, values in read],
+    }
+    write_snapshot(args.file, content)
+    readable = sum("hex" in values for _, values in read)
+    if args.json:
+        say_json({"through": opened.used, **found.as_json(), "file": str(args.file), "objects": readable})
+    else:
+        say(f"{found}\n  {readable} objects written to {args.file}, {len(read) - readable} could not be read")
+    return DONE
+
+
+def _as_json(address: tuple[int, int], name: str, values: dict[str, Any]) -> dict[str, Any]:
+    if isinstance(values.get("value"), float):
+        values = {**values, "value": _finite(values["value"])}
+    return {"index": f"0x{address[0]:04X}", "subindex": address[1], "name": name, **values}
+
+
+def _finite(value: float) -> float | None:
+    return value if abs(value) < float("inf") else None
+
+
+def _restore(args: argparse.Namespace) -> int:
+    snapshot = read_snapshot(args.file)
+    with link(args) as opened:
+        found = opened.choose(args.sensor)
+        _check_whose(found.identity, snapshot.identity, args)
+        sensor = opened.in_force(found)
+        lacking = sorted(snapshot.settings.keys() - sensor.settings.keys())
+        settings = {name: value for name, value in snapshot.settings.items() if name not in lacking}
+        changed = changes(sensor, settings)
+        differing, unreadable = finish(_differing(opened.sdo(found.place), snapshot))
+        if changed or differing:
+            with signals_held_back():
+                _put_back(opened, found, sensor, settings, differing)
+        if args.save:
+            save_now(opened, found)
+    left = [*lacking, *(f"0x{index:04X}:{sub}" for index, sub in unreadable)]
+    if args.json:
+        written = [
+            {**_as_json(address, BY_ADDRESS[address].name, {"now": old.hex(), "then": new.hex()})}
+            for address, (old, new) in differing.items()
+        ]
+        say_json(
+            {
+                "through": opened.used, **found.as_json(), "changes": changed, "objects": written,
+                "left_alone": left, "saved": args.save,
+            }
+        )  # fmt: skip
+        return DONE
+    say(str(found))
+    if changed:
+        say(change_lines(changed))
+    if differing:
+        say(columns([_object_line(address, *pair) for address, pair in differing.items()], indent=2))
+    if left:
+        say(f"  left alone, for this sensor does not have them: {', '.join(left)}")
+    if not changed and not differing:
+        say("  nothing to restore: the sensor holds what the file says")
+    elif not args.save:
+        say(UNSAVED)
+    if args.save:
+        say("saved to the sensor's flash")
+    return DONE
+
+
+def _check_whose(sensor: Identity, file: Identity, args: argparse.Namespace) -> None:
+    if (sensor.name, sensor.serial) != (file.name, file.serial) and not args.force:
+        raise ServerError(
+            f"{args.file} is of the {file}, but this is the {sensor}: connect that one, or use --force"
+        )
+    if sensor.firmware != file.firmware:
+        note(f"{args.file} was taken with firmware {file.firmware}, the sensor now has {sensor.firmware}")
+
+
+def _differing(
+    sdo: Sdo, snapshot: Snapshot
+) -> Steps[tuple[dict[tuple[int, int], tuple[bytes, bytes]], list[tuple[int, int]]]]:
+    """What the sensor holds and the file says, where that is not the same; what the sensor does not have."""
+    differing, unreadable = {}, []
+    for row in RESTORABLE:
+        wanted = snapshot.objects.get(row.address)
+        if wanted is None:
+            continue
+        try:
+            held = yield from sdo.read(*row.address)
+        except SdoAbortError:
+            unreadable.append(row.address)
+            continue
+        if held != wanted:
+            differing[row.address] = held, wanted
+    return differing, unreadable
+
+
+def _put_back(
+    opened: Link,
+    found: Found,
+    sensor: Sensor,
+    settings: Mapping[str, SettingValue],
+    objects: Mapping[tuple[int, int], tuple[bytes, bytes]],
+) -> None:
+    """Write all of it and verify it; on failure take back what was written, as a whole."""
+    sdo, before = opened.sdo(found.place), dict(sensor.settings)
+    if any(before.get(name) != value for name, value in settings.items()):
+        opened.configure(found.place, settings, save=False)
+    written = []
+    try:
+        verify(opened.in_force(found), settings)
+        for address, (_, wanted) in objects.items():
+            written.append(address)
+            finish(_write(sdo, address, wanted))
+    except BusError as error:
+        try:
+            for address in written:
+                finish(_write(sdo, address, objects[address][0]))
+            opened.configure(found.place, before, save=False)
+        except BusError as again:
+            raise BusError(
+                f"{error}; and it could not be taken back ({again}): power the sensor off and on"
+            ) from None
+        raise failed_change(error) from None
+
+
+def _write(sdo: Sdo, address: tuple[int, int], data: bytes) -> Steps[None]:
+    yield from sdo.write(*address, data)
+    held = yield from sdo.read(*address)
+    if held != data:
+        raise BusError(
+            f"object 0x{address[0]:04X}:{address[1]} did not take {data.hex()}: it holds {held.hex()}"
+        )
+
+
+def _object_line(address: tuple[int, int], held: bytes, wanted: bytes) -> tuple[str, ...]:
+    row = BY_ADDRESS[address]
+    now, then = (value_text(row.type.unpack(data)) for data in (held, wanted))
+    return f"0x{address[0]:04X}:{address[1]}", row.name, now, then, row.unit
+
+
+COMMANDS = (
+    Command("snapshot", "write all readable objects to a file", _arguments, _snapshot),
+    Command("restore", "write a snapshot back, as far as it differs", _restore_arguments, _restore),
+)

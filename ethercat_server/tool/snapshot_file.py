@@ -1,0 +1,81 @@
+"""The snapshot file: all readable objects of one sensor as JSON, with whose they are."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from ethercat_server.errors import UsageError
+from ethercat_server.known_objects import BY_ADDRESS
+from ethercat_server.objects import OBJECTS, Access, ObjectEntry
+from ethercat_server.sensor import Identity
+from protocol.errors import SettingError
+from protocol.settings import SettingValue, check_settings
+
+_FORMAT: Final = "ethercat-sensor snapshot"
+_VERSION: Final = 1
+_CONFIGURATION: Final = range(0x8000, 0x8011)
+"""What is the sensor's configuration: not the factory calibration, outputs or commands."""
+
+RESTORABLE: Final[tuple[ObjectEntry, ...]] = tuple(
+    row for row in OBJECTS if row.access is not Access.RO and row.index in _CONFIGURATION and not row.setting
+)
+"""Objects that are restored as they are; settings are restored as settings."""
+
+
+class Snapshot(NamedTuple):
+    """What a file says, checked."""
+
+    identity: Identity
+    settings: dict[str, SettingValue]
+    objects: dict[tuple[int, int], bytes]
+    """Of those that can be restored."""
+
+
+def write_snapshot(path: Path, content: Mapping[str, Any]) -> None:
+    """Write the file, whole or not at all."""
+    text = json.dumps({"format": _FORMAT, "version": _VERSION, **content}, indent=1, allow_nan=False)
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_text(text + "\n", encoding="utf-8")
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def read_snapshot(path: Path) -> Snapshot:
+    """Read a file; UsageError if it is no snapshot."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}") from None
+    except (ValueError, RecursionError):
+        raise UsageError(f"{path} is no snapshot: it is not valid JSON") from None
+    if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (
+        _FORMAT,
+        _VERSION,
+    ):
+        raise UsageError(
+            f"{path} is no snapshot of version {_VERSION}: make one with ethercat-sensor snapshot"
+        )
+    try:
+        identity = Identity(
+            str(content["model"]), int(content["serial"]), str(content["hardware"]), str(content["firmware"])
+        )
+        settings = check_settings(dict(content["settings"]))
+        rows = [(int(row["index"], 16), row["subindex"], row.get("hex")) for row in content["objects"]]
+        held = {(index, sub): bytes.fromhex(text) for index, sub, text in rows if text is not None}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UsageError(f"the snapshot {path} is damaged ({error!r}): make a new one") from None
+    except SettingError as error:
+        raise UsageError(f"the snapshot {path}: {error}") from None
+    wanted = {row.address: held[row.address] for row in RESTORABLE if row.address in held}
+    for address, data in wanted.items():
+        if len(data) != BY_ADDRESS[address].type.size:
+            raise UsageError(
+                f"the snapshot {path} is damaged: object 0x{address[0]:04X}:{address[1]} has another size"
+            )
+    return Snapshot(identity, settings, wanted)

@@ -1,0 +1,54 @@
+"""`tare`: sets the sensor's own force/torque offset so that its mean reading becomes a given wrench."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import Final
+
+from ethercat_server.errors import UsageError
+from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
+from ethercat_server.tool.settings_commands import UNSAVED
+from ethercat_server.tool.show import columns, say, say_json
+from protocol.control import ACTIONS, MAX_TARE_SAMPLES
+
+_AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+_DEFAULT_SAMPLES: Final = ACTIONS["tare"].parameters["samples"].default
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add_link_arguments(parser)
+    parser.add_argument(
+        "--samples", type=int, default=_DEFAULT_SAMPLES, metavar="N",
+        help=f"how many samples to average, 1 to {MAX_TARE_SAMPLES} (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--target", type=float, nargs=6, default=[0.0] * 6, metavar=_AXES,
+        help="what the sensor is to read, in N and Nm (default: zeros)",
+    )  # fmt: skip
+
+
+def _tare(args: argparse.Namespace) -> int:
+    if not 1 <= args.samples <= MAX_TARE_SAMPLES:
+        raise UsageError(f"--samples {args.samples}: it must be from 1 to {MAX_TARE_SAMPLES}")
+    if not all(map(math.isfinite, args.target)):
+        raise UsageError("--target must be six finite numbers: Fx Fy Fz in N, Mx My Mz in Nm")
+    with link(args) as opened:
+        found = opened.choose(args.sensor)
+        tared = opened.tare(found.place, args.samples, args.target)
+    keys = ("old_offset", "new_offset", "residual", "deviation")
+    if args.json:
+        say_json({"through": opened.used, **found.as_json(), **{key: tared[key] for key in keys}})
+        return DONE
+    rows: list[tuple[str, ...]] = [("", "old offset", "new offset", "residual", "deviation", "")]
+    for n, axis in enumerate(_AXES):
+        rows.append((axis, *(f"{tared[key][n]:.4f}" for key in keys), "N" if n < 3 else "Nm"))
+    say(str(found))
+    say(columns(rows, indent=2))
+    say(UNSAVED.replace("--save, or the command save,", "the command save"))
+    return DONE
+
+
+COMMANDS = (
+    Command("tare", "set the force/torque offset so that the mean reading becomes zero", _arguments, _tare),
+)

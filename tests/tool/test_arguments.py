@@ -1,0 +1,177 @@
+"""Wrong arguments, and the guard that keeps the factory calibration: no bus is needed."""
+
+from __future__ import annotations
+
+import ast
+import json
+from pathlib import Path
+
+import pytest
+
+from ethercat_server.objects import FACTORY_CALIBRATION
+from ethercat_server.sdo import Steps, finish
+from ethercat_server.tool.holder import find_holder
+from ethercat_server.tool.link import ForbiddenWriteError, GuardedSdo, sinc_length_in_force
+from ethercat_server.tool.snapshot_file import RESTORABLE
+from tests.server.running import needs_bus
+from tests.tool.running import one_sentence, tool
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+class Recorder:
+    """An `Sdo` that remembers what was written."""
+
+    def __init__(self) -> None:
+        self.written: list[tuple[int, int, bytes]] = []
+
+    def read(self, index: int, subindex: int) -> Steps[bytes]:
+        yield from ()
+        return b"\0"
+
+    def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
+        yield from ()
+        self.written.append((index, subindex, data))
+
+
+def test_the_guard_lets_no_write_of_the_factory_calibration_through() -> None:
+    sdo = Recorder()
+    guarded = GuardedSdo(sdo)
+    for subindex in range(256):
+        with pytest.raises(ForbiddenWriteError, match="never written"):
+            finish(guarded.write(FACTORY_CALIBRATION, subindex, b"\0"))
+    assert not sdo.written
+    finish(guarded.write(0x8000, 1, b"\0"))
+    assert sdo.written == [(0x8000, 1, b"\0")]
+    assert finish(guarded.read(FACTORY_CALIBRATION, 1)) == b"\0", "it may be looked at"
+
+
+def test_all_that_can_write_is_behind_the_guard() -> None:
+    unguarded = {"BlockingSdo", "CyclicSdo", "_ServerSdo", "sdo"}
+    for path in (ROOT / "ethercat_server" / "tool").glob("*.py"):
+        tree = ast.parse(path.read_text())
+        inside = {
+            id(call)
+            for outer in ast.walk(tree)
+            if isinstance(outer, ast.Call) and _name(outer) == "GuardedSdo"
+            for call in outer.args
+        }
+        for call in ast.walk(tree):
+            if not isinstance(call, ast.Call) or _name(call) not in unguarded:
+                continue
+            is_links = _name(call) == "sdo" and "recovery" not in ast.unparse(call.func)
+            assert is_links or id(call) in inside, f"{path.name}: {ast.unparse(call)}"
+        assert "sdo_write(" not in path.read_text(), path
+    assert not [row for row in RESTORABLE if row.index in {FACTORY_CALIBRATION, 0x7000, 0x8030}]
+
+
+def _name(call: ast.Call) -> str:
+    return call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+
+
+@pytest.mark.parametrize(
+    ("read", "rate", "length"),
+    [
+        (64, 800, 64),
+        (2048, 150, 341),
+        (341, 150, 341),
+        (51, 1003, 51),
+        (None, 250, 205),
+        (64, None, 64),
+        (64, 0, 64),
+    ],
+)
+def test_the_rate_decides_which_sinc_length_is_in_force(
+    read: int | None, rate: int | None, length: int
+) -> None:
+    assert sinc_length_in_force(read, rate) == length
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["objects"], "either an interface"),
+        (["objects", "ens5", "--server", "localhost:12001"], "either an interface"),
+        (["objects", "--server", "localhost"], "HOST:PORT"),
+        (["objects", "--server", "localhost:0"], "HOST:PORT"),
+        (["plan", "ens5"], "nothing is asked for"),
+        (["plan", "ens5", "--set", "sinc_length"], "NAME=VALUE"),
+        (["apply", "ens5", "--set", "colour=1"], "no setting 'colour'"),
+        (["apply", "ens5", "--set", "sinc_length=0"], "from 32 to 2048"),
+        (["plan", "ens5", "--config", "/nonexistent.toml"], "/nonexistent.toml"),
+        (["tare", "ens5", "--samples", "0"], "from 1 to 20000"),
+        (["tare", "ens5", "--target", "1", "2", "3", "4", "5", "inf"], "six finite numbers"),
+        (["watch", "ens5", "--samples", "0"], "1 or more"),
+        (["restore", "ens5", "/nonexistent.json"], "/nonexistent.json"),
+    ],
+)
+def test_wrong_arguments_are_one_sentence_and_exit_code_2(arguments: list[str], named: str) -> None:
+    assert named in one_sentence(tool(*arguments, code=2))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["colour"], ["objects", "--colour"], ["watch", "a", "b"], ["watch", "a", "--seconds", "-1"]],
+)
+def test_what_argparse_finds_is_exit_code_2(arguments: list[str]) -> None:
+    assert "usage: ethercat-sensor" in tool(*arguments, code=2).err
+
+
+def test_help_names_every_command_and_the_exit_codes() -> None:
+    shown = tool("--help").out
+    for name in (
+        "adapters",
+        "eeprom",
+        "watch",
+        "objects",
+        "plan",
+        "apply",
+        "save",
+        "tare",
+        "snapshot",
+        "restore",
+    ):
+        assert f"\n  {name} " in shown
+    assert "3 plan: there are changes" in shown
+    assert "--set NAME=VALUE" in tool("plan", "--help").out
+
+
+@needs_bus
+@pytest.mark.parametrize("command", ["eeprom", "watch", "objects", "save", "tare"])
+def test_no_such_interface(command: str) -> None:
+    failed = tool(command, "nosuch0", "--json", code=1)
+    assert "no network interface 'nosuch0'" in one_sentence(failed)
+    assert "nosuch0" in json.loads(failed.out)["error"]
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("{", "not valid JSON"),
+        ("[]", "no snapshot"),
+        ('{"format": "ethercat-sensor snapshot", "version": 2}', "no snapshot"),
+        ('{"format": "ethercat-sensor snapshot", "version": 1}', "damaged"),
+    ],
+)
+def test_a_file_that_is_no_snapshot(tmp_path: Path, text: str, named: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    assert named in one_sentence(tool("restore", "ens5", path, code=2))
+
+
+def test_nobody_holds_an_interface_that_is_not_there() -> None:
+    assert find_holder("nosuch0") is None
+
+
+@pytest.mark.parametrize(
+    ("script", "command"),
+    [
+        ("find_ethernet_adapters", "adapters"),
+        ("read_eeprom", "eeprom"),
+        ("bota_ethercat_minimal_example", "watch"),
+        ("sensor_configuration_SDO_reader", "objects"),
+    ],
+)
+def test_the_notes_scripts_are_these_commands(script: str, command: str) -> None:
+    text = (ROOT / "scripts" / f"{script}.py").read_text()
+    assert f'main(["{command}", *sys.argv[1:]])' in text

@@ -1,0 +1,127 @@
+"""The same through a running server: named with --server, or found because it holds the interface."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.server.running import Program, Server, Veth, needs_bus, server, virtual_sensor
+from tests.tool.running import command, one_sentence, stats, tool, written
+
+pytestmark = [pytest.mark.bus, needs_bus]
+Bench = tuple[Veth, Program, Server]
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    with (
+        virtual_sensor("--sensors", "2", "--serial", "10,20", "--pdo", "77") as (veth, sensor),
+        server(veth.near, "--rt-priority", "0") as running,
+    ):
+        yield veth, sensor, running
+        assert stats(sensor)["calibration_writes"] == 0
+        assert running.process.poll() is None
+
+
+def address(running: Server) -> tuple[str, str]:
+    return "--server", f"localhost:{running.port}"
+
+
+def test_a_server_that_holds_the_interface_is_found_and_said(bench: Bench) -> None:
+    veth, _, running = bench
+    ended = tool("objects", veth.near, "--sensor", 0, "--json")
+    used = f"the server at 127.0.0.1:{running.port}, process {running.process.pid}"
+    assert used in one_sentence(ended)
+    assert used in ended.json["through"]
+    held = {row["name"]: row["held_by"] for row in tool("adapters", "--json").json["adapters"]}
+    assert f"process {running.process.pid}" in held[veth.near]
+
+
+def test_a_master_that_is_no_server_is_named(bench: Bench) -> None:
+    veth, sensor, running = bench
+    said = one_sentence(tool("objects", veth.far, code=1))
+    assert f"{veth.far} is in use by process {sensor.process.pid}" in said
+    assert f"process {running.process.pid}" in one_sentence(tool("eeprom", veth.near, code=1))
+
+
+def test_objects_and_watch(bench: Bench) -> None:
+    _, _, running = bench
+    sensors = tool("objects", *address(running), "--json").json["sensors"]
+    assert [row["serial"] for row in sensors] == [10, 20]
+    rates = [row["value"] for row in sensors[1]["objects"] if row["index"] == "0x8011"]
+    assert rates == [800]
+    ended = tool("watch", *address(running), "--samples", 100, "--interval", 20, "--json")
+    rows = [json.loads(line) for line in ended.out.splitlines()]
+    assert [(row["sensor"], row["samples"]) for row in rows] == [(0, 100), (1, 100)]
+    assert len(rows[0]["force"]) == 3
+    assert "sensor 1: " in tool("watch", *address(running), "--sensor", 20, "--seconds", 0.2).out
+
+
+def test_plan_apply_save(bench: Bench) -> None:
+    _, sensor, running = bench
+    asked = ("--sensor", "20", "--set", "sinc_length=128", *address(running))
+    assert tool("plan", *asked, "--json", code=3).json["changes"][0]["then"] == 128
+    applied = tool("apply", *asked, "--json").json
+    assert (applied["rate_hz"], applied["settings"]["sinc_length"]) == (400, 128)
+    assert "nothing to change" in tool("plan", *asked).out
+    tool("save", "--sensor", 1, *address(running))
+    assert ("0x8030", 1, "01") in written(sensor, 1)
+    with running.connect() as client:
+        assert [row["rate_hz"] for row in client.ask("describe")["sensors"]] == [800, 400]
+
+
+def test_apply_that_fails_half_way_takes_everything_back() -> None:
+    with (
+        virtual_sensor(module="tests.server.odd_sensor", first=("refusing",)) as (veth, sensor),
+        server(veth.near) as running,
+    ):
+        asked = ("--set", "sinc_length=128", "--set", "fir=on", *address(running))
+        said = one_sentence(tool("apply", *asked, code=1))
+        assert "the former settings are in force" in said
+        assert ("0x8006", 2, "00") in written(sensor), "FIR had been switched on"
+        assert len(tool("plan", *asked, "--json", code=3).json["changes"]) == 2
+
+
+def test_what_the_sensor_lacks_or_contradicts_itself_changes_nothing(bench: Bench) -> None:
+    _, sensor, running = bench
+    with running.connect() as client:
+        before = client.ask("describe")["sensors"][0]["settings"]
+        asked = ("--sensor", 0, *address(running), "--set", "temperature_compensation=on")
+        command(sensor, "abort 0x8010 4 0x06020000")
+        missing = tool("apply", *asked, "--set", "coordinate_system=on", code=1)
+        assert "has no setting coordinate_system" in one_sentence(missing)
+        assert client.ask("describe")["sensors"][0]["settings"] == before
+    refused = tool("apply", *asked, "--set", "fast=on", code=2)
+    assert "fast is true but fir is false" in one_sentence(refused)
+
+
+def test_tare(bench: Bench) -> None:
+    _, sensor, running = bench
+    tared = tool("tare", "--sensor", 0, "--samples", 50, *address(running), "--json").json
+    assert len(tared["new_offset"]) == 6
+    assert {row[0] for row in written(sensor)} == {"0x8000"}
+
+
+def test_snapshot_and_restore(bench: Bench, tmp_path: Path) -> None:
+    _, sensor, running = bench
+    path = tmp_path / "a.json"
+    tool("snapshot", path, "--sensor", 0, *address(running))
+    tool("apply", "--sensor", 0, *address(running), "--set", "chop=on")
+    content = json.loads(path.read_text())
+    for row in content["objects"]:
+        if row["index"] == "0x8000" and row["subindex"] == 2:
+            row["hex"] = "0000803f"
+    path.write_text(json.dumps(content))
+    assert "serial 20" in one_sentence(tool("restore", path, "--sensor", 1, *address(running), code=1))
+    restored = tool("restore", *address(running), path, "--sensor", 0, "--json").json
+    assert [(row["name"], row["then"]) for row in restored["changes"]] == [("chop", False)]
+    assert [(row["index"], row["subindex"]) for row in restored["objects"]] == [("0x8000", 2)]
+    assert ("0x8000", 2, "0000803f") in written(sensor)
+
+
+def test_a_port_where_no_server_is(bench: Bench) -> None:
+    said = one_sentence(tool("objects", "--server", "localhost:1", "--json", code=1))
+    assert "no server answers at localhost:1" in said
