@@ -1,19 +1,31 @@
-"""The ROS 2 package `bridge` for colcon; for pip, use the pyproject.toml above."""
+"""The ROS 2 package `bridge` for colcon; for pip, use the pyproject.toml above.
+
+What goes to share/bridge is what lies in these folders; the pyproject.toml names the same ones.
+"""
+
+from pathlib import Path
 
 from setuptools import setup
+
+SHARED_FOLDERS = ("launch", "config", "urdf")
+
+
+def data_files():
+    yield "share/ament_index/resource_index/packages", ["resource/bridge"]
+    yield "share/bridge", ["package.xml"]
+    for folder in SHARED_FOLDERS:
+        files = sorted(str(file) for file in Path(folder).iterdir() if file.is_file())
+        yield f"share/bridge/{folder}", files
+
 
 setup(
     name="bridge",
     version="0.1.0",
     packages=["bridge", "protocol"],
     package_data={"": ["py.typed"]},
-    data_files=[
-        ("share/ament_index/resource_index/packages", ["resource/bridge"]),
-        ("share/bridge", ["package.xml"]),
-        ("share/bridge/launch", ["launch/bridge.launch.py"]),
-        ("share/bridge/config", ["config/bridge.yaml"]),
-    ],
+    data_files=list(data_files()),
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
     zip_safe=False,
     python_requires=">=3.11",
     maintainer="The ethercat-server authors",

@@ -19,7 +19,7 @@ OTHERS = [
     ROOT / "ros2_bridge" / "setup.py",
     *(
         p
-        for folder in ("ros2_bridge/launch", "scripts", "tests")
+        for folder in ("ros2_bridge/launch", "ros2_bridge/test", "scripts", "tests")
         for p in sorted((ROOT / folder).rglob("*.py"))
     ),
 ]

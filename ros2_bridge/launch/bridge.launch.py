@@ -1,26 +1,73 @@
-"""Starts the node with config/bridge.yaml, or with `params_file:=FILE`; `namespace:=NAME` is taken too."""
+"""Starts the node with its parameter file; what is given as an argument wins over the file.
 
-from launch.actions import DeclareLaunchArgument
+`ros2 launch bridge bridge.launch.py --show-args` lists the arguments.
+"""
+
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 
+# Parameters of the node that are arguments here. Text must stay text, even if it looks like a number; what is
+# wrong with a number is for the node to say.
+TEXT, NUMBER = str, None
+PARAMETERS = {
+    "server_host": (TEXT, "Host that ethercat-server runs on"),
+    "server_port": (NUMBER, "TCP port of ethercat-server"),
+    "sensor": (NUMBER, "The sensor's place on the bus, from 0"),
+    "frame_id": (TEXT, "Frame of the wrench"),
+    "imu_frame_id": (TEXT, "Frame of the IMU"),
+    "array_topic": (TEXT, "Topic of the Float64MultiArray; without a leading slash it is in the namespace"),
+}
+IN_FILE = " (empty: as in params_file)"
+
+
+def start_node(context):
+    def value(name):
+        return LaunchConfiguration(name).perform(context)
+
+    given = {
+        name: ParameterValue(LaunchConfiguration(name), value_type=value_type)
+        for name, (value_type, _) in PARAMETERS.items()
+        if value(name)
+    }
+    return [
+        Node(
+            package="bridge",
+            executable="client",
+            name="bridge",
+            namespace=value("namespace"),
+            parameters=[value("params_file"), *([given] if given else [])],
+            ros_arguments=["--log-level", value("log_level")] if value("log_level") else [],
+            respawn=LaunchConfiguration("respawn"),
+            respawn_delay=2.0,
+            output="screen",
+        )
+    ]
+
 
 def generate_launch_description():
-    default = PathJoinSubstitution([FindPackageShare("bridge"), "config", "bridge.yaml"])
+    file = PathJoinSubstitution([FindPackageShare("bridge"), "config", "bridge.yaml"])
     return LaunchDescription(
         [
-            DeclareLaunchArgument("params_file", default_value=default, description="The node's parameters"),
+            DeclareLaunchArgument("params_file", default_value=file, description="The node's parameters"),
             DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node"),
-            Node(
-                package="bridge",
-                executable="client",
-                name="bridge",
-                namespace=LaunchConfiguration("namespace"),
-                parameters=[LaunchConfiguration("params_file")],
-                output="screen",
+            *(
+                DeclareLaunchArgument(name, default_value="", description=description + IN_FILE)
+                for name, (_, description) in PARAMETERS.items()
             ),
+            DeclareLaunchArgument(
+                "respawn",
+                default_value="false",
+                description="true starts the node again 2 s after it ends, for whatever reason",
+            ),
+            DeclareLaunchArgument(
+                "log_level", default_value="", description="debug, info, warn, error or fatal (empty: info)"
+            ),
+            # A function, because whether an argument was given is known only when the launch runs.
+            OpaqueFunction(function=start_node),
         ]
     )

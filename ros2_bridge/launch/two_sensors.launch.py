@@ -1,0 +1,55 @@
+"""A SensONE and a Rokubi on one bus and one server: a node and a namespace for each.
+
+`virtual:=true` starts the server too, with a virtual bus that has both.
+"""
+
+from pathlib import Path
+
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.conditions import IfCondition
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+
+from launch import LaunchDescription
+
+# Namespace, in the order of the bus, and the model that stands there if the bus is virtual.
+SENSORS = {"sensone": "BFT-SENS-ECAT-M8", "rokubi": "BFT-ROKS-ECAT-M8"}
+
+
+def include(file, condition=None, **arguments):
+    # A plain path, so that --show-args can look into the file.
+    source = PythonLaunchDescriptionSource(str(Path(__file__).with_name(file)))
+    return IncludeLaunchDescription(source, condition=condition, launch_arguments=arguments.items())
+
+
+def generate_launch_description():
+    # The other arguments of the included files, such as params_file, go for both nodes.
+    port = LaunchConfiguration("server_port")
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("server_port", default_value="12001", description="TCP port of the server"),
+            DeclareLaunchArgument(
+                "virtual", default_value="false", description="true starts a server with two virtual sensors"
+            ),
+            # The nodes first: if launch cannot make sense of their arguments, no server is left behind.
+            *(
+                include(
+                    "bridge.launch.py",
+                    server_port=port,
+                    namespace=namespace,
+                    sensor=str(place),
+                    # Relative: the default is one absolute name, which both would publish on.
+                    array_topic="sensor_data",
+                    frame_id=f"{namespace}_ft_sensor",
+                    imu_frame_id=f"{namespace}_ft_sensor_imu",
+                )
+                for place, namespace in enumerate(SENSORS)
+            ),
+            include(
+                "virtual_server.launch.py",
+                condition=IfCondition(LaunchConfiguration("virtual")),
+                server_port=port,
+                sensor_options=f"--model {','.join(SENSORS.values())}",
+            ),
+        ]
+    )

@@ -1,0 +1,51 @@
+"""Starts `ethercat-server` on a virtual bus, for launch files without hardware; its end ends the launch."""
+
+import shlex
+import shutil
+
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction, Shutdown
+from launch.logging import get_logger
+from launch.substitutions import LaunchConfiguration
+
+from launch import LaunchDescription
+
+
+def start_server(context):
+    def value(name):
+        return LaunchConfiguration(name).perform(context)
+
+    command = shlex.split(value("server_command"))
+    if not command or shutil.which(command[0]) is None:
+        # Shut down, not an exception: that would leave behind what has been started already.
+        missing = f"{value('server_command')!r} is no program: give server_command:=/path/to/ethercat-server"
+        get_logger("virtual_server").error(missing)
+        return [Shutdown(reason=missing)]
+    # "--virtual=..." in one word: what follows begins with dashes itself.
+    sensors = [f"--virtual={value('sensor_options')}"] if value("sensor_options") else []
+    return [
+        ExecuteProcess(
+            cmd=[*command, *sensors, "virtual", value("server_port")],
+            name="ethercat-server",
+            output="screen",
+            on_exit=Shutdown(reason="ethercat-server has ended"),
+        )
+    ]
+
+
+def generate_launch_description():
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("server_port", default_value="12001", description="TCP port of the server"),
+            DeclareLaunchArgument(
+                "sensor_options",
+                default_value="",
+                description="Options of ethercat-virtual-sensor, such as '--pdo 77'",
+            ),
+            DeclareLaunchArgument(
+                "server_command",
+                default_value="ethercat-server",
+                description="The server, which needs root: 'sudo -n /path/to/ethercat-server', say",
+            ),
+            OpaqueFunction(function=start_server),
+        ]
+    )

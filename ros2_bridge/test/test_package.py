@@ -1,0 +1,33 @@
+"""What `colcon test` runs: the package is whole. What it does is tested in the repository's tests/."""
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    "name", ["bridge.client", "bridge.connection", "bridge.selection", "protocol.framing"]
+)
+def test_it_imports_without_ros(name: str) -> None:
+    assert importlib.import_module(name)
+
+
+def test_the_node_imports_with_ros() -> None:
+    pytest.importorskip("rclpy", reason="ROS 2 is not sourced")
+    assert importlib.import_module("bridge.node")
+
+
+def test_the_program_says_how_it_is_used() -> None:
+    run = subprocess.run(
+        [sys.executable, "-m", "bridge.client", "--help"], check=True, capture_output=True, text=True
+    )
+    assert run.stdout.startswith("usage: ros2 run bridge client")
+
+
+def test_the_files_it_shares_are_there() -> None:
+    package = Path(__file__).parent.parent
+    for name in ("launch/bridge.launch.py", "config/bridge.yaml", "urdf/bota_sensor.xacro"):
+        assert (package / name).stat().st_size, name

@@ -1,0 +1,77 @@
+"""pip (pyproject.toml) and colcon (setup.py) install the same files: all in the package's folders."""
+
+from __future__ import annotations
+
+import runpy
+import shutil
+import subprocess
+import sys
+import tomllib
+import types
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.ros_package.package_files import PACKAGE, ROOT, SHARED_FOLDERS, shared_files
+
+MARKER = "share/ament_index/resource_index/packages"
+
+
+def data_files_of_pip() -> dict[str, set[str]]:
+    table = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["data-files"]
+    return {
+        target: {str(path.relative_to(PACKAGE)) for pattern in patterns for path in ROOT.glob(pattern)}
+        for target, patterns in table.items()
+    }
+
+
+def data_files_of_colcon(monkeypatch: pytest.MonkeyPatch) -> dict[str, set[str]]:
+    asked: dict[str, Any] = {}
+    stand_in = types.ModuleType("setuptools")
+    stand_in.__dict__["setup"] = lambda **keywords: asked.update(keywords)
+    monkeypatch.setitem(sys.modules, "setuptools", stand_in)
+    monkeypatch.chdir(PACKAGE)
+    runpy.run_path("setup.py")
+    return {target: set(files) for target, files in asked["data_files"]}
+
+
+def test_both_install_everything_in_the_shared_folders(monkeypatch: pytest.MonkeyPatch) -> None:
+    for installed in (data_files_of_pip(), data_files_of_colcon(monkeypatch)):
+        found = [installed[f"share/bridge/{folder}"] for folder in SHARED_FOLDERS]
+        assert set().union(*found) == shared_files()
+        for folder, files in zip(SHARED_FOLDERS, found, strict=True):
+            assert all(Path(file).parent.name == folder for file in files)
+
+
+def test_both_install_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    pip = data_files_of_pip()
+    # colcon makes this one itself, from the entry point.
+    assert pip.pop("lib/bridge") == {"resource/client"}
+    assert pip == data_files_of_colcon(monkeypatch)
+    assert pip[MARKER] == {"resource/bridge"}
+    assert pip["share/bridge"] == {"package.xml"}
+
+
+def test_no_other_folder_has_files() -> None:
+    """A new folder has to be named in both, or it is installed by neither."""
+    folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] not in "._"}
+    assert folders - {"bridge.egg-info"} == {*SHARED_FOLDERS, "bridge", "protocol", "resource", "test"}
+
+
+@pytest.mark.long
+def test_the_wheel_has_them(tmp_path: Path) -> None:
+    # Of a copy: pip leaves what it builds in the folder that it builds from.
+    copy = tmp_path / "copy"
+    shutil.copytree(
+        ROOT, copy, symlinks=True, ignore=shutil.ignore_patterns(".*", "build", "*.egg-info", "__pycache__")
+    )
+    subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "-w", tmp_path, copy], check=True
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name.partition(".data/data/")[2] for name in archive.namelist()}
+    assert {f"share/bridge/{file}" for file in shared_files()} <= names
+    assert {f"{MARKER}/bridge", "share/bridge/package.xml", "lib/bridge/client"} <= names

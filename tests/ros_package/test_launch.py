@@ -1,0 +1,223 @@
+"""The launch files, run by `ros2 launch` where it is installed; what the page about them says, anywhere."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.ros_package.package_files import PACKAGE, ROOT
+from tests.server.running import free_port, needs_bus
+
+PATIENCE_S = 30.0
+SERVER = f"server_command:={sys.executable} -m ethercat_server.cli"
+CLIENT = f"""#!{sys.executable}
+import sys
+sys.path[:0] = ["{ROOT}", "{PACKAGE}"]
+from bridge.client import main
+sys.exit(main())
+"""
+
+
+class Launched:
+    """`ros2 launch` with one of our files, in a session of its own."""
+
+    def __init__(self, environment: dict[str, str], file: str, *arguments: str) -> None:
+        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115
+        self.process = subprocess.Popen(
+            ["ros2", "launch", str(PACKAGE / "launch" / file), *arguments],
+            env=environment,
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+
+    @property
+    def log(self) -> str:
+        self._log.seek(0)
+        return self._log.read()
+
+    def says(self, *words: str) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while not all(word in self.log for word in words):
+            assert time.monotonic() < deadline, f"waited in vain for {words} in:\n{self.log}"
+            assert self.process.poll() is None or all(word in self.log for word in words), self.log
+            time.sleep(0.05)
+
+    def stop(self) -> int:
+        """End it as Ctrl-C does; the exit code."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(PATIENCE_S)
+
+    def close(self) -> None:
+        # Not SIGTERM: at that, `ros2 launch` leaves its processes behind.
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(PATIENCE_S)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+        self._log.close()
+
+
+Launch = Callable[..., Launched]
+
+
+@pytest.fixture
+def launch(tmp_path: Path) -> Iterator[Launch]:
+    """Gives a function that runs a launch file, with this checkout as the package `bridge`."""
+    pytest.importorskip("launch_ros", reason="launch_ros is missing: source ROS 2")
+    pytest.importorskip("rclpy", reason="rclpy is missing: source ROS 2")
+    if shutil.which("ros2") is None:
+        pytest.skip("ros2 launch is missing: source ROS 2")
+    (tmp_path / "share/ament_index/resource_index/packages").mkdir(parents=True)
+    (tmp_path / "share/ament_index/resource_index/packages/bridge").touch()
+    (tmp_path / "share/bridge").symlink_to(PACKAGE)
+    (tmp_path / "lib/bridge").mkdir(parents=True)
+    client = tmp_path / "lib/bridge/client"
+    client.write_text(CLIENT)
+    client.chmod(0o755)
+    environment = os.environ | {
+        "AMENT_PREFIX_PATH": f"{tmp_path}:{os.environ.get('AMENT_PREFIX_PATH', '')}",
+        "ROS_LOG_DIR": str(tmp_path),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "PYTHONUNBUFFERED": "1",
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    running: list[Launched] = []
+
+    def start(file: str, *arguments: str) -> Launched:
+        running.append(Launched(environment, file, *arguments))
+        return running[-1]
+
+    yield start
+    for launched in running:
+        launched.close()
+
+
+@pytest.mark.ros
+def test_what_is_given_wins_over_the_file_and_the_rest_stays(launch: Launch, tmp_path: Path) -> None:
+    file_port, given_port = free_port(), free_port()
+    file = tmp_path / "parameters.yaml"
+    file.write_text(f"bridge:\n  ros__parameters: {{server_host: 127.0.0.1, server_port: {file_port}}}\n")
+    as_in_file = launch("bridge.launch.py", f"params_file:={file}")
+    given = launch("bridge.launch.py", f"params_file:={file}", f"server_port:={given_port}")
+    as_in_file.says(f"no server at 127.0.0.1:{file_port}")
+    given.says(f"no server at 127.0.0.1:{given_port}")
+    for launched in (as_in_file, given):
+        assert launched.stop() == 0
+        assert "process has finished cleanly" in launched.log
+
+
+@pytest.mark.ros
+def test_namespace_log_level_and_text_that_looks_like_a_number(launch: Launch) -> None:
+    launched = launch(
+        "bridge.launch.py", "namespace:=left", "server_host:=127", f"server_port:={free_port()}"
+    )
+    launched.says("[left.bridge]: no server at 127:")
+    quiet = launch("bridge.launch.py", "log_level:=error", "server_port:=70000")
+    quiet.says("parameter server_port is 70000", "--log-level error")
+
+
+@pytest.mark.ros
+def test_respawn_starts_the_node_again(launch: Launch) -> None:
+    launched = launch("bridge.launch.py", "sensor:=300", "respawn:=true")
+    launched.says("parameter sensor is 300")
+    deadline = time.monotonic() + PATIENCE_S
+    while launched.log.count("parameter sensor is 300") < 2:
+        assert time.monotonic() < deadline, launched.log
+        time.sleep(0.1)
+
+
+@pytest.mark.ros
+def test_a_server_that_is_not_there_ends_the_demo_with_a_sentence(launch: Launch) -> None:
+    launched = launch("demo.launch.py", "server_command:=/no/such/server")
+    launched.process.wait(PATIENCE_S)
+    assert "'/no/such/server' is no program: give server_command:=" in launched.log
+
+
+@pytest.mark.ros
+@pytest.mark.bus
+@needs_bus
+def test_the_demo_runs_and_ends_cleanly(launch: Launch) -> None:
+    port = free_port()
+    launched = launch("demo.launch.py", f"server_port:={port}", SERVER)
+    launched.says(f"connected to localhost:{port}: sensor 0 (BFT-SENS-ECAT-M8", "streaming")
+    assert launched.stop() == 0
+    assert launched.log.count("process has finished cleanly") == 2, launched.log
+    assert "has died" not in launched.log
+
+
+@pytest.mark.ros
+@pytest.mark.bus
+@needs_bus
+def test_the_end_of_the_server_ends_the_demo(launch: Launch) -> None:
+    launched = launch("demo.launch.py", f"server_port:={free_port()}", SERVER)
+    launched.says("connected to localhost")
+    (pid,) = re.findall(r"\[ethercat-server-\d+\]: process started with pid \[(\d+)\]", launched.log)
+    os.kill(int(pid), signal.SIGTERM)
+    assert launched.process.wait(PATIENCE_S) == 0
+    assert launched.log.count("process has finished cleanly") == 2, launched.log
+
+
+@pytest.mark.ros
+@pytest.mark.bus
+@needs_bus
+def test_two_sensors_have_a_node_and_a_namespace_each(launch: Launch) -> None:
+    launched = launch("two_sensors.launch.py", "virtual:=true", f"server_port:={free_port()}", SERVER)
+    launched.says("streaming")
+    for namespace, sensor in (("sensone", r"0 \(BFT-SENS-"), ("rokubi", r"1 \(BFT-ROKS-")):
+        pattern = rf"\[{namespace}\.bridge\]: connected to \S+ sensor {sensor}"
+        deadline = time.monotonic() + PATIENCE_S
+        while not re.search(pattern, launched.log):
+            assert time.monotonic() < deadline, launched.log
+            time.sleep(0.05)
+    assert launched.stop() == 0
+    assert launched.log.count("process has finished cleanly") == 3, launched.log
+
+
+def arguments_of(file: Path) -> set[str]:
+    """The arguments that a launch file declares, read from its source."""
+    tree = ast.parse(file.read_text())
+    names = {
+        str(call.args[0].value)
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call)
+        and isinstance(call.func, ast.Name)
+        and call.func.id == "DeclareLaunchArgument"
+        and isinstance(call.args[0], ast.Constant)
+    }
+    for assignment in ast.walk(tree):
+        if isinstance(assignment, ast.Assign) and ast.unparse(assignment.targets[0]) == "PARAMETERS":
+            assert isinstance(assignment.value, ast.Dict)
+            names |= {str(key.value) for key in assignment.value.keys if isinstance(key, ast.Constant)}
+    return names
+
+
+def test_bridge_launch_file_takes_what_it_is_to_take() -> None:
+    assert arguments_of(PACKAGE / "launch/bridge.launch.py") >= {
+        "server_host", "server_port", "sensor", "namespace", "frame_id", "imu_frame_id", "params_file",
+        "respawn", "log_level",
+    }  # fmt: skip
+
+
+def test_the_page_names_every_file_and_argument() -> None:
+    page = (ROOT / "docs/ros2-workspace.md").read_text()
+    for file in (PACKAGE / "launch").glob("*.py"):
+        assert f"`{file.name}`" in page
+        for name in arguments_of(file):
+            assert f"`{name}`" in page, f"{file.name}: {name}"

@@ -1,0 +1,94 @@
+"""The URDF macro: the published frames of every model, and a tree that URDF readers take."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+import pytest
+
+from ethercat_server.objects import MODELS
+from tests.ros_package.package_files import PACKAGE
+
+xacro = pytest.importorskip("xacro", reason="xacro is missing: pip install xacro, or source ROS 2")
+
+URDF = PACKAGE / "urdf"
+# From the mounting face to the wrench's origin and to the IMU, in mm.
+FIGURES = {
+    "SENS": (35.0, 9.3),
+    "ROKS": (32.0, 9.8),
+    "ROKA": (32.0, 9.8),
+    "MEDS": (32.0, 9.8),
+    "MEDA": (32.0, 9.8),
+    "LAXS": (44.5, 11.95),
+    "MEGS": (59.0, 13.4),
+}
+
+
+def example(**arguments: str) -> ElementTree.Element:
+    document = xacro.process_file(str(URDF / "example.urdf.xacro"), mappings=arguments)
+    return ElementTree.fromstring(document.toxml())
+
+
+def offset_mm(robot: ElementTree.Element, parent: str, child: str) -> float:
+    """How far along z the fixed joint between two links reaches; nothing else may be moved or turned."""
+    (joint,) = [
+        joint
+        for joint in robot.findall("joint")
+        if (joint.find("parent[@link]"), joint.find("child[@link]")) != (None, None)
+        and joint.find("parent").get("link") == parent  # type: ignore[union-attr]
+        and joint.find("child").get("link") == child  # type: ignore[union-attr]
+    ]
+    assert joint.get("type") == "fixed"
+    origin = joint.find("origin")
+    assert origin is not None
+    assert origin.get("rpy") == "0 0 0"
+    x, y, z = (float(text) for text in str(origin.get("xyz")).split())
+    assert (x, y) == (0.0, 0.0)
+    return z * 1000
+
+
+@pytest.mark.parametrize("model", FIGURES)
+def test_frames_are_where_the_figures_say(model: str) -> None:
+    robot = example(model=model)
+    wrench, imu = FIGURES[model]
+    assert offset_mm(robot, "ft_sensor_mounting", "ft_sensor") == pytest.approx(wrench)
+    assert offset_mm(robot, "ft_sensor_mounting", "ft_sensor_imu") == pytest.approx(imu)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_model_that_the_server_knows_is_taken_by_its_whole_name(name: str) -> None:
+    robot = example(model=name)
+    wrench, _ = FIGURES[name.split("-")[1]]
+    assert offset_mm(robot, "ft_sensor_mounting", "ft_sensor") == pytest.approx(wrench)
+
+
+def test_the_result_is_one_tree_with_unique_names() -> None:
+    robot = example(prefix="left_")
+    links = [str(link.get("name")) for link in robot.findall("link")]
+    assert links == ["base_link", "left_ft_sensor_mounting", "left_ft_sensor", "left_ft_sensor_imu"]
+    joints = [str(joint.get("name")) for joint in robot.findall("joint")]
+    assert len(joints) == len(set(joints)) == len(links) - 1
+    children = [str(child.get("link")) for child in robot.findall("joint/child")]
+    assert sorted(children) == sorted(links[1:])
+    assert all(parent.get("link") in links for parent in robot.findall("joint/parent"))
+    assert {element.tag for element in robot} == {"link", "joint"}
+
+
+def test_two_sensors_fit_on_one_robot() -> None:
+    text = f"""<robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro">
+      <xacro:include filename="{URDF / "bota_sensor.xacro"}"/>
+      <link name="base"/>
+      <xacro:bota_sensor model="SENS" parent="base" prefix="a_"><origin xyz="0 0 1"/></xacro:bota_sensor>
+      <xacro:bota_sensor model="MEGS" parent="a_ft_sensor" prefix="b_"><origin/></xacro:bota_sensor>
+    </robot>"""
+    document = xacro.parse(text)
+    xacro.process_doc(document)
+    robot = ElementTree.fromstring(document.toxml())
+    assert len(robot.findall("link")) == 7
+    assert offset_mm(robot, "a_ft_sensor_mounting", "a_ft_sensor") == pytest.approx(35)
+    assert offset_mm(robot, "b_ft_sensor_mounting", "b_ft_sensor") == pytest.approx(59)
+
+
+def test_an_unknown_model_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(xacro.XacroException, match="no model FOO: it must be one of SENS, ROKS"):
+        example(model="FOO")
