@@ -20,6 +20,8 @@ from bridge.monitor import Monitor
 from bridge.parameters import ParameterError, declare
 from bridge.reader import Reader
 from bridge.requests import Requests
+from bridge.services import Services
+from bridge.settings_parameters import SettingsParameters
 from bridge.signals import call_on_stop_signal
 
 SUPERVISOR_TOPIC = "/supervisor_status_data"
@@ -38,6 +40,9 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.reader = Reader(parameters, outputs, self.get_logger(), self._fail)
         self.monitor = Monitor(self, parameters.thresholds, self.reader, outputs, self._fail)
         self.requests = Requests(parameters, self.reader.link)
+        self.triggers = Services(self, self.reader.link, self.requests)
+        self.sensor_settings = SettingsParameters(self, self.reader.link, self.requests)
+        self.reader.link.on_change = self.sensor_settings.changed
         self.create_subscription(
             KeyValue,
             SUPERVISOR_TOPIC,
