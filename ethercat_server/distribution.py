@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections import deque
+from itertools import accumulate
+from operator import add, sub
 from typing import Final
 
 _STEPS_BITS: Final = 5
@@ -18,17 +22,17 @@ class Distribution:
     Recording is one list increment. Durations are whole nanoseconds; negative ones count as 0.
     """
 
-    __slots__ = ("_counts", "_max", "count")
+    __slots__ = ("_counts", "count", "max")
 
     def __init__(self) -> None:
         self._counts = [0] * (_OCTAVES * _STEPS)
-        self._max = 0
+        self.max = 0
         self.count = 0
 
     def record(self, duration_ns: int) -> None:
         """Count one duration."""
-        if duration_ns > self._max:
-            self._max = duration_ns
+        if duration_ns > self.max:
+            self.max = duration_ns
         elif duration_ns < 0:
             duration_ns = 0
         self.count += 1
@@ -41,25 +45,26 @@ class Distribution:
 
     def add(self, other: Distribution) -> None:
         """Count everything that `other` has counted."""
-        self._counts = list(map(int.__add__, self._counts, other._counts))
-        self._max = max(self._max, other._max)
+        self._counts = list(map(add, self._counts, other._counts))
+        self.max = max(self.max, other.max)
         self.count += other.count
 
-    def percentile_ns(self, fraction: float) -> int:
-        """The duration that `fraction` (0 to 1) of all are at most; 0 if there is none."""
-        wanted = fraction * self.count
-        seen = 0
-        for bucket, count in enumerate(self._counts):
-            seen += count
-            if count and seen >= wanted:
-                return min(_upper_edge(bucket), self._max)
-        return self._max
+    def take_away(self, other: Distribution, new_max: int) -> None:
+        """Forget what `other` has counted, which was added before; the maximum is `new_max` then."""
+        self._counts = list(map(sub, self._counts, other._counts))
+        self.max = new_max
+        self.count -= other.count
+
+    def percentiles_ns(self, *fractions: float) -> list[int]:
+        """The durations that these parts (0 to 1) of all are at most; 0 if there is none."""
+        seen = list(accumulate(self._counts))
+        buckets = (bisect_left(seen, max(fraction * self.count, 1)) for fraction in fractions)
+        return [min(_upper_edge(bucket), self.max) if self.count else self.max for bucket in buckets]
 
     def summary_us(self) -> dict[str, float]:
         """p50, p99, p999 and max in microseconds, as `status` gives them."""
-        points = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-        summary = {name: self.percentile_ns(fraction) / 1000 for name, fraction in points.items()}
-        return {**summary, "max": self._max / 1000}
+        p50, p99, p999 = self.percentiles_ns(0.5, 0.99, 0.999)
+        return {"p50": p50 / 1000, "p99": p99 / 1000, "p999": p999 / 1000, "max": self.max / 1000}
 
 
 class RecentDistribution:
@@ -68,20 +73,28 @@ class RecentDistribution:
     `record` is that of the slot of the current second; call `roll` once a second.
     """
 
-    __slots__ = ("_before", "_slots", "record")
+    __slots__ = ("_before", "_finished", "_now", "_recent", "record")
 
     def __init__(self) -> None:
         self._before = Distribution()
-        """What is older than the slots."""
-        self._slots = [Distribution()]
-        self.record = self._slots[-1].record
+        """What is older than the last ten slots."""
+        self._finished: deque[Distribution] = deque()
+        """The slots of the last ten seconds but for the one now."""
+        self._recent = Distribution()
+        """Their sum, kept so that `status` need not add them up between two exchanges."""
+        self._now = Distribution()
+        self.record = self._now.record
 
     def roll(self) -> None:
         """A second has passed."""
-        self._slots.append(Distribution())
-        self.record = self._slots[-1].record
-        if len(self._slots) > _WINDOW_SLOTS:
-            self._before.add(self._slots.pop(0))
+        self._finished.append(self._now)
+        self._recent.add(self._now)
+        self._now = Distribution()
+        self.record = self._now.record
+        if len(self._finished) == _WINDOW_SLOTS:
+            oldest = self._finished.popleft()
+            self._before.add(oldest)
+            self._recent.take_away(oldest, max(slot.max for slot in self._finished))
 
     def everything(self) -> Distribution:
         """All durations since the start."""
@@ -92,8 +105,8 @@ class RecentDistribution:
     def last_10s(self) -> Distribution:
         """Those of the last ten seconds."""
         total = Distribution()
-        for slot in self._slots:
-            total.add(slot)
+        total.add(self._recent)
+        total.add(self._now)
         return total
 
 
