@@ -97,6 +97,8 @@ def _stream(s: Snapshot, t: Thresholds) -> Status:
         verdict.add(Level.ERROR, f"no new sample for {s.silent_s:.1f} s: {_why_silent(s)}")
     else:
         _judge_samples(verdict, s, t)
+    if s.connected:
+        _judge_losses(verdict, s, t)
     mine, recent = s.server_row, mapping(s.server.get("last_10s"))
     age = row_of(recent.get("age_us"), s.sensor)
     wake, exchange = mapping(recent.get("wake_us")), mapping(recent.get("exchange_us"))
@@ -135,6 +137,9 @@ def _judge_samples(verdict: _Verdict, s: Snapshot, t: Thresholds) -> None:
         verdict.add(
             level, f"samples are {s.age_us[1] / 1000:.1f} ms old (p99): this machine or the node is busy"
         )
+
+
+def _judge_losses(verdict: _Verdict, s: Snapshot, t: Thresholds) -> None:
     missing = max(s.new.lost, s.new_server_lost)
     if missing >= t.lost_warn:
         verdict.add(Level.WARN, f"{missing} samples lost at the server or on the way")

@@ -137,7 +137,7 @@ class Reader:
             same_clock=connection.same_machine,
             limit_hz=self._parameters.publishing_frequency,
         )
-        decoders, outputs, watch = self._decoders, self._outputs, self.watch
+        decoders, outputs, watch, link = self._decoders, self._outputs, self.watch, self.link
         monotonic_ns = time.monotonic_ns
         frames: list[DataMessage] = []
         silent = False
@@ -155,6 +155,7 @@ class Reader:
                 reads += 1
             silent = silent and (not frames or self._say_no_more_silent())
             watch.see(frames)
+            selector.rate_hz = link.rate_hz
             for frame in selector.select(frames, monotonic_ns()):
                 sample = decoders[len(frame.process_data)].decode(frame.process_data)
                 if sample.is_finite:
