@@ -81,7 +81,7 @@ class Link:
     def take_settings(self, settings: object) -> None:
         """Note the settings that a message says are in force."""
         found = known_settings(settings)
-        if not found:
+        if not found or self.connection is None:
             return
         if (length := found.get("sinc_length")) != self.settings.get("sinc_length") and length:
             self.rate_hz = float(sampling_rate_hz(int(length)))
