@@ -17,13 +17,15 @@ from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
 from protocol.control import PROTOCOL_VERSION, request
-from protocol.errors import ProtocolError
+from protocol.errors import ProtocolError, SettingError
 from protocol.framing import DataMessage, FrameDecoder, JsonObject, encode_json
+from protocol.settings import SETTINGS, SettingValue
 
 CONNECT_TIMEOUT_S: Final = 2.0
 SILENCE_S: Final = 1.0
 """`receive` gives up waiting after this time, so that silence can be reported."""
 _REPLY_TIMEOUT_S: Final = 3.0
+_MOST_HZ: Final = 1e6
 _KEEPALIVE: Final = ((socket.TCP_KEEPIDLE, 2), (socket.TCP_KEEPINTVL, 1), (socket.TCP_KEEPCNT, 3))
 
 
@@ -43,6 +45,11 @@ class SensorInfo(NamedTuple):
     serial: str
     rate_hz: str
     state: str
+    hardware: str = "?"
+    firmware: str = "?"
+    rate: float = 0.0
+    """`rate_hz` as a number; 0 if it is none."""
+    settings: Mapping[str, SettingValue] = {}
 
     def __str__(self) -> str:
         """One phrase for the log."""
@@ -140,6 +147,12 @@ class Connection:
             raise ConnectionFailedError(f"cannot send: {error.strerror or error}") from None
         return future
 
+    def forget(self, future: Future[JsonObject]) -> None:
+        """Nobody waits for this reply any more."""
+        for identifier, waiting in list(self._replies.items()):
+            if waiting is future:
+                self._replies.pop(identifier, None)
+
     def ask(self, action: str, **values: object) -> JsonObject:
         """Send a request and receive until its reply is there; DATA on the way is dropped.
 
@@ -201,16 +214,30 @@ def refusal(reply: Mapping[str, Any]) -> str:
     return printable(f"{error.get('message', 'no message')} ({error.get('code', 'no code')})")
 
 
+def known_settings(settings: object) -> dict[str, SettingValue]:
+    """Those of `settings`, a message's, that are in the table and have a value that they can have."""
+    found: dict[str, SettingValue] = {}
+    for name, value in settings.items() if isinstance(settings, dict) else ():
+        if name in SETTINGS:
+            with contextlib.suppress(SettingError):
+                found[name] = SETTINGS[name].check(value)
+    return found
+
+
 def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
     """The row of `sensor` in a `describe` reply; ConnectionFailedError if there is none."""
     rows = description.get("sensors")
     found = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
     for row in found:
         if row.get("sensor") == sensor and not isinstance(row.get("sensor"), bool):
-            name, serial, rate, state = (
-                printable(row.get(key, "?"), 40) for key in ("name", "serial", "rate_hz", "state")
+            name, serial, rate, state, hardware, firmware = (
+                printable(row.get(key, "?"), 40)
+                for key in ("name", "serial", "rate_hz", "state", "hardware", "firmware")
             )
-            return SensorInfo(sensor, name, serial, rate, state)
+            hz = row.get("rate_hz")
+            number = float(hz) if isinstance(hz, int | float) and 0 < hz <= _MOST_HZ else 0.0
+            settings = known_settings(row.get("settings"))
+            return SensorInfo(sensor, name, serial, rate, state, hardware, firmware, number, settings)
     there = ", ".join(printable(row.get("sensor"), 10) for row in found[:16]) or "none"
     raise ConnectionFailedError(
         f"the server has no sensor {sensor} (it has: {there}): set the parameter 'sensor' to one it has"

@@ -1,48 +1,93 @@
 """The ROS messages: each made once, then refilled and published.
 
-An output is anything with `publish(sample, stamp_ns)`. It runs in the reader's thread, so it must not block.
+An output's `publish` runs in the reader's thread, for every selected sample and only while somebody has
+subscribed, so it must not block and should not allocate. To add a topic, add a class here and to `make`.
 """
 
 from __future__ import annotations
 
 import math
 from array import array
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Any, Final, Protocol
 
+from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
+from bridge.parameter_row import Numbers
+from bridge.parameters import Parameters
 from protocol.pdo import Sample
 
-ARRAY_LABEL = "Fx Fy Fz Mx My Mz Ax Ay Az Rx Ry Rz"
+ARRAY_LABEL: Final = "Fx Fy Fz Mx My Mz Ax Ay Az Rx Ry Rz"
 """The label of the array's one dimension: what its values are, in order."""
-ARRAY_SIZE = len(ARRAY_LABEL.split())
-QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-"""Reliable and short: what a subscriber is too slow for is replaced by newer samples."""
+ARRAY_SIZE: Final = len(ARRAY_LABEL.split())
+_DEPTH: Final = 10
+"""Short: what a subscriber is too slow for is replaced by newer samples."""
+_NS_PER_S: Final = 1_000_000_000
 
 
 class Output(Protocol):
     """One topic that is fed with every selected sample."""
 
-    def publish(self, sample: Sample, stamp_ns: int) -> bool:
-        """Publish `sample`; False if it holds a number that is not finite, and so was not published.
+    publisher: Any
 
-        `stamp_ns` is the sample's time, ns since the Unix epoch.
-        """
+    @property
+    def fields(self) -> Sequence[str]:
+        """The fields of `Sample` that it publishes: all of them are finite when `publish` is called."""
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish `sample`; `stamp_ns` is its time, ns since the Unix epoch."""
+
+
+class Outputs:
+    """All outputs. `wanted` are those that somebody has subscribed to, as of the last `refresh`."""
+
+    def __init__(self, outputs: Sequence[Output]) -> None:
+        self.all = tuple(outputs)
+        self.wanted: tuple[Output, ...] = ()
+
+    def refresh(self) -> None:
+        """Look who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
+        self.wanted = tuple(output for output in self.all if output.publisher.get_subscription_count())
+
+    def publish_finite(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish a sample that is not finite everywhere where it is."""
+        for output in self.wanted:
+            if all(_is_finite(getattr(sample, field)) for field in output.fields):
+                output.publish(sample, stamp_ns)
+
+
+def make(node: Node, parameters: Parameters) -> Outputs:
+    """The node's outputs."""
+    return Outputs(
+        [
+            ArrayOutput(node, parameters.array_topic),
+            WrenchOutput(node, "wrench", parameters.frame_id),
+            ImuOutput(node, "imu/data_raw", parameters),
+            TemperatureOutput(node, "temperature", parameters),
+        ]
+    )
+
+
+def create_publisher(node: Node, message_type: Any, topic: str) -> Any:
+    """A reliable publisher, unless parameters override its QoS."""
+    # A profile of its own each: rclpy writes what was overridden into the one it is given.
+    profile = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
+    options = QoSOverridingOptions.with_default_policies()
+    return node.create_publisher(message_type, topic, profile, qos_overriding_options=options)
 
 
 class ArrayOutput:
     """`std_msgs/Float64MultiArray`: N, Nm, m/s², rad/s, in the order of ARRAY_LABEL."""
 
+    fields = ("force", "torque", "acceleration", "angular_rate")
+
     def __init__(self, node: Node, topic: str) -> None:
-        self._publisher = node.create_publisher(
-            Float64MultiArray,
-            topic,
-            QOS,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        self.publisher = create_publisher(node, Float64MultiArray, topic)
         self._message = Float64MultiArray()
         self._message.layout.dim = [
             MultiArrayDimension(label=ARRAY_LABEL, size=ARRAY_SIZE, stride=ARRAY_SIZE)
@@ -50,13 +95,98 @@ class ArrayOutput:
         self._message.data = array("d", bytes(8 * ARRAY_SIZE))
         self._data: array[float] = self._message.data
 
-    def publish(self, sample: Sample, stamp_ns: int) -> bool:  # noqa: ARG002 - the message has no header
+    def publish(self, sample: Sample, stamp_ns: int) -> None:  # noqa: ARG002 - the message has no header
         """Publish the twelve values."""
-        values = sample.array
-        # A NaN or an infinity survives every sum, and float32 values cannot add up to one.
-        if not math.isfinite(sum(values)):
-            return False
-        if self._publisher.get_subscription_count():
-            self._data[:] = array("d", values)
-            self._publisher.publish(self._message)
+        self._data[:] = array("d", sample.array)
+        self.publisher.publish(self._message)
+
+
+class WrenchOutput:
+    """`geometry_msgs/WrenchStamped`: N and Nm, in the sensor's frame, as measured."""
+
+    fields = ("force", "torque")
+
+    def __init__(self, node: Node, topic: str, frame_id: str) -> None:
+        self.publisher = create_publisher(node, WrenchStamped, topic)
+        self._message = WrenchStamped()
+        self._message.header.frame_id = frame_id
+        self._stamp = self._message.header.stamp
+        self._force, self._torque = self._message.wrench.force, self._message.wrench.torque
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish force and torque."""
+        self._stamp.sec, self._stamp.nanosec = divmod(stamp_ns, _NS_PER_S)
+        force, torque = self._force, self._torque
+        force.x, force.y, force.z = sample.force
+        torque.x, torque.y, torque.z = sample.torque
+        self.publisher.publish(self._message)
+
+
+class ImuOutput:
+    """`sensor_msgs/Imu`: m/s², rad/s; the sensor's own orientation, if it estimates one."""
+
+    fields = ("acceleration", "angular_rate", "orientation")
+
+    def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
+        self.publisher = create_publisher(node, Imu, topic)
+        self._message = Imu()
+        self._message.header.frame_id = parameters.imu_frame_id
+        self._message.angular_velocity_covariance = _covariance(parameters.angular_velocity_covariance)
+        self._message.linear_acceleration_covariance = _covariance(parameters.linear_acceleration_covariance)
+        self._known = _covariance(parameters.orientation_covariance)
+        self._unknown = [-1.0, *[0.0] * 8]  # REP 145
+        self._message.orientation_covariance = self._unknown
+        self._has_orientation = False
+        self._stamp = self._message.header.stamp
+        self._orientation = self._message.orientation
+        self._rate, self._acceleration = self._message.angular_velocity, self._message.linear_acceleration
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish acceleration, angular rate and, where there is one, the orientation."""
+        self._stamp.sec, self._stamp.nanosec = divmod(stamp_ns, _NS_PER_S)
+        a, r, q = self._acceleration, self._rate, self._orientation
+        a.x, a.y, a.z = sample.acceleration
+        r.x, r.y, r.z = sample.angular_rate
+        if sample.orientation is not None:
+            q.x, q.y, q.z, q.w = sample.orientation
+        if (sample.orientation is not None) is not self._has_orientation:
+            self._change_orientation(there=sample.orientation is not None)
+        self.publisher.publish(self._message)
+
+    def _change_orientation(self, *, there: bool) -> None:
+        self._has_orientation = there
+        self._message.orientation_covariance = self._known if there else self._unknown
+        if not there:
+            q = self._orientation
+            q.x, q.y, q.z, q.w = 0.0, 0.0, 0.0, 1.0
+
+
+class TemperatureOutput:
+    """`sensor_msgs/Temperature`: °C, inside the sensor."""
+
+    fields = ("temperature",)
+
+    def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
+        self.publisher = create_publisher(node, Temperature, topic)
+        self._message = Temperature(variance=parameters.temperature_variance)
+        self._message.header.frame_id = parameters.frame_id
+        self._stamp = self._message.header.stamp
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish the temperature."""
+        self._stamp.sec, self._stamp.nanosec = divmod(stamp_ns, _NS_PER_S)
+        self._message.temperature = sample.temperature
+        self.publisher.publish(self._message)
+
+
+def _covariance(values: Numbers) -> list[float]:
+    """Nine numbers, row by row, from nine or from three variances."""
+    if len(values) == 9:
+        return list(values)
+    return [values[place // 4] if place % 4 == 0 else 0.0 for place in range(9)]
+
+
+def _is_finite(value: float | Sequence[float] | None) -> bool:
+    if value is None:
         return True
+    return math.isfinite(sum(value) if isinstance(value, Sequence) else value)

@@ -15,9 +15,13 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
-from bridge.messages import ArrayOutput
+from bridge.messages import make
+from bridge.monitor import Monitor
 from bridge.parameters import ParameterError, declare
 from bridge.reader import Reader
+from bridge.requests import Requests
+from bridge.services import Services
+from bridge.settings_parameters import SettingsParameters
 from bridge.signals import call_on_stop_signal
 
 SUPERVISOR_TOPIC = "/supervisor_status_data"
@@ -32,8 +36,13 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         super().__init__("bridge")
         self.finished: Future = Future()
         parameters = declare(self)
-        outputs = [ArrayOutput(self, parameters.array_topic)]
+        outputs = make(self, parameters)
         self.reader = Reader(parameters, outputs, self.get_logger(), self._fail)
+        self.monitor = Monitor(self, parameters.thresholds, self.reader, outputs, self._fail)
+        self.requests = Requests(parameters, self.reader.link)
+        self.triggers = Services(self, self.reader.link, self.requests)
+        self.sensor_settings = SettingsParameters(self, self.reader.link, self.requests)
+        self.reader.link.on_change = self.sensor_settings.changed
         self.create_subscription(
             KeyValue,
             SUPERVISOR_TOPIC,
@@ -46,6 +55,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         """End the node, from any thread; the first call counts."""
         if not self.finished.done():
             self.finished.set_result(exit_code)
+        self.requests.cancel()
 
     def _fail(self, reason: str) -> None:
         self.get_logger().error(reason)
@@ -55,7 +65,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         if message.key != SUPERVISOR_KEY or message.value != SUPERVISOR_STOP or self.finished.done():
             return
         self.get_logger().info("the supervisor stops the force/torque sensors")
-        self.get_logger().info(self.reader.shut_server_down())
+        self.get_logger().info(self.requests.shut_server_down())
         self.finish(0)
 
 
@@ -83,12 +93,14 @@ def _spin(node: BridgeNode) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     node.reader.start()
+    node.monitor.start()
     try:
         executor.spin_until_future_complete(node.finished)
         return int(node.finished.result() if node.finished.done() else 0)
     finally:
-        if not node.reader.stop():
-            node.get_logger().error("the reader did not end in time")
+        stopped = node.monitor.stop() & node.reader.stop()
+        if not stopped:
+            node.get_logger().error("a thread did not end in time")
         executor.shutdown()
         node.destroy_node()
 

@@ -1,74 +1,23 @@
 """The node's parameters: one table, from which they are declared, checked, described and documented.
 
-All are read-only: they say what the node is. A wrong value ends the node at start with one sentence.
+All are read-only: they say what the node is. A wrong value ends the node at start with one sentence. The
+sensor's settings are parameters too, but the server's business: `settings_parameters`.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
+from bridge.parameter_row import Numbers, ParameterError, ParameterValue, Row
 from protocol.pdo import ImuUnits
 
-ParameterValue = bool | int | float | str
+__all__ = ["PARAMETERS", "ParameterError", "Parameters", "Thresholds", "declare"]
 
-
-class ParameterError(Exception):
-    """A parameter has a value that it cannot have; the text is one sentence."""
-
-
-class Row(NamedTuple):
-    """One parameter. The default's type is the parameter's."""
-
-    name: str
-    default: ParameterValue
-    description: str
-    low: float | None = None
-    high: float | None = None
-    choices: tuple[str, ...] = ()
-
-    def check(self, value: object) -> ParameterValue:
-        """Return `value`, a whole number as float where one is meant; ParameterError if it cannot be."""
-        wanted = type(self.default)
-        if wanted is float and type(value) is int:
-            value = float(value)
-        in_type = type(value) is wanted and (not isinstance(value, float) or math.isfinite(value))
-        if not in_type or not isinstance(value, bool | int | float | str) or not self._allows(value):
-            raise ParameterError(f"parameter {self.name} is {value!r}: it must be {self._choices_text()}")
-        return value
-
-    def _allows(self, value: ParameterValue) -> bool:
-        if isinstance(value, str):
-            return value in self.choices if self.choices else bool(value)
-        return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
-
-    def _choices_text(self) -> str:
-        if self.choices:
-            return " or ".join(self.choices)
-        if isinstance(self.default, str):
-            return "text that is not empty"
-        kind = "a whole number" if isinstance(self.default, int) else "a number"
-        return f"{kind} from {self.low:g} to {self.high:g}"
-
-    def descriptor(self) -> ParameterDescriptor:
-        """What `ros2 param describe` shows."""
-        descriptor = ParameterDescriptor(description=self.description, read_only=True)
-        if self.choices:
-            descriptor.additional_constraints = self._choices_text()
-        if self.low is not None and self.high is not None:
-            if isinstance(self.default, float):
-                descriptor.floating_point_range = [
-                    FloatingPointRange(from_value=float(self.low), to_value=float(self.high), step=0.0)
-                ]
-            else:
-                descriptor.integer_range = [
-                    IntegerRange(from_value=int(self.low), to_value=int(self.high), step=1)
-                ]
-        return descriptor
-
+_UNKNOWN: Final = (0.0, 0.0, 0.0)
+_COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"
 
 PARAMETERS: Final = (
     Row("server_host", "localhost", "Host that ethercat-server runs on"),
@@ -77,13 +26,38 @@ PARAMETERS: Final = (
     Row("sensor", 0, "The sensor's place on the bus, from 0", 0, 255),
     Row("publishing_frequency", 0.0, "Most messages a second, always the newest; 0 = every sample", 0, 1e6),
     Row("array_topic", "/sensone_sensor_data", "Topic of the Float64MultiArray"),
+    Row("frame_id", "ft_sensor", "Frame of the wrench (its origin is the sensor's) and of the temperature"),
+    Row("imu_frame_id", "ft_sensor_imu", "Frame of the IMU's messages"),
     Row(
         "imu_raw_units",
         ImuUnits.G_DPS.value,
         "What the sensor sends acceleration and angular rate in",
         choices=tuple(units.value for units in ImuUnits),
     ),
+    Row("orientation_covariance", _UNKNOWN, f"Of the IMU's orientation, rad²: {_COVARIANCE}", 0, 1e12),
+    Row("angular_velocity_covariance", _UNKNOWN, f"Of the IMU, (rad/s)²: {_COVARIANCE}", 0, 1e12),
+    Row("linear_acceleration_covariance", _UNKNOWN, f"Of the IMU, (m/s²)²: {_COVARIANCE}", 0, 1e12),
+    Row("temperature_variance", 0.0, "Of the temperature, K²; 0 = unknown", 0, 1e6),
+    Row("diagnostics.stale_after", 0.5, "Seconds without a new sample that are an error", 0.05, 60),
+    Row("diagnostics.rate_tolerance", 0.05, "Part by which the rate may differ before it is a warning", 0, 1),
+    Row("diagnostics.age_warn", 0.01, "Age of the samples (p99), s, from which it is a warning", 0, 60),
+    Row("diagnostics.age_error", 0.1, "Age of the samples (p99), s, from which it is an error", 0, 60),
+    Row("diagnostics.lost_warn", 1, "Samples lost or skipped in a second that are a warning", 1, 10**6),
+    Row("diagnostics.temperature_warn", 60.0, "Temperature, °C, from which it is a warning", -40, 200),
+    Row("diagnostics.temperature_error", 80.0, "Temperature, °C, from which it is an error", -40, 200),
 )
+
+
+class Thresholds(NamedTuple):
+    """From where on the diagnostics warn: the parameters `diagnostics.*`."""
+
+    stale_after: float = 0.5
+    rate_tolerance: float = 0.05
+    age_warn: float = 0.01
+    age_error: float = 0.1
+    lost_warn: int = 1
+    temperature_warn: float = 60.0
+    temperature_error: float = 80.0
 
 
 class Parameters(NamedTuple):
@@ -95,26 +69,29 @@ class Parameters(NamedTuple):
     publishing_frequency: float
     array_topic: str
     imu_units: ImuUnits
+    frame_id: str = "ft_sensor"
+    imu_frame_id: str = "ft_sensor_imu"
+    orientation_covariance: Numbers = _UNKNOWN
+    angular_velocity_covariance: Numbers = _UNKNOWN
+    linear_acceleration_covariance: Numbers = _UNKNOWN
+    temperature_variance: float = 0.0
+    thresholds: Thresholds = Thresholds()
 
 
 def declare(node: Node) -> Parameters:
     """Declare every parameter on `node` and return their values; ParameterError if one is wrong."""
-    values = {row.name: _declare(node, row) for row in PARAMETERS}
-    port, alias = values["server_port"], values["SERVER_PORT"]
+    # Of any type here: `Row.check` has made each what its default is.
+    values: dict[str, Any] = {row.name: _declare(node, row) for row in PARAMETERS}
+    port, alias = values["server_port"], values.pop("SERVER_PORT")
     if alias:
         if port not in (12001, alias):
             raise ParameterError(
                 f"parameters server_port is {port} and SERVER_PORT is {alias}: they are one thing, give one"
             )
-        port = alias
-    return Parameters(
-        server_host=str(values["server_host"]),
-        server_port=int(port),
-        sensor=int(values["sensor"]),
-        publishing_frequency=float(values["publishing_frequency"]),
-        array_topic=str(values["array_topic"]),
-        imu_units=ImuUnits(values["imu_raw_units"]),
-    )
+        values["server_port"] = alias
+    thresholds = Thresholds(**{name: values.pop(f"diagnostics.{name}") for name in Thresholds._fields})
+    units = ImuUnits(values.pop("imu_raw_units"))
+    return Parameters(**values, imu_units=units, thresholds=thresholds)
 
 
 def _declare(node: Node, row: Row) -> ParameterValue:

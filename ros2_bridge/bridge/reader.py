@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import TimeoutError as FutureTimeoutError
+from collections.abc import Callable, Mapping
 from typing import Any, Final, Protocol
 
 from bridge.connection import (
@@ -17,14 +16,15 @@ from bridge.connection import (
     ConnectionFailedError,
     UnreachableError,
     printable,
-    refusal,
 )
-from bridge.messages import Output
+from bridge.link import Link
+from bridge.messages import Outputs
 from bridge.parameters import Parameters
 from bridge.selection import FrameCounts, FrameSelector
+from bridge.watch import Watch
 from protocol.control import Event
 from protocol.framing import DataMessage, JsonObject
-from protocol.pdo import LAYOUTS, SampleDecoder
+from protocol.pdo import LAYOUTS, Sample, SampleDecoder
 
 _FIRST_DELAY_S: Final = 0.1
 _LONGEST_DELAY_S: Final = 1.0
@@ -51,19 +51,24 @@ class Log(Protocol):
 
 
 class Reader:
-    """Feeds `outputs` from the server until `stop`. `on_failure` hears of an error that should not be."""
+    """Feeds `outputs` from the server until `stop`. `on_failure` hears of an error that should not be.
+
+    `link` and `watch` are what it tells the other threads.
+    """
 
     def __init__(
-        self, parameters: Parameters, outputs: Sequence[Output], log: Log, on_failure: Callable[[str], object]
+        self, parameters: Parameters, outputs: Outputs, log: Log, on_failure: Callable[[str], object]
     ) -> None:
         self._parameters = parameters
-        self._outputs = tuple(outputs)
+        self._outputs = outputs
         self._log = log
         self._on_failure = on_failure
         self.counts = FrameCounts()
         self.not_finite = 0
         self._decoders = {size: SampleDecoder(size, parameters.imu_units) for size in LAYOUTS}
         self._address = f"{printable(parameters.server_host)}:{parameters.server_port}"
+        self.link = Link(self._address, parameters.sensor)
+        self.watch = Watch(parameters.sensor)
         self._stopping = threading.Event()
         self._connection: Connection | None = None
         self._problem: str | None = None
@@ -84,31 +89,6 @@ class Reader:
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
-    def shut_server_down(self, timeout_s: float = 3.0) -> str:
-        """Ask the server to shut down, from another thread; a sentence that says what came of it.
-
-        Uses the reader's connection, or where it has none makes one attempt of its own.
-        """
-        deadline = time.monotonic() + timeout_s
-        connection, own = self._connection, None
-        try:
-            if connection is None:
-                own = Connection(self._parameters.server_host, self._parameters.server_port, timeout_s)
-                reply = own.ask("shutdown")
-            else:
-                waiting = connection.send_request("shutdown")
-                reply = waiting.result(max(deadline - time.monotonic(), 0.1))
-                if reply.get("ok") is not True:
-                    return f"the server at {self._address} refused to shut down: {refusal(reply)}"
-        except FutureTimeoutError:
-            return f"the server at {self._address} did not answer the request to shut down"
-        except ConnectionFailedError as error:
-            return f"the server at {self._address} could not be told to shut down: {error}"
-        finally:
-            if own is not None:
-                own.close()
-        return f"the server at {self._address} is shutting down"
-
     def _run(self) -> None:
         try:
             self._connect_for_ever()
@@ -123,6 +103,7 @@ class Reader:
             try:
                 self._session()
             except ConnectionFailedError as error:
+                self.link.disconnected(str(error))
                 if self._stopping.is_set():
                     return
                 if time.monotonic() - began_s > _STEADY_S and not isinstance(error, UnreachableError):
@@ -143,6 +124,7 @@ class Reader:
             self._log.info(f"connected{again} to {self._address}: {info}")
             self._was_connected = True
             self._problem = None
+            self.link.connected(connection, info)
             self._stream(connection)
         finally:
             self._connection = None
@@ -155,32 +137,43 @@ class Reader:
             same_clock=connection.same_machine,
             limit_hz=self._parameters.publishing_frequency,
         )
-        decoders, outputs, monotonic_ns = self._decoders, self._outputs, time.monotonic_ns
+        decoders, outputs, watch, link = self._decoders, self._outputs, self.watch, self.link
+        monotonic_ns = time.monotonic_ns
         frames: list[DataMessage] = []
         silent = False
         self._take(connection, frames)  # what followed the reply
         while not self._stopping.is_set():
             more = connection.receive()
             if more is None:
-                if not silent:
-                    self._log.warning(f"nothing came from {self._address} for {SILENCE_S:g} s")
-                silent = True
+                silent = silent or self._say_silent()
                 continue
-            if silent:
-                self._log.info(f"{self._address} sends again")
-                silent = False
             self._take(connection, frames)
             reads = 1
             while more and reads < _MAX_READS:
                 more = connection.receive(wait=False)
                 self._take(connection, frames)
                 reads += 1
+            silent = silent and (not frames or self._say_no_more_silent())
+            watch.see(frames)
+            selector.rate_hz = link.rate_hz
             for frame in selector.select(frames, monotonic_ns()):
                 sample = decoders[len(frame.process_data)].decode(frame.process_data)
-                for output in outputs:
-                    if not output.publish(sample, frame.stamp_ns):
-                        self._count_not_finite()
+                if sample.is_finite:
+                    for output in outputs.wanted:
+                        output.publish(sample, frame.stamp_ns)
+                    watch.sample = sample
+                else:
+                    self._publish_finite(sample, frame.stamp_ns)
+                watch.ages.append(monotonic_ns() - frame.monotonic_ns)
             frames.clear()
+
+    def _say_silent(self) -> bool:
+        self._log.warning(f"nothing came from {self._address} for {SILENCE_S:g} s")
+        return True
+
+    def _say_no_more_silent(self) -> bool:
+        self._log.info(f"{self._address} sends again")
+        return False
 
     def _take(self, connection: Connection, frames: list[DataMessage]) -> None:
         """Move every whole message that has been received to `frames`; answer the others."""
@@ -192,7 +185,8 @@ class Reader:
             elif not connection.take_reply(message):
                 self._say_event(message)
 
-    def _count_not_finite(self) -> None:
+    def _publish_finite(self, sample: Sample, stamp_ns: int) -> None:
+        self._outputs.publish_finite(sample, stamp_ns)
         self.not_finite += 1
         now_s = time.monotonic()
         if now_s >= self._next_warning_s:
@@ -202,7 +196,7 @@ class Reader:
             )
 
     def _say_event(self, message: JsonObject) -> None:
-        if "event" not in message:
+        if "event" not in message or not self.link.take_event(message):
             return
         event = printable(message["event"], 40)
         details = {key: value for key, value in message.items() if key != "event"}

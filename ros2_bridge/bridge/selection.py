@@ -43,7 +43,7 @@ class FrameCounts:
     gaps: int = 0
     """Frames that the server marked with GAP."""
     lost: int = 0
-    """Samples missing in those gaps, as far as `sequence` tells; at least one a gap."""
+    """Samples missing in those gaps, as `sequence` and the time between tell; at least one a gap."""
     skipped: int = 0
     """Fresh frames left out because newer ones were waiting."""
     limited: int = 0
@@ -60,6 +60,9 @@ class FrameSelector:
         self._limit = RateLimit(limit_hz) if limit_hz > 0 else None
         self._sequence = -1
         self._monotonic_ns = -1
+        self._fresh_ns = -1
+        self.rate_hz = 0.0
+        """The sensor's rate, if it is known: samples that the server never saw have no number."""
         self._same_clock = same_clock
         self._offset_ns: int | None = 0 if same_clock else None
         self._now_ns = 0
@@ -120,6 +123,8 @@ class FrameSelector:
         if flags & _GAP:
             counts.gaps += 1
             missing = sequence - self._sequence - 1 if self._sequence >= 0 else 1
+            if self._fresh_ns >= 0 and self.rate_hz:
+                missing = max(missing, round((monotonic_ns - self._fresh_ns) * self.rate_hz / 1e9) - 1)
             counts.lost += max(missing, 1)
         self._sequence, self._monotonic_ns = sequence, monotonic_ns
         if flags & _INVALID:
@@ -129,6 +134,7 @@ class FrameSelector:
             counts.repeated += 1
             return False
         counts.fresh += 1
+        self._fresh_ns = monotonic_ns
         return True
 
 

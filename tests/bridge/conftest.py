@@ -44,7 +44,7 @@ class Listener:
         self.topic, self.supervisor_topic = f"/{self.tag}/array", f"/{self.tag}/supervisor"
         self.messages: queue.Queue[Any] = queue.Queue()
         self._key_value = KeyValue
-        self._node = rclpy.create_node(self.tag)
+        self.node = self._node = rclpy.create_node(self.tag)
         self._node.create_subscription(Float64MultiArray, self.topic, self.messages.put, 2000)
         self._supervisor = self._node.create_publisher(KeyValue, self.supervisor_topic, 10)
         self._executor = SingleThreadedExecutor()
@@ -56,6 +56,47 @@ class Listener:
         self._executor.shutdown()
         self._thread.join(5)
         self._node.destroy_node()
+
+    def subscribe(self, message_type: Any, topic: str) -> queue.Queue[Any]:
+        """What comes on a topic of the node's namespace from now on."""
+        messages: queue.Queue[Any] = queue.Queue()
+        self._node.create_subscription(message_type, f"/{self.tag}/{topic}", messages.put, 2000)
+        return messages
+
+    def call(self, service_type: Any, name: str, request: Any = None) -> Any:
+        """The response of one of the node's services."""
+        client = self._node.create_client(service_type, f"/{self.tag}/bridge/{name}")
+        try:
+            assert client.wait_for_service(PATIENCE_S), f"no service {name}"
+            done: queue.Queue[Any] = queue.Queue()
+            client.call_async(request or service_type.Request()).add_done_callback(done.put)
+            return done.get(timeout=PATIENCE_S).result()
+        finally:
+            self._node.destroy_client(client)
+
+    def trigger(self, name: str) -> tuple[bool, str]:
+        """Whether a Trigger service did it, and what it says."""
+        from std_srvs.srv import Trigger
+
+        response = self.call(Trigger, name)
+        return response.success, response.message
+
+    def parameters(self, *names: str) -> list[Any]:
+        """The values of the node's parameters; None is NOT_SET."""
+        from rcl_interfaces.srv import GetParameters
+        from rclpy.parameter import parameter_value_to_python
+
+        response = self.call(GetParameters, "get_parameters", GetParameters.Request(names=names))
+        return [parameter_value_to_python(value) for value in response.values]
+
+    def set_parameter(self, name: str, value: Any) -> tuple[bool, str]:
+        """Whether the node took the value, and why not."""
+        from rcl_interfaces.srv import SetParameters
+        from rclpy.parameter import Parameter
+
+        message = Parameter(name, value=value).to_parameter_msg()
+        response = self.call(SetParameters, "set_parameters", SetParameters.Request(parameters=[message]))
+        return response.results[0].successful, response.results[0].reason
 
     def next_number(self) -> float:
         """The first value of the next message: the number that the sample was made from."""
@@ -142,8 +183,13 @@ def starter(listener: Listener) -> Iterator[Start]:
     def start_node(port: int, **parameters: object) -> NodeProcess:
         values = {"server_port": port, "array_topic": listener.topic, **parameters}
         options = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
-        remap = f"/supervisor_status_data:={listener.supervisor_topic}"
-        started.append(NodeProcess("--ros-args", "-r", remap, *options))
+        remaps = (
+            f"/supervisor_status_data:={listener.supervisor_topic}",
+            f"/diagnostics:=/{listener.tag}/diagnostics",
+            f"__ns:=/{listener.tag}",
+        )
+        options += [word for remap in remaps for word in ("-r", remap)]
+        started.append(NodeProcess("--ros-args", *options))
         return started[-1]
 
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,13 @@ def test_defaults_are_the_contracts() -> None:
     defaults = {name: row.default for name, row in ROWS.items()}
     assert defaults == {
         "server_host": "localhost", "server_port": 12001, "SERVER_PORT": 0, "sensor": 0,
-        "publishing_frequency": 0.0, "array_topic": "/sensone_sensor_data", "imu_raw_units": "g_dps",
+        "publishing_frequency": 0.0, "array_topic": "/sensone_sensor_data", "frame_id": "ft_sensor",
+        "imu_frame_id": "ft_sensor_imu", "imu_raw_units": "g_dps", "temperature_variance": 0.0,
+        "orientation_covariance": (0.0, 0.0, 0.0), "angular_velocity_covariance": (0.0, 0.0, 0.0),
+        "linear_acceleration_covariance": (0.0, 0.0, 0.0), "diagnostics.stale_after": 0.5,
+        "diagnostics.rate_tolerance": 0.05, "diagnostics.age_warn": 0.01, "diagnostics.age_error": 0.1,
+        "diagnostics.lost_warn": 1, "diagnostics.temperature_warn": 60.0,
+        "diagnostics.temperature_error": 80.0,
     }  # fmt: skip
     assert all(row.check(row.default) == row.default for row in PARAMETERS)
 
@@ -29,7 +36,8 @@ def test_defaults_are_the_contracts() -> None:
 def test_the_configuration_file_says_the_same() -> None:
     pairs = (line.split("#")[0].partition(":") for line in CONFIG.read_text().splitlines())
     given = {name.strip(): value.strip() for name, _, value in pairs if value.strip()}
-    assert given == {name: str(row.default) for name, row in ROWS.items() if name != "SERVER_PORT"}
+    defaults = {name: row.default for name, row in ROWS.items() if name != "SERVER_PORT"}
+    assert given == {name: str([*d] if isinstance(d, tuple) else d) for name, d in defaults.items()}
 
 
 @pytest.mark.parametrize(
@@ -39,7 +47,10 @@ def test_the_configuration_file_says_the_same() -> None:
         ("server_port", "12001"), ("server_port", True), ("server_port", 12001.0), ("server_port", None),
         ("sensor", -1), ("sensor", 256), ("publishing_frequency", -1.0), ("publishing_frequency", math.nan),
         ("publishing_frequency", math.inf), ("publishing_frequency", True), ("publishing_frequency", "fast"),
-        ("imu_raw_units", "SI"), ("imu_raw_units", ""), ("array_topic", ""),
+        ("imu_raw_units", "SI"), ("imu_raw_units", ""), ("array_topic", ""), ("frame_id", ""),
+        ("orientation_covariance", 0.1), ("orientation_covariance", [0.1]),
+        ("orientation_covariance", "abc"), ("orientation_covariance", [0.1, 0.1, math.nan]),
+        ("linear_acceleration_covariance", [True, False, True]), ("diagnostics.stale_after", 0.0),
     ],
 )  # fmt: skip
 def test_wrong_values_are_named(name: str, value: Any) -> None:
@@ -51,6 +62,11 @@ def test_a_whole_number_is_a_number() -> None:
     checked = ROWS["publishing_frequency"].check(100)
     assert checked == 100.0
     assert isinstance(checked, float)
+
+
+@pytest.mark.parametrize("value", [[1, 2, 3], array("d", [1, 2, 3]), [0.5] * 9, [-0.5] * 9])
+def test_a_covariance_is_three_or_nine_numbers(value: Any) -> None:
+    assert ROWS["orientation_covariance"].check(value) == tuple(map(float, value))
 
 
 def test_every_parameter_describes_itself() -> None:

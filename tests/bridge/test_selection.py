@@ -78,6 +78,14 @@ def test_lost_samples_are_counted_where_the_server_says_so() -> None:
     assert counts.lost == 3 + 1  # 2, 3, 4, and at least one before 6; repeated frames withheld are no loss
 
 
+def test_samples_that_the_server_never_saw_are_counted_by_time() -> None:
+    select, counts = selector()
+    select.rate_hz = 800.0
+    select.select([frame(1, sequence=1), frame(900, INVALID, sequence=2)], 900 * PERIOD_NS)
+    select.select([frame(1001, GAP, sequence=3), frame(1002, sequence=4)], 1002 * PERIOD_NS)
+    assert counts.lost == 999
+
+
 def test_a_gap_in_the_first_frame_counts_one() -> None:
     select, counts = selector()
     select.select([frame(1_000_000, GAP)], 1_000_000 * PERIOD_NS)

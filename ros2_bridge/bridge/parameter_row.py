@@ -1,0 +1,84 @@
+"""One row of the table of parameters: its default, what it may be, and how it is described."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+
+Numbers = tuple[float, ...]
+ParameterValue = bool | int | float | str | Numbers
+_LENGTHS: Final = (3, 9)
+
+
+class ParameterError(Exception):
+    """A parameter has a value that it cannot have; the text is one sentence."""
+
+
+class Row(NamedTuple):
+    """One parameter. The default's type is the parameter's; a tuple is a covariance, 3 or 9 numbers."""
+
+    name: str
+    default: ParameterValue
+    description: str
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+
+    def check(self, value: object) -> ParameterValue:
+        """Return `value`, a whole number as float where one is meant; ParameterError if it cannot be."""
+        checked = self._numbers(value) if isinstance(self.default, tuple) else self._one(value)
+        if checked is None:
+            raise ParameterError(f"parameter {self.name} is {value!r}: it must be {self._choices_text()}")
+        return checked
+
+    def _one(self, value: object) -> ParameterValue | None:
+        wanted = type(self.default)
+        if wanted is float and type(value) is int:
+            value = float(value)
+        if type(value) is not wanted or not isinstance(value, bool | int | float | str):
+            return None
+        if isinstance(value, str):
+            allowed = value in self.choices if self.choices else bool(value)
+        else:
+            allowed = math.isfinite(value) and self._in_range(value)
+        return value if allowed else None
+
+    def _numbers(self, value: object) -> Numbers | None:
+        # rclpy gives an array.array or a list, of whole numbers if all are.
+        items = list(value) if hasattr(value, "__iter__") and not isinstance(value, str | bytes) else []
+        if len(items) not in _LENGTHS or not all(type(item) in (int, float) for item in items):
+            return None
+        if not all(math.isfinite(item) and self._in_range(abs(item)) for item in items):
+            return None
+        return tuple(float(item) for item in items)
+
+    def _in_range(self, value: float) -> bool:
+        return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
+
+    def _choices_text(self) -> str:
+        if self.choices:
+            return " or ".join(self.choices)
+        if isinstance(self.default, str):
+            return "text that is not empty"
+        if isinstance(self.default, tuple):
+            return "3 numbers, the variances, or 9, the covariance row by row"
+        kind = "a whole number" if isinstance(self.default, int) else "a number"
+        return f"{kind} from {self.low:g} to {self.high:g}"
+
+    def descriptor(self) -> ParameterDescriptor:
+        """What `ros2 param describe` shows."""
+        descriptor = ParameterDescriptor(description=self.description, read_only=True)
+        if self.choices or isinstance(self.default, tuple):
+            descriptor.additional_constraints = self._choices_text()
+        if self.low is not None and self.high is not None:
+            if isinstance(self.default, int):
+                descriptor.integer_range = [
+                    IntegerRange(from_value=int(self.low), to_value=int(self.high), step=1)
+                ]
+            elif isinstance(self.default, float):
+                descriptor.floating_point_range = [
+                    FloatingPointRange(from_value=float(self.low), to_value=float(self.high), step=0.0)
+                ]
+        return descriptor

@@ -1,0 +1,89 @@
+"""The node's services, all `std_srvs/Trigger`: the server does the work, the message says what came of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any, Final
+
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from bridge.connection import ConnectionFailedError, find_sensor
+from bridge.link import Link
+from bridge.requests import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, RequestFailedError, Requests
+
+_AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+_TARE_S: Final = 0.5
+"""How long a tare averages."""
+_FEWEST_SAMPLES, _MOST_SAMPLES = 20, 2000
+_TARE_PATIENCE: Final = 6.0
+"""The server may take so many times as long as the samples should: it takes them twice."""
+_TARE_EXTRA_S: Final = 4.0
+
+
+class Services:
+    """Each blocks the executor until the server has answered or a time-out, and never the stream."""
+
+    def __init__(self, node: Node, link: Link, requests: Requests) -> None:
+        self._link, self._requests, self._log = link, requests, node.get_logger()
+        for name, act in (
+            ("sensor_tare", self._sensor_tare),
+            ("get_settings", self._get_settings),
+            ("save_settings", self._save_settings),
+        ):
+            node.create_service(Trigger, f"~/{name}", self._answering(name, act))
+
+    def _answering(self, name: str, act: Callable[[], str]) -> Callable[[Any, Any], Any]:
+        def answer(_request: Any, response: Any) -> Any:
+            try:
+                response.message = act()
+                response.success = True
+            except RequestFailedError as error:
+                response.message = str(error)
+                response.success = False
+                self._log.warning(f"{name} failed: {error}")
+            return response
+
+        return answer
+
+    def _sensor_tare(self) -> str:
+        rate_hz = self._link.rate_hz or 800.0
+        samples = min(max(round(_TARE_S * rate_hz), _FEWEST_SAMPLES), _MOST_SAMPLES)
+        timeout_s = _TARE_EXTRA_S + _TARE_PATIENCE * samples / rate_hz
+        reply = self._requests.ask("tare", timeout_s, sensor=self._link.sensor, samples=samples)
+        titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
+        parts = [f"{title} {_wrench_text(reply.get(key))}" for key, title in titles]
+        text = f"sensor {self._link.sensor} tared (N, Nm): " + "; ".join(parts)
+        self._log.info(text)
+        return text
+
+    def _get_settings(self) -> str:
+        reply = self._requests.ask("describe", DESCRIBE_TIMEOUT_S)
+        try:
+            info = find_sensor(reply, self._link.sensor)
+        except ConnectionFailedError as error:
+            raise RequestFailedError(str(error)) from None
+        return json.dumps({**info.settings, "rate_hz": info.rate})
+
+    def _save_settings(self) -> str:
+        # `configure` wants at least one setting: one as it is.
+        setting = next(iter(self._link.settings.items()), None)
+        if setting is None:
+            raise RequestFailedError(
+                f"the settings of sensor {self._link.sensor} are not known: there is no server at "
+                f"{self._link.address}, or the sensor has none"
+            )
+        name, value = setting
+        self._requests.ask(
+            "configure", CONFIGURE_TIMEOUT_S, sensor=self._link.sensor, settings={name: value}, save=True
+        )
+        text = f"sensor {self._link.sensor} keeps its settings and offset in its flash now"
+        self._log.info(text)
+        return text
+
+
+def _wrench_text(values: object) -> str:
+    if not isinstance(values, list) or len(values) != 6 or not all(type(v) in (int, float) for v in values):
+        return "unknown"
+    return " ".join(f"{axis} {value:.4f}" for axis, value in zip(_AXES, values, strict=True))

@@ -1,0 +1,188 @@
+"""/diagnostics: what it says of a healthy stream and of what can be wrong. One node for all tests."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
+
+from protocol.framing import DataFlag
+from protocol.pdo import encode
+from protocol.warnings_register import WARNINGS
+from tests.bridge.conftest import Listener, NodeProcess, starter
+from tests.bridge.scripted_server import ScriptedServer
+from tests.bridge.streaming import Diagnostics, Stream, status, streaming, streaming_description, values
+
+pytestmark = pytest.mark.ros
+OK, WARN, ERROR, STALE = range(4)
+HEALTHY = {"link": OK, "stream": OK, "sensor": OK, "clock": OK}
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ScriptedServer]:
+    with ScriptedServer() as scripted:
+        yield scripted
+
+
+@pytest.fixture(scope="module")
+def stream(server: ScriptedServer) -> Iterator[Stream]:
+    with streaming(server) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def listener(_ros: None) -> Iterator[Listener]:
+    opened = Listener()
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def node(server: ScriptedServer, stream: Stream, listener: Listener) -> Iterator[NodeProcess]:
+    with starter(listener) as start:
+        # This machine may be busy: ages are judged in test_health.
+        yield start(server.port, **{"diagnostics.age_warn": 1.0, "diagnostics.rate_tolerance": 0.2})
+
+
+@pytest.fixture(scope="module")
+def _diagnostics(listener: Listener, node: NodeProcess) -> Diagnostics:
+    return Diagnostics(listener)
+
+
+@pytest.fixture
+def diagnostics(_diagnostics: Diagnostics, node: NodeProcess) -> Iterator[Diagnostics]:
+    _diagnostics.until(**HEALTHY)
+    yield _diagnostics
+    assert node.process.poll() is None
+    assert "Traceback" not in node.log
+
+
+def test_a_healthy_stream(diagnostics: Diagnostics) -> None:
+    diagnostics.until(**HEALTHY)
+    began = time.monotonic()
+    for _ in range(2):
+        array = diagnostics.next()
+    assert 1.5 < time.monotonic() - began < 2.7  # once a second
+    assert set(array) == set(HEALTHY)
+    assert {item.hardware_id for item in array.values()} == {"BFT-SENS-ECAT-M8 1"}
+    link, stream, sensor, clock = (values(array[name]) for name in HEALTHY)
+    assert (link["connected"], link["reconnects"]) == ("true", "0")
+    assert link["address"].startswith("localhost:")
+    assert 80 < float(stream["rate_hz"]) < 120
+    assert stream["expected_hz"] == "100.0"
+    assert 0 < float(stream["age_p50_us"]) <= float(stream["age_p99_us"])
+    for key in ("lost", "skipped", "repeated", "invalid", "server_lost", "server_late_p99_us"):
+        assert stream[key].replace(".", "").isdigit(), key
+    assert (sensor["serial"], sensor["al_state"]) == ("1", "OP")
+    assert (clock["mode"], clock["uncertainty_us"]) == ("locked", "5.0")
+
+
+def test_warning_bits_of_one_frame_each_are_told_once(diagnostics: Diagnostics, stream: Stream) -> None:
+    began = time.monotonic()
+    for row in WARNINGS:
+        stream.once(process_data=encode(61, {"warnings": row.flag}))
+    first = diagnostics.until(sensor=ERROR)
+    assert time.monotonic() - began < 0.8  # at once
+    sensor = (first if len(first["sensor"].message) > 400 else diagnostics.next())["sensor"]
+    for row in WARNINGS:
+        assert f"{row.meaning}: {row.remedy}" in sensor.message
+    assert int(values(sensor)["warnings_register"], 16) == 0x7F
+    assert diagnostics.until(sensor=OK)["sensor"].message == "as it should be"
+
+
+def test_saturation_and_heat(diagnostics: Diagnostics, stream: Stream) -> None:
+    stream.once(process_data=encode(61, {"force_torque_saturated": 0b101}))
+    sensor = diagnostics.until(sensor=WARN)["sensor"]
+    assert "force torque saturated: axes 0x5" in sensor.message
+    diagnostics.until(sensor=OK)
+    stream.changes = {"process_data": encode(61, {"temperature": 85.0})}
+    assert "85.0 °C" in diagnostics.until(sensor=ERROR)["sensor"].message
+    stream.changes = {}
+
+
+def test_lost_samples_are_counted(diagnostics: Diagnostics, stream: Stream, server: ScriptedServer) -> None:
+    server.sequence += 7
+    stream.once(flags=DataFlag.GAP)
+    array = diagnostics.until(stream=WARN)
+    assert "7 samples lost" in array["stream"].message
+    diagnostics.until(**HEALTHY)
+    server.answers["status"] = lambda _: status(lost_samples=11)
+    array = diagnostics.until(stream=WARN)
+    assert "11 samples lost" in array["stream"].message
+    assert values(array["stream"])["server_lost"] == "11"
+
+
+def test_another_rate_than_expected(diagnostics: Diagnostics, stream: Stream, server: ScriptedServer) -> None:
+    server.description["sensors"][0]["rate_hz"] = 200
+    assert "samples a second instead of 200" in diagnostics.until(stream=WARN)["stream"].message
+    server.description = streaming_description()
+
+
+def test_a_sensor_that_repeats_itself(diagnostics: Diagnostics, stream: Stream) -> None:
+    stream.changes = {"flags": DataFlag.REPEATED}
+    array = diagnostics.until(stream=ERROR, sensor=STALE, clock=STALE)
+    assert "the same sample again and again" in array["stream"].message
+    stream.changes = {}
+
+
+def test_a_lost_sensor(diagnostics: Diagnostics, stream: Stream, server: ScriptedServer) -> None:
+    server.send_json({"event": "sensor_lost", "sensor": 1, "message": "another one"})
+    stream.changes = {"flags": DataFlag.INVALID}
+    server.send_json({"event": "sensor_lost", "sensor": 0, "message": "sensor 0 is lost: no power"})
+    array = diagnostics.until(sensor=ERROR, stream=ERROR, clock=STALE)
+    assert array["sensor"].message.startswith("sensor 0 is lost: no power")
+    assert "sensor 0 is lost: no power" in array["stream"].message
+    stream.changes = {}
+    server.send_json({"event": "sensor_back", "sensor": 0})
+
+
+def test_a_clock_that_is_not_followed(diagnostics: Diagnostics, server: ScriptedServer) -> None:
+    server.answers["status"] = lambda _: status(mode="oversampling", lost_samples=11)
+    assert "oversampling" in diagnostics.until(clock=WARN)["clock"].message
+    server.answers["status"] = lambda _: status(lost_samples=11)
+
+
+def test_a_server_that_does_not_answer(diagnostics: Diagnostics, server: ScriptedServer) -> None:
+    owed: list[dict[str, object]] = []
+
+    def keep(message: dict[str, object]) -> None:
+        owed.append(message)
+
+    answer = server.answers["status"]
+    server.answers["status"] = keep
+    array = diagnostics.until(link=WARN)
+    assert "has not answered" in array["link"].message
+    assert array["stream"].level[0] == OK  # samples come all the same
+    assert len(owed) == 1  # it is not asked again before it has answered
+    server.answers["status"] = answer
+    server.send_json({"reply": "status", "id": owed[0]["id"], **status()})
+
+
+def test_a_server_that_is_gone_and_comes_back(
+    diagnostics: Diagnostics, stream: Stream, server: ScriptedServer
+) -> None:
+    stream.paused = True
+    server.description = {**streaming_description(), "sensors": []}
+    server.drop()
+    array = diagnostics.until(link=ERROR, stream=STALE, sensor=STALE, clock=STALE)
+    for words in ("no server at localhost:", "start ethercat-server"):
+        assert words in array["link"].message
+    assert values(array["link"])["connected"] == "false"
+    server.description = streaming_description()
+    stream.paused = False
+    array = diagnostics.until(**HEALTHY)
+    assert values(array["link"])["reconnects"] == "1"
+
+
+def test_a_node_that_stood_still(diagnostics: Diagnostics, node: NodeProcess) -> None:
+    node.send_signal(signal.SIGSTOP)
+    time.sleep(2.0)
+    diagnostics.forget()
+    node.send_signal(signal.SIGCONT)
+    array = diagnostics.until(stream=WARN)
+    assert "old samples skipped" in array["stream"].message
+    assert int(values(array["stream"])["skipped"]) > 100

@@ -1,0 +1,109 @@
+"""The judgement: each thing that can be wrong, its level and its words; hostile replies are survived."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
+
+from bridge.connection import SensorInfo
+from bridge.health import Level, Status, judge, text_of
+from bridge.parameters import Thresholds
+from bridge.selection import FrameCounts
+from bridge.snapshot import Snapshot
+from bridge.watch import Flags, Watch
+from protocol.framing import DataMessage
+from protocol.pdo import encode
+from protocol.warnings_register import WARNINGS, Severity
+
+pytestmark = pytest.mark.ros
+SAFEOP = SensorInfo(0, "", "", "", "SAFEOP")
+GOOD = Snapshot(
+    sensor=0, address="localhost:1", connected=True, problem="", connection_s=5.0, connects=1, new_connects=0,
+    info=SensorInfo(0, "name", "7", "800", "OP"), lost=None, silent_s=0.0, rate_hz=800.0, expected_hz=800.0,
+    age_us=(100.0, 300.0), counts=FrameCounts(), new=FrameCounts(), not_finite=0, new_not_finite=0,
+    flags=Flags(), temperature=30.0, server={"sensors": [{"clock": {"mode": "locked"}}]}, new_server_lost=0,
+    answer_s=0.0,
+)  # fmt: skip
+
+
+def statuses(**changes: Any) -> dict[str, Status]:
+    return {status.name: status for status in judge(GOOD._replace(**changes), Thresholds())}
+
+
+def test_good_is_good() -> None:
+    assert [status.level for status in statuses().values()] == [Level.OK] * 4
+    assert statuses()["stream"].message == "800 samples a second"
+
+
+@pytest.mark.parametrize(
+    ("name", "level", "words", "changes"),
+    [
+        ("link", Level.ERROR, "no server at localhost:1: gone", {"connected": False, "problem": "gone"}),
+        ("stream", Level.STALE, "see link", {"connected": False}),
+        ("sensor", Level.STALE, "see link", {"connected": False}),
+        ("clock", Level.STALE, "see stream", {"connected": False}),
+        ("link", Level.WARN, "has not answered for 3 s", {"answer_s": 3.0}),
+        ("link", Level.WARN, "again", {"connects": 2, "new_connects": 1}),
+        ("stream", Level.ERROR, "no new sample for 0.6 s", {"silent_s": 0.6}),
+        ("stream", Level.ERROR, "stopped or overloaded", {"silent_s": 2.0, "answer_s": 1.5}),
+        ("stream", Level.ERROR, "in state SAFEOP", {"silent_s": 2.0, "info": SAFEOP}),
+        ("stream", Level.ERROR, "again and again", {"silent_s": 2.0, "new": FrameCounts(repeated=1)}),
+        ("stream", Level.ERROR, "take part", {"silent_s": 2.0, "new": FrameCounts(invalid=1)}),
+        ("stream", Level.WARN, "700 samples a second instead of 800", {"rate_hz": 700.0}),
+        ("stream", Level.OK, "798", {"rate_hz": 798.0}),
+        ("stream", Level.WARN, "12.0 ms old", {"age_us": (1.0, 12_000.0)}),
+        ("stream", Level.ERROR, "120.0 ms old", {"age_us": (1.0, 120_000.0)}),
+        ("stream", Level.WARN, "3 samples lost", {"new": FrameCounts(lost=3)}),
+        ("stream", Level.WARN, "4 samples lost", {"new_server_lost": 4}),
+        ("stream", Level.WARN, "5 old samples skipped", {"new": FrameCounts(skipped=5)}),
+        ("stream", Level.WARN, "not finite", {"new_not_finite": 1}),
+        ("sensor", Level.ERROR, "no power; check its cable", {"lost": "no power"}),
+        ("sensor", Level.STALE, "see stream", {"silent_s": 2.0}),
+        ("sensor", Level.WARN, "force torque saturated: axes 0x2", {"flags": Flags(0, 0, 2)}),
+        ("sensor", Level.WARN, "61.0 °C", {"temperature": 61.0}),
+        ("sensor", Level.ERROR, "81.0 °C", {"temperature": 81.0}),
+        ("clock", Level.STALE, "not said", {"server": {}}),
+        ("clock", Level.WARN, "oversampling", {"server": {"sensors": [{"clock": {"mode": "oversampling"}}]}}),
+        ("clock", Level.STALE, "not said", {"server": {"sensors": 5, "last_10s": [], "uptime_s": {}}}),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said(name: str, level: Level, words: str, changes: dict[str, Any]) -> None:
+    status = statuses(**changes)[name]
+    assert status.level == level
+    assert words in status.message
+
+
+@pytest.mark.parametrize("row", WARNINGS, ids=lambda row: str(row.flag))
+def test_each_bit_has_its_level_and_remedy(row: Any) -> None:
+    status = statuses(flags=Flags(warnings=row.flag))["sensor"]
+    assert status.level == (Level.WARN if row.severity is Severity.WARNING else Level.ERROR)
+    assert status.message == f"{row.meaning}: {row.remedy}"
+
+
+def test_the_worst_comes_first() -> None:
+    status = statuses(flags=Flags(warnings=0x61))["sensor"]
+    assert status.level == Level.ERROR
+    assert status.message.index("saturated") < status.message.index("Overtemperature")
+
+
+def test_values_are_printable_text() -> None:
+    assert [text_of(v) for v in (True, 1.5, "a\x1bb", "")] == ["true", "1.5", "a?b", ""]
+
+
+def test_flags_of_one_frame_are_kept_until_taken() -> None:
+    watch = Watch(0)
+
+    def see(sensor: int = 0, **fields: float) -> None:
+        watch.see([DataMessage(1, 0, 0, sensor, 0, 3, encode(61, fields))])
+
+    see(warnings=1, status=2)
+    see(warnings=4, force_torque_saturated=8)
+    see(sensor=1, warnings=64)
+    see()
+    assert watch.take_flags() == (2, 5, 8, 0, 0)
+    assert watch.take_flags() == (0, 0, 0, 0, 0)
+    see(warnings=32)
+    assert [watch.take_flags().warnings for _ in range(2)] == [32, 32]  # it is still set

@@ -1,0 +1,226 @@
+"""Services and the settings as parameters: granted, refused, unanswered; the stream goes on meanwhile."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
+
+from protocol.control import ErrorCode, Event, event
+from protocol.framing import JsonObject
+from protocol.settings import SETTINGS as TABLE
+from tests.bridge.conftest import Listener, NodeProcess, starter, wait_until
+from tests.bridge.scripted_server import ScriptedServer
+from tests.bridge.streaming import SETTINGS, Stream, streaming
+
+pytestmark = pytest.mark.ros
+NAMES = ("settings.sinc_length", "settings.fir", "settings.acceleration_range_g", "settings.chop")
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ScriptedServer]:
+    with ScriptedServer() as scripted:
+        yield scripted
+
+
+@pytest.fixture(scope="module")
+def stream(server: ScriptedServer) -> Iterator[Stream]:
+    with streaming(server) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def listener(_ros: None) -> Iterator[Listener]:
+    opened = Listener()
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def _node(server: ScriptedServer, stream: Stream, listener: Listener) -> Iterator[NodeProcess]:
+    with starter(listener) as start:
+        yield start(server.port, **{"settings.sinc_length": 64})
+
+
+@pytest.fixture(autouse=True)
+def node(_node: NodeProcess, listener: Listener) -> Iterator[NodeProcess]:
+    wait_until(lambda: listener.parameters(*NAMES) == [512, False, 2, None], "the server's settings")
+    yield _node
+    assert _node.process.poll() is None
+    assert "Traceback" not in _node.log
+
+
+def refuse(message: str, code: str = ErrorCode.SENSOR) -> JsonObject:
+    return {"ok": False, "error": {"code": str(code), "message": message}}
+
+
+def test_settings_given_at_start_are_not_taken_in_silence(node: NodeProcess, server: ScriptedServer) -> None:
+    assert "parameter settings.sinc_length is given at start and ignored" in node.log
+    assert "--set sinc_length=64" in node.log
+    assert not [r for r in server.requests if r["action"] == "configure"]
+
+
+def test_tare(server: ScriptedServer, listener: Listener) -> None:
+    asked: list[JsonObject] = []
+
+    def answer(message: JsonObject) -> JsonObject:
+        asked.append(message)
+        return {"ok": True, "old_offset": [1, 2, 3, 4, 5, 6], "new_offset": [0.5] * 6, "residual": [1e-3] * 6}
+
+    server.answers["tare"] = answer
+    done, text = listener.trigger("sensor_tare")
+    assert done
+    assert "old offset Fx 1.0000 Fy 2.0000" in text
+    assert "new offset Fx 0.5000" in text
+    assert "residual Fx 0.0010" in text
+    assert (asked[0]["sensor"], asked[0]["samples"]) == (0, 50)  # half a second
+
+
+def test_a_refusal_in_the_servers_own_words(server: ScriptedServer, listener: Listener) -> None:
+    server.answers["tare"] = lambda _: refuse("sensor 0 is not at rest: hold it still", ErrorCode.NOT_READY)
+    assert listener.trigger("sensor_tare") == (False, "sensor 0 is not at rest: hold it still (not_ready)")
+    server.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
+    assert listener.set_parameter("settings.fir", True) == (False, "not for uid 7 (denied)")
+    assert listener.parameters("settings.fir") == [False]
+    assert listener.trigger("save_settings") == (False, "not for uid 7 (denied)")
+
+
+def test_settings_are_shown_and_saved(server: ScriptedServer, listener: Listener) -> None:
+    done, text = listener.trigger("get_settings")
+    assert done
+    assert json.loads(text) == {**SETTINGS, "rate_hz": 100.0}
+    asked: list[JsonObject] = []
+
+    def answer(message: JsonObject) -> JsonObject:
+        asked.append(message)
+        return {"ok": True, "settings": SETTINGS, "saved": True}
+
+    server.answers["configure"] = answer
+    done, text = listener.trigger("save_settings")
+    assert done, text
+    assert asked[0]["save"] is True
+    assert asked[0]["settings"].items() <= SETTINGS.items()
+
+
+def test_a_setting_is_set(server: ScriptedServer, listener: Listener) -> None:
+    held = dict(SETTINGS)
+    asked: list[Any] = []
+
+    def answer(message: JsonObject) -> JsonObject:
+        asked.append(message["settings"])
+        held.update(message["settings"])
+        server.send_json(event(Event.RECONFIGURED, sensor=0, settings=held))
+        return {"ok": True, "settings": held}
+
+    server.answers["configure"] = answer
+    for value in (64, SETTINGS["sinc_length"]):
+        assert listener.set_parameter("settings.sinc_length", value) == (True, "")
+        assert listener.parameters("settings.sinc_length") == [value]
+    assert asked == [{"sinc_length": 64}, {"sinc_length": 512}]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("sinc_length", 5, "range"),
+        ("sinc_length", "64", "it must be a whole number from 32 to 2048"),
+        ("acceleration_range_g", 3, "it must be one of 2, 4, 8, 16"),
+        ("fir", 1, "it must be true or false"),
+        ("fir", None, "it must be true or false"),
+        ("no_such", 1, "undeclared"),
+    ],
+)
+def test_a_value_that_cannot_be(listener: Listener, name: str, value: Any, words: str) -> None:
+    done, reason = listener.set_parameter(f"settings.{name}", value)
+    assert not done
+    assert words in reason
+
+
+def test_a_change_that_did_not_take(server: ScriptedServer, listener: Listener) -> None:
+    server.answers["configure"] = lambda _: {"ok": True, "settings": SETTINGS}
+    done, reason = listener.set_parameter("settings.fir", True)
+    assert (done, reason) == (False, "fir is still False, says the server: it did not take True")
+
+
+def test_the_parameters_follow_what_others_change(server: ScriptedServer, listener: Listener) -> None:
+    changed = {**SETTINGS, "sinc_length": 128, "chop": True, "odd": 1, "fir": "x"}
+    server.send_json(event(Event.RECONFIGURED, sensor=1, settings={"sinc_length": 99}))
+    server.send_json(event(Event.RECONFIGURED, sensor=0, settings=changed))
+    wait_until(lambda: listener.parameters(*NAMES) == [128, None, 2, True], "the changed settings")
+    server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS))
+
+
+def test_an_unanswered_request_holds_up_neither_stream_nor_node(
+    server: ScriptedServer, listener: Listener, stream: Stream
+) -> None:
+    answer = server.answers.pop("describe", None)
+    server.answers["describe"] = lambda _: None
+    got: list[tuple[bool, str]] = []
+    caller = threading.Thread(target=lambda: got.append(listener.trigger("get_settings")))
+    began = time.monotonic()
+    caller.start()
+    time.sleep(0.3)
+    listener.numbers()
+    numbers = [listener.next_number() for _ in range(50)]
+    assert numbers == list(range(int(numbers[0]), int(numbers[0]) + 50))
+    caller.join()
+    assert 2.5 < time.monotonic() - began < 5
+    assert "did not answer describe: no reply within 3 s" in got[0][1]
+    del server.answers["describe"]
+    if answer is not None:
+        server.answers["describe"] = answer
+    assert listener.trigger("get_settings")[0]
+
+
+def test_without_a_server(server: ScriptedServer, listener: Listener, stream: Stream) -> None:
+    description, server.description = server.description, {**server.description, "sensors": []}
+    server.drop()
+    wait_until(lambda: listener.parameters(*NAMES) == [None] * 4, "no settings")
+    for done, text in (
+        listener.trigger("sensor_tare"),
+        listener.trigger("get_settings"),
+        listener.set_parameter("settings.sinc_length", 64),
+    ):
+        assert not done
+        assert "there is no server at localhost:" in text
+    assert not listener.trigger("save_settings")[0]
+    server.description = description
+
+
+def test_every_setting_is_a_parameter_that_describes_itself(listener: Listener) -> None:
+    from rcl_interfaces.srv import DescribeParameters
+
+    names = [f"settings.{name}" for name in TABLE]
+    response = listener.call(
+        DescribeParameters, "describe_parameters", DescribeParameters.Request(names=names)
+    )
+    assert [row.name for row in response.descriptors] == names
+    assert all(row.description for row in response.descriptors)
+
+
+def test_the_node_ends_while_a_service_waits(
+    server: ScriptedServer, listener: Listener, stream: Stream
+) -> None:
+    other = Listener()
+    try:
+        with ScriptedServer() as mute, starter(other) as start:
+            node = start(mute.port)
+            mute.answers["tare"] = lambda _: None
+            assert mute.subscribed.wait(20)
+            caller = threading.Thread(target=lambda: other.trigger("sensor_tare"), daemon=True)
+            caller.start()
+            wait_until(lambda: any(r["action"] == "tare" for r in mute.requests), "the request")
+            began = time.monotonic()
+            node.send_signal(signal.SIGTERM)
+            assert node.ends() == 0
+            assert time.monotonic() - began < 2
+            assert "Traceback" not in node.log
+    finally:
+        other.close()

@@ -1,0 +1,179 @@
+"""The node against the real server and a virtual sensor: all that only shows when both are what they are."""
+
+from __future__ import annotations
+
+import json
+import queue
+import signal
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
+
+from geometry_msgs.msg import WrenchStamped
+from sensor_msgs.msg import Imu
+
+from tests.bridge.conftest import Listener, NodeProcess, starter, wait_until
+from tests.bridge.streaming import Diagnostics, values
+from tests.server.running import Program, Server, needs_bus, virtual_sensor
+
+pytestmark = [pytest.mark.ros, pytest.mark.bus, needs_bus]
+OK, WARN, ERROR, STALE = range(4)
+HEALTHY = {"link": OK, "stream": OK, "sensor": OK, "clock": OK}
+
+
+class Bench:
+    """A virtual sensor, the server on it, the node, and who listens."""
+
+    def __init__(self, ifname: str, sensor: Program, listener: Listener) -> None:
+        self.ifname, self.sensor, self.listener = ifname, sensor, listener
+        self.server = Server(ifname).wait_streaming()
+        self.port = self.server.port
+        self.diagnostics = Diagnostics(listener)
+        self.wrench: queue.Queue[Any] = listener.subscribe(WrenchStamped, "wrench")
+
+    def restart_server(self) -> None:
+        self.server.close()
+        self.server = Server.__new__(Server)
+        self.server.port = self.port
+        Program.__init__(self.server, "ethercat_server.cli", [self.ifname, str(self.port)])
+        self.server.wait_streaming()
+
+    def command(self, text: str) -> None:
+        assert self.sensor.process.stdin is not None
+        self.sensor.process.stdin.write(text + "\n")
+        self.sensor.process.stdin.flush()
+
+    def forget(self) -> None:
+        while not self.wrench.empty():
+            self.wrench.get()
+        self.diagnostics.forget()
+
+    def next_wrench(self) -> Any:
+        return self.wrench.get(timeout=20)
+
+    def age_s(self, message: Any) -> float:
+        stamp = message.header.stamp
+        return time.time() - float(stamp.sec) - float(stamp.nanosec) / 1e9
+
+
+@pytest.fixture(scope="module")
+def listener(_ros: None) -> Iterator[Listener]:
+    opened = Listener()
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def _bench(listener: Listener) -> Iterator[Bench]:
+    with virtual_sensor("--pdo", "77", "--signal", "scene") as (veth, sensor):
+        bench = Bench(veth.near, sensor, listener)
+        try:
+            yield bench
+        finally:
+            bench.server.close()
+
+
+@pytest.fixture(scope="module")
+def node(_bench: Bench, listener: Listener) -> Iterator[NodeProcess]:
+    with starter(listener) as start:
+        tolerant = {
+            "diagnostics.age_warn": 1.0,
+            "diagnostics.rate_tolerance": 0.2,
+            "diagnostics.lost_warn": 60,
+        }
+        yield start(_bench.port, **tolerant)
+
+
+@pytest.fixture
+def bench(_bench: Bench, node: NodeProcess) -> Iterator[Bench]:
+    _bench.diagnostics.until(**HEALTHY)
+    _bench.forget()
+    yield _bench
+    assert node.process.poll() is None
+    assert "Traceback" not in node.log
+
+
+def test_gravity_and_orientation(bench: Bench, listener: Listener) -> None:
+    imu = listener.subscribe(Imu, "imu/data_raw").get(timeout=20)
+    a = imu.linear_acceleration
+    assert (a.x**2 + a.y**2 + a.z**2) ** 0.5 == pytest.approx(9.8, abs=2.0)
+    assert imu.orientation_covariance[0] == -1.0  # mapped, but not estimated
+    assert listener.set_parameter("settings.orientation_estimation", True) == (True, "")
+    messages = listener.subscribe(Imu, "imu/data_raw")
+    wait_until(lambda: messages.get(timeout=20).orientation_covariance[0] == 0.0, "an orientation")
+    assert bench.age_s(bench.next_wrench()) < 10
+
+
+def test_settings(bench: Bench, listener: Listener) -> None:
+    assert listener.parameters("settings.sinc_length", "settings.chop") == [64, False]
+    assert listener.set_parameter("settings.sinc_length", 256) == (True, "")
+    done, text = listener.trigger("get_settings")
+    assert done
+    assert (json.loads(text)["sinc_length"], json.loads(text)["rate_hz"]) == (256, 200)
+    array = bench.diagnostics.until(**HEALTHY)
+    assert values(array["stream"])["expected_hz"] == "200.0"
+    done, reason = listener.set_parameter("settings.fast", True)
+    assert not done
+    assert "FAST filter works only with the FIR filter on (bad_request)" in reason
+    with bench.server.connect() as other:
+        assert other.ask("configure", settings={"temperature_compensation": True})["ok"]
+    wait_until(
+        lambda: listener.parameters("settings.temperature_compensation") == [True], "the other's change"
+    )
+    assert listener.trigger("save_settings")[0]
+
+
+def test_tare(bench: Bench, listener: Listener) -> None:
+    for _ in range(20):  # the wrist turns, and touches something now and then
+        done, text = listener.trigger("sensor_tare")
+        if done:
+            break
+        assert "is not at rest" in text
+    assert done
+    assert "old offset Fx 0.0000" in text
+    assert "residual Fx" in text
+
+
+def test_a_server_that_stood_still(bench: Bench) -> None:
+    bench.server.signal(signal.SIGSTOP)
+    try:
+        array = bench.diagnostics.until(stream=ERROR, sensor=STALE, clock=STALE)
+        assert "no new sample for" in array["stream"].message
+        time.sleep(2.0)
+        bench.forget()
+    finally:
+        bench.server.signal(signal.SIGCONT)
+    first = bench.next_wrench()
+    assert bench.age_s(first) < 0.5
+    array = bench.diagnostics.until(stream=WARN)
+    assert "samples lost" in array["stream"].message
+    assert int(values(array["stream"])["lost"]) > 300
+
+
+def test_a_sensor_without_power(bench: Bench) -> None:
+    bench.command("power off")
+    array = bench.diagnostics.until(sensor=ERROR, stream=ERROR, clock=STALE)
+    assert "is lost" in array["sensor"].message
+    bench.forget()
+    time.sleep(0.3)
+    assert bench.wrench.empty()
+    bench.command("power on")
+    began = time.time()
+    first = bench.next_wrench()
+    assert first.header.stamp.sec + first.header.stamp.nanosec / 1e9 > began
+    bench.diagnostics.until(**HEALTHY)
+
+
+def test_a_server_that_starts_again(bench: Bench, listener: Listener) -> None:
+    bench.server.close()
+    bench.diagnostics.until(link=ERROR, stream=STALE)
+    assert listener.parameters("settings.sinc_length") == [None]
+    bench.restart_server()
+    array = bench.diagnostics.until(**HEALTHY)
+    assert values(array["link"])["reconnects"] == "1"
+    assert listener.parameters("settings.sinc_length") == [64]  # the server's own default again
+    assert bench.age_s(bench.next_wrench()) < 10
