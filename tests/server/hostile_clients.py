@@ -11,6 +11,7 @@ import contextlib
 import errno
 import itertools
 import json
+import os
 import random
 import select
 import socket
@@ -28,6 +29,8 @@ from tests.server.as_another_user import become_nobody
 MOST_HELD = 8
 """Connections that are left hanging at a time: half of what one user may have."""
 CROWD_S = 3.0
+FIRST_UID, USERS, OF_ONE_USER = 60_000, 1_000, 4
+"""The connections come from many users, because one may not have many."""
 _RESET = struct.pack("ii", 1, 0)
 _SHUTDOWN = request("shutdown")
 
@@ -209,14 +212,20 @@ def hear_some(sock: socket.socket) -> None:
 def main() -> None:
     """Make the connections."""
     port, count = int(sys.argv[1]), int(sys.argv[2])
-    become_nobody()
     if sys.argv[3] == "crowd":
+        become_nobody()
         crowd(port, count)
         return
+    am_root = os.geteuid() == 0
+    "x".encode("idna")  # what connecting by name loads, while this user can still read it
     rng = random.Random(int(sys.argv[3]))
     done: collections.Counter[str] = collections.Counter()
     for number in range(count):
         nuisance = KINDS[number] if number < len(KINDS) else rng.choice(KINDS)
+        if am_root and number % OF_ONE_USER == 0:
+            # A socket belongs to whoever its maker was at that moment.
+            os.seteuid(0)
+            os.seteuid(FIRST_UID + number // OF_ONE_USER % USERS)
         host = "::1" if rng.random() < 0.1 and socket.has_ipv6 else "127.0.0.1"
         try:
             sock = socket.create_connection((host, port), timeout=20)
