@@ -26,8 +26,6 @@ _IDLE_FRAME_NS: Final = 10_000_000
 """A `fresh_only` client gets a REPEATED frame only when it has had nothing for this long."""
 _REPEATED: Final = int(DataFlag.REPEATED)
 _GAP: Final = int(DataFlag.GAP)
-
-
 _UNFINISHED_NS: Final = 10_000_000_000
 """A message that has begun must end within this."""
 _EFFORT_NS: Final = 30_000

@@ -84,11 +84,17 @@ class Jobs:
         except RequestError as refused:
             # A new one: in a variable of this frame, the one that was raised would keep itself alive.
             error = RequestError(refused.code, str(refused), **refused.extra)
-        except SdoAbortError as abort:
-            error = RequestError(ErrorCode.SENSOR, str(abort), abort_code=abort.abort_code)
         except BusError as failed:
-            error = RequestError(ErrorCode.NOT_READY, str(failed))
+            error = refusal(failed)
         steps.close()
         self._queues[place].popleft()
         self.waiting -= 1
         done(result, error)
+
+
+def refusal(error: BusError, addition: str = "") -> RequestError:
+    """What a client is told when its work on a sensor fails; `addition` follows the error's own text."""
+    text = f"{error}{addition}"
+    if isinstance(error, SdoAbortError):
+        return RequestError(ErrorCode.SENSOR, text, abort_code=error.abort_code)
+    return RequestError(ErrorCode.NOT_READY, text)

@@ -8,9 +8,9 @@ from typing import Any, Final
 from ethercat_server import objects
 from ethercat_server.configuration import Change, apply_in_op, save
 from ethercat_server.connection import Connection
-from ethercat_server.errors import BusError, SdoAbortError
+from ethercat_server.errors import BusError
 from ethercat_server.hub import Hub
-from ethercat_server.jobs import Done, Jobs
+from ethercat_server.jobs import Done, Jobs, refusal
 from ethercat_server.recovery import Recovery
 from ethercat_server.sdo import Sdo, Steps
 from ethercat_server.sensor import Sensor, read_offset
@@ -153,7 +153,7 @@ class SensorActions:
         def changed(error: BusError | None) -> None:
             self._changing.discard(place)
             if error is not None:
-                done({}, _refusal(error))
+                done({}, refusal(error, "; the former settings are in force"))
                 return
             try:
                 self._start_change(place, self._finish_change(sensor, save_too), done)
@@ -189,13 +189,6 @@ def _answer(request: Request, values: Mapping[str, Any], error: RequestError | N
     if request.has_id:
         message["id"] = request.id
     return error_reply(message, error.code, str(error), **error.extra)
-
-
-def _refusal(error: BusError) -> RequestError:
-    text = f"{error}; the former settings are in force"
-    if isinstance(error, SdoAbortError):
-        return RequestError(ErrorCode.SENSOR, text, abort_code=error.abort_code)
-    return RequestError(ErrorCode.NOT_READY, text)
 
 
 def _read(sdo: Sdo, index: int, subindex: int, kind: SdoType | None) -> Steps[Mapping[str, Any]]:
