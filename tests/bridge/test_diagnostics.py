@@ -15,30 +15,13 @@ from protocol.pdo import encode
 from protocol.warnings_register import WARNINGS
 from tests.bridge.conftest import Listener, NodeProcess, starter
 from tests.bridge.scripted_server import ScriptedServer
-from tests.bridge.streaming import Diagnostics, Stream, status, streaming, streaming_description, values
+from tests.bridge.shared import listener, server, stream
+from tests.bridge.streaming import Diagnostics, Stream, status, streaming_description, values
 
+__all__ = ["listener", "server", "stream"]
 pytestmark = pytest.mark.ros
 OK, WARN, ERROR, STALE = range(4)
 HEALTHY = {"link": OK, "stream": OK, "sensor": OK, "clock": OK}
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[ScriptedServer]:
-    with ScriptedServer() as scripted:
-        yield scripted
-
-
-@pytest.fixture(scope="module")
-def stream(server: ScriptedServer) -> Iterator[Stream]:
-    with streaming(server) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def listener(_ros: None) -> Iterator[Listener]:
-    opened = Listener()
-    yield opened
-    opened.close()
 
 
 @pytest.fixture(scope="module")

@@ -18,29 +18,12 @@ from protocol.framing import JsonObject
 from protocol.settings import SETTINGS as TABLE
 from tests.bridge.conftest import Listener, NodeProcess, starter, wait_until
 from tests.bridge.scripted_server import ScriptedServer
-from tests.bridge.streaming import SETTINGS, Stream, streaming
+from tests.bridge.shared import listener, server, stream
+from tests.bridge.streaming import SETTINGS, Stream
 
+__all__ = ["listener", "server", "stream"]
 pytestmark = pytest.mark.ros
 NAMES = ("settings.sinc_length", "settings.fir", "settings.acceleration_range_g", "settings.chop")
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[ScriptedServer]:
-    with ScriptedServer() as scripted:
-        yield scripted
-
-
-@pytest.fixture(scope="module")
-def stream(server: ScriptedServer) -> Iterator[Stream]:
-    with streaming(server) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def listener(_ros: None) -> Iterator[Listener]:
-    opened = Listener()
-    yield opened
-    opened.close()
 
 
 @pytest.fixture(scope="module")

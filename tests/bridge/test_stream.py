@@ -14,21 +14,10 @@ from protocol.framing import DataFlag
 from protocol.pdo import encode
 from tests.bridge.conftest import Listener, NodeProcess, establish, starter
 from tests.bridge.scripted_server import ScriptedServer, description, process_data
+from tests.bridge.shared import listener, server
 
+__all__ = ["listener", "server"]
 pytestmark = pytest.mark.ros
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[ScriptedServer]:
-    with ScriptedServer() as scripted:
-        yield scripted
-
-
-@pytest.fixture(scope="module")
-def listener(_ros: None) -> Iterator[Listener]:
-    opened = Listener()
-    yield opened
-    opened.close()
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,9 @@ from sensor_msgs.msg import Imu, Temperature
 from protocol.pdo import encode
 from tests.bridge.conftest import PATIENCE_S, Listener, NodeProcess, establish, starter, wait_until
 from tests.bridge.scripted_server import ScriptedServer, process_data
+from tests.bridge.shared import listener, server
 
+__all__ = ["listener", "server"]
 pytestmark = pytest.mark.ros
 QUATERNION = {"orientation.x": 0.5, "orientation.y": -0.5, "orientation.z": 0.5, "orientation.w": 0.5}
 
@@ -34,19 +36,6 @@ class Topics:
 
     def all(self) -> tuple[queue.Queue[Any], ...]:
         return self.wrench, self.imu, self.temperature
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[ScriptedServer]:
-    with ScriptedServer() as scripted:
-        yield scripted
-
-
-@pytest.fixture(scope="module")
-def listener(_ros: None) -> Iterator[Listener]:
-    opened = Listener()
-    yield opened
-    opened.close()
 
 
 @pytest.fixture(scope="module")

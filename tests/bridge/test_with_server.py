@@ -17,9 +17,11 @@ from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import Imu
 
 from tests.bridge.conftest import Listener, NodeProcess, starter, wait_until
+from tests.bridge.shared import listener
 from tests.bridge.streaming import Diagnostics, values
 from tests.server.running import Program, Server, needs_bus, virtual_sensor
 
+__all__ = ["listener"]
 pytestmark = [pytest.mark.ros, pytest.mark.bus, needs_bus]
 OK, WARN, ERROR, STALE = range(4)
 HEALTHY = {"link": OK, "stream": OK, "sensor": OK, "clock": OK}
@@ -58,13 +60,6 @@ class Bench:
     def age_s(self, message: Any) -> float:
         stamp = message.header.stamp
         return time.time() - float(stamp.sec) - float(stamp.nanosec) / 1e9
-
-
-@pytest.fixture(scope="module")
-def listener(_ros: None) -> Iterator[Listener]:
-    opened = Listener()
-    yield opened
-    opened.close()
 
 
 @pytest.fixture(scope="module")
