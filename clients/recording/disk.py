@@ -79,4 +79,6 @@ class DiskFile:
 
     def close(self) -> None:
         """Close the file; what waits is not written."""
-        os.close(self._fd)
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1

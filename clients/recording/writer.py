@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import IO, Any, Final, cast
 
 from mcap.writer import CompressionType, Writer
@@ -68,10 +68,8 @@ class RecordingWriter:
         """Bytes of the file, without the chunk that is being filled."""
         return self._disk.tell()
 
-    def describe(self, stamp_ns: int, description: JsonObject, sensors: Sequence[int]) -> None:
-        """Write a reply to `describe`; `sensors` are the places that will have frames."""
-        for sensor in sensors:
-            self._open_sensor(sensor)
+    def describe(self, stamp_ns: int, description: JsonObject) -> None:
+        """Write a reply to `describe`."""
         self._note(self._descriptions, stamp_ns, description)
 
     def event(self, stamp_ns: int, event: JsonObject) -> None:

@@ -47,7 +47,7 @@ def record(
 ) -> list[DataMessage]:
     """A whole recording of `frames`, with a chunk for so many of them; returns them."""
     made = writer(path)
-    made.describe(START_NS, describe(*sensors), sensors)
+    made.describe(START_NS, describe(*sensors))
     written = []
     for count, item in enumerate(frames, 1):
         written.append(item)

@@ -76,12 +76,12 @@ def test_sensors_are_told_apart(path: Path) -> None:
 
 def test_settings_are_known_over_time(path: Path) -> None:
     made = writer(path)
-    made.describe(START_NS, describe(0, chop=False), [0])
+    made.describe(START_NS, describe(0, chop=False))
     made.frame(frame(0))
     made.event(START_NS + 10, {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}})
     reply = describe(0)
     reply["sensors"][0] |= {"settings": {"sinc_length": 32}, "rate_hz": 1600}
-    made.describe(START_NS + 20, reply, [0])
+    made.describe(START_NS + 20, reply)
     made.frame(frame(1))
     made.finish({"reason": "asked to"})
     with open_recording(path) as recording:
