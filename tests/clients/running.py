@@ -1,4 +1,4 @@
-"""Runs `ethercat-record` and `ethercat-replay` as processes. A replay stands in for a server: it needs no bus."""
+"""Runs `ethercat-record` and `ethercat-replay` as processes. A replay is a server that needs no bus."""
 
 from __future__ import annotations
 
