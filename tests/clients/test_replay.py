@@ -106,7 +106,8 @@ def test_several_recordings_are_played_one_after_the_other(tmp_path: Path) -> No
 def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(
     path: Path, frames: list[DataMessage]
 ) -> None:
-    path.write_bytes(path.read_bytes()[:-2000])
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
     with replaying("--original-stamps", path) as served, connect(served.port, fresh_only=False) as client:
         played = list(client.frames())
         assert "was cut off" in served.said()
