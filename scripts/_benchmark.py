@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -28,6 +28,8 @@ from scripts._benchmark_clients import measure_clients
 from scripts._benchmark_plot import Curves, draw
 from scripts._benchmark_records import may_be_real_time
 from scripts._benchmark_report import print_configuration
+from scripts._benchmark_sdo import SECONDS as SDO_SECONDS
+from scripts._benchmark_sdo import measure_sdo
 from scripts._benchmark_soak import soak
 from scripts._demo import DemoError, Stopped, ignore_signals, loopback_up, on_signal
 
@@ -112,6 +114,12 @@ def run(options: argparse.Namespace, console: Console) -> None:
         write_json(options.json, options, priority, clients=result)
         print(f"written: {options.json}")
         return
+    if options.sdo:
+        one = setup(options.rates[0], 1)
+        one = replace(one, seconds=options.seconds or SDO_SECONDS)
+        write_json(options.json, options, priority, sdo=measure_sdo(one, console))
+        print(f"written: {options.json}")
+        return
     wanted = [setup(rate, sensors) for rate in options.rates for sensors in options.sensors]
     ways = 2 if options.ros else 1
     progress = Progress(console, sum(1 + ways * (2 if one.sensors == 1 else 1) for one in wanted))
@@ -168,12 +176,13 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--ppm", type=float, default=150.0, help="the sensors' clock error (%(default)g)")
     parser.add_argument("--soak", type=float, metavar="MINUTES", help="only the server, for so long")
     parser.add_argument("--clients", action="store_true", help="only the server, eight clients against one")
+    parser.add_argument("--sdo", action="store_true", help="only the server, without and with SDO traffic")
     parser.add_argument("--no-ros", dest="ros", action="store_false", help="TCP only")
     parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
                         help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip
     options = parser.parse_args(argv)
     options.json, options.plot = here / options.json, here / options.plot
-    only_one = options.quick or options.soak or options.clients
+    only_one = options.quick or options.soak or options.clients or options.sdo
     options.rates = options.rates or ([800] if only_one else [800, 1600])
     options.sensors = options.sensors or ([1] if only_one else [1, 2])
     return options

@@ -114,9 +114,9 @@ class ServerLink:
         self._socket = socket.create_connection(("127.0.0.1", port), timeout=2.0)
         self._decoder = FrameDecoder()
 
-    def ask(self, action: str) -> dict[str, Any]:
-        """Send a request and return its reply; DATA on the way is dropped."""
-        self._socket.sendall(encode_json(request(action, action)))
+    def ask(self, action: str, **values: object) -> dict[str, Any]:
+        """Send a request and return its reply; DATA on the way is dropped. DemoError if it is refused."""
+        self._socket.sendall(encode_json(request(action, action, **values)))
         for message in self._messages():
             if isinstance(message, dict) and message.get("reply") == action:
                 if message.get("ok") is not True:
