@@ -72,6 +72,15 @@ def test_connection_and_selection_need_no_ros() -> None:
         assert not imports(ROOT / "ros2_bridge" / "bridge" / f"{name}.py") & {"rclpy", "std_msgs"}, name
 
 
+def test_compensation_is_numpy_and_the_standard_library() -> None:
+    compensation = [path for path in BRIDGE if path.parent.name == "compensation"]
+    assert compensation
+    for path in compensation:
+        assert imports(path) <= set(sys.stdlib_module_names) | {"numpy", "protocol", "bridge"}, path
+        ours = set(re.findall(r"^\s*(?:from|import) (bridge[\w.]*)", path.read_text(), re.MULTILINE))
+        assert all(name.startswith("bridge.compensation") for name in ours), path
+
+
 @pytest.mark.parametrize("path", PROTOCOL + SERVER + BRIDGE + OTHERS, ids=lambda p: str(p.relative_to(ROOT)))
 def test_every_file_says_what_it_is_for(path: Path) -> None:
     text = path.read_text()
