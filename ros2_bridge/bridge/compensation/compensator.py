@@ -1,7 +1,7 @@
 """The equations for one sample at a time, in plain floats: what runs for every sample of a stream.
 
-Same signs and units as `equations`, which the tests hold it to. NumPy would cost more here than the
-arithmetic.
+Same signs and units as `equations`, which the tests hold it to. NumPy would cost more here than
+the arithmetic.
 """
 
 from __future__ import annotations
@@ -42,8 +42,7 @@ class Compensator:
         inertia: bool = False,
         imu_position: Vector3 = ZERO,
     ) -> None:
-        """`inertia` switches the inertial term on; `imu_position` (m) is the IMU's, from the wrench
-        origin."""
+        """`inertia` switches the inertial term on; `imu_position` is the IMU's, m from the wrench origin."""
         self.payload, self.bias = payload, bias
         self.inertia, self.imu_position = inertia, imu_position
 

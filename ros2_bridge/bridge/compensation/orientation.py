@@ -189,8 +189,7 @@ class QuaternionGravity:
         return math.inf if self._latest is None else abs(now_s - self._latest[1])
 
     def gravity(self, now_s: float) -> Vector3 | None:
-        """Gravity in the sensor's frame, m/s²; None when the latest orientation is older than
-        `stale_after_s`."""
+        """Gravity in the sensor's frame, m/s²; None when the orientation is older than `stale_after_s`."""
         latest = self._latest
         if latest is None or not abs(now_s - latest[1]) <= self.stale_after_s:
             return None

@@ -1,5 +1,4 @@
-"""What the parts of compensation hand to each other: wrench, payload, and the error that carries a
-sentence."""
+"""What the parts of compensation hand to each other: wrench, payload, and the error with a sentence."""
 
 from __future__ import annotations
 

@@ -113,8 +113,7 @@ class StillWindow:
         )
 
     def means(self) -> StillMeans:
-        """The means over the window. NotStillError, a sentence, if the sensor did not rest or a sample was
-        bad."""
+        """The means over the window; NotStillError, a sentence, if the sensor did not rest throughout."""
         if self.spoiled is not None:
             raise NotStillError(f"the window is spoiled: {self.spoiled}")
         seconds = 0.0 if self._first_s is None else self._last_s - self._first_s
