@@ -98,6 +98,9 @@ def _record(
                 if options.seconds is not None and time.monotonic() - began >= options.seconds:
                     reason = "time is up"
                     break
+                if not (source.connected or options.reconnect):
+                    reason = "the server ended"
+                    break
                 progress.show(recorder, connected=source.connected)
                 batch = source.receive()
         except ProtocolError as error:
