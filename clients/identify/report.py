@@ -28,7 +28,7 @@ def show_poses(
             left = [f"{_length(residual.force):.3f}", f"{_length(residual.torque):.5f}"]
         table.add_row(
             str(number + 1), f"{still.begin_s:.1f}", f"{still.seconds:.1f}", str(pose.samples),
-            *(f"{part + 0.0:.2f}" for part in pose.up), *left,
+            *(f"{round(part, 2) + 0.0:.2f}" for part in pose.up), *left,
         )  # fmt: skip
     console.print(table)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import random
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -201,19 +201,28 @@ def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.Capture
     assert "usage: ethercat-identify" in capsys.readouterr().err
 
 
-def test_ctrl_c_and_a_closed_pipe_are_no_traceback(recording: Path) -> None:
-    def start() -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            [sys.executable, "-m", "clients.identify.cli", str(recording), "--json"],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+def start(path: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "clients.identify.cli", str(path), "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
 
-    with start() as interrupted, start() as closed:
-        assert closed.stdout is not None
-        closed.stdout.close()
-        time.sleep(0.3)  # somewhere in the middle of it
-        interrupted.send_signal(signal.SIGINT)
-        for program in (interrupted, closed):
+
+def test_ctrl_c_is_no_traceback(tmp_path: Path) -> None:
+    pipe = tmp_path / "endless.mcap"
+    os.mkfifo(pipe)
+    with start(pipe) as program:
+        with pipe.open("wb"):  # waits until the program reads
+            program.send_signal(signal.SIGINT)
             assert program.stderr is not None
-            assert "Traceback" not in program.stderr.read()
-            program.wait(timeout=30)
+            assert program.stderr.read() == ""
+        assert program.wait(timeout=30) == -signal.SIGINT
+
+
+def test_a_reader_that_has_had_enough_is_no_traceback(recording: Path) -> None:
+    with start(recording) as program:
+        assert program.stdout is not None
+        program.stdout.close()
+        assert program.stderr is not None
+        assert program.stderr.read() == ""
+        assert program.wait(timeout=30) == 1
