@@ -106,12 +106,13 @@ def _record(
         except ProtocolError as error:
             reason, code = f"the server refused: {error}", 1
             progress.say(reason)
+        seconds = time.monotonic() - began
         source.close()
         recorder.stop(reason)
     if recorder.error is not None:
         _say(f"{recorder.error}; what was written before is whole")
         code = 1
-    _say(_summary(recorder, parts, time.monotonic() - began))
+    _say(_summary(recorder, parts, seconds))
     return code
 
 

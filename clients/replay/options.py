@@ -48,7 +48,7 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
         help=f"recordings; a number behind them is the port (default {DEFAULT_PORT})")  # fmt: skip
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument("--speed", type=_speed, default=1.0, metavar="X",
-        help="so many times as fast; 'max': as fast as the clients take it, without losing a frame")  # fmt: skip
+        help="so many times as fast; 'max' is as fast as the clients take it, without a loss")  # fmt: skip
     pace.add_argument("--step", action="store_true",
         help="one frame for each line on standard input, N frames for the line N")  # fmt: skip
     add("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
