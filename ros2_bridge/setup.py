@@ -21,7 +21,7 @@ def data_files():
 setup(
     name="bridge",
     version="0.1.0",
-    packages=["bridge", "protocol"],
+    packages=["bridge", "bridge.compensation", "protocol"],
     package_data={"": ["py.typed"]},
     data_files=list(data_files()),
     install_requires=["setuptools"],

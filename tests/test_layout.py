@@ -86,6 +86,15 @@ def test_connection_and_selection_need_no_ros() -> None:
         assert not imports(ROOT / "ros2_bridge" / "bridge" / f"{name}.py") & {"rclpy", "std_msgs"}, name
 
 
+def test_compensation_is_numpy_and_the_standard_library() -> None:
+    compensation = [path for path in BRIDGE if path.parent.name == "compensation"]
+    assert compensation
+    for path in compensation:
+        assert imports(path) <= set(sys.stdlib_module_names) | {"numpy", "protocol", "bridge"}, path
+        ours = set(re.findall(r"^\s*(?:from|import) (bridge[\w.]*)", path.read_text(), re.MULTILINE))
+        assert all(name.startswith("bridge.compensation") for name in ours), path
+
+
 def test_nothing_imports_the_clients_and_they_need_neither_ros_nor_the_bus() -> None:
     assert CLIENTS
     assert not list(importers(PROTOCOL + SERVER + BRIDGE, "clients"))
@@ -96,6 +105,15 @@ def test_nothing_imports_the_clients_and_they_need_neither_ros_nor_the_bus() -> 
 def test_of_the_clients_only_the_replay_uses_the_server() -> None:
     using = set(importers(CLIENTS, "ethercat_server"))
     assert all(path.startswith("clients/replay/") for path in using), using
+
+
+def test_of_the_clients_only_identify_uses_the_bridge_and_only_its_compensation() -> None:
+    using = [path for path in CLIENTS if "bridge" in imports(path)]
+    assert {path.parent.name for path in using} <= {"identify"}
+    for path in using:
+        assert not re.search(
+            r"^\s*(from|import) bridge(?!\.compensation\.)", path.read_text(), re.MULTILINE
+        ), path
 
 
 def test_recordings_are_opened_in_one_place() -> None:
