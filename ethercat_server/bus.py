@@ -21,7 +21,7 @@ import pysoem
 
 from ethercat_server.al import AlState, AlStatus
 from ethercat_server.errors import BusError, SdoAbortError
-from ethercat_server.raw_socket import FPRD, FPWR, SOEM_INDICES, RawSocket, packet_sockets
+from ethercat_server.raw_socket import APRD, APWR, BRD, FPRD, FPWR, SOEM_INDICES, RawSocket, packet_sockets
 
 _SDO_ATTEMPTS: Final = 3
 _OP_TIMEOUT_S: Final = 10.0
@@ -66,6 +66,8 @@ class Bus:
         self._master: Any = pysoem.Master()
         self._slaves: list[Any] = []
         self._opened = False
+        self._scanned = False
+        """The slaves' states are this master's business from here on."""
         self._abandoned = False
         """A thread that never ended still uses the socket: it must not be closed."""
         self._stations: list[int] = []
@@ -126,7 +128,7 @@ class Bus:
         )
         thread.start()
         deadline = time.monotonic() + _SCAN_TIMEOUT_S
-        self._abandoned = True
+        self._abandoned = self._scanned = True
         while thread.is_alive():
             thread.join(0.05)
             check_interrupt()
@@ -263,6 +265,24 @@ class Bus:
         """Write ESC registers or a mailbox of `slave` with one datagram; False if it did not do it."""
         return self._datagram(FPWR, slave, address, data)[0] == 1
 
+    def count_slaves(self, size: int, timeout_s: float) -> int:
+        """How many slaves answer a broadcast read of `size` bytes from register 0 on; -1 if it is lost.
+
+        Needs no scan and changes nothing, so it also tells how long a frame of that size takes.
+        """
+        answer = self._socket.datagram(BRD, 0, 0, bytes(size), timeout_s)
+        return -1 if answer is None else answer[0]
+
+    def read_at(self, place: int, address: int, size: int) -> bytes | None:
+        """Read ESC registers of the slave at `place` on the bus, scanned or not; None if it did not do it."""
+        answer = self._socket.datagram(APRD, -place & 0xFFFF, address, bytes(size), _PATIENT_TIMEOUT_S)
+        return answer[1] if answer is not None and answer[0] == 1 else None
+
+    def write_at(self, place: int, address: int, data: bytes) -> bool:
+        """Write ESC registers of the slave at `place` on the bus, scanned or not; False if it did not."""
+        answer = self._socket.datagram(APWR, -place & 0xFFFF, address, data, _PATIENT_TIMEOUT_S)
+        return answer is not None and answer[0] == 1
+
     def _datagram(self, command: int, slave: int, address: int, data: bytes) -> tuple[int, bytes]:
         station = self._stations[slave]
         answer = self._socket.datagram(command, station, address, data, self._datagram_timeout_s)
@@ -294,14 +314,18 @@ class Bus:
         return bool(recovered)
 
     def close(self) -> None:
-        """Take the slaves to INIT and close the socket. May be called at any time, any number of times."""
+        """Take the slaves to INIT and close the socket. May be called at any time, any number of times.
+
+        Slaves that were never scanned are left in the state they are in.
+        """
         if not self._opened or self._abandoned:
             return
         self._opened = False
         with contextlib.suppress(*_PYSOEM_ERRORS):
             self._socket.set_blocking(True)
-            self._master.state = pysoem.INIT_STATE
-            self._master.write_state()
+            if self._scanned:
+                self._master.state = pysoem.INIT_STATE
+                self._master.write_state()
         self._socket.close()
         self._master.close()
 
