@@ -114,7 +114,7 @@ class Bus:
         return True
 
     def _damaged_at(self) -> int | None:
-        """Count what a damaged frame makes the controllers count; how many sensors got it whole, None for all.
+        """Count what a damaged frame makes the controllers count; how many sensors got it whole, None: all.
 
         The one that finds it damaged marks it; those it then passes, on the way out at port 0 and on the way
         back at port 1, count it as forwarded.
