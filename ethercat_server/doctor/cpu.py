@@ -78,7 +78,8 @@ def idle_states(machine: Machine) -> Iterator[Finding]:
 def _latency_limit_us(machine: Machine) -> int | None:
     """What programs hold /dev/cpu_dma_latency at; None if nobody does, or only root can see it."""
     try:
-        raw = machine.path(_LATENCY_FILE).open("rb").read(4)
+        with machine.path(_LATENCY_FILE).open("rb") as file:
+            raw = file.read(4)
     except OSError:
         return None
     limit = struct.unpack("=i", raw)[0] if len(raw) == 4 else -1

@@ -230,25 +230,29 @@ def _routes(ifname: str) -> Routes:
     )
 
 
-def _ethtool(ifname: str) -> Any:
+@contextlib.contextmanager
+def _ethtool(ifname: str) -> Iterator[Any]:
     from pyroute2.ethtool.ioctl import IoctlEthtool  # noqa: PLC0415 - takes a moment
 
-    asked = IoctlEthtool()
-    asked.change_ifname(ifname)
-    return asked
+    with contextlib.closing(IoctlEthtool()) as asked:
+        asked.change_ifname(ifname)
+        yield asked
 
 
 def _settings(ifname: str) -> tuple[int | None, str | None]:
-    found = _ethtool(ifname).get_link_settings()
+    with _ethtool(ifname) as asked:
+        found = asked.get_link_settings()
     return None if found.speed in _UNKNOWN_SPEEDS else int(found.speed), _DUPLEX.get(found.duplex)
 
 
 def _coalescing(ifname: str) -> dict[str, int]:
-    return {name: int(value) for name, value in _ethtool(ifname).get_coalesce().items() if name != "cmd"}
+    with _ethtool(ifname) as asked:
+        return {name: int(value) for name, value in asked.get_coalesce().items() if name != "cmd"}
 
 
 def _offloads(ifname: str) -> dict[str, bool]:
-    found: dict[str, bool] = _ethtool(ifname).get_offload_flags()
+    with _ethtool(ifname) as asked:
+        found: dict[str, bool] = asked.get_offload_flags()
     return found
 
 

@@ -138,10 +138,10 @@ def processor_list(text: str) -> list[int]:
     """The numbers in a list as the kernel writes it, such as 0-2,5; CannotLookError if it is none."""
     found: list[int] = []
     for part in filter(None, text.strip().split(",")):
-        first, _, last = part.partition("-")
-        if not first.isdecimal() or not (last or first).isdecimal() or int(last or first) > _MOST_PROCESSORS:
+        match = re.fullmatch(r"(\d{1,5})(?:-(\d{1,5}))?", part)
+        if match is None or int(match[2] or match[1]) > _MOST_PROCESSORS:
             cannot_look(f"{text[:40]!r} is no list of processors")
-        found.extend(range(int(first), int(last or first) + 1))
+        found.extend(range(int(match[1]), int(match[2] or match[1]) + 1))
     return found
 
 
