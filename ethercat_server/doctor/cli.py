@@ -143,7 +143,9 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
 
 def _machine(args: argparse.Namespace, cleanup: contextlib.ExitStack) -> Machine:
     """This machine, and the interface, which for `virtual` is brought up and taken down by `cleanup`."""
+    from ethercat_server.doctor.examination import check_rights  # noqa: PLC0415
     from ethercat_server.doctor.facts import InterfaceFacts, collect  # noqa: PLC0415
+    from ethercat_server.doctor.finding import CannotLookError  # noqa: PLC0415
     from ethercat_server.doctor.machine import Machine  # noqa: PLC0415
     from ethercat_server.virtual_bus import VirtualBus  # noqa: PLC0415
 
@@ -151,11 +153,14 @@ def _machine(args: argparse.Namespace, cleanup: contextlib.ExitStack) -> Machine
     own = {"asked": args.iface, "timer_resolution_s": resolution, "rt_priority": args.rt_priority}
     if args.iface != VIRTUAL_INTERFACE:
         return Machine(args.iface, facts=collect(args.iface), **own)
-    if os.geteuid() != 0:
-        why = "a virtual bus needs root, or CAP_NET_ADMIN and CAP_NET_RAW; run with sudo"
-        return Machine(args.iface, facts=InterfaceFacts(link=why), **own)
-    ifname = cleanup.enter_context(VirtualBus("", args.rt_priority)).ifname
-    return Machine(ifname, facts=collect(ifname), **own)
+    machine = Machine(args.iface, **own)
+    try:
+        check_rights(machine)
+        machine.ifname = cleanup.enter_context(VirtualBus("", args.rt_priority)).ifname
+        machine.facts = collect(machine.ifname)
+    except (CannotLookError, ServerError) as error:
+        machine.facts = InterfaceFacts(link=f"there is no virtual bus: {error}")
+    return machine
 
 
 def _check(args: argparse.Namespace) -> None:

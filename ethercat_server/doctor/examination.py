@@ -123,13 +123,7 @@ def _check_may_look(machine: Machine, holder: Holder | None) -> None:
     if holder is not None:
         cannot_look("an EtherCAT master has it, and only root can see which: run with sudo")
     there = machine.facts.there
-    missing = [
-        name
-        for bit, name in ((_NET_RAW, "CAP_NET_RAW"), (_NET_ADMIN, "CAP_NET_ADMIN"))
-        if not machine.has_capability(bit)
-    ]
-    if missing:
-        cannot_look(f"{' and '.join(missing)} missing; run with sudo")
+    check_rights(machine)
     if there.loopback:
         cannot_look("it is the loopback interface")
     routes = machine.facts.routes
@@ -139,6 +133,14 @@ def _check_may_look(machine: Machine, holder: Holder | None) -> None:
         cannot_look("it carries IP or is part of a bridge or bond: no frame is sent into that network")
     if not there.up or not there.carrier:
         cannot_look("it is down" if not there.up else "it has no carrier")
+
+
+def check_rights(machine: Machine) -> None:
+    """CannotLookError unless this process may open a bus."""
+    needed = ((_NET_RAW, "CAP_NET_RAW"), (_NET_ADMIN, "CAP_NET_ADMIN"))
+    missing = [name for bit, name in needed if not machine.has_capability(bit)]
+    if missing:
+        cannot_look(f"{' and '.join(missing)} missing; run with sudo")
 
 
 def _through_server(

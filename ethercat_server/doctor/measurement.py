@@ -128,31 +128,10 @@ class _Client:
 def _client() -> Iterator[_Client]:
     with contextlib.ExitStack() as cleanup:
         try:
-            listener = cleanup.enter_context(socket.create_server(("127.0.0.1", 0)))
+            receiver, connection = _start_receiver(cleanup)
         except OSError:
             yield _Client(None)
             return
-        listener.settimeout(_CONNECT_TIMEOUT_S)
-        command = [
-            sys.executable,
-            "-P",
-            "-m",
-            "ethercat_server.doctor.receiver",
-            str(listener.getsockname()[1]),
-        ]
-        receiver = cleanup.enter_context(
-            subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-                start_new_session=True,
-            )
-        )  # fmt: skip
-        cleanup.callback(receiver.kill)
-        try:
-            connection, _ = listener.accept()
-        except OSError:
-            yield _Client(None)
-            return
-        cleanup.enter_context(connection)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setblocking(False)
         client = _Client(connection)
@@ -162,6 +141,24 @@ def _client() -> Iterator[_Client]:
             data, _ = receiver.communicate(timeout=_CONNECT_TIMEOUT_S)
             figures = array("q", data[: len(data) // 16 * 16])
             client.result = dict(zip(figures[::2], figures[1::2], strict=True))
+
+
+def _start_receiver(cleanup: contextlib.ExitStack) -> tuple[subprocess.Popen[bytes], socket.socket]:
+    """The receiving process and the connection to it; OSError if there can be none."""
+    # It listens no longer than it must: a process with an EtherCAT socket that listens is taken for a server.
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.settimeout(_CONNECT_TIMEOUT_S)
+        port = str(listener.getsockname()[1])
+        receiver = cleanup.enter_context(
+            subprocess.Popen(
+                [sys.executable, "-P", "-m", "ethercat_server.doctor.receiver", port],
+                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        )  # fmt: skip
+        cleanup.callback(receiver.kill)
+        connection, _ = listener.accept()
+    return receiver, cleanup.enter_context(connection)
 
 
 @contextlib.contextmanager

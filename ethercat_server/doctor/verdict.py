@@ -15,6 +15,8 @@ _WAKE_WARNING_US: Final = 250
 _EXCHANGE_NOTE_US: Final = 250
 _EXCHANGE_WARNING_US: Final = 500
 _MESSAGE_NOTE_US: Final = 500
+_TIMEOUT_NS: Final = 0.75 * PERIOD_NS
+"""How long the server waits for a frame."""
 _MANY: Final = 0.001
 """A part of all cycles: more than so many late or lost make it bad."""
 FORMULA: Final = (
@@ -84,19 +86,23 @@ def exchanges(measured: Measured, size: int) -> Iterator[Finding]:
         return
     summary = summary_us(whole)
     text = f"{points(summary)} for frames with {size} bytes of data"
-    yield exchange_finding(text, summary, measured.lost, len(measured.exchanges))
+    late = sum(value > _TIMEOUT_NS for value in whole)
+    yield exchange_finding(text, summary, measured.lost, late, len(measured.exchanges))
 
 
-def exchange_finding(text: str, summary: Mapping[str, Any], lost: int, count: int) -> Finding:
-    """The same for figures of any origin."""
-    values: dict[str, Any] = {**summary, "exchanges": count, "lost": lost}
-    if lost:
-        make = bad if lost > _MANY * count else warning
+def exchange_finding(text: str, summary: Mapping[str, Any], lost: int, late: int, count: int) -> Finding:
+    """The same for figures of any origin: `late` came back when the server would not wait any more."""
+    values: dict[str, Any] = {**summary, "exchanges": count, "lost": lost, "late": late}
+    if lost or late:
+        make = bad if lost + late > _MANY * count else warning
         why = (
             "each may lose a sample: check the cable; on a virtual machine or under load it may have "
             "been late"
         )
-        return make(f"{text}; {lost} of {count} did not come back in time", why, **values)
+        missing = ([f"{lost} did not come back"] if lost else []) + (
+            [f"{late} came too late"] if late else []
+        )
+        return make(f"{text}; {' and '.join(missing)} of {count}", why, **values)
     if summary["p99"] > _EXCHANGE_WARNING_US:
         return warning(
             text, "the network card or its driver takes its time: see coalescing, interrupts", **values

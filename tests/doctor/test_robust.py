@@ -32,7 +32,9 @@ def test_garbage_in_every_file(tmp_path: Path, number: int) -> None:
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.dictionaries(st.sampled_from(sorted(GOOD)), st.one_of(st.text(max_size=40), st.binary(max_size=40))))
+@given(
+    st.dictionaries(st.sampled_from(sorted(GOOD)), st.one_of(st.text(max_size=40), st.binary(max_size=40)))
+)
 def test_any_text_in_any_file(tmp_path: Path, files: dict[str, str | bytes]) -> None:
     assert faults(machine(tmp_path, {**GOOD, **files})) == []
 

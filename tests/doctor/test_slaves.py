@@ -89,10 +89,20 @@ def counted(**by_name: Any) -> ErrorCounters:
         (0, counted(), Level.OK, "none"),
         (0, counted(invalid=(3, 0, 0, 0)), Level.WARNING, "3 damaged between the interface and slave 0"),
         (1, counted(physical=(4, 0, 0, 0)), Level.WARNING, "4 damaged between slave 0 and slave 1"),
-        (0, counted(invalid=(0, 255, 0, 0)), Level.WARNING, "255 or more damaged between slave 0 and slave 1"),
+        (
+            0,
+            counted(invalid=(0, 255, 0, 0)),
+            Level.WARNING,
+            "255 or more damaged between slave 0 and slave 1",
+        ),
         (1, counted(invalid=(0, 1, 0, 0)), Level.WARNING, "1 damaged at port 1 of slave 1"),
         (1, counted(forwarded=(2, 0, 0, 0)), Level.NOTE, "2 damaged before it came to slave 1, port 0"),
-        (0, counted(lost_links=(1, 0, 0, 0)), Level.NOTE, "link lost 1 times between the interface and slave 0"),
+        (
+            0,
+            counted(lost_links=(1, 0, 0, 0)),
+            Level.NOTE,
+            "link lost 1 times between the interface and slave 0",
+        ),
         (0, counted(processing_unit=1), Level.NOTE, "processing unit 1, PDI 0"),
     ],
 )

@@ -17,7 +17,7 @@ def of(late_us: list[int], exchanges_us: list[int] | None = None, message_us: in
     return Measured(
         late=[n * 1000 for n in late_us],
         exchanges=[n * 1000 if n >= 0 else -1 for n in exchanges_us or []],
-        messages={n: message_us * 1000 for n in range(len(late_us))},
+        messages=dict.fromkeys(range(len(late_us)), message_us * 1000),
         real_time=True,
         priority=80,
     )
@@ -50,6 +50,9 @@ def test_exchanges_matter_by_their_losses_and_their_time() -> None:
     assert exchange([80] * 900 + [600] * 100).level is Level.WARNING
     assert exchange([80] * 2000 + [-1]).level is Level.WARNING
     assert exchange([80] * 900 + [-1] * 100).level is Level.BAD
+    late = exchange([80] * 2000 + [1100])
+    assert (late.level, late.values["late"]) == (Level.WARNING, 1)
+    assert "1 came too late of 2001" in late.found
     none = exchange([-1] * 5)
     assert (none.level, none.values["lost"]) == (Level.BAD, 5)
 
@@ -61,7 +64,9 @@ def test_the_age_follows_the_formula() -> None:
     late = of([30] * 99 + [130], [100] * 100, message_us=40)
     assert late.ages()[-1] == expected + 100_000
     early = of([30] * 99 + [0], [100] * 100, message_us=40)
-    assert early.ages()[-1] == 90_000, "too early to see it: another exchange follows at once, none is younger"
+    assert early.ages()[-1] == 90_000, (
+        "too early to see it: another exchange follows at once, none is younger"
+    )
     slow = of([30] * 99 + [30], [100] * 99 + [300], message_us=40)
     assert slow.ages()[-1] == pytest.approx(AIM_NS + (300_000 - 102_000) / 2 + 150_000 + 40_000)
     assert len(of([30] * 3, [100, -1, 100]).ages()) == 2, "a lost frame brings nothing"
