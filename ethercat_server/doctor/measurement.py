@@ -51,23 +51,25 @@ class Measured:
         """Exchanges that did not come back."""
         return self.exchanges.count(-1)
 
-    def ages(self) -> list[float]:
-        """How old each cycle's sample would have been at a client: the formula in docs/doctor.md.
+    def ages(self) -> tuple[list[float], list[float]]:
+        """How old each cycle's sample would have been when handed out, and at a client: docs/doctor.md.
 
         The server aims each exchange so that the sensor, half-way through it, looks at its data AIM_NS after
         the sample came to be, and brings its deadlines forward by its usual lateness.
         """
         whole = [time_ns for time_ns in self.exchanges if time_ns >= 0]
-        if not whole or not self.messages:
-            return []
+        if not whole:
+            return [], []
         usual_late = sorted(self.late)[len(self.late) // 2]
         usual_look = sum(whole) / len(whole) / 2
-        found = []
+        handed_out, arrived = [], []
         for number, (late, exchange) in enumerate(zip(self.late, self.exchanges, strict=True)):
-            if exchange >= 0 and number in self.messages:
+            if exchange >= 0:
                 looked = max(0.0, AIM_NS + late - usual_late + exchange / 2 - usual_look)
-                found.append(looked + exchange / 2 + self.messages[number])
-        return found
+                handed_out.append(looked + exchange / 2)
+                if number in self.messages:
+                    arrived.append(handed_out[-1] + self.messages[number])
+        return handed_out, arrived
 
 
 def summary_us(values: list[int] | list[float]) -> dict[str, float]:

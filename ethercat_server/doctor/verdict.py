@@ -20,10 +20,9 @@ _TIMEOUT_NS: Final = 0.75 * PERIOD_NS
 _MANY: Final = 0.001
 """A part of all cycles: more than so many late or lost make it bad."""
 FORMULA: Final = (
-    f"age = max(0, {AIM_NS / 1000:.0f} µs + lateness - its median + (exchange - its mean) / 2) "
-    "+ exchange / 2 + message"
+    f"age = max(0, {AIM_NS / 1000:.0f} µs + lateness - its median + (exchange - its mean) / 2) + exchange / 2"
 )
-_AS_ROOT: Final = "run with sudo, or see 'A steadier cycle' in docs/operations.md"
+_STEADIER: Final = "see 'A steadier cycle' in docs/operations.md"
 
 
 def points(summary: Mapping[str, Any]) -> str:
@@ -39,7 +38,10 @@ def scheduling(measured: Measured) -> Iterator[Finding]:
     elif not measured.priority:
         yield note("ordinary scheduling, as asked for", "other programs come in between", real_time=False)
     else:
-        why = f"real-time priority was not granted, and other programs come in between: {_AS_ROOT}"
+        why = (
+            "real-time priority was not granted, and other programs come in between: run with sudo, "
+            "or use the service"
+        )
         yield note("ordinary scheduling", why, real_time=False)
 
 
@@ -59,14 +61,17 @@ def wake_finding(summary: Mapping[str, Any], late: int, count: int) -> Finding:
     if late:
         text += f"; {late} of {count} by more than a sample period"
         make = bad if late > _MANY * count else warning
-        why = f"each of them loses samples; a machine that stops does so too: {_AS_ROOT}"
+        why = (
+            "each loses samples; other work, or the host of a virtual machine, took the processor: "
+            f"{_STEADIER}"
+        )
         return make(text, why, **values)
     if summary["p99"] > _WAKE_WARNING_US:
-        return warning(text, f"makes the samples that much older: {_AS_ROOT}", **values)
+        return warning(text, f"makes the samples that much older: {_STEADIER}", **values)
     if summary["p99"] > _WAKE_NOTE_US:
         return note(
             text,
-            f"usual without a real-time kernel; samples are older by that now and then: {_AS_ROOT}",
+            f"usual without a real-time kernel; samples are older by that now and then: {_STEADIER}",
             **values,
         )
     return ok(text, **values)
@@ -130,14 +135,14 @@ def messages(measured: Measured) -> Iterator[Finding]:
 
 
 def age(measured: Measured) -> Iterator[Finding]:
-    """How old samples would be at a client."""
-    ages = measured.ages()
-    if not ages:
-        yield skipped(
-            "it follows from exchanges on the bus and messages over loopback TCP, and one of them is missing"
-        )
+    """How old samples would be when the server hands them out, and at a client."""
+    handed_out, arrived = measured.ages()
+    if not handed_out:
+        yield skipped("it follows from exchanges on the bus")
         return
-    yield age_finding("expected at a client on this machine", summary_us(ages), FORMULA)
+    yield age_finding("expected when handed out", summary_us(handed_out), FORMULA)
+    if arrived:
+        yield age_finding("expected at a client here", summary_us(arrived), "the same + message")
 
 
 def age_finding(what: str, summary: Mapping[str, Any], how: str) -> Finding:
