@@ -47,6 +47,27 @@ def identity(slave: Slave) -> Iterator[Finding]:
         yield ok(f"{text}, a model the server knows", **values)
 
 
+def line(slaves: Sequence[Slave]) -> Iterator[Finding]:
+    """Whether something is connected that does not answer: cables have two ends, one is the interface's."""
+    if not slaves:
+        return
+    values: dict[str, Any] = {"links": [list(slave.links) for slave in slaves]}
+    linked = [f"port {port} of slave {slave.place}" for slave in slaves for port in _ports(slave)]
+    if len(linked) > 2 * len(slaves) - 1:
+        yield note(
+            f"more links than slaves: {', '.join(linked)}",
+            "something behind them does not answer: no EtherCAT slave, or one that is still starting",
+            **values,
+        )
+    else:
+        yield ok("a slave at the end of every link", **values)
+
+
+def _ports(slave: Slave) -> list[int]:
+    """Those with a link."""
+    return [port for port, on in enumerate(slave.links) if on]
+
+
 def state(slave: Slave) -> Iterator[Finding]:
     """Its AL state, which the doctor leaves as it is."""
     values: dict[str, Any] = {

@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 from typing import TYPE_CHECKING, Final
 
@@ -121,7 +121,7 @@ def _run(args: argparse.Namespace) -> int:
     if report is not None:
         who = "as root" if header["root"] else "not as root"
         report.heading(f"ethercat-doctor {__version__} on {args.iface}: Linux {header['kernel']}, {who}")
-    for finding in _examined(args):
+    for finding in _examined(args, report.wait if report is not None else lambda _: None):
         findings.append(finding)
         if report is not None:
             report.write(finding)
@@ -132,18 +132,19 @@ def _run(args: argparse.Namespace) -> int:
     return EXIT_CODES[worst(findings)]
 
 
-def _examined(args: argparse.Namespace) -> Iterator[Finding]:
-    from ethercat_server.doctor.examination import examine_bus, examine_machine  # noqa: PLC0415
+def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iterator[Finding]:
+    from ethercat_server.doctor.bus_examination import Request, examine_bus  # noqa: PLC0415
+    from ethercat_server.doctor.examination import examine_machine  # noqa: PLC0415
 
     with contextlib.ExitStack() as cleanup:
         machine = _machine(args, cleanup)
         yield from examine_machine(machine)
-        yield from examine_bus(machine, args.seconds, args.cpu)
+        yield from examine_bus(machine, Request(args.seconds, args.cpu, announce))
 
 
 def _machine(args: argparse.Namespace, cleanup: contextlib.ExitStack) -> Machine:
     """This machine, and the interface, which for `virtual` is brought up and taken down by `cleanup`."""
-    from ethercat_server.doctor.examination import check_rights  # noqa: PLC0415
+    from ethercat_server.doctor.bus_examination import check_rights  # noqa: PLC0415
     from ethercat_server.doctor.facts import InterfaceFacts, collect  # noqa: PLC0415
     from ethercat_server.doctor.finding import CannotLookError  # noqa: PLC0415
     from ethercat_server.doctor.machine import Machine  # noqa: PLC0415

@@ -1,7 +1,6 @@
-"""What the kernel says of a network interface, over netlink and ethtool. Changes nothing, needs no rights.
+"""What the kernel says of a network interface, over netlink and ethtool. Needs no rights.
 
-Asked of the kernel, not of /sys: /sys shows the network namespace that it was mounted in. pyroute2 brings the
-ethtool requests but two, which are here: the driver, and energy-efficient Ethernet (linux/ethtool.h).
+Asked of the kernel, not of /sys: /sys shows the network namespace that it was mounted in.
 """
 
 from __future__ import annotations
@@ -12,25 +11,16 @@ import fcntl
 import os
 import socket
 import struct
-from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from ethercat_server.doctor import ethtool
 from ethercat_server.doctor.finding import cannot_look
 
 _GET_FLAGS: Final = 0x8913
 _SET_FLAGS: Final = 0x8914
 _IFF_PROMISC: Final = 0x100
-_SIOCETHTOOL: Final = 0x8946
-_GET_DRIVER: Final = 0x03
-_GET_EEE: Final = 0x44
-_DRIVER: Final = struct.Struct("=I32s32s32s32s32s12sIIIII")
-"""Command; driver, version, firmware, bus, ROM; reserved; numbers of statistics and more."""
-_EEE: Final = struct.Struct("=IIIIIIIIII")
-"""Command; modes supported, advertised, the partner's; active, enabled, low power idle on sending, timer."""
-_UNKNOWN_SPEEDS: Final = frozenset({0, 0xFFFF, 0xFFFFFFFF})
-_DUPLEX: Final = {0: "half", 1: "full"}
 _MAIN_TABLE: Final = 254
 _MADE_BY_KERNEL: Final = 2
 _NO_SUPPORT: Final = "the driver does not support it"
@@ -112,11 +102,11 @@ def collect(ifname: str) -> InterfaceFacts:
         link=_asked(_link, ifname),
         names=names,
         routes=_asked(_routes, ifname),
-        settings=_asked(_settings, ifname),
-        driver=_asked(_driver, ifname),
-        coalescing=_asked(_coalescing, ifname),
-        offloads=_asked(_offloads, ifname),
-        eee=_asked(_eee, ifname),
+        settings=_asked(ethtool.settings, ifname),
+        driver=_asked(ethtool.driver, ifname),
+        coalescing=_asked(ethtool.coalescing, ifname),
+        offloads=_asked(ethtool.offloads, ifname),
+        eee=_asked(ethtool.eee, ifname),
     )
 
 
@@ -228,49 +218,3 @@ def _routes(ifname: str) -> Routes:
         default=any(row["dst_len"] == 0 for row in routes),
         others=tuple(f"{row.get_attr('RTA_DST')}/{row['dst_len']}" for row in made),
     )
-
-
-@contextlib.contextmanager
-def _ethtool(ifname: str) -> Iterator[Any]:
-    from pyroute2.ethtool.ioctl import IoctlEthtool  # noqa: PLC0415 - takes a moment
-
-    with contextlib.closing(IoctlEthtool()) as asked:
-        asked.change_ifname(ifname)
-        yield asked
-
-
-def _settings(ifname: str) -> tuple[int | None, str | None]:
-    with _ethtool(ifname) as asked:
-        found = asked.get_link_settings()
-    return None if found.speed in _UNKNOWN_SPEEDS else int(found.speed), _DUPLEX.get(found.duplex)
-
-
-def _coalescing(ifname: str) -> dict[str, int]:
-    with _ethtool(ifname) as asked:
-        return {name: int(value) for name, value in asked.get_coalesce().items() if name != "cmd"}
-
-
-def _offloads(ifname: str) -> dict[str, bool]:
-    with _ethtool(ifname) as asked:
-        found: dict[str, bool] = asked.get_offload_flags()
-    return found
-
-
-def _driver(ifname: str) -> tuple[str, str]:
-    answer = _DRIVER.unpack(_request(ifname, _GET_DRIVER, _DRIVER.size))
-    driver, bus = (text.split(b"\0")[0].decode("ascii", errors="replace") for text in (answer[1], answer[4]))
-    return driver, bus
-
-
-def _eee(ifname: str) -> tuple[bool, bool]:
-    answer = _EEE.unpack(_request(ifname, _GET_EEE, _EEE.size))
-    return bool(answer[5]), bool(answer[4])
-
-
-def _request(ifname: str, command: int, size: int) -> bytes:
-    """An ethtool request through its ioctl, which is given the address of the answer's place."""
-    place = array("B", struct.pack("=I", command).ljust(size, b"\0"))
-    request = struct.pack("16sP16x", os.fsencode(ifname), place.buffer_info()[0])
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        fcntl.ioctl(asked, _SIOCETHTOOL, request)
-    return place.tobytes()

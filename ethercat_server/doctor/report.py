@@ -17,6 +17,7 @@ _COLOURS: Final = {
     Level.BAD: "\x1b[1;31m",
 }  # fmt: skip
 _END: Final = "\x1b[0m"
+_CLEAR_LINE: Final = "\x1b[K"
 _BOLD: Final = "\x1b[1m"
 _LEVEL_WIDTH: Final = max(len(level.name) for level in Level)
 _NAME_WIDTH: Final = 20
@@ -47,10 +48,18 @@ class Report:
         )
         self._width = max(_LEAST_TEXT, width - len(_INDENT))
         self._subject = ""
+        self._waiting = False
 
     def heading(self, text: str) -> None:
         """The first line."""
         self._say(text + "\n")
+
+    def wait(self, text: str) -> None:
+        """Say on a terminal what takes a while, until the next line."""
+        if self._stream.isatty():
+            self._stream.write(f"{text}\r")
+            self._stream.flush()
+            self._waiting = True
 
     def write(self, finding: Finding) -> None:
         """One finding, below its subject."""
@@ -69,9 +78,7 @@ class Report:
     def summary(self, findings: Sequence[Finding]) -> None:
         """How many of each, and what that means."""
         counts = {level: sum(f.level is level for f in findings) for level in reversed(Level)}
-        names = {Level.OK: "ok", Level.SKIPPED: "skipped", Level.NOTE: "notes", Level.WARNING: "warnings",
-                 Level.BAD: "bad"}  # fmt: skip
-        text = ", ".join(f"{count} {names[level]}" for level, count in counts.items() if count)
+        text = ", ".join(f"{count} {_counted(level, count)}" for level, count in counts.items() if count)
         self._say(f"\n{text}")
 
     def _lines(self, text: str) -> list[str]:
@@ -81,8 +88,16 @@ class Report:
         return f"{colour}{text}{_END}" if self._colour else text
 
     def _say(self, text: str) -> None:
+        if self._waiting:
+            self._stream.write(_CLEAR_LINE)
+            self._waiting = False
         self._stream.write(printable(text) + "\n")
         self._stream.flush()
+
+
+def _counted(level: Level, count: int) -> str:
+    name = level.name.lower()
+    return f"{name}s" if level in {Level.NOTE, Level.WARNING} and count != 1 else name
 
 
 def printable(text: str) -> str:

@@ -7,10 +7,10 @@ import sys
 
 import pyroute2.ethtool.ioctl
 
-from ethercat_server.doctor import cli, examination, report
+from ethercat_server.doctor import bus_examination, cli, report
 from tests.server.as_another_user import become_nobody
 
-LOADED = (pyroute2.ethtool.ioctl, pyroute2.IPRoute, examination, report)
+LOADED = (pyroute2.ethtool.ioctl, pyroute2.IPRoute, bus_examination, report)
 """What it would load later, from where nobody may not be able to read it."""
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ def test_everything_is_aligned_below_its_subject() -> None:
     assert shown[-3] == " " * at + "$ echo 1 | sudo tee /x"
     assert shown[-4].strip() == "because"
     assert max(map(len, shown)) <= 120
-    assert shown[-1] == "1 warnings, 1 ok"
+    assert shown[-1] == "1 warning, 1 ok"
 
 
 def test_commands_are_never_broken(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -126,3 +126,13 @@ def test_names_from_the_bus_are_told_in_json() -> None:
     found = the(bus.identity(slave(al=AlStatus.parse(struct.pack("<HHH", 0x14, 0, 0x1B)))))
     assert found.values["al_state"] == "SAFEOP"
     assert found.values["al_error"] is True
+
+
+def test_something_connected_that_does_not_answer() -> None:
+    alone, linked = (True, False, False, False), (True, True, False, False)
+    assert the(bus.line([slave(links=alone)])).level is Level.OK
+    assert the(bus.line([slave(links=linked), slave(place=1, links=alone)])).level is Level.OK
+    found = the(bus.line([slave(links=linked), slave(place=1, links=linked)]))
+    assert found.level is Level.NOTE
+    assert found.found.endswith("port 0 of slave 1, port 1 of slave 1")
+    assert list(bus.line([])) == []

@@ -56,7 +56,7 @@ def test_losses_show(bench: Bench) -> None:
     with running.connect() as client:
         wait_until(lambda: client.ask("status")["sensors"][1]["recoveries"] >= 1, "the recovery")
     rows = [row for row in doctor(veth.near, *QUICK).json["findings"] if row["check"] == "sensors"]
-    assert rows[1]["level"] in {"note", "warning"}
+    assert rows[1]["level"] != "ok"
     assert rows[1]["values"]["recoveries"] >= 1
 
 
