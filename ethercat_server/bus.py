@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from ethercat_server.errors import BusError
-from ethercat_server.raw_socket import FPRD, FPWR, SOEM_INDICES
+from ethercat_server.raw_socket import APRD, APWR, BRD, FPRD, FPWR, SOEM_INDICES
 from ethercat_server.soem import Master
 
 _DATAGRAM_TIMEOUT_S: Final = 0.002
@@ -99,6 +99,24 @@ class Bus(Master):
     def write_register(self, slave: int, address: int, data: bytes) -> bool:
         """Write ESC registers or a mailbox of `slave` with one datagram; False if it did not do it."""
         return self._datagram(FPWR, slave, address, data)[0] == 1
+
+    def count_slaves(self, size: int, timeout_s: float) -> int:
+        """How many slaves answer a broadcast read of `size` bytes from register 0 on; -1 if it is lost.
+
+        Needs no scan and changes nothing, so it also tells how long a frame of that size takes.
+        """
+        answer = self._socket.datagram(BRD, 0, 0, bytes(size), timeout_s)
+        return -1 if answer is None else answer[0]
+
+    def read_at(self, place: int, address: int, size: int) -> bytes | None:
+        """Read ESC registers of the slave at `place` on the bus, scanned or not; None if it did not do it."""
+        answer = self._socket.datagram(APRD, -place & 0xFFFF, address, bytes(size), _PATIENT_TIMEOUT_S)
+        return answer[1] if answer is not None and answer[0] == 1 else None
+
+    def write_at(self, place: int, address: int, data: bytes) -> bool:
+        """Write ESC registers of the slave at `place` on the bus, scanned or not; False if it did not."""
+        answer = self._socket.datagram(APWR, -place & 0xFFFF, address, data, _PATIENT_TIMEOUT_S)
+        return answer is not None and answer[0] == 1
 
     def _datagram(self, command: int, slave: int, address: int, data: bytes) -> tuple[int, bytes]:
         station = self._stations[slave]

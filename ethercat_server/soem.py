@@ -59,6 +59,8 @@ class Master:
         self._master: Any = pysoem.Master()
         self._slaves: list[Any] = []
         self._opened = False
+        self._scanned = False
+        """The slaves' states are this master's business from here on."""
         self._abandoned = False
         """A thread that never ended still uses the socket: it must not be closed."""
         self._stations: list[int] = []
@@ -114,7 +116,7 @@ class Master:
         )
         thread.start()
         deadline = time.monotonic() + _SCAN_TIMEOUT_S
-        self._abandoned = True
+        self._abandoned = self._scanned = True
         while thread.is_alive():
             thread.join(0.05)
             check_interrupt()
@@ -172,14 +174,18 @@ class Master:
         raise BusError(self._state_complaint(AlState.OP))
 
     def close(self) -> None:
-        """Take the slaves to INIT and close the socket. May be called at any time, any number of times."""
+        """Take the slaves to INIT and close the socket. May be called at any time, any number of times.
+
+        Slaves that were never scanned are left in the state they are in.
+        """
         if not self._opened or self._abandoned:
             return
         self._opened = False
         with contextlib.suppress(*_PYSOEM_ERRORS):
             self._socket.set_blocking(True)
-            self._master.state = pysoem.INIT_STATE
-            self._master.write_state()
+            if self._scanned:
+                self._master.state = pysoem.INIT_STATE
+                self._master.write_state()
         self._socket.close()
         self._master.close()
 

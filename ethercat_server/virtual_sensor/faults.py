@@ -15,7 +15,7 @@ from typing import Final
 
 from ethercat_server.objects import MODELS
 from ethercat_server.virtual_sensor.al import AlState
-from ethercat_server.virtual_sensor.bus import Bus
+from ethercat_server.virtual_sensor.bus import Bus, Damage
 from ethercat_server.virtual_sensor.firmware import Firmware
 from ethercat_server.virtual_sensor.sensor import VirtualSensor
 from ethercat_server.virtual_sensor.signals import SIGNALS
@@ -96,6 +96,23 @@ def _deaf_after(call: _Call) -> None:
 def _hear(call: _Call) -> None:
     call.bus.deaf_until = call.bus.deaf_after = None
     call.bus.lose = 0
+    call.bus.damage = None
+
+
+def _port(call: _Call, at: int) -> int:
+    port = whole(call.arguments[at], 0, 1) if len(call.arguments) > at else 0
+    if port == 1 and call.sensor is call.bus.sensors[-1]:
+        raise CommandError("port 1 of the last sensor is open: nothing comes from there")
+    return port
+
+
+def _damage(call: _Call) -> None:
+    frames, port = whole(call.arguments[0], 0, 2**31), _port(call, 1)
+    call.bus.damage = Damage(call.sensor, port, frames) if frames else None
+
+
+def _flap(call: _Call) -> None:
+    call.bus.flap(call.sensor, _port(call, 0))
 
 
 def _power(call: _Call) -> None:
@@ -207,7 +224,12 @@ COMMANDS: Final[tuple[FaultCommand, ...]] = (
     FaultCommand("lose", "lose N", (1,), "lose the next N frames", _lose),
     FaultCommand("deaf", "deaf [SECONDS]", (0, 1), "lose every frame, until `hear` or for a time", _deaf),
     FaultCommand("deaf-after", "deaf-after N", (1,), "answer N frames more, then be `deaf`", _deaf_after),
-    FaultCommand("hear", "hear", (0,), "end `deaf`, `deaf-after` and `lose`", _hear),
+    FaultCommand("hear", "hear", (0,), "end `deaf`, `deaf-after`, `lose` and `damage`", _hear),
+    FaultCommand(
+        "damage", "damage N [PORT] [@N]", (1, 2),
+        "damage the next N frames on their way to this sensor: to port 0, or back to port 1", _damage,
+    ),
+    FaultCommand("flap", "flap [PORT] [@N]", (0, 1), "the link at port 0 or 1 goes and comes back", _flap),
     FaultCommand(
         "power", "power off|on|cycle SECONDS [@N]", (1, 2),
         "switch a sensor off or on; what was not saved is gone, and sensors behind it are cut off", _power,

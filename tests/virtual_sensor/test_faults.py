@@ -316,3 +316,82 @@ def test_any_line_gets_one_line(line: str) -> None:
         answer = obey(RawMaster().bus, line)
         assert answer.startswith(("ok", "error: "))
         assert "\n" not in answer
+
+
+def counters(master: RawMaster, place: int = 0) -> dict[str, tuple[int, int]]:
+    """What the controller at `place` has counted, at port 0 and at port 1."""
+    found = master.read(0x0300, 0x14, place)
+    assert not any(found[4:8] + found[10:16] + found[18:20]), "no ports 2 and 3, no other errors"
+    return {
+        "invalid": (found[0], found[2]),
+        "physical": (found[1], found[3]),
+        "forwarded": (found[8], found[9]),
+        "lost links": (found[16], found[17]),
+    }
+
+
+CLEAN = {"invalid": (0, 0), "physical": (0, 0), "forwarded": (0, 0), "lost links": (0, 0)}
+
+
+def test_a_damaged_frame_is_lost_and_counted_where_it_was_damaged() -> None:
+    master = RawMaster(*chain(3))
+    do(master, "damage 2 @1")
+    assert [answering(master) for _ in range(4)] == [0, 0, 3, 3]
+    assert stats(master)["frames_lost"] == 2
+    assert counters(master, 0) == {**CLEAN, "forwarded": (0, 2)}, "on its way back"
+    assert counters(master, 1) == {**CLEAN, "invalid": (2, 0), "physical": (2, 0), "forwarded": (0, 2)}
+    assert counters(master, 2) == {**CLEAN, "forwarded": (2, 0)}, "the end of the line"
+
+
+def test_a_frame_damaged_on_its_way_back_has_done_its_work() -> None:
+    master = RawMaster(*chain(3))
+    do(master, "damage 1 1 @1")
+    assert master.frame((Command.BWR, 0, 0x0F80, b"!")) is None
+    assert [master.read(0x0F80, 1, place) for place in range(3)] == [b"!"] * 3
+    assert counters(master, 0) == {**CLEAN, "forwarded": (0, 1)}
+    assert counters(master, 1) == {**CLEAN, "invalid": (0, 1), "physical": (0, 1)}
+    assert counters(master, 2) == CLEAN
+
+
+def test_a_damaged_frame_reaches_only_those_before_the_damage() -> None:
+    master = RawMaster(*chain(3))
+    do(master, "damage 1 @1")
+    assert master.frame((Command.BWR, 0, 0x0F80, b"!")) is None
+    assert [master.read(0x0F80, 1, place) for place in range(3)] == [b"!", b"\0", b"\0"]
+
+
+def test_a_link_that_flaps_is_counted_at_both_ends() -> None:
+    master = RawMaster(*chain(2))
+    do(master, "flap")
+    assert [counters(master, n)["lost links"] for n in range(2)] == [(1, 0), (0, 0)]
+    do(master, "flap 1")
+    do(master, "flap @1")
+    assert [counters(master, n)["lost links"] for n in range(2)] == [(1, 2), (2, 0)]
+    do(master, "power off @1")
+    assert counters(master)["lost links"] == (1, 3)
+
+
+def test_error_counters_stop_at_255_and_a_write_clears_their_group() -> None:
+    master = RawMaster(*chain(2))
+    do(master, "damage 300 @1")
+    do(master, "flap @1")
+    assert sum(answering(master) == 0 for _ in range(310)) == 300
+    assert counters(master, 1)["invalid"] == (255, 0)
+    assert master.write(0x0303, b"\x55", 1) == 1
+    assert counters(master, 1) == {**CLEAN, "lost links": (1, 0)}
+    assert master.write(0x0310, b"\0", 1) == 1
+    assert counters(master, 1) == CLEAN
+    assert counters(master, 0)["forwarded"] == (0, 255)
+    assert master.write(0x030E, b"\0\0", 1) == 0, "nothing there"
+
+
+def test_hear_ends_damage_and_the_last_port_is_open() -> None:
+    master = RawMaster(*chain(2))
+    do(master, "damage 5")
+    do(master, "hear")
+    assert answering(master) == 2
+    assert obey(master.bus, "damage 1 1 @1").startswith("error: port 1 of the last sensor")
+    assert obey(master.bus, "damage 1 2").startswith("error: ")
+    do(master, "power off @1")
+    do(master, "damage 1 @1")
+    assert answering(master) == 1, "nobody there to find it damaged"
