@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ethercat_server import objects
-from ethercat_server.bus import Bus, SlaveIdentity
+from ethercat_server.bus import Bus
 from ethercat_server.errors import BusError, UsageError
 from ethercat_server.options import ServerOptions
 from ethercat_server.sdo import BlockingSdo, finish
 from ethercat_server.sensor import Sensor, identify, is_known_model, set_up
+from ethercat_server.soem import SlaveIdentity
 from protocol.errors import PdoSizeError
 from protocol.pdo import layout_for
 

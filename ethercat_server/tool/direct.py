@@ -9,7 +9,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from ethercat_server import realtime
-from ethercat_server.bus import Bus, SlaveIdentity
+from ethercat_server.bus import Bus
 from ethercat_server.configuration import Change, save
 from ethercat_server.cycle import Cycle
 from ethercat_server.errors import BusError, UsageError
@@ -21,6 +21,7 @@ from ethercat_server.recovery import Recovery
 from ethercat_server.sdo import BlockingSdo, Sdo, Steps, finish
 from ethercat_server.sensor import Sensor, set_up
 from ethercat_server.server_settings import DEFAULT_RT_PRIORITY
+from ethercat_server.soem import SlaveIdentity
 from ethercat_server.start_up import enter_op, find_sensors
 from ethercat_server.stream import SensorStream
 from ethercat_server.tare import tare
