@@ -9,13 +9,14 @@ from __future__ import annotations
 import logging
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 from ethercat_server import objects
 from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError
 from ethercat_server.sdo import Sdo, Steps
+from protocol.meaning import value_meaning
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue
 
 _MODEL_NAME: Final = re.compile(r"BFT-[A-Z]{4}-ECAT-M8")
@@ -56,7 +57,9 @@ class Sensor:
     rate_hz: int = 0
     state: str = "PREOP"
     settings: dict[str, SettingValue] = field(default_factory=dict)
-    """The settings in force."""
+    """The settings in force; `hold` changes them."""
+    meaning: dict[str, str] = field(default_factory=dict)
+    """What each of them means. Kept, so that telling it takes no time from the samples."""
     offset: tuple[float, ...] | None = None
     """The force/torque offset that was set while streaming; written again when the sensor has lost it."""
 
@@ -64,6 +67,11 @@ class Sensor:
     def period_ns(self) -> float:
         """Nominal sample period; 0x8011 rounds the rate to whole Hz, so it follows from the SINC length."""
         return 1e9 * self.wanted["sinc_length"] / BASE_SAMPLING_RATE_HZ
+
+    def hold(self, settings: Mapping[str, SettingValue]) -> None:
+        """These settings are in force now."""
+        self.settings = dict(settings)
+        self.meaning = {name: value_meaning(name, value) for name, value in settings.items()}
 
     def describe(self) -> dict[str, Any]:
         """The sensor's part of the `describe` reply."""
@@ -76,7 +84,8 @@ class Sensor:
             "pdo_size": self.pdo_size,
             "rate_hz": self.rate_hz,
             "state": self.state,
-            "settings": dict(self.settings),
+            "settings": self.settings,
+            "meaning": self.meaning,
         }
 
 
@@ -190,7 +199,7 @@ def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
         except ValueError as error:
             log.warning("sensor %d: %s", sensor.place, error)
     held["sinc_length"] = sensor.wanted["sinc_length"]
-    sensor.settings = held
+    sensor.hold(held)
 
 
 def _read(sdo: Sdo, address: tuple[int, int]) -> Steps[bytes | None]:

@@ -231,7 +231,7 @@ def _write(sdo: Sdo, sensor: Sensor, index: int, subindex: int, data: bytes) -> 
             value = None
         if value is not None:
             sensor.wanted = {**sensor.wanted, entry.setting: value}
-            sensor.settings[entry.setting] = value
+            sensor.hold({**sensor.settings, entry.setting: value})
     if index == objects.FORCE_TORQUE_OFFSET:
         sensor.offset = yield from read_offset(sdo)
     return {"index": index, "subindex": subindex, "hex": data.hex()}

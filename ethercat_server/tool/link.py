@@ -136,7 +136,7 @@ def read_in_force(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     sensor.wanted = {"sinc_length": held or 0}
     yield from read_settings(sdo, sensor)
     if not held:
-        del sensor.settings["sinc_length"]
+        sensor.hold({name: value for name, value in sensor.settings.items() if name != "sinc_length"})
     sensor.wanted = dict(sensor.settings)
 
 

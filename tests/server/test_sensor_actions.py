@@ -146,6 +146,7 @@ def test_filters_are_changed_by_way_of_preop_and_the_stream_goes_on(
     assert (last[-1].monotonic_ns - last[0].monotonic_ns) / 99 == pytest.approx(2.5e6, rel=0.02)
     described = asking.ask("describe")["sensors"][0]
     assert (described["state"], described["rate_hz"]) == ("OP", 400)
+    assert described["meaning"]["sinc_length"].startswith("400 Hz; cut-off 105 Hz")
     assert asking.ask("status")["sensors"][0]["recoveries"] == 0, "it was not lost"
     assert [event["event"] for event in listener.events] == ["reconfigured"]
 
