@@ -1,4 +1,4 @@
-"""The EtherCAT master from power-on to OP: scan, SDO, SII, mapping, states. The only file that knows pysoem.
+"""The EtherCAT master from power-on to OP: scan, SDO, mapping, states. The only file that knows pysoem.
 
 Everything pysoem raises is translated here, and its traps are kept in here: the descriptor it leaks on a
 failed open, its close that must happen once, its scan that may take minutes, and its error ring, which can
@@ -35,14 +35,13 @@ _PYSOEM_ERRORS: Final = (
     pysoem.PacketError,
     pysoem.WkcError,
     pysoem.ConfigMapError,
-    pysoem.EepromError,
     pysoem.NetworkInterfaceNotOpenError,
 )
 log = logging.getLogger(__name__)
 
 
 class SlaveIdentity(NamedTuple):
-    """What the SII of a slave says."""
+    """What the SII of a slave says; zeros if it cannot be read."""
 
     vendor: int
     product: int
@@ -121,8 +120,8 @@ class Master:
             check_interrupt()
             if time.monotonic() > deadline:
                 raise BusError(
-                    f"the scan of {self.ifname} does not end: a slave stopped answering in its middle; "
-                    "check cable and power, then start again"
+                    f"the scan of {self.ifname} does not end: a slave stopped answering in its middle, or "
+                    "its EEPROM does not answer; check cable and power, then start again"
                 )
         self._abandoned = False
         return counts[0] if counts else 0
@@ -140,16 +139,6 @@ class Master:
     def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
         """Download an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
         self._sdo(slave, index, subindex, f"writing {data.hex()} to object 0x{index:04X}:{subindex}", data)
-
-    def sii_words(self, slave: int, word: int) -> bytes:
-        """The two words of the SII at `word` and after it, four bytes; BusError if it cannot be read."""
-        try:
-            data: bytes = self._slaves[slave].eeprom_read(word)
-        except _PYSOEM_ERRORS as error:
-            raise BusError(
-                f"the SII of slave {slave} cannot be read at word 0x{word:04x}: {_texts([error])}"
-            ) from None
-        return data
 
     def map_process_data(self) -> list[int]:
         """Map the process data and take the slaves to SAFEOP; returns each slave's input size in bytes."""

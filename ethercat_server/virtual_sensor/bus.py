@@ -92,6 +92,9 @@ class Bus:
             for datagram in datagrams:
                 execute(life.esc, frame, datagram)
         frame[wire.SOURCE_ADDRESS] |= wire.PROCESSED_BIT
+        for sensor in self.sensors:
+            while sensor.due:
+                sensor.due.pop(0)()
         return True
 
     def prepare(self) -> None:

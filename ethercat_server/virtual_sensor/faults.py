@@ -6,9 +6,10 @@ without it sensor 0). The answer is one line: `ok ...`, or `error: ` and a sente
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,6 +18,7 @@ from ethercat_server.virtual_sensor.al import AlState
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.firmware import Firmware
 from ethercat_server.virtual_sensor.sensor import VirtualSensor
+from ethercat_server.virtual_sensor.sii import SiiInterface
 
 LONGEST_LINE: Final = 1000
 PPM_LIMIT: Final = 100_000.0
@@ -49,7 +51,7 @@ class FaultCommand:
 
     name: str
     usage: str
-    counts: tuple[int, ...]
+    counts: Sequence[int]
     """Numbers of arguments that it takes."""
     meaning: str
     run: Callable[[_Call], str | None]
@@ -141,7 +143,36 @@ def _swap(call: _Call) -> None:
 
 def _abort(call: _Call) -> None:
     index, subindex = whole(call.arguments[0], 0, 0xFFFF), whole(call.arguments[1], 0, 0xFF)
-    call.life.aborts[index, subindex] = whole(call.arguments[2], 0, 0xFFFFFFFF)
+    call.life.aborts.arm((index, subindex), whole(call.arguments[2], 0, 0xFFFFFFFF))
+
+
+def _on_write(call: _Call) -> None:
+    address = whole(call.arguments[0], 0, 0xFFFF), whole(call.arguments[1], 0, 0xFF)
+    later = _parse(call.bus, " ".join(call.arguments[2:]), call.sensor)
+
+    def do() -> None:
+        with contextlib.suppress(CommandError):  # it has no power then
+            later()
+
+    call.sensor.on_write(address, do)
+
+
+def _saving(call: _Call) -> None:
+    flash = call.sensor.flash
+    flash.seconds = real(call.arguments[0], 0, 1e6)
+    flash.result = whole(call.arguments[1], 0, 0xFE) if len(call.arguments) > 1 else 0
+
+
+def _cut_save(call: _Call) -> None:
+    sensor, count = call.sensor, whole(call.arguments[0], 0, 1000)
+    sensor.flash.cut = count, lambda: sensor.due.append(lambda: call.bus.power(sensor, False))
+
+
+def _sii(call: _Call) -> None:
+    faults = SiiInterface.FAULTS.get(call.arguments[0])
+    if faults is None:
+        raise CommandError(f"sii takes {', '.join(SiiInterface.FAULTS)}")
+    call.life.esc.sii.fail(faults)
 
 
 def _mute(call: _Call) -> None:
@@ -184,7 +215,19 @@ COMMANDS: Final[tuple[FaultCommand, ...]] = (
     FaultCommand(
         "abort", "abort INDEX SUBINDEX CODE [@N]", (3,), "abort the next SDO on that entry", _abort
     ),
+    FaultCommand(
+        "on-write", "on-write INDEX SUBINDEX COMMAND ...", range(3, 7),
+        "do a command right after the next SDO write to that entry", _on_write,
+    ),
+    FaultCommand(
+        "saving", "saving SECONDS [STATUS] [@N]", (1, 2),
+        "from now on the save command takes so long, and ends with this status", _saving,
+    ),
+    FaultCommand(
+        "cut-save", "cut-save N [@N]", (1,), "lose power in the next save, after N entries of it", _cut_save
+    ),
     FaultCommand("mute-mailbox", "mute-mailbox N [@N]", (1,), "swallow the next N mailbox requests", _mute),
+    FaultCommand("sii", "sii error|busy|ok [@N]", (1,), "how reading its EEPROM ends", _sii),
     FaultCommand("ppm", "ppm X [@N]", (1,), "change the error of the sensor's clock", _ppm),
     FaultCommand("stats", "stats", (0,), "counters and states, as JSON", _stats),
     FaultCommand("help", "help", (0,), "this list", _help),
@@ -204,6 +247,11 @@ def obey(bus: Bus, line: str) -> str:
 
 
 def _run(bus: Bus, line: str) -> str | None:
+    return _parse(bus, line, None)()
+
+
+def _parse(bus: Bus, line: str, sensor: VirtualSensor | None) -> Callable[[], str | None]:
+    """What the command in `line` does, to `sensor` unless it names another; CommandError if it is none."""
     words = line.split()
     places = [word for word in words if word.startswith("@")]
     words = [word for word in words if not word.startswith("@")]
@@ -216,5 +264,7 @@ def _run(bus: Bus, line: str) -> str | None:
         raise CommandError(f"wrong number of arguments: {command.usage}")
     if len(places) > 1:
         raise CommandError("more than one sensor named: one `@N` a command")
-    place = whole(places[0][1:], 0, len(bus.sensors) - 1) if places else 0
-    return command.run(_Call(bus, bus.sensors[place], words[1:]))
+    if places:
+        sensor = bus.sensors[whole(places[0][1:], 0, len(bus.sensors) - 1)]
+    call = _Call(bus, sensor or bus.sensors[0], words[1:])
+    return lambda: command.run(call)

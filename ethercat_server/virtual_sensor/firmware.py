@@ -10,11 +10,13 @@ from collections.abc import Callable
 from typing import Final
 
 from ethercat_server.virtual_sensor import registers as reg
+from ethercat_server.virtual_sensor.abort_faults import AbortFaults
 from ethercat_server.virtual_sensor.al import AlCode, AlState, AlStateMachine
 from ethercat_server.virtual_sensor.clock import SampleClock
 from ethercat_server.virtual_sensor.coe import CoeServer
-from ethercat_server.virtual_sensor.dictionary import Address, Dictionary
+from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.esc import Esc
+from ethercat_server.virtual_sensor.flash import Flash
 from ethercat_server.virtual_sensor.layout import SYNC_MANAGERS, sync_manager_lengths
 from ethercat_server.virtual_sensor.mailbox import Mailbox
 from ethercat_server.virtual_sensor.measurement import Measurement
@@ -49,17 +51,16 @@ class Firmware:
         now: CLOCK_MONOTONIC in ns; whoever hands over a frame sets it first.
     """
 
-    def __init__(
-        self, options: SensorOptions, flash: dict[Address, bytes], now: int, on_write: OnWrite
-    ) -> None:
+    def __init__(self, options: SensorOptions, flash: Flash, now: int, on_write: OnWrite) -> None:
         self.now = now
         self._on_write = on_write
         self._options = options
         self._layout = layout_for(options.pdo_size)
         self._signal = make_signal(options)
         self.dictionary = Dictionary(
-            options.model, options.serial, options.pdo_size, flash, self.inputs, self._settings_changed
-        )
+            options.model, options.serial, options.pdo_size,
+            flash, self.inputs, self._settings_changed, lambda: self.now,
+        )  # fmt: skip
         sinc_length = int(self.dictionary.settings()["sinc_length"])
         self._power_on = self.now
         self.clock = SampleClock(self.now, sinc_length, options.ppm)
@@ -71,7 +72,7 @@ class Firmware:
         self.made = 0
         self._warnings, self._warnings_until = 0, -1
         self._stuck = b""
-        self.aborts: dict[Address, int] = {}
+        self.aborts = AbortFaults()
         self._fed = 0  # when the process data watchdog was last triggered; 0 = not running
         self._number, self._data = -1, b""
         self._prepared_number, self._prepared = -1, b""
@@ -210,14 +211,9 @@ class Firmware:
         """The last reply was lost on the way."""
         self.mailbox.repeat()
 
-    def _fault_on(self, index: int, subindex: int) -> None:
-        code = self.aborts.pop((index, subindex), None)
-        if code is not None:
-            raise SdoAbortError(code)
-
     def read(self, index: int, subindex: int) -> bytes:
         """An SDO upload."""
-        self._fault_on(index, subindex)
+        self.aborts.check_read((index, subindex))
         return self.dictionary.read(index, subindex)
 
     def check_download(self, index: int, subindex: int, length: int) -> None:
@@ -236,7 +232,7 @@ class Firmware:
         """An SDO download."""
         abort = 0
         try:
-            self._fault_on(index, subindex)
+            self.aborts.check_write((index, subindex), data, self.now)
             self.dictionary.write(index, subindex, data, self.al.state)
         except SdoAbortError as error:
             abort = error.code

@@ -145,7 +145,81 @@ def test_abort_once() -> None:
     assert master.upload(0x8010, 3) == b"\1"
     with pytest.raises(Abort, match="0x6040043"):
         master.download(0x8006, 1, b"\x40\0")
+    with pytest.raises(Abort, match="0x6040043"):
+        master.download(0x8006, 1, b"\x40\0")  # its answer could have been lost on the way
+    master.download(0x8006, 1, b"\x80\0")
+    master.wait(300_000_000)
     master.download(0x8006, 1, b"\x40\0")
+
+
+def test_a_command_waits_for_a_write() -> None:
+    master = RawMaster(SensorOptions(serial=1), SensorOptions(serial=2)).go(PREOP)
+    do(master, "on-write 0x8010 3 error 0x1B")
+    master.download(0x8010, 2, b"\1")
+    assert [row["al_error"] for row in stats(master)["sensors"]] == [False, False]
+    master.download(0x8010, 3, b"\1")
+    assert [row["al_error"] for row in stats(master)["sensors"]] == [True, False]
+    for line in ("on-write 0x8010 3", "on-write 0x8010 3 dance", "on-write 0x8010 3 lose"):
+        assert obey(master.bus, line).startswith("error: ")
+
+
+SAVE, STATUS = (0x8030, 1), (0x8030, 2)
+
+
+def test_saving_takes_its_time_and_a_power_cut_leaves_the_rest() -> None:
+    master = RawMaster().go(PREOP)
+    do(master, "saving 0.37")  # ten milliseconds each
+    for subindex, data in ((1, b"\x80\0"), (2, b"\0"), (4, b"\1")):
+        master.download(0x8006, subindex, data)
+    master.download(*SAVE, b"\1")
+    assert master.upload(*STATUS) == b"\xff"
+    master.wait(265_000_000)
+    do(master, "power off")
+    do(master, "power on")
+    master.go(PREOP)
+    assert [master.upload(0x8006, n) for n in (1, 2, 3, 4)] == [b"\x80\0", b"\0", b"\0", b"\0"]
+    assert master.upload(*STATUS) == b"\0"
+    master.download(*SAVE, b"\1")
+    master.wait(371_000_000)
+    assert master.upload(*STATUS) == b"\0"
+
+
+def test_a_save_may_end_with_a_status_or_with_the_power() -> None:
+    master = RawMaster().go(PREOP)
+    do(master, "saving 0 7")
+    master.download(0x8006, 4, b"\1")
+    master.download(*SAVE, b"\1")
+    assert master.upload(*STATUS) == b"\x07"
+    do(master, "power cycle 0")
+    master.go(PREOP)
+    assert master.upload(0x8006, 4) == b"\0"
+    do(master, "saving 0")
+    master.download(0x8006, 2, b"\0")
+    master.download(0x8006, 4, b"\1")
+    do(master, "cut-save 27")
+    with pytest.raises(AssertionError):
+        master.download(*SAVE, b"\1")
+    assert answering(master) == 0
+    do(master, "power on")
+    master.go(PREOP)
+    assert [master.upload(0x8006, n) for n in (2, 4)] == [b"\0", b"\0"]
+
+
+def test_an_eeprom_that_cannot_be_read() -> None:
+    master = RawMaster()
+
+    def status() -> int:
+        master.write(0x0502, struct.pack("<HI", 0x0100, 8))
+        return master.read16(0x0502) & 0xE000
+
+    assert status() == 0
+    do(master, "sii error")
+    assert status() == 0x2000
+    do(master, "sii busy")
+    assert status() == 0x8000
+    do(master, "sii ok")
+    assert status() == 0
+    assert obey(master.bus, "sii sometimes").startswith("error: ")
 
 
 def test_mute_mailbox() -> None:
