@@ -29,6 +29,8 @@ from scripts._benchmark_node import measure_node
 from scripts._benchmark_plot import Curves, draw
 from scripts._benchmark_records import may_be_real_time
 from scripts._benchmark_report import print_configuration
+from scripts._benchmark_sdo import SECONDS as SDO_SECONDS
+from scripts._benchmark_sdo import measure_sdo
 from scripts._benchmark_soak import soak
 from scripts._demo import DemoError, Stopped, ignore_signals, loopback_up, on_signal
 
@@ -43,6 +45,7 @@ _RATES: Final = tuple(OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512
 MODES: Final[dict[str, tuple[Callable[[Setup, Console], dict[str, Any]], str]]] = {
     "clients": (measure_clients, "only the server, eight clients against one"),
     "node": (measure_node, "only the ROS 2 node: ages beside a TCP client, CPU, first message after a stop"),
+    "sdo": (measure_sdo, "only the server, without and with SDO reads and tares"),
 }
 """Options that measure one thing, by themselves."""
 
@@ -104,7 +107,8 @@ def run(options: argparse.Namespace, console: Console) -> None:
     if options.ros and find_spec("rclpy") is None:
         console.print("no ROS 2 here (rclpy): only up to a TCP client")
         options.ros = False
-    seconds = options.seconds or (_QUICK_SECONDS if options.quick else _SECONDS)
+    usual = SDO_SECONDS if options.sdo else _QUICK_SECONDS if options.quick else _SECONDS
+    seconds = options.seconds or usual
 
     def setup(rate: int, sensors: int) -> Setup:
         return Setup(rate, sensors, seconds, warm_up_s=1.0, priority=priority, ppm=options.ppm)
