@@ -29,7 +29,8 @@ _NONE: Final = 0x0000
 _BUSY: Final = 0x8000
 _ERRORS: Final = 0x7800
 _EIGHT_BYTES: Final = 0x0040
-_WORD_TIMEOUT_S: Final = 0.3
+_WORD_TIMEOUT_S: Final = 1.5
+"""So long reading is tried again: a bus that is deaf for a moment is no refusal."""
 
 
 def read_sii(bus: Bus, slave: int, word: int, count: int) -> Steps[bytes]:
@@ -54,23 +55,23 @@ def has_coe(bus: Bus, slave: int) -> Steps[bool]:
 def _read_word(bus: Bus, slave: int, word: int) -> Steps[bytes]:
     """What one read command gives: two words, or four."""
     deadline = time.monotonic() + _WORD_TIMEOUT_S
-    answer = "no answer"
+    answer, asked = "no answer", False
     while time.monotonic() < deadline:
-        bus.write_register(slave, _CONTROL, _COMMAND.pack(_READ, word))
-        yield
-        while time.monotonic() < deadline:
-            found = bus.read_register(slave, _CONTROL, _REGISTERS.size)
-            if found is None:
-                break
+        if not asked:
+            asked = bus.write_register(slave, _CONTROL, _COMMAND.pack(_READ, word))
+            yield
+            continue
+        found = bus.read_register(slave, _CONTROL, _REGISTERS.size)
+        if found is not None:
             status, address, data = _REGISTERS.unpack(found)
-            if not status & (_BUSY | _ERRORS) and address == word:
-                return bytes(data if status & _EIGHT_BYTES else data[:4])
-            answer = f"it stays busy (status 0x{status:04X})"
-            if status & _ERRORS and not status & _BUSY:
+            if status & _BUSY:
+                answer = f"it stays busy (status 0x{status:04X})"
+            elif status & _ERRORS or address != word:
                 answer = f"it refuses (status 0x{status:04X})"
                 bus.write_register(slave, _CONTROL, _COMMAND.pack(_NONE, word))
-                break
-            yield
+                asked = False
+            else:
+                return bytes(data if status & _EIGHT_BYTES else data[:4])
         yield
     raise _unreadable(slave, word, answer)
 
