@@ -1,6 +1,7 @@
-"""The wire protocol between the server and its clients, without sockets or threads.
+"""The wire protocol between the server and its clients; standard library only, no threads.
 
 `pdo` the process data, `warnings_register` its warnings, `settings` the sensor's settings, `filters` and
-`meaning` what they mean, `framing` bytes
-to messages and back, `control` what JSON messages may carry, `errors` every exception.
+`meaning` what they mean, `framing` bytes to messages and back, `control` what JSON messages may carry,
+`errors` every exception. None of these opens a socket. `client` does, over `connection`: the small blocking
+client for programs that are not on ROS, which nothing else here loads.
 """

@@ -6,11 +6,18 @@ ProtocolError
 +-- BadMessageError       one message was no JSON object: answer it and carry on
 +-- RequestError          one request cannot be granted: answer it and carry on
 +-- SettingError          a setting's name or value is wrong
++-- ConnectionFailedError the connection cannot be made or used any more: close it
+|   +-- UnreachableError  there is no server at that address
+|   +-- NoReplyError      a request was not answered in time
++-- RefusedError          the server refused a request; the connection goes on
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from protocol.text import printable
 
 
 class ProtocolError(Exception):
@@ -45,3 +52,40 @@ class RequestError(ProtocolError):
 
 class SettingError(ProtocolError):
     """A setting that does not exist, or a value that it cannot have."""
+
+
+class ConnectionFailedError(ProtocolError):
+    """The connection cannot be made or used any more; the text says why. Close it."""
+
+
+class UnreachableError(ConnectionFailedError):
+    """There is no server at that address, as far as can be told."""
+
+
+class NoReplyError(ConnectionFailedError):
+    """A request was not answered in time; whether it was done is not known."""
+
+
+class RefusedError(ProtocolError):
+    """The server refused a request: its own sentence, made safe to print.
+
+    `code` is one of `protocol.control.ErrorCode`, `abort_code` the SDO abort code behind it, if any.
+    """
+
+    def __init__(self, code: str, message: str, abort_code: int | None = None) -> None:
+        super().__init__(message)
+        self.code = code
+        self.abort_code = abort_code
+
+    @classmethod
+    def of(cls, reply: Mapping[str, Any]) -> RefusedError:
+        """The error that `reply`, which does not grant a request, says."""
+        error = reply.get("error")
+        if not isinstance(error, dict):
+            return cls("internal", "the server gave no reason")
+        abort_code = error.get("abort_code")
+        return cls(
+            printable(error.get("code", "no code"), 40),
+            printable(error.get("message", "the server gave no reason"), 1000),
+            abort_code if isinstance(abort_code, int) and not isinstance(abort_code, bool) else None,
+        )

@@ -17,10 +17,12 @@ import numpy as np
 import psutil
 
 from ethercat_server.virtual_bus import VirtualBus
+from protocol.client import Client
+from protocol.errors import ProtocolError
 from scripts import _benchmark_statistics as statistics
 from scripts._benchmark_records import began
 from scripts._benchmark_statistics import Floats, Ints
-from scripts._demo import Child, DemoError, ServerLink
+from scripts._demo import Child, DemoError
 
 PORT: Final = 12001
 OVERSAMPLING_HZ: Final = 51200
@@ -190,7 +192,7 @@ def virtual_bus(setup: Setup) -> Iterator[tuple[str, int]]:
         yield bus.ifname, sensor.pid
 
 
-def start_server(running: Chain, ifname: str) -> ServerLink:
+def start_server(running: Chain, ifname: str) -> Client:
     """ethercat-server, ready, and a connection to it."""
     setup = running.setup
     server = running.start(
@@ -198,18 +200,18 @@ def start_server(running: Chain, ifname: str) -> ServerLink:
         "--set", f"sinc_length={setup.sinc}", "--rt-priority", setup.priority,
     )  # fmt: skip
     running.watch("server", server.pid)
-    links: list[ServerLink] = []
+    clients: list[Client] = []
 
     def ready() -> bool:
-        with contextlib.suppress(OSError):
-            links.append(ServerLink(PORT))
-            return len(links[-1].ask("describe")["sensors"]) == setup.sensors
+        with contextlib.suppress(ProtocolError):
+            clients.append(Client(PORT))
+            return len(clients[-1].description["sensors"]) == setup.sensors
         return False
 
     running.wait(ready, "the server was not ready")
-    for link in links[:-1]:
-        link.close()
-    return links[-1]
+    for client in clients[:-1]:
+        client.close()
+    return clients[-1]
 
 
 def recording(running: Chain, name: str) -> tuple[Path, tuple[str, ...]]:

@@ -16,8 +16,9 @@ from typing import Any, Final
 
 from rich.console import Console
 
+from protocol.client import Client
 from scripts._benchmark_chain import PORT, Chain, Setup, chain, start_server, virtual_bus
-from scripts._demo import Child, ServerLink
+from scripts._demo import Child
 from scripts._odd_clients import EIGHT
 
 ONE: Final = ("honest",)
@@ -47,7 +48,7 @@ def clients(manners: Sequence[str]) -> Iterator[None]:
         yield
 
 
-def measure(running: Chain, link: ServerLink, server: Child, manners: Sequence[str]) -> dict[str, Any]:
+def measure(running: Chain, link: Client, server: Child, manners: Sequence[str]) -> dict[str, Any]:
     """The server's own figures with these clients."""
     with clients(manners):
         _wait(running, _SETTLE_S)

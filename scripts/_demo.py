@@ -19,13 +19,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
-from protocol.control import request
-from protocol.framing import DataMessage, FrameDecoder, encode_json
+from protocol.client import Client
+from protocol.errors import ConnectionFailedError, ProtocolError
 from scripts._measure import Measurement, verdict
 from scripts._show import Screen, print_summary
 
@@ -107,55 +107,16 @@ class Child:
         return None if code == 0 else f"{self.name} ended with exit code {code}"
 
 
-class ServerLink:
-    """The demo's own connection to the server."""
-
-    def __init__(self, port: int) -> None:
-        self._socket = socket.create_connection(("127.0.0.1", port), timeout=2.0)
-        self._decoder = FrameDecoder()
-
-    def ask(self, action: str) -> dict[str, Any]:
-        """Send a request and return its reply; DATA on the way is dropped."""
-        self._socket.sendall(encode_json(request(action, action)))
-        for message in self._messages():
-            if isinstance(message, dict) and message.get("reply") == action:
-                if message.get("ok") is not True:
-                    raise DemoError(f"the server refused {action}: {message.get('error')}")
-                return message
-        raise DemoError(f"the server closed the connection instead of answering {action}")
-
-    def frames(self) -> Iterator[DataMessage]:
-        """Every frame that comes, until the connection ends."""
-        self._socket.settimeout(None)
-        with contextlib.suppress(OSError):
-            yield from (m for m in self._messages() if isinstance(m, DataMessage))
-
-    def _messages(self) -> Iterator[DataMessage | dict[str, Any]]:
-        while True:
-            yield from self._decoder
-            data = self._socket.recv(65536)
-            if not data:
-                return
-            self._decoder.feed(data)
-
-    def close(self) -> None:
-        """End the connection, from any thread."""
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-        self._socket.close()
-
-
-def wait_for_server(server: Child) -> tuple[ServerLink, dict[str, Any]]:
+def wait_for_server(server: Child) -> tuple[Client, dict[str, Any]]:
     """Connect as soon as the server describes a sensor; its row of the description."""
     deadline = time.monotonic() + _START_TIMEOUT_S
     while time.monotonic() < deadline:
         server.check()
-        with contextlib.suppress(OSError):
-            link = ServerLink(PORT)
-            sensors = link.ask("describe")["sensors"]
-            if sensors:
-                return link, sensors[0]
-            link.close()
+        with contextlib.suppress(ProtocolError):
+            client = Client(PORT)
+            if sensors := client.description["sensors"]:
+                return client, sensors[0]
+            client.close()
         time.sleep(0.1)
     raise DemoError(f"the server did not get ready within {_START_TIMEOUT_S:g} s")
 
@@ -163,13 +124,13 @@ def wait_for_server(server: Child) -> tuple[ServerLink, dict[str, Any]]:
 class Ears:
     """The two threads that listen: to the server and to the ROS topic."""
 
-    def __init__(self, link: ServerLink, measurement: Measurement) -> None:
+    def __init__(self, client: Client, measurement: Measurement) -> None:
         import rclpy  # noqa: PLC0415 - only now that the signals are in hand
         from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415
         from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
         from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
 
-        self._link = link
+        self._client = client
         self.measurement = measurement
         self.lock = threading.Lock()
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
@@ -182,15 +143,16 @@ class Ears:
             threading.Thread(target=self._hear_server, daemon=True),
             threading.Thread(target=self._executor.spin, daemon=True),
         ]
-        link.ask("subscribe")
+        client.subscribe()
         for thread in self._threads:
             thread.start()
 
     def _hear_server(self) -> None:
-        for frame in self._link.frames():
-            now_ns = time.monotonic_ns()
-            with self.lock:
-                self.measurement.take_frame(frame, now_ns)
+        with contextlib.suppress(ConnectionFailedError):
+            for frame in self._client.frames():
+                now_ns = time.monotonic_ns()
+                with self.lock:
+                    self.measurement.take_frame(frame, now_ns)
 
     def _on_message(self, message: Any) -> None:
         now_ns = time.monotonic_ns()
@@ -199,7 +161,7 @@ class Ears:
 
     def close(self) -> None:
         """Stop listening."""
-        self._link.close()
+        self._client.close()
         self._executor.shutdown()
         for thread in self._threads:
             thread.join(3)
@@ -229,9 +191,9 @@ def run(seconds: float | None, directory: Path) -> int:
         stack.callback(stop_children)
         server = start("ethercat-server", "virtual", str(PORT))
         start("bridge-client", "--ros-args", "-p", f"server_port:={PORT}")
-        link, sensor = wait_for_server(server)
-        stack.callback(link.close)
-        ears = Ears(link, measurement)
+        client, sensor = wait_for_server(server)
+        stack.callback(client.close)
+        ears = Ears(client, measurement)
         stack.callback(ears.close)
         wait_for_messages(children, measurement)
         time.sleep(_SETTLING_S)

@@ -37,17 +37,30 @@ def imports(path: Path) -> set[str]:
     return names
 
 
+def modules(path: Path) -> set[str]:
+    """The modules that a file imports from, whole names."""
+    return {str(n.module) for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.ImportFrom)}
+
+
 def importers(paths: list[Path], name: str) -> Iterator[str]:
     return (str(path.relative_to(ROOT)) for path in paths if name in imports(path))
 
 
-def test_protocol_is_standard_library_without_sockets_or_threads() -> None:
+def test_protocol_is_standard_library_without_threads_and_one_file_opens_sockets() -> None:
     assert PROTOCOL
     allowed = set(sys.stdlib_module_names) | {"protocol"}
+    with_sockets = {"connection.py": {"socket"}, "client.py": {"select"}}
     forbidden = {"socket", "socketserver", "select", "selectors", "asyncio", "ssl", "threading", "_thread"}
     forbidden |= {"multiprocessing", "concurrent", "subprocess", "queue"}
     for path in PROTOCOL:
-        assert imports(path) <= allowed - forbidden, path
+        assert imports(path) <= (allowed - forbidden) | with_sockets.get(path.name, set()), path
+
+
+def test_what_needs_no_socket_does_not_load_the_client() -> None:
+    """The server and every decoder get by with the half of `protocol` that has no sockets in it."""
+    for path in PROTOCOL:
+        if path.name not in ("connection.py", "client.py"):
+            assert not {"protocol.connection", "protocol.client"} & modules(path), path
 
 
 def test_server_and_bridge_do_not_know_each_other() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import select
-import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
@@ -13,9 +11,16 @@ from ethercat_server.sdo import Steps
 from ethercat_server.sensor import Identity
 from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, signals_held_back
 from ethercat_server.tool.show import note
-from protocol.control import PROTOCOL_VERSION, ErrorCode, Event, request
-from protocol.errors import ProtocolError
-from protocol.framing import DataMessage, FrameDecoder, JsonObject, encode_json
+from protocol.client import Client
+from protocol.control import ErrorCode, Event
+from protocol.errors import (
+    ConnectionFailedError,
+    NoReplyError,
+    ProtocolError,
+    RefusedError,
+    UnreachableError,
+)
+from protocol.framing import JsonObject
 from protocol.settings import SettingValue
 
 _CONNECT_TIMEOUT_S: Final = 5.0
@@ -42,67 +47,40 @@ class ServerLink(Link):
         self._name = f"the server at {host}:{port}"
         self.used = used or self._name
         try:
-            self._socket = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT_S)
-        except OSError as error:
-            reason = error.strerror or str(error)
+            self._client = Client(port, host, timeout_s=_CONNECT_TIMEOUT_S)
+        except UnreachableError as error:
             raise ServerError(
-                f"no server answers at {host}:{port} ({reason}): start ethercat-server"
+                f"no server answers at {host}:{port} ({error}): start ethercat-server"
             ) from None
-        self._decoder = FrameDecoder()
-        self._asked = 0
+        except ProtocolError as error:
+            raise ServerError(
+                f"what answers at {host}:{port} is no ethercat-server that this tool understands ({error}): "
+                "check the port, or install the same version of both"
+            ) from None
         try:
-            described = self.ask("describe", _CONNECT_TIMEOUT_S)
-            if described.get("protocol") != PROTOCOL_VERSION:
-                raise ServerError(
-                    f"{self.used} does not speak version {PROTOCOL_VERSION}: update it or the tool"
-                )
-            self.sensors = [_found(row) for row in described["sensors"]]
+            self.sensors = [_found(row) for row in self._client.description["sensors"]]
         except (KeyError, TypeError):
+            self._client.close()
             raise ServerError(
                 f"what answers at {host}:{port} is no ethercat-server: check the port"
             ) from None
-        except BaseException:
-            self._socket.close()
-            raise
 
     def close(self) -> None:
         """See `Link`."""
-        self._socket.close()
+        self._client.close()
 
     def ask(self, action: str, timeout_s: float = _ANSWER_TIMEOUT_S, **values: object) -> JsonObject:
         """The reply to a request; SdoAbortError or BusError if it is refused."""
-        self._asked += 1
-        self._socket.settimeout(timeout_s)
         try:
-            self._socket.sendall(encode_json(request(action, self._asked, **values)))
-            while True:
-                message = self._next()
-                if "event" not in message and message.get("id") in (self._asked, None):
-                    break
-        except TimeoutError:
-            raise BusError(f"{self._name} did not answer {action} in {timeout_s:.0f} s: ask again") from None
-        except OSError as error:
-            raise ServerError(f"{self._name} is gone ({error.strerror or error}): see its log") from None
-        except ProtocolError as error:
-            raise ServerError(f"{self._name} is no ethercat-server ({error}): check the port") from None
-        if message.get("ok"):
-            return message
-        refused = message.get("error", {})
-        if refused.get("code") == ErrorCode.SENSOR:
-            raise SdoAbortError(str(refused.get("message")), int(refused.get("abort_code", 0)))
-        raise BusError(str(refused.get("message", "refused")))
-
-    def _next(self) -> JsonObject:
-        """The next JSON message; frames go to whoever watches."""
-        while True:
-            message = self._decoder.next_message()
-            if message is None:
-                data = self._socket.recv(65536)
-                if not data:
-                    raise ConnectionError("it closed the connection")
-                self._decoder.feed(data)
-            elif not isinstance(message, DataMessage):
-                return message
+            return self._client.ask(action, timeout_s, **values)
+        except RefusedError as error:
+            if error.code == ErrorCode.SENSOR:
+                raise SdoAbortError(str(error), error.abort_code or 0) from None
+            raise BusError(str(error)) from None
+        except NoReplyError as error:
+            raise BusError(f"{self._name} gave {error}: ask again") from None
+        except ConnectionFailedError as error:
+            raise ServerError(f"{self._name} is gone ({error}): see its log") from None
 
     def sdo(self, place: int) -> GuardedSdo:
         """See `Link`."""
@@ -121,21 +99,20 @@ class ServerLink(Link):
     def watch(self, places: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
         """See `Link`."""
         self.ask("subscribe", sensors=list(places))
-        self._socket.settimeout(_ANSWER_TIMEOUT_S)
         while on_idle():
-            for message in self._decoder:
-                if isinstance(message, DataMessage):
-                    if not on_frame(message):
-                        return
-                elif message.get("event") == Event.SHUTTING_DOWN:
+            try:
+                frames = self._client.receive(_IDLE_S)
+            except ConnectionFailedError as error:
+                raise ServerError(f"{self._name} is gone ({error}): see its log") from None
+            for frame in frames:
+                if not on_frame(frame):
+                    return
+            while self._client.events:
+                event = self._client.events.popleft()
+                if event["event"] == Event.SHUTTING_DOWN:
                     raise ServerError(f"{self._name} is shutting down")
-                elif message.get("sensor") in places:
-                    _tell(message)
-            if select.select((self._socket,), (), (), _IDLE_S)[0]:
-                data = self._socket.recv(65536)
-                if not data:
-                    raise ServerError(f"{self._name} closed the connection: see its log")
-                self._decoder.feed(data)
+                if event.get("sensor") in places:
+                    _tell(event)
 
 
 class _ServerSdo:

@@ -1,4 +1,4 @@
-"""One TCP connection to the server: connect, ask, receive. Everything that can go wrong is one exception.
+"""The node's connection to the server: what the reader asks it, and what every other thread may ask.
 
 One thread, the reader, receives. Any thread may `request`; the reader finds the reply and wakes it up.
 """
@@ -7,34 +7,21 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
-import socket
-import struct
 import threading
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
+from protocol.connection import CONNECT_TIMEOUT_S, FramedConnection
 from protocol.control import PROTOCOL_VERSION, request
-from protocol.errors import ProtocolError, SettingError
-from protocol.framing import DataMessage, FrameDecoder, JsonObject, encode_json
+from protocol.errors import ConnectionFailedError, SettingError
+from protocol.framing import DataMessage, JsonObject
 from protocol.settings import SETTINGS, SettingValue
+from protocol.text import printable
 
-CONNECT_TIMEOUT_S: Final = 2.0
-SILENCE_S: Final = 1.0
-"""`receive` gives up waiting after this time, so that silence can be reported."""
 _REPLY_TIMEOUT_S: Final = 3.0
 _MOST_HZ: Final = 1e6
-_KEEPALIVE: Final = ((socket.TCP_KEEPIDLE, 2), (socket.TCP_KEEPINTVL, 1), (socket.TCP_KEEPCNT, 3))
-
-
-class ConnectionFailedError(Exception):
-    """The connection cannot be made or used any more; the text says why. Close it."""
-
-
-class UnreachableError(ConnectionFailedError):
-    """There is no server at that address, as far as can be told."""
 
 
 class SensorInfo(NamedTuple):
@@ -56,74 +43,15 @@ class SensorInfo(NamedTuple):
         return f"sensor {self.sensor} ({self.name}, serial {self.serial}, {self.rate_hz} Hz, {self.state})"
 
 
-def printable(value: object, limit: int = 200) -> str:
-    """Text from the other side as it may appear in a log: one line, no control characters, not endless."""
-    text = "".join(c if c.isprintable() else "?" for c in str(value)[: limit + 1])
-    return text if len(text) <= limit else text[: limit - 3] + "..."
-
-
-class Connection:
-    """A connection to the server at `host`:`port`.
-
-    `same_machine` tells whether the server's CLOCK_MONOTONIC is ours.
-    """
+class Connection(FramedConnection):
+    """A framed connection that several threads may ask over."""
 
     def __init__(self, host: str, port: int, timeout_s: float = CONNECT_TIMEOUT_S) -> None:
         """Connect; UnreachableError if there is nothing to connect to."""
-        self._decoder = FrameDecoder()
         self._replies: dict[object, Future[JsonObject]] = {}
         self._ids = itertools.count(1)
         self._send_lock = threading.Lock()
-        try:
-            self._socket = socket.create_connection((host, port), timeout=timeout_s)
-        except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot be one
-            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
-            raise UnreachableError(reason) from None
-        try:
-            self._prepare_socket()
-        except OSError as error:
-            self._socket.close()
-            raise UnreachableError(str(error)) from None
-
-    def _prepare_socket(self) -> None:
-        ours, theirs = self._socket.getsockname(), self._socket.getpeername()
-        if ours == theirs:  # a free port of the ephemeral range may connect to itself
-            raise OSError("nothing listens there")
-        self.same_machine: bool = ours[0] == theirs[0]
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # Finds out that a machine is gone, which sends no goodbye.
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in _KEEPALIVE:
-            self._socket.setsockopt(socket.IPPROTO_TCP, option, value)
-        # The kernel's own timeouts cost no system call per read, as settimeout() would.
-        self._socket.settimeout(None)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(SILENCE_S))
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _timeval(SILENCE_S))
-
-    def receive(self, *, wait: bool = True) -> bool | None:
-        """Take what has arrived, at most one buffer full, blocking for the first byte if `wait`.
-
-        True if more may be waiting, False if that was all, None if nothing came within SILENCE_S (or, not
-        waiting, there is nothing). Then read `messages`. ConnectionFailedError when the connection is over.
-        """
-        with self._decoder.get_buffer() as buffer:
-            try:
-                count = self._socket.recv_into(buffer, 0, 0 if wait else socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                return None
-            except OSError as error:
-                raise ConnectionFailedError(error.strerror or str(error)) from None
-            if count == 0:
-                raise ConnectionFailedError("the server closed it")
-            self._decoder.received(count)
-            return count == len(buffer)
-
-    def next_message(self) -> DataMessage | JsonObject | None:
-        """The next whole message received; ConnectionFailedError if the bytes are not this protocol."""
-        try:
-            return self._decoder.next_message()
-        except ProtocolError as error:
-            raise ConnectionFailedError(f"what came is not this protocol: {printable(error)}") from None
+        super().__init__(host, port, timeout_s)
 
     def take_reply(self, message: JsonObject) -> bool:
         """Hand `message` to the thread that waits for it; False if it is no reply that someone waits for."""
@@ -140,11 +68,8 @@ class Connection:
         """Send a request; the future gets the reply once the reader has seen it."""
         identifier = next(self._ids)
         future = self._replies[identifier] = Future()
-        try:
-            with self._send_lock:
-                self._socket.sendall(encode_json(request(action, identifier, **values)))
-        except OSError as error:
-            raise ConnectionFailedError(f"cannot send: {error.strerror or error}") from None
+        with self._send_lock:
+            self.send(request(action, identifier, **values))
         return future
 
     def forget(self, future: Future[JsonObject]) -> None:
@@ -187,23 +112,13 @@ class Connection:
         self.ask("subscribe", sensors=[sensor])
         return info
 
-    def shutdown(self) -> None:
-        """End the connection from any thread; a blocked `receive` returns."""
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-
     def close(self) -> None:
         """Close the socket; whoever waits for a reply is told that none will come."""
-        self.shutdown()
-        self._socket.close()
+        super().close()
         for identifier in list(self._replies):
             future = self._replies.pop(identifier, None)
             if future is not None:
                 future.set_exception(ConnectionFailedError("the connection ended before the reply"))
-
-
-def _timeval(seconds: float) -> bytes:
-    return struct.pack("@ll", int(seconds), int(seconds % 1 * 1e6))
 
 
 def refusal(reply: Mapping[str, Any]) -> str:

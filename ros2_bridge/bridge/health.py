@@ -9,9 +9,9 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from bridge.connection import printable
 from bridge.parameters import Thresholds
 from bridge.snapshot import Snapshot, mapping, row_of
+from protocol.text import printable
 from protocol.warnings_register import Severity, explain
 
 Values = dict[str, object]

@@ -9,10 +9,11 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from bridge.connection import Connection, SensorInfo, known_settings, printable
+from bridge.connection import Connection, SensorInfo, known_settings
 from protocol.control import Event
 from protocol.framing import JsonObject
 from protocol.settings import SettingValue, sampling_rate_hz
+from protocol.text import printable
 
 NEVER_CONNECTED: Final = "no connection yet"
 

@@ -8,12 +8,13 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from bridge.compensation_state import CompensationState
-from bridge.connection import ConnectionFailedError, find_sensor
+from bridge.connection import find_sensor
 from bridge.poll import Poll
 from bridge.reader import Reader
 from bridge.selection import FrameCounts
 from bridge.snapshot import Snapshot, server_lost
 from bridge.watch import Flags
+from protocol.errors import ConnectionFailedError
 
 _SHORTEST_RATE_S: Final = 0.8
 """A rate measured over less time than this says little."""

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from concurrent.futures import Future
 from typing import Any
 
-from bridge.connection import Connection, ConnectionFailedError
+from bridge.connection import Connection
+from protocol.errors import ConnectionFailedError
 from protocol.framing import JsonObject
 
 

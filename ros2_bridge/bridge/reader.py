@@ -10,21 +10,18 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final, Protocol
 
-from bridge.connection import (
-    SILENCE_S,
-    Connection,
-    ConnectionFailedError,
-    UnreachableError,
-    printable,
-)
+from bridge.connection import Connection
 from bridge.link import Link
 from bridge.messages import Outputs
 from bridge.parameters import Parameters
 from bridge.selection import FrameCounts, FrameSelector
 from bridge.watch import Watch
+from protocol.connection import SILENCE_S
 from protocol.control import Event
+from protocol.errors import ConnectionFailedError, UnreachableError
 from protocol.framing import DataMessage, JsonObject
 from protocol.pdo import LAYOUTS, Sample, SampleDecoder
+from protocol.text import printable
 
 _FIRST_DELAY_S: Final = 0.1
 _LONGEST_DELAY_S: Final = 1.0

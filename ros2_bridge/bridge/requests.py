@@ -10,9 +10,10 @@ from concurrent.futures import FIRST_COMPLETED, Future
 from concurrent.futures import wait as wait_for
 from typing import Any, Final
 
-from bridge.connection import Connection, ConnectionFailedError, refusal
+from bridge.connection import Connection, refusal
 from bridge.link import Link
 from bridge.parameters import Parameters
+from protocol.errors import ConnectionFailedError
 from protocol.framing import JsonObject
 
 CONFIGURE_TIMEOUT_S: Final = 10.0

@@ -8,10 +8,11 @@ from typing import Final
 
 from rclpy.node import Node
 
-from bridge.connection import ConnectionFailedError, find_sensor
+from bridge.connection import find_sensor
 from bridge.link import Link
 from bridge.requests import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, RequestFailedError, Requests
 from bridge.triggers import create_triggers
+from protocol.errors import ConnectionFailedError
 
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _TARE_S: Final = 0.5

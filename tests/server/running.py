@@ -16,8 +16,10 @@ from typing import Any
 
 import pytest
 
+from protocol.connection import FramedConnection
 from protocol.control import request
-from protocol.framing import DataFlag, DataMessage, FrameDecoder, JsonObject, encode_json
+from protocol.errors import ConnectionFailedError
+from protocol.framing import DataFlag, DataMessage, JsonObject
 
 START_TIMEOUT_S = 40.0
 PATIENCE_S = 30.0
@@ -182,11 +184,11 @@ def virtual_sensor(
 
 
 class Client:
-    """A framed connection."""
+    """A framed connection that keeps everything, and looks into refused replies too."""
 
     def __init__(self, port: int) -> None:
-        self.sock = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
-        self.decoder = FrameDecoder()
+        self.connection = FramedConnection("127.0.0.1", port)
+        self.sock = self.connection.sock
         self.events: list[JsonObject] = []
         self.frames: list[DataMessage] = []
         self._id = 0
@@ -195,36 +197,32 @@ class Client:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.sock.close()
+        self.connection.close()
 
     def receive(self) -> JsonObject | None:
         """Wait for one message; a reply is returned, frames and events are put by."""
-        while True:
-            message = self.decoder.next_message()
-            if message is None:
-                data = self.sock.recv(65536)
-                if not data:
-                    raise ConnectionError("the server closed the connection")
-                self.decoder.feed(data)
-                continue
-            if isinstance(message, DataMessage):
-                self.frames.append(message)
-                return None
-            if "event" in message:
-                self.events.append(message)
-                return None
-            return message
+        deadline = time.monotonic() + PATIENCE_S
+        while (message := self.connection.next_message()) is None:
+            assert time.monotonic() < deadline, f"nothing came for {PATIENCE_S} s"
+            self.connection.receive()
+        if isinstance(message, DataMessage):
+            self.frames.append(message)
+            return None
+        if "event" in message:
+            self.events.append(message)
+            return None
+        return message
 
     def receive_all(self) -> None:
         """Receive until the server closes the connection."""
-        with contextlib.suppress(ConnectionError):
+        with contextlib.suppress(ConnectionFailedError):
             while True:
                 self.receive()
 
     def ask(self, action: str, **values: object) -> dict[str, Any]:
         """The reply to a request."""
         self._id += 1
-        self.sock.sendall(encode_json(request(action, self._id, **values)))
+        self.connection.send(request(action, self._id, **values))
         while True:
             message = self.receive()
             if message is not None:

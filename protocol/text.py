@@ -1,0 +1,9 @@
+"""Text from the other side, made safe to print."""
+
+from __future__ import annotations
+
+
+def printable(value: object, limit: int = 200) -> str:
+    """Text from the other side as it may appear in a log: one line, no control characters, not endless."""
+    text = "".join(c if c.isprintable() else "?" for c in str(value)[: limit + 1])
+    return text if len(text) <= limit else text[: limit - 3] + "..."

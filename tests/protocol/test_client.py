@@ -1,0 +1,190 @@
+"""The blocking client, against a scripted server and a real one."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from protocol.client import Client, connect
+from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
+from protocol.framing import DataFlag
+from protocol.pdo import STANDARD_GRAVITY, ImuUnits
+from tests.bridge.scripted_server import ScriptedServer, description, process_data
+from tests.server.running import free_port, needs_bus, server
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def scripted() -> Iterator[ScriptedServer]:
+    with ScriptedServer() as running:
+        yield running
+
+
+def test_samples_come_decoded_in_order_and_nothing_old(scripted: ScriptedServer) -> None:
+    with connect(scripted.port) as sensor:
+        assert scripted.subscribed.wait(5)
+        scripted.send_sample(1.0)
+        scripted.send_sample(1.0, DataFlag.REPEATED)
+        scripted.send_sample(1.0, DataFlag.INVALID)
+        scripted.send_sample(2.0, DataFlag.GAP)
+        samples = iter(sensor)
+        first, second = next(samples), next(samples)
+        assert [first.force[0], second.force[0]] == [1.0, 2.0]
+        assert first.acceleration[0] == pytest.approx((1.0 + 6 / 16) * STANDARD_GRAVITY)
+        assert sensor.frame is not None
+        assert sensor.frame.sequence == 4
+        assert sensor.frame.flags & DataFlag.GAP
+
+
+def test_units_and_sizes(scripted: ScriptedServer) -> None:
+    with connect(scripted.port, imu_units=ImuUnits.SI) as sensor:
+        assert scripted.subscribed.wait(5)
+        scripted.send_sample(3.0, process_data=process_data(3.0, 77))
+        assert next(iter(sensor)).acceleration[0] == 3.0 + 6 / 16
+
+
+def test_frames_gives_everything_and_ends_when_the_server_shuts_down(scripted: ScriptedServer) -> None:
+    with connect(scripted.port, fresh_only=False, every=2, sensors=[0]) as sensor:
+        assert scripted.subscribed.wait(5)
+        assert {**scripted.requests[-1], "id": 0} == {
+            "action": "subscribe", "id": 0, "fresh_only": False, "every": 2, "sensors": [0]
+        }  # fmt: skip
+        for flags in (0, DataFlag.REPEATED, DataFlag.INVALID):
+            scripted.send_sample(1.0, flags)
+        scripted.send_json({"event": "shutting_down"})
+        scripted.drop()
+        assert [frame.flags for frame in sensor.frames()] == [0, 1, 2]
+        assert sensor.events.popleft() == {"event": "shutting_down"}
+
+
+def test_a_connection_that_breaks_is_an_error_after_the_last_frame(scripted: ScriptedServer) -> None:
+    with connect(scripted.port) as sensor:
+        assert scripted.subscribed.wait(5)
+        scripted.send_sample(1.0)
+        scripted.drop()
+        frames = sensor.frames()
+        assert next(frames).sequence == 1
+        with pytest.raises(ConnectionFailedError, match="closed"):
+            next(frames)
+
+
+def test_what_comes_before_a_reply_is_kept(scripted: ScriptedServer) -> None:
+    with connect(scripted.port) as sensor:
+        assert scripted.subscribed.wait(5)
+        scripted.send_sample(1.0)
+        scripted.send_json({"event": "reconfigured", "sensor": 0})
+        assert sensor.ask("status")["ok"]
+        assert [frame.sequence for frame in sensor.receive(0.0)] == [1]
+        assert sensor.events[0]["event"] == "reconfigured"
+        assert sensor.receive(0.01) == []
+
+
+def test_receive_hands_out_the_last_frames_of_a_connection_that_ended(scripted: ScriptedServer) -> None:
+    with connect(scripted.port) as sensor:
+        assert scripted.subscribed.wait(5)
+        scripted.send_sample(1.0)
+        scripted.drop()
+        scripted.disconnected.wait(5)
+        assert len(sensor.receive(5.0)) == 1
+        with pytest.raises(ConnectionFailedError):
+            sensor.receive(5.0)
+
+
+def test_a_refusal_is_the_servers_sentence(scripted: ScriptedServer) -> None:
+    refused = {"code": "sensor", "message": "it\nrefuses", "abort_code": 0x06090011}
+    scripted.answers["sdo_read"] = lambda _: {"ok": False, "error": refused}
+    scripted.answers["status"] = lambda _: {"ok": False}
+    with Client(scripted.port) as client:
+        with pytest.raises(RefusedError, match="it\\?refuses") as caught:
+            client.ask("sdo_read", sensor=0, index=0x8011)
+        assert (caught.value.code, caught.value.abort_code) == ("sensor", 0x06090011)
+        with pytest.raises(RefusedError, match="no reason"):
+            client.ask("status")
+        assert client.ask("describe")["ok"], "the connection goes on"
+
+
+def test_no_reply_and_another_protocol_and_bytes_that_are_none(scripted: ScriptedServer) -> None:
+    scripted.answers["status"] = lambda _: None
+    with Client(scripted.port) as client:
+        with pytest.raises(NoReplyError, match="no reply to status"):
+            client.ask("status", timeout_s=0.05)
+        scripted.send_raw(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+        with pytest.raises(ConnectionFailedError, match="not this protocol"):
+            client.ask("describe")
+    for version in (2, True, None):
+        scripted.description = description(protocol=version)
+        with pytest.raises(ConnectionFailedError, match="install the same version"):
+            Client(scripted.port)
+
+
+def test_nobody_there() -> None:
+    with pytest.raises(UnreachableError):
+        connect(free_port())
+    with pytest.raises(UnreachableError):
+        connect(70000)
+
+
+def test_a_refused_subscription_closes_the_connection(scripted: ScriptedServer) -> None:
+    scripted.answers["subscribe"] = lambda _: {"ok": False, "error": {"code": "bad_request", "message": "no"}}
+    with pytest.raises(RefusedError):
+        connect(scripted.port)
+    assert scripted.disconnected.wait(5)
+
+
+def test_another_thread_may_close_it(scripted: ScriptedServer) -> None:
+    client = connect(scripted.port)
+    closer = threading.Timer(0.1, client.close)
+    closer.start()
+    with pytest.raises(ConnectionFailedError):
+        list(client)
+    closer.join()
+    with pytest.raises(ConnectionFailedError, match="closed"):
+        client.receive(1.0)
+
+
+@needs_bus
+@pytest.mark.bus
+def test_every_sample_of_a_real_server_once_and_in_order() -> None:
+    with server("virtual") as running, connect(running.port) as sensor:
+        assert sensor.description["sensors"][0]["rate_hz"] == 800
+        numbers = []
+        for sample in sensor:
+            assert sensor.frame is not None
+            assert sample.is_finite
+            assert time.monotonic_ns() > sensor.frame.monotonic_ns
+            numbers.append(sensor.frame.sequence)
+            if len(numbers) == 400:
+                break
+        assert numbers == sorted(set(numbers))
+        assert sensor.ask("status")["ok"]
+        assert sensor.receive(1.0)
+
+
+def test_the_ten_lines_of_the_docs_run() -> None:
+    text = (ROOT / "docs" / "protocol.md").read_text()
+    example = text.split("## A client in ten lines")[1].split("```python\n")[1].split("```")[0]
+    assert len(example.splitlines()) <= 10
+    with ScriptedServer() as scripted:
+
+        def three_samples() -> None:
+            for number in range(3):
+                scripted.send_sample(float(number))
+            scripted.send_json({"event": "shutting_down"})
+            scripted.drop()
+
+        scripted.on_subscribe = three_samples
+        run = subprocess.run(
+            [sys.executable, "-c", example.replace("12001", str(scripted.port))],
+            check=False, capture_output=True, text=True, timeout=30, cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+    assert run.stdout.count("\n") == 3, run.stderr
+    assert run.returncode == 0, run.stderr
