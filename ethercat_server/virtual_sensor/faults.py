@@ -17,6 +17,7 @@ from ethercat_server.virtual_sensor.al import AlState
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.firmware import Firmware
 from ethercat_server.virtual_sensor.sensor import VirtualSensor
+from ethercat_server.virtual_sensor.signals import SIGNALS
 
 LONGEST_LINE: Final = 1000
 PPM_LIMIT: Final = 100_000.0
@@ -152,6 +153,13 @@ def _ppm(call: _Call) -> None:
     call.sensor.set_ppm(real(call.arguments[0], -PPM_LIMIT, PPM_LIMIT))
 
 
+def _signal(call: _Call) -> None:
+    name = call.arguments[0].lower()
+    if name not in SIGNALS:
+        raise CommandError(f"no signal {name[:40]!r}: there are {', '.join(SIGNALS)}")
+    call.sensor.set_signal(name)
+
+
 def _stats(call: _Call) -> str:
     return json.dumps(call.bus.statistics(), separators=(",", ":"))
 
@@ -186,6 +194,7 @@ COMMANDS: Final[tuple[FaultCommand, ...]] = (
     ),
     FaultCommand("mute-mailbox", "mute-mailbox N [@N]", (1,), "swallow the next N mailbox requests", _mute),
     FaultCommand("ppm", "ppm X [@N]", (1,), "change the error of the sensor's clock", _ppm),
+    FaultCommand("signal", "signal NAME [@N]", (1,), "measure another signal, from its beginning", _signal),
     FaultCommand("stats", "stats", (0,), "counters and states, as JSON", _stats),
     FaultCommand("help", "help", (0,), "this list", _help),
     FaultCommand("quit", "quit", (0,), "end the virtual sensor", _quit),

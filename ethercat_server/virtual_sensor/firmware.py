@@ -18,6 +18,7 @@ from ethercat_server.virtual_sensor.esc import Esc
 from ethercat_server.virtual_sensor.layout import SYNC_MANAGERS, sync_manager_lengths
 from ethercat_server.virtual_sensor.mailbox import Mailbox
 from ethercat_server.virtual_sensor.measurement import Measurement
+from ethercat_server.virtual_sensor.motion import MOTIONS
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.scene import Scene
 from ethercat_server.virtual_sensor.sdo_abort import SdoAbortError
@@ -32,8 +33,8 @@ _WATCHDOG_UNIT_NS: Final = 40
 
 def make_signal(options: SensorOptions) -> Signal:
     """The signal that `options` name."""
-    if options.signal == "scene":
-        return Scene(options.seed, options.noise)
+    if options.signal in MOTIONS:
+        return Scene(options.seed, options.noise, MOTIONS[options.signal]())
     return FORMULAS[options.signal]()
 
 
@@ -61,7 +62,7 @@ class Firmware:
             options.model, options.serial, options.pdo_size, flash, self.inputs, self._settings_changed
         )
         sinc_length = int(self.dictionary.settings()["sinc_length"])
-        self._power_on = self.now
+        self._signal_start = self.now
         self.clock = SampleClock(self.now, sinc_length, options.ppm)
         self.esc = Esc(self, build_image(options.model, options.serial, options.pdo_size))
         self.al = AlStateMachine(self._mailbox_fault, self._process_data_fault)
@@ -103,7 +104,7 @@ class Firmware:
     def _make(self, number: int) -> bytes:
         self.made += 1
         instant = self.clock.instant(number)
-        reading = self._signal.reading(number, instant, (instant - self._power_on) * 1e-9)
+        reading = self._signal.reading(number, instant, (instant - self._signal_start) * 1e-9)
         return self._measurement.pack(reading, self._warnings if number < self._warnings_until else 0)
 
     def _settings_changed(self) -> None:
@@ -257,6 +258,12 @@ class Firmware:
     def stick(self, on: bool) -> None:
         """Give the same process data for ever, or stop doing so."""
         self._stuck = self.inputs() if on else b""
+
+    def set_signal(self, options: SensorOptions) -> None:
+        """Measure the signal that `options` name, which begins with the next sample."""
+        self._signal = make_signal(options)
+        self._signal_start = self.clock.instant(self.clock.number_at(self.now) + 1)
+        self._settings_changed()
 
     def set_ppm(self, ppm: float) -> None:
         """Another error of the clock, from the newest sample on."""

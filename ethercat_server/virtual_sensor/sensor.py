@@ -89,6 +89,12 @@ class VirtualSensor:
         if self.life is not None:
             self.life.set_ppm(ppm)
 
+    def set_signal(self, signal: str) -> None:
+        """Measure something else, now and after a power cycle."""
+        self._options = replace(self._options, signal=signal)
+        if self.life is not None:
+            self.life.set_signal(self._options)
+
     def statistics(self) -> dict[str, Any]:
         """What `stats` says of it."""
         life = self.life

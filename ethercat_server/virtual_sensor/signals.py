@@ -1,6 +1,6 @@
 """What the sensor measures: `clock`, `ramp`, `sine` and `constant`, each exact for a sample number.
 
-`scene`, the physical one, is in `scene.py`. Formulas are in docs/virtual-sensor.md.
+The physical ones, `scene`, `poses` and `turn`, are in `scene.py`. Formulas are in docs/virtual-sensor.md.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple, Protocol
 
-SIGNALS: Final = ("scene", "clock", "ramp", "sine", "constant")
+SIGNALS: Final = ("scene", "poses", "turn", "clock", "ramp", "sine", "constant")
 
 
 class Reading(NamedTuple):

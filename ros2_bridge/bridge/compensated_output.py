@@ -147,5 +147,5 @@ class CompensatedOutput:
             sample.force, sample.torque, gravity, sample.acceleration, sample.angular_rate
         )
         for topic in self._wanted:
-            topic.send(stages[topic.place], stamp_ns)
+            topic.send(*stages[topic.place], stamp_ns)
         self.published += 1

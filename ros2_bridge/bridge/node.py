@@ -49,12 +49,13 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
             self, parameters.thresholds, self.reader, self.compensation.state, outputs, self._fail
         )
         self.requests = Requests(parameters, link)
-        self.triggers = (
-            Services(self, link, self.requests, self.compensation.after_sensor_tare),
-            BiasServices(self, self.compensation, parameters.publishing_frequency),
-            IdentifyServices(self, self.compensation, parameters.publishing_frequency),
-        )
         self.sensor_settings = SettingsParameters(self, link, self.requests)
+        limit_hz = parameters.publishing_frequency
+        self.triggers = (
+            Services(self, link, self.requests, self.sensor_settings, self.compensation.after_sensor_tare),
+            BiasServices(self, self.compensation, limit_hz),
+            IdentifyServices(self, self.compensation, limit_hz),
+        )
         link.on_change = self._on_link_change
         self.create_subscription(
             KeyValue,

@@ -11,6 +11,7 @@ from rclpy.node import Node
 from bridge.connection import find_sensor
 from bridge.link import Link
 from bridge.requests import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, RequestFailedError, Requests
+from bridge.settings_parameters import SettingsParameters
 from bridge.triggers import create_triggers
 from protocol.errors import ConnectionFailedError
 
@@ -26,13 +27,22 @@ _TARE_EXTRA_S: Final = 4.0
 class Services:
     """Each blocks the executor until the server has answered or a time-out, and never the stream."""
 
-    def __init__(self, node: Node, link: Link, requests: Requests, after_tare: Callable[[], str]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        link: Link,
+        requests: Requests,
+        settings: SettingsParameters,
+        after_tare: Callable[[], str],
+    ) -> None:
         """`after_tare` says what a new offset in the sensor means for the rest of the node; "" if nothing."""
         self._after_tare = after_tare
         self._link, self._requests, self._log = link, requests, node.get_logger()
+        self._settings = settings
         acts = {
             "sensor_tare": self._sensor_tare,
             "get_settings": self._get_settings,
+            "apply_settings": self._apply_settings,
             "save_settings": self._save_settings,
         }
         create_triggers(node, acts, RequestFailedError)
@@ -57,6 +67,11 @@ class Services:
         except ConnectionFailedError as error:
             raise RequestFailedError(str(error)) from None
         return json.dumps({**info.settings, "rate_hz": info.rate})
+
+    def _apply_settings(self) -> str:
+        text = f"sensor {self._link.sensor} has these settings now: {json.dumps(self._settings.apply())}"
+        self._log.info(text)
+        return text
 
     def _save_settings(self) -> str:
         # `configure` wants at least one setting: one as it is.

@@ -12,6 +12,7 @@ from ethercat_server.virtual_sensor.faults import COMMANDS, QuitCommand, obey
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.signals import decode_clock
 from ethercat_server.virtual_sensor.wire import Command
+from protocol.pdo import SampleDecoder
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, Abort, RawMaster, chain
 
 PERIOD = 1_250_000
@@ -157,6 +158,25 @@ def test_mute_mailbox() -> None:
     assert len(master.upload(0x1000, 0)) == 4
 
 
+def test_another_signal_begins_with_the_next_sample_and_outlasts_a_power_cycle() -> None:
+    master = RawMaster(SensorOptions(signal="clock")).go(OP)
+    master.wait(7 * PERIOD + PERIOD // 2)
+    before = master.inputs()
+    do(master, "signal poses")
+    assert master.inputs() == before, "what was given away does not change"
+    master.wait(PERIOD)
+    decode = SampleDecoder(61).decode
+    assert decode(master.inputs()).force[2] == pytest.approx(-0.8 * 9.80665, abs=1.5), (
+        "the first pose, from its beginning"
+    )
+    master.wait(3_500 * 1_000_000)
+    assert decode(master.inputs()).angular_rate[0] > 0.1, "moving to the second one"
+    do(master, "power cycle 0")
+    master.wait(10**6)
+    master.go(OP)
+    assert decode(master.inputs()).force[2] == pytest.approx(-0.8 * 9.80665, abs=1.5)
+
+
 def test_ppm_keeps_the_phase() -> None:
     master = RawMaster(SensorOptions(signal="clock")).go(OP)
     master.wait(100 * PERIOD)
@@ -196,8 +216,8 @@ def test_quit() -> None:
     "line",
     [
         "", "jump", "lose", "lose x", "lose -1", "lose 1 2", "power", "power maybe", "power cycle", "safeop",
-        "safeop 0x10000", "deaf nan", "deaf -1", "ppm inf", "warn 1 0", "swap A", "swap é 1", "stick @1",
-        "stick @x", "stick @0 @0", "abort 1 2", "abort 0x8000 256 0",
+        "safeop 0x10000", "deaf nan", "deaf -1", "ppm inf", "signal noise", "warn 1 0", "swap A", "swap é 1",
+        "stick @1", "stick @x", "stick @0 @0", "abort 1 2", "abort 0x8000 256 0",
     ],
 )  # fmt: skip
 def test_bad_commands_are_answered_with_a_sentence(line: str) -> None:

@@ -8,6 +8,18 @@ import pytest
 
 from ethercat_server.virtual_sensor import scene
 from ethercat_server.virtual_sensor.clock import SampleClock
+from ethercat_server.virtual_sensor.motion import (
+    MOTIONS,
+    MOVE_LENGTH,
+    POSE_LENGTH,
+    POSES,
+    TURN_LENGTH,
+    Motion,
+    Posing,
+    Swaying,
+    Turning,
+    to_sensor,
+)
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.signals import CONSTANT, decode_clock
 from protocol.pdo import STANDARD_GRAVITY, SampleDecoder, encode
@@ -130,9 +142,10 @@ def rotate(q: tuple[float, float, float, float], v: tuple[float, float, float]) 
 
 
 @pytest.mark.parametrize("seconds", TIMES)
-def test_force_torque_and_acceleration_agree(seconds: float) -> None:
-    reading = scene.Scene(0, noise=False).reading(0, 0, seconds)
-    contact = scene.contact_force(seconds)
+@pytest.mark.parametrize("name", MOTIONS)
+def test_force_torque_and_acceleration_agree(name: str, seconds: float) -> None:
+    reading = scene.Scene(0, noise=False, motion=MOTIONS[name]()).reading(0, 0, seconds)
+    contact = scene.contact_force(seconds) if name == "scene" else (0.0, 0.0, 0.0)
     specific = [a * STANDARD_GRAVITY for a in reading.acceleration]
     weight = tuple(-scene.TOOL_MASS * f for f in specific)
     force, torque = reading.force_torque[:3], reading.force_torque[3:]
@@ -155,16 +168,17 @@ def test_orientation_agrees_with_the_accelerometer(seconds: float) -> None:
     world = rotate(reading.orientation, reading.acceleration)
     # What is left of the world's specific force without gravity is the wrist's own, small, acceleration.
     assert length((world[0], world[1], world[2] - 1)) * STANDARD_GRAVITY < 0.3
-    gravity = scene.to_sensor(seconds, (0.0, 0.0, 1.0))
+    gravity = to_sensor(Swaying().attitude(seconds)[0], (0.0, 0.0, 1.0))
     assert rotate(reading.orientation, gravity) == pytest.approx((0, 0, 1), abs=1e-9)
 
 
-def test_the_gyroscope_integrates_to_the_attitude() -> None:
-    source = scene.Scene(0, noise=False)
+@pytest.mark.parametrize(("motion", "begin"), [(Swaying(), 0.0), (Posing(), 23.0), (Turning(), 7.0)])
+def test_the_gyroscope_integrates_to_the_attitude(motion: Motion, begin: float) -> None:
+    source = scene.Scene(0, noise=False, motion=motion)
     step = 1e-4
-    q = source.reading(0, 0, 0.0).orientation
+    q = source.reading(0, 0, begin).orientation
     for n in range(20_000):
-        rate = source.reading(0, 0, (n + 0.5) * step).angular_rate
+        rate = source.reading(0, 0, begin + (n + 0.5) * step).angular_rate
         dx, dy, dz = (math.radians(r) * step / 2 for r in rate)
         x, y, z, w = q
         moved = (
@@ -175,7 +189,44 @@ def test_the_gyroscope_integrates_to_the_attitude() -> None:
         )
         size = length(moved)
         q = (moved[0] / size, moved[1] / size, moved[2] / size, moved[3] / size)
-    assert q == pytest.approx(source.reading(0, 0, 20_000 * step).orientation, abs=1e-5)
+    wanted = source.reading(0, 0, begin + 20_000 * step).orientation
+    sign = math.copysign(1.0, sum(a * b for a, b in zip(q, wanted, strict=True)))
+    assert q == pytest.approx([sign * part for part in wanted], abs=1e-5)
+
+
+def test_poses_are_held_still_with_each_axis_up_and_down() -> None:
+    source = scene.Scene(0, noise=False, motion=Posing())
+    ups = {f"{sign}{axis}": number for number, axis in enumerate("xyz") for sign in "+-"}
+    assert sorted(name for name, _ in POSES) == sorted(ups)
+    cycle = POSE_LENGTH + MOVE_LENGTH
+    for number, (name, _) in enumerate(POSES * 2):
+        for seconds in (0.0, 0.5 * POSE_LENGTH, POSE_LENGTH - 1e-6):
+            reading = source.reading(0, 0, number * cycle + seconds)
+            wanted = [0.0, 0.0, 0.0]
+            wanted[ups[name]] = 1.0 if name[0] == "+" else -1.0
+            assert reading.acceleration == pytest.approx(wanted, abs=1e-9)
+            assert reading.angular_rate == (0.0, 0.0, 0.0)
+
+
+def test_moves_between_poses_begin_and_end_at_rest_and_within_the_gyroscopes_range() -> None:
+    source = scene.Scene(0, noise=False, motion=Posing())
+    cycle = POSE_LENGTH + MOVE_LENGTH
+    for number in range(len(POSES)):
+        moving = [number * cycle + POSE_LENGTH + k * MOVE_LENGTH / 200 for k in range(200)]
+        rates = [length(source.reading(0, 0, seconds).angular_rate) for seconds in moving]
+        assert rates[0] == 0.0
+        assert rates[-1] < 1.0
+        assert 60.0 < max(rates) < 240.0
+
+
+def test_the_turn_goes_all_the_way_round_slowly() -> None:
+    source = scene.Scene(0, noise=False, motion=Turning())
+    readings = [source.reading(0, 0, k * TURN_LENGTH / 100) for k in range(101)]
+    assert readings[100].acceleration == pytest.approx(readings[0].acceleration)
+    for axis in range(3):
+        swept = [reading.acceleration[axis] for reading in readings]
+        assert max(swept) - min(swept) > 0.9
+    assert max(length(reading.angular_rate) for reading in readings) < 9.0
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,257 @@
+"""The bias: taken only at rest, pose-aware, ramped, undone."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from bridge.compensation.bias import BiasHistory, BiasRamp, estimate_bias, gravity_of
+from bridge.compensation.compensator import Compensator
+from bridge.compensation.quantities import NO_WRENCH, CompensationError, Wrench
+from bridge.compensation.still import NotStillError, StillLimits, StillMeans, StillWindow
+from protocol.framing import DataFlag
+from protocol.pdo import STANDARD_GRAVITY, Sample
+from protocol.warnings_register import WarningFlag
+from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, noisy, sample
+
+RATE = 800
+
+
+def window(
+    make: Callable[[int], Sample], seconds: float = 1.0, limits: StillLimits | None = None
+) -> StillWindow:
+    """A window that was fed until it was complete."""
+    collected = StillWindow(seconds, limits)
+    for number in range(100_000):
+        if collected.add(make(number), number / RATE):
+            return collected
+    raise AssertionError("the window never ended")
+
+
+def at_rest(up: tuple[float, float, float] = (0, 0, 1), seed: int = 0, **changed: Any) -> StillMeans:
+    noise = random.Random(seed)
+    wrench = load(up)
+    return window(lambda _: noisy(noise, wrench, up, **changed)).means()
+
+
+# Rest.
+
+
+def test_a_window_at_rest_gives_means_and_spreads() -> None:
+    means = at_rest()
+    assert means.samples == RATE + 1
+    assert means.seconds == pytest.approx(1.0)
+    assert means.wrench.values == pytest.approx(load((0, 0, 1)).values, abs=0.05)
+    assert max(means.force_spread) == pytest.approx(0.3, rel=0.15)
+    assert max(means.torque_spread) == pytest.approx(0.007, rel=0.15)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_of_a_healthy_sensor_is_rest(seed: int) -> None:
+    """Not one false alarm in twenty windows, at the rate and noise of SINC 51 and of a slow sensor."""
+    noise = random.Random(seed)
+    for seconds in (0.1, 1.0):
+        window(lambda _: noisy(noise, BIAS), seconds).means()
+
+
+Moved = Callable[[float, random.Random], dict[str, Any]]
+
+
+@pytest.mark.parametrize(
+    ("moved", "message"),
+    [
+        (lambda t, n: {"force": (3 * math.sin(9 * t), 0.0, 0.0)}, r"force x moved by \d.* N .*at most 0.8 N"),
+        (lambda t, n: {"torque": (0.0, 0.1 * math.sin(9 * t), 0.0)}, r"torque y moved by 0\.0\d+ Nm"),
+        (lambda t, n: {"force": (0.0, n.gauss(0, 0.3), t)}, r"force z wandered by 0\.\d+ N within"),
+        (lambda t, n: {"torque": (0.03 * t, 0.0, 0.0)}, r"torque x wandered by 0\.02\d* Nm"),
+        (lambda t, n: {"acceleration": (math.sin(30 * t), 0.0, 9.8)}, r"acceleration x moved by 0\.\d+ m/s²"),
+        (lambda t, n: {"acceleration": (0.2 * t, 0.0, 9.8)}, r"acceleration x wandered by"),
+        (lambda t, n: {"angular_rate": (0.0, 0.0, 0.2)}, r"turns: its mean angular rate is 0\.2 rad/s"),
+        (lambda t, n: {"angular_rate": (0.0, 0.1 * math.sin(30 * t), 0.0)}, r"rate y moved by 0\.0\d+"),
+    ],
+)  # fmt: skip
+def test_a_refusal_says_what_moved_by_how_much_and_what_the_limit_is(moved: Moved, message: str) -> None:
+    noise = random.Random(1)
+    collected = window(lambda k: noisy(noise, BIAS, **moved(k / RATE, noise)))
+    with pytest.raises(NotStillError, match=message):
+        collected.means()
+
+
+def test_limits_can_be_widened() -> None:
+    noise = random.Random(1)
+    limits = StillLimits(angular_rate=0.3)
+    window(lambda _: noisy(noise, BIAS, angular_rate=(0.0, 0.0, 0.2)), limits=limits).means()
+
+
+@pytest.mark.parametrize(
+    ("bad", "flags", "message"),
+    [
+        ({"force": (math.nan, 0.0, 0.0)}, 0, "not finite"),
+        ({"temperature": math.inf}, 0, "not finite"),
+        ({"force_torque_saturated": 4}, 0, "saturated or out of range"),
+        ({"warnings": int(WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)}, 0, "saturated or out of range"),
+        ({"warnings": int(WarningFlag.ADC_OUT_OF_SYNC)}, 0, "saturated or out of range"),
+        ({"acceleration_saturated": 1}, 0, "IMU was saturated"),
+        ({"angular_rate_saturated": 1}, 0, "IMU was saturated"),
+        ({}, int(DataFlag.INVALID), "marked INVALID"),
+    ],
+)
+def test_one_bad_sample_spoils_the_window(bad: dict[str, Any], flags: int, message: str) -> None:
+    collected = StillWindow(1.0)
+    for number in range(30):
+        assert not collected.add(sample(), number / RATE)
+    assert collected.add(sample(**bad), 30 / RATE, flags), "a spoiled window is complete"
+    assert collected.add(sample(), 31 / RATE), "and stays so"
+    with pytest.raises(NotStillError, match=f"spoiled: .*{message}"):
+        collected.means()
+
+
+def test_other_warnings_and_gaps_do_not_spoil_it() -> None:
+    warm = sample(warnings=int(WarningFlag.OVERTEMPERATURE))
+    collected = StillWindow(1.0)
+    for number in range(RATE):
+        collected.add(warm, number / RATE, int(DataFlag.GAP))
+    assert collected.means().samples == RATE
+
+
+def test_repeated_frames_are_no_samples() -> None:
+    collected = StillWindow(1.0)
+    for number in range(1, RATE):
+        collected.add(sample(), number / RATE, int(DataFlag.REPEATED))
+    assert collected.add(sample(), 1.1), "time passes all the same"
+    with pytest.raises(NotStillError, match=r"only 1 new samples came in 1\.1 s, at least 20"):
+        collected.means()
+
+
+def test_nothing_at_all_is_refused() -> None:
+    with pytest.raises(NotStillError, match="only 0 new samples"):
+        StillWindow().means()
+
+
+def test_a_sensor_without_imu_cannot_say_that_it_rests() -> None:
+    silent = sample(acceleration=(0.0, 0.0, 0.0))
+    with pytest.raises(NotStillError, match=r"only zeros.*imu_active"):
+        window(lambda _: silent).means()
+
+
+def test_a_clock_that_jumps_back_ends_the_window() -> None:
+    collected = StillWindow(1.0)
+    assert not collected.add(sample(), 100.0)
+    assert collected.add(sample(), 99.0)
+
+
+# The estimate.
+
+
+def test_without_payload_everything_is_bias() -> None:
+    means = at_rest()
+    assert estimate_bias(means) == means.wrench
+
+
+@pytest.mark.parametrize("up", AXES)
+def test_with_the_tool_on_only_the_offset_is_taken_in_every_pose(up: tuple[float, float, float]) -> None:
+    bias = estimate_bias(at_rest(up), TOOL)
+    assert bias.force == pytest.approx(BIAS.force, abs=0.05)
+    assert bias.torque == pytest.approx(BIAS.torque, abs=0.002)
+
+
+def test_a_bias_of_one_pose_holds_in_another() -> None:
+    """The point of it: tare and gravity compensation together leave nothing in any pose."""
+    compensator = Compensator(TOOL, estimate_bias(at_rest((1, 0, 0)), TOOL))
+    for up in AXES:
+        final = compensator.compensate(*load(up), gravity_for(up)).final
+        assert final.force == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
+        assert final.torque == pytest.approx((0.0, 0.0, 0.0), abs=0.004)
+
+
+def test_gravity_of_another_source_and_a_target_are_taken() -> None:
+    means = at_rest()
+    target = Wrench((0.0, 0.0, -5.0), (0.0, 0.0, 0.0))
+    bias = estimate_bias(means, TOOL, gravity_for((0, 1, 0)), target)
+    final = Compensator(TOOL, bias).compensate(*means.wrench, gravity_for((0, 1, 0))).final
+    assert final.values == pytest.approx(target.values)
+
+
+def test_an_accelerometer_that_reads_nothing_like_g_is_not_believed() -> None:
+    means = at_rest(acceleration=(0.0, 0.0, 1.0))
+    with pytest.raises(CompensationError, match=r"reads 1\.00 m/s² where 9\.81 should be.*imu_raw_units"):
+        estimate_bias(means, TOOL)
+    estimate_bias(means)  # without payload nobody needs it
+
+
+def test_only_the_direction_comes_from_the_accelerometer() -> None:
+    assert gravity_of((0.0, 0.0, 10.0)) == (0.0, 0.0, -STANDARD_GRAVITY)
+
+
+# Ramp and undo.
+
+OLD, NEW = Wrench.of([0, 0, 0, 0, 0, 0]), Wrench.of([1, -2, 4, 0.5, 0, -1])
+
+
+def test_the_ramp_is_straight_and_ends_exactly() -> None:
+    ramp = BiasRamp(OLD, seconds=2.0)
+    ramp.go(NEW, 10.0)
+    assert ramp.at(10.0) == OLD
+    assert ramp.at(10.5).values == pytest.approx([0.25 * value for value in NEW.values])
+    assert not ramp.arrived(11.9)
+    assert ramp.at(12.0) == NEW
+    assert ramp.at(1e9) == NEW
+    assert ramp.arrived(12.0)
+
+
+def test_a_late_sample_from_before_the_ramp_has_the_old_bias() -> None:
+    ramp = BiasRamp(OLD, seconds=2.0)
+    ramp.go(NEW, 10.0)
+    assert ramp.at(9.0) == OLD
+
+
+def test_a_ramp_that_takes_no_time_jumps() -> None:
+    ramp = BiasRamp(OLD)
+    ramp.go(NEW, 10.0)
+    assert ramp.at(10.0) == NEW
+
+
+def test_a_ramp_that_is_turned_round_does_not_jump() -> None:
+    ramp = BiasRamp(OLD, seconds=2.0)
+    ramp.go(NEW, 10.0)
+    before = ramp.at(10.7)
+    ramp.go(OLD, 10.7, seconds=1.0)
+    assert ramp.at(10.7) == before
+    assert ramp.at(11.7) == OLD
+
+
+def test_no_sample_sees_a_jump_larger_than_its_share() -> None:
+    ramp = BiasRamp(OLD, seconds=0.5)
+    ramp.go(NEW, 0.0)
+    steps = [ramp.at(k / RATE).force[2] for k in range(RATE)]
+    assert max(b - a for a, b in itertools.pairwise(steps)) <= 4.0 / (0.5 * RATE) + 1e-12
+
+
+def test_changes_are_undone_one_by_one() -> None:
+    history = BiasHistory(ramp_seconds=1.0)
+    assert not history.can_undo
+    history.set(NEW, 0.0)
+    history.set(BIAS, 5.0)
+    assert history.undo(10.0) == NEW
+    assert history.ramp.at(10.0) == BIAS
+    assert history.ramp.at(11.0) == NEW
+    assert history.undo(20.0) == NO_WRENCH
+    with pytest.raises(CompensationError, match="no change of the bias to undo"):
+        history.undo(30.0)
+
+
+def test_what_can_be_undone_is_bounded() -> None:
+    history = BiasHistory()
+    for number in range(100):
+        history.set(Wrench.of([number] * 6), 0.0)
+    undone = 0
+    while history.can_undo:
+        history.undo(0.0)
+        undone += 1
+    assert undone == 16
+    assert history.bias == Wrench.of([83] * 6)

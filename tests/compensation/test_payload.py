@@ -1,0 +1,386 @@
+"""Payload identification: right where the poses suffice, a sentence where they do not."""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.compensation import equations
+from bridge.compensation.parameter_file import (
+    CompensationParameters,
+    ParameterFileError,
+    from_yaml,
+    parameters_of,
+    read_yaml,
+    to_yaml,
+    write_yaml,
+)
+from bridge.compensation.payload import IdentificationError, identify
+from bridge.compensation.poses import Pose, coverage, pose_of
+from bridge.compensation.quantities import CompensationError, Payload, Wrench
+from bridge.compensation.session import IdentificationSession, summary
+from bridge.compensation.still import StillMeans
+from bridge.compensation.student import two_sided
+from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, pose
+
+Up = tuple[float, float, float]
+
+
+def circle(count: int = 8, tilt: float = 0.0) -> list[Up]:
+    """Turned about the sensor's x axis only; `tilt` is how much of gravity stays along it."""
+    turns = [math.tau * k / count for k in range(count)]
+    return [(tilt, math.sin(turn), math.cos(turn)) for turn in turns]
+
+
+def refusal(poses: list[Pose], *, one_axis: bool = False) -> str:
+    with pytest.raises(IdentificationError) as caught:
+        identify(poses, one_axis=one_axis)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+# Answers.
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_without_noise_the_answer_is_exact(seed: int) -> None:
+    draw = random.Random(seed)
+    payload = Payload(draw.uniform(0.1, 20), (draw.gauss(0, 0.1), draw.gauss(0, 0.1), draw.gauss(0, 0.1)))
+    bias = Wrench.of([draw.gauss(0, 30) for _ in range(6)])
+    poses = [pose(up, payload, bias) for up in AXES]
+    found = identify(poses)
+    assert found.payload.mass == pytest.approx(payload.mass, rel=1e-9)
+    assert found.payload.centre == pytest.approx(payload.centre, abs=1e-9)
+    assert found.bias.values == pytest.approx(bias.values, abs=1e-9)
+    assert found.mass_interval == pytest.approx(0.0, abs=1e-9)
+    assert found.notes == ()
+
+
+def test_it_is_the_least_squares_answer_of_the_stacked_problem() -> None:
+    """The two problems together are the one with ten unknowns, solved here in one piece."""
+    noise = random.Random(2)
+    poses = [pose(up, noise=noise) for up in [*AXES, (1, 1, 1)]]
+    design, measured = [], []
+    for each in poses:
+        g = np.array(each.gravity)
+        cross = np.array([[0, g[2], -g[1]], [-g[2], 0, g[0]], [g[1], -g[0], 0]])
+        force = np.hstack([g[:, None], np.zeros((3, 3)), np.eye(3), np.zeros((3, 3))])
+        torque = np.hstack([np.zeros((3, 1)), cross, np.zeros((3, 3)), np.eye(3)])
+        design += [force, torque]
+        measured += [each.wrench.force, each.wrench.torque]
+    wanted = np.linalg.lstsq(np.vstack(design), np.hstack(measured), rcond=None)[0]
+    found = identify(poses)
+    assert found.payload.mass == pytest.approx(wanted[0])
+    assert found.payload.centre == pytest.approx(wanted[1:4] / wanted[0])
+    assert found.bias.values == pytest.approx(wanted[4:])
+    assert len(found.residuals) == len(poses)
+    modelled = equations.compensate(
+        poses[3].wrench.force, poses[3].wrench.torque, bias=found.bias.values, mass=found.payload.mass,
+        centre=found.payload.centre, gravity=poses[3].gravity,
+    )  # fmt: skip
+    assert found.residuals[3].force == pytest.approx(modelled.final_force)
+    assert found.residuals[3].torque == pytest.approx(modelled.final_torque)
+
+
+@pytest.mark.parametrize("confidence", [0.8, 0.95])
+def test_the_intervals_cover_the_truth_as_often_as_they_say(confidence: float) -> None:
+    noise = random.Random(3)
+    runs, hits = 400, np.zeros(10)
+    truth = [TOOL.mass, *TOOL.centre, *BIAS.values]
+    for _ in range(runs):
+        found = identify([pose(up, noise=noise) for up in AXES], confidence=confidence)
+        got = [found.payload.mass, *found.payload.centre, *found.bias.values]
+        half = [found.mass_interval, *found.centre_interval, *found.bias_interval.values]
+        hits += [abs(a - b) <= c for a, b, c in zip(got, truth, half, strict=True)]
+    shares = hits / runs
+    # The centre takes the larger of two t quantiles, so it may cover a little more.
+    assert shares.min() > confidence - 0.06
+    assert shares.max() < confidence + 0.06
+
+
+def test_students_quantiles_are_those_of_the_tables() -> None:
+    for confidence, degrees, t in (
+        (0.95, 1, 12.7062), (0.95, 8, 2.3060), (0.95, 14, 2.1448), (0.99, 14, 2.9768), (0.5, 3, 0.7649),
+        (0.999, 2, 31.5991), (0.95, 1000, 1.9623),
+    ):  # fmt: skip
+        assert two_sided(confidence, degrees) == pytest.approx(t, rel=1e-4)
+    for confidence, degrees in ((0.0, 5), (1.0, 5), (0.5, 0), (math.nan, 5)):
+        with pytest.raises(ValueError, match="no quantile"):
+            two_sided(confidence, degrees)
+
+
+def test_six_axes_are_nearly_as_good_as_poses_get() -> None:
+    assert identify([pose(up) for up in AXES]).condition == pytest.approx(math.sqrt(1.5))
+    flat = [(0.35 * x, 0.35 * y, 1.0) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1), (0.2, 0.1))]
+    upside_down = (0.0, 0.0, -1.0)
+    assert identify([pose(up) for up in [*flat, upside_down]]).condition > 1.5
+
+
+# Refusals.
+
+
+def test_poses_all_alike_are_refused_with_what_is_unseen() -> None:
+    """Turning about the vertical does not help: gravity stays where it is."""
+    text = refusal([pose((0.3, 0.2, 1.0))] * 8)
+    assert "all 8 poses had gravity in the same direction" in text
+    assert "mass and centre of gravity are unseen" in text
+    assert "turn the sensor so that its" in text
+
+
+def test_two_directions_leave_the_centre_along_their_line_unseen() -> None:
+    text = refusal([pose((0, 0, 1)), pose((0, 0, -1))] * 3)
+    assert "only along the sensor's z axis, so the centre of gravity along it is unseen" in text
+    text = refusal([pose((1, 1, 0)), pose((-1, -1, 0))] * 3)
+    assert "only along the direction (0.71, 0.71, 0.00) of the sensor's frame" in text
+
+
+def test_it_is_really_unseen() -> None:
+    """Another centre along that line gives the same wrenches but for the bias."""
+    other = Payload(TOOL.mass, (TOOL.centre[0], TOOL.centre[1], 0.3))
+    for up in ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)):
+        assert load(up, other).values == pytest.approx(load(up).values)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5])
+def test_one_axis_only_is_refused_with_the_direction_that_never_changed(tilt: float) -> None:
+    text = refusal([pose(up) for up in circle(tilt=tilt)])
+    assert "about one axis only: gravity never changed along the sensor's x axis" in text
+    assert re.search(r"turn the sensor so that its [+-]x axis points up", text)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5])
+def test_one_axis_is_taken_on_request(tilt: float) -> None:
+    found = identify([pose(up) for up in circle(tilt=tilt)], one_axis=True)
+    assert found.payload.mass == pytest.approx(TOOL.mass)
+    assert found.payload.centre == pytest.approx(TOOL.centre)
+    assert found.bias.values == pytest.approx(BIAS.values)
+
+
+def test_even_on_request_two_directions_are_too_few() -> None:
+    assert "centre of gravity along it is unseen" in refusal(
+        [pose((0, 0, 1)), pose((0, 1, 0))] * 4, one_axis=True
+    )
+
+
+def test_few_poses_are_refused() -> None:
+    assert "there is no pose yet" in refusal([])
+    assert "the only pose had" in refusal([pose((0, 0, 1))])
+    assert "about one axis only" in refusal([pose(up) for up in ((0, 0, 1), (0, 1, 0), (1, 0, 0))])
+    identify([pose(up) for up in ((0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1))])
+
+
+def test_small_tilts_are_refused() -> None:
+    """20° to every side sees two axes, but hardly the third."""
+    tilts = [(0.34 * x, 0.34 * y, 0.94) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    assert "along the sensor's z axis" in refusal([pose(up) for up in [*tilts, (0, 0, 1)]])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda up: pose(up, Payload(-0.8, TOOL.centre)), r"negative \(-0\.8 kg\).*opposite signs"),
+        (lambda up: pose(up, Payload(0.0, TOOL.centre)), "cannot be told from zero"),
+        (lambda up: pose(up, Payload(0.001), noise=random.Random(str(up))), "cannot be told from zero"),
+        (lambda up: pose(up, Payload(900.0)), "900 kg cannot hang on a sensor"),
+        (lambda up: pose(up, Payload(0.1, (3.0, 0.0, 0.0))), "3 m from the sensor"),
+        (lambda up: Pose(Wrench((math.nan,) * 3, (0.0,) * 3), gravity_for(up)), "not finite"),
+        (lambda up: Pose(Wrench.of([0.0] * 6), (0.0, math.inf, 0.0)), "not finite"),
+    ],
+)
+def test_absurd_answers_are_refused(make: Callable[[Up], Pose], message: str) -> None:
+    assert re.search(message, refusal([make(up) for up in AXES]))
+
+
+def test_a_pose_in_which_something_held_the_tool_is_refused_by_its_number() -> None:
+    poses = [pose(up) for up in AXES]
+    x, y, z = poses[2].wrench.force
+    poses[2] = poses[2]._replace(wrench=Wrench((x, y + 15.0, z), poses[2].wrench.torque))
+    assert "do not fit one payload" in refusal(poses)
+    assert "pose 3 fits worst" in refusal(poses)
+
+
+def test_a_pose_that_was_touched_lightly_is_named_in_a_note() -> None:
+    noise = random.Random(4)
+    poses = [pose(up, noise=noise) for up in [*AXES, (1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1)]]
+    x, y, z = poses[4].wrench.force
+    poses[4] = poses[4]._replace(wrench=Wrench((x, y, z + 1.5), poses[4].wrench.torque))
+    notes = identify(poses).notes
+    assert any("pose 5 fits worse than the others" in note for note in notes)
+
+
+def test_a_wide_interval_is_a_note() -> None:
+    noise = random.Random(7)
+    notes = identify([pose(up, Payload(0.2, TOOL.centre), noise=noise, deviation=0.7) for up in AXES]).notes
+    assert any(re.search(r"mass is known to ± \d+ % only", note) for note in notes)
+    assert any(re.search(r"centre of gravity is known to ± \d+ mm only", note) for note in notes)
+
+
+# Advice.
+
+
+def direction(sentence: str) -> Up:
+    """What the advice asks for, carried out to the letter."""
+    x, y, z = (
+        sum({"+": 1.0, "-": -1.0}[sign] for sign in re.findall(rf"([+-]){axis}\b", sentence))
+        for axis in "xyz"
+    )
+    assert (x, y, z) != (0.0, 0.0, 0.0), sentence
+    return x, y, z
+
+
+def test_who_follows_the_advice_has_enough_after_four_poses_and_the_six_axes_after_six() -> None:
+    session = IdentificationSession()
+    taken: list[Up] = []
+    sufficed = []
+    for _ in range(6):
+        taken.append(direction(session.coverage.next_pose))
+        session.poses.append(pose(taken[-1]))
+        sufficed.append(session.coverage.missing is None)
+    assert sufficed == [False, False, False, True, True, True]
+    assert sorted(taken) == sorted(tuple(float(part) for part in up) for up in AXES)
+    assert session.solve().payload.mass == pytest.approx(TOOL.mass)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_advice_always_leads_to_an_answer(seed: int) -> None:
+    draw = random.Random(seed)
+    up = (draw.gauss(0, 1), draw.gauss(0, 1), draw.gauss(0, 1))
+    poses = [pose(up)]
+    while coverage(poses).missing:
+        poses.append(pose(direction(coverage(poses).next_pose)))
+    assert len(poses) <= 5
+    identify(poses)
+
+
+def test_the_worst_seen_direction_is_named() -> None:
+    assert coverage([pose(up) for up in circle()]).worst == pytest.approx((1.0, 0.0, 0.0))
+    assert coverage([pose(up) for up in AXES]).spread == pytest.approx((3**-0.5,) * 3)
+
+
+# A session, step by step.
+
+
+def still(up: Up) -> StillMeans:
+    x, y, z = (-part for part in gravity_for(up))
+    return StillMeans(load(up), (x, y, z), (0.0,) * 3, (0.3,) * 3, (0.007,) * 3, 800, 1.0)
+
+
+def test_a_session_tells_after_every_pose_what_is_missing() -> None:
+    session = IdentificationSession()
+    told = [session.add(still(up)) for up in AXES]
+    assert told[0].startswith("pose 1 taken (up is 0.00, 0.00, 1.00 in the sensor's frame); not enough yet")
+    assert "pose 5 taken" in told[4]
+    assert "the poses suffice" in told[4]
+    assert session.solve().payload.centre == pytest.approx(TOOL.centre)
+    assert "5 are left" in session.drop()
+
+
+def test_a_bad_pose_leaves_the_others() -> None:
+    session = IdentificationSession()
+    session.add(still((0, 0, 1)))
+    with pytest.raises(CompensationError, match=r"where 9\.81 should be"):
+        session.add(still((0, 0, 1))._replace(acceleration=(0.0, 0.0, 1.0)))
+    with pytest.raises(CompensationError, match="without gravity"):
+        session.add(still((0, 0, 1)), (0.0, 0.0, 0.0))
+    assert len(session.poses) == 1
+    session.drop()
+    with pytest.raises(CompensationError, match="no pose to take back"):
+        session.drop()
+
+
+def test_gravity_of_another_source_is_used_as_it_is() -> None:
+    assert pose_of(still((0, 0, 1)), (0.0, -9.7, 0.0)).gravity == (0.0, -9.7, 0.0)
+
+
+def test_the_summary_has_numbers_and_notes() -> None:
+    text = summary(identify([pose(up) for up in AXES]))
+    assert re.search(r"mass 0\.\d+ ± 0\.\d+ kg, centre of gravity \(\d", text)
+    assert "(95 % confidence) from 6 poses" in text
+
+
+# The YAML file.
+
+
+def test_yaml_reads_back_what_was_written(tmp_path: Path) -> None:
+    parameters = parameters_of(identify([pose(up) for up in AXES]))
+    path = tmp_path / "tool.yaml"
+    write_yaml(path, parameters, "gripper\nfrom 6 poses")
+    assert path.read_text().startswith(
+        "# gripper\n# from 6 poses\n/**:\n  ros__parameters:\n    tool_mass: 0.8"
+    )
+    back = read_yaml(path)
+    assert back.payload.mass == pytest.approx(parameters.payload.mass, abs=1e-9)
+    assert back.payload.centre == pytest.approx(parameters.payload.centre, abs=1e-9)
+    assert back.bias.values == pytest.approx(parameters.bias.values, abs=1e-9)
+    assert back.gravity == pytest.approx((0.0, 0.0, -9.80665), abs=1e-9)
+
+
+def test_ros_reads_every_number_as_a_float() -> None:
+    """No exponent without a point, which YAML 1.1 takes for text; and no whole number."""
+    tiny = CompensationParameters(Payload(1.0, (1e-7, 0.0, 2.0)), Wrench.of([1e-5, -0.0, 3, 4, 5, 6]))
+    for number in re.findall(r"[\[ ](-?[\d][^,\]\s]*)", re.sub("#.*", "", to_yaml(tiny))):
+        assert re.fullmatch(r"-?\d+\.\d+", number), number
+
+
+def test_block_lists_as_ros2_param_dump_writes_them() -> None:
+    text = """
+/bridge:
+  ros__parameters:
+    publishing_frequency: 0.0
+    bias:
+    - 1.0
+    - 2.0
+    - 3.0
+    - 4.0
+    - 5.0
+    - -6.0
+    tool_center_of_gravity: [0.1, 0.2,
+      0.3]
+    tool_mass: 2.5
+"""
+    with pytest.raises(ParameterFileError, match="line 12 does not close its list"):
+        from_yaml(text)
+    parameters = from_yaml(text.replace(",\n      0.3", ", 0.3"))
+    assert parameters == CompensationParameters(Payload(2.5, (0.1, 0.2, 0.3)), Wrench.of([1, 2, 3, 4, 5, -6]))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "there is none of tool_mass"),
+        ("a: 1", "there is none of"),
+        ("tool_mass: x", "a mass is a finite number"),
+        ("tool_mass: -1.0", "cannot be negative"),
+        ("tool_mass: [1.0, 2.0]", "tool_mass is one number"),
+        ("tool_mass: .nan", "a mass is a finite number"),
+        ("bias: [1.0]", "a wrench is 6 finite numbers"),
+        ("gravity:", "gravity is 3 finite numbers"),
+        ("tool_mass: 1.0\ntool_mass: 2.0", "line 2 gives tool_mass a second time"),
+    ],
+)
+def test_yaml_that_is_no_good_is_one_sentence(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(ParameterFileError, match=f"bad.yaml is not used: .*{message}") as caught:
+        read_yaml(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_read_or_written_are_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ParameterFileError, match="cannot be read: No such file"):
+        read_yaml(tmp_path / "none.yaml")
+    with pytest.raises(ParameterFileError, match="cannot be written"):
+        write_yaml(tmp_path / "none" / "x.yaml", CompensationParameters())
+    (tmp_path / "binary").write_bytes(b"\xff\xff")
+    with pytest.raises(ParameterFileError, match="it is not text"):
+        read_yaml(tmp_path / "binary")
+    (tmp_path / "large").write_bytes(b" " * ((1 << 20) + 1))
+    with pytest.raises(ParameterFileError, match="too large"):
+        read_yaml(tmp_path / "large")
