@@ -21,6 +21,7 @@ ZERO6 = [0.0] * 6
 QUICK: dict[str, object] = {
     "rest.duration": 0.3,
     "bias_ramp_time": 0.0,
+    "accelerometer.time_constant": 0.05,
     # This machine may be busy: ages and rates are judged elsewhere.
     "diagnostics.age_warn": 10.0,
     "diagnostics.age_error": 20.0,

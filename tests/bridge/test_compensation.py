@@ -65,6 +65,7 @@ def _stages(listener: Listener, node: NodeProcess) -> Stages:
 @pytest.fixture
 def stages(_stages: Stages, stream: Stream, listener: Listener, node: NodeProcess) -> Iterator[Stages]:
     """The tool hangs from an upright sensor and is compensated; there is no bias."""
+    stream.forget_once()
     hold(stream, UP)
     for name, value in START.items():
         assert listener.set_parameter(name, value) == (True, "")
@@ -330,7 +331,7 @@ def test_several_are_set_at_once_or_not_at_all(stages: Stages, stream: Stream, l
 
     assert not put(tool_mass=2.0, bias=[0.0] * 5).successful
     assert listener.parameters("tool_mass") == [TOOL.mass]
-    assert put(tool_mass=0.4, bias=[1.0, 0, 0, 0, 0, 0]).successful
+    assert put(tool_mass=0.4, bias=[1.0, *ZERO6[1:]]).successful
     half = [part / 2 for part in weight(UP)]
     stages.settle([half[0] - 1.0, *half[1:]])
 
