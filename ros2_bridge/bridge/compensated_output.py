@@ -37,6 +37,7 @@ class RestWindow:
         self.source = source
         self.done = threading.Event()
         self._still = StillWindow(seconds, limits)
+        self._fewest = limits.least_samples
         self._gravity = ZERO
         self._count = 0
         self._blind: str | None = None
@@ -49,7 +50,9 @@ class RestWindow:
             self._count += 1
         elif self._blind is None:
             self._blind = self.source.why_none(time_s)
-        if not self._still.add(sample, time_s):
+        still = self._still
+        # Too few samples, as of a slow sensor or a busy machine, make it longer.
+        if not still.add(sample, time_s) or not (still.count >= self._fewest or still.spoiled):
             return False
         self.done.set()
         return True

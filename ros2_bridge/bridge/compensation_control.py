@@ -10,7 +10,6 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 
 from bridge import kept_bias
@@ -179,8 +178,8 @@ class CompensationControl:
             topic = wanted.orientation.topic
             try:
                 self._node.resolve_topic_name(topic)
-            except InvalidTopicNameException as error:
-                reason = " ".join(str(error).split())
+            except RuntimeError as error:  # rclpy has no public name for it
+                reason = str(error).removeprefix("failed to resolve name: ").partition(", at /")[0]
                 raise ParameterError(f"parameter orientation.topic is {topic!r}: {reason}") from None
 
     def _apply(self, wanted: CompensationParameters) -> None:
@@ -256,7 +255,7 @@ class CompensationControl:
     def _take_sensor(self, serial: str, *, is_first: bool) -> None:
         self._kept = None
         stored = self._look_up(serial)
-        if stored is not None and is_first and self.bias != NO_WRENCH:
+        if stored is not None and is_first and self.bias not in (NO_WRENCH, stored.bias):
             self._log.warning(
                 f"the bias kept of sensor {serial} is not used, because the parameter bias is given; "
                 "it is replaced by it"
@@ -276,7 +275,7 @@ class CompensationControl:
                 f"another sensor is there now, serial number {serial}: the bias was the other's and is "
                 "zero now; tare"
             )
-        if not self.keeping:
+        if not self.keeping and (stored is not None or self.bias != NO_WRENCH):
             self._keep()
 
     def _look_up(self, serial: str) -> Stored | None:

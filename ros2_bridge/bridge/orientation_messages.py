@@ -51,9 +51,7 @@ TOPIC_KINDS: Final = {
 def read_message(kind: TopicKind, message: Any) -> Oriented:
     """The orientation in a message; UnusableError if it has none that can be used."""
     if kind.type is Imu and message.orientation_covariance[0] == -1.0:
-        raise UnusableError(
-            "its messages say that they have no orientation (orientation_covariance[0] is -1)"
-        )
+        raise UnusableError("its messages say that they have none (orientation_covariance[0] is -1)")
     stamp = message.header.stamp
     if not stamp.sec and not stamp.nanosec:
         raise UnusableError("its messages have no time stamp: the publisher must fill in header.stamp")

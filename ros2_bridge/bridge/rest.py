@@ -27,9 +27,9 @@ def take_window(control: CompensationControl, limit_hz: float) -> RestWindow:
             f"there is no server at {link.address} ({link.problem}), so there are no samples"
         )
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
-    if limit_hz > 0:
-        seconds = max(seconds, (limits.least_samples + 1) / limit_hz)
     window = RestWindow(seconds, limits, control.source)
+    if limit_hz > 0:
+        seconds = max(seconds, limits.least_samples / limit_hz)
     patience_s = 1.5 * seconds + _PATIENCE_S
     deadline_s = time.monotonic() + patience_s
     control.output.window = window

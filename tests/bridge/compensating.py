@@ -82,6 +82,11 @@ def six(message: Any) -> list[float]:
     return [f.x, f.y, f.z, m.x, m.y, m.z]
 
 
+def stamp_ns(message: Any) -> int:
+    """A message's time, ns since the Unix epoch."""
+    return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+
 def is_near(message: Any, wanted: Sequence[float], within: float = 1e-3) -> bool:
     return all(abs(a - b) <= within for a, b in zip(six(message), wanted, strict=True))
 
