@@ -107,8 +107,18 @@ def test_of_the_clients_only_the_replay_uses_the_server() -> None:
     assert all(path.startswith("clients/replay/") for path in using), using
 
 
+def test_of_the_clients_only_identify_uses_the_bridge_and_only_its_compensation() -> None:
+    using = [path for path in CLIENTS if "bridge" in imports(path)]
+    assert {path.parent.name for path in using} <= {"identify"}
+    for path in using:
+        assert not re.search(
+            r"^\s*(from|import) bridge(?!\.compensation\.)", path.read_text(), re.MULTILINE
+        ), path
+
+
 def test_recordings_are_opened_in_one_place() -> None:
     assert set(importers(PROTOCOL + SERVER + BRIDGE + CLIENTS, "mcap")) <= {
+        "clients/recording/chunk.py",
         "clients/recording/container.py",
         "clients/recording/writer.py",
     }

@@ -98,17 +98,21 @@ def _record(
                 if options.seconds is not None and time.monotonic() - began >= options.seconds:
                     reason = "time is up"
                     break
+                if not (source.connected or options.reconnect):
+                    reason = "the server ended"
+                    break
                 progress.show(recorder, connected=source.connected)
                 batch = source.receive()
         except ProtocolError as error:
             reason, code = f"the server refused: {error}", 1
             progress.say(reason)
+        seconds = time.monotonic() - began
         source.close()
         recorder.stop(reason)
     if recorder.error is not None:
         _say(f"{recorder.error}; what was written before is whole")
         code = 1
-    _say(_summary(recorder, parts, time.monotonic() - began))
+    _say(_summary(recorder, parts, seconds))
     return code
 
 

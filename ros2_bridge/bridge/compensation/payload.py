@@ -26,6 +26,10 @@ _LARGEST_MISFIT: Final = 0.1
 _FORGIVEN_MISFIT: Final = 1.0
 """N: residuals are refused beyond this plus a tenth of the weight."""
 _SUSPICIOUS: Final = 3.0
+_NEGLIGIBLE: Final = 0.01
+"""Of the weight: a residual below it is not worth a word."""
+_ARM: Final = 0.05
+"""m: what makes a torque of it."""
 
 Array = NDArray[np.float64]
 
@@ -123,7 +127,7 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
         torque.rms,
         _condition(gravity),
         seen,
-        tuple(_notes(force, torque, mass, mass_interval, centre_interval)),
+        tuple(_notes(poses, residuals, mass, mass_interval, centre_interval)),
     )
 
 
@@ -212,17 +216,26 @@ def _check_fit(force: _Solution, weight: float) -> None:
 
 
 def _notes(
-    force: _Solution, torque: _Solution, mass: float, mass_interval: float, centre_interval: Vector3
+    poses: Sequence[Pose],
+    residuals: Sequence[Residual],
+    mass: float,
+    mass_interval: float,
+    centre_interval: Vector3,
 ) -> list[str]:
     notes = []
-    for name, unit, part in (("force", "N", force), ("torque", "Nm", torque)):
-        sizes = np.linalg.norm(part.residuals, axis=1)
+    weight = mass * length(poses[0].gravity)
+    for name, unit, negligible, spreads in (
+        ("force", "N", _NEGLIGIBLE * weight, [pose.force_spread for pose in poses]),
+        ("torque", "Nm", _NEGLIGIBLE * weight * _ARM, [pose.torque_spread for pose in poses]),
+    ):
+        sizes = np.array([length(getattr(residual, name)) for residual in residuals])
         worst = int(sizes.argmax())
-        others = np.delete(sizes, worst)
-        if sizes[worst] > _SUSPICIOUS * max(float(np.sqrt(np.mean(others**2))), 1e-9):
+        others = float(np.sqrt(np.mean(np.delete(sizes, worst) ** 2)))
+        by_chance = length(spreads[worst]) / poses[worst].samples ** 0.5
+        if sizes[worst] > max(_SUSPICIOUS * others, _SUSPICIOUS * by_chance, negligible):
             notes.append(
-                f"pose {worst + 1} fits worse than the others: {sizes[worst]:.2g} {unit} of {name} are "
-                "left over; if something touched the tool, take it again"
+                f"pose {worst + 1} fits worse than the others: {sizes[worst]:.2g} {unit} of {name} are left "
+                "over; if something touched the tool, take it again"
             )
     if mass_interval > 0.05 * mass:
         notes.append(

@@ -103,7 +103,8 @@ def name_direction(direction: NDArray[np.float64]) -> str:
     if abs(unit[axis]) > _SAME_POSE:
         return f"the sensor's {'xyz'[axis]} axis"
     unit = unit * np.sign(unit[axis])
-    return f"the direction ({', '.join(f'{part + 0.0:.2f}' for part in unit)}) of the sensor's frame"
+    parts = ", ".join(f"{round(float(part), 2) + 0.0:.2f}" for part in unit)
+    return f"the direction ({parts}) of the sensor's frame"
 
 
 def _spread(

@@ -35,7 +35,7 @@ class IdentificationSession:
             raise CompensationError(f"there are {MOST_POSES} poses already: solve, or cancel")
         pose = pose_of(means, gravity, self.magnitude)
         self.poses.append(pose)
-        x, y, z = pose.up
+        x, y, z = (round(part, 2) + 0.0 for part in pose.up)
         return (
             f"pose {len(self.poses)} taken (up is {x:.2f}, {y:.2f}, {z:.2f} in the sensor's frame); "
             f"{self.advice}"

@@ -22,9 +22,10 @@ _MOST_SAMPLES: Final = 200_000
 _BLOCKS: Final = 4
 _WANDER_ALLOWANCE: Final = 5.0
 """Means of blocks of noise differ by chance: by this many of their standard errors hardly ever."""
-_BAD_WRENCH: Final = (
+BAD_WRENCH: Final = (
     WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.ADC_OUT_OF_SYNC | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE
 )
+"""Warnings with which force and torque are not to be used."""
 
 
 class NotStillError(CompensationError):
@@ -200,7 +201,7 @@ def _what_is_wrong(sample: Sample, flags: int) -> str | None:
         return "the sensor did not answer the bus (a frame is marked INVALID)"
     if not sample.is_finite:
         return "a sample has numbers that are not finite"
-    if sample.force_torque_saturated or sample.warnings & _BAD_WRENCH:
+    if sample.force_torque_saturated or sample.warnings & BAD_WRENCH:
         return "force or torque was saturated or out of range"
     if sample.acceleration_saturated or sample.angular_rate_saturated:
         return "the IMU was saturated"

@@ -1,0 +1,20 @@
+"""`ethercat-identify`: what is started. Everything else is loaded after Ctrl-C has been made harmless."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Sequence
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Identify; returns the exit code."""
+    # It only reads, so Ctrl-C may end it anywhere, and at once.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from clients.identify.command import run  # noqa: PLC0415 - NumPy takes a while to load
+
+    return run(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+"""What `ethercat-identify FILE.mcap` does: finds the static poses, solves, prints, writes the parameters."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+
+from rich.console import Console
+
+from bridge.compensation.parameter_file import parameters_of, write_yaml
+from bridge.compensation.payload import Identified, identify
+from bridge.compensation.poses import MOST_POSES, Pose, pose_of
+from bridge.compensation.quantities import CompensationError
+from bridge.compensation.session import summary
+from clients.identify.options import IdentifyOptions, parse_options
+from clients.identify.report import as_json, show_poses, show_result
+from clients.identify.stills import Still, Stills, find_stills
+from clients.recording.columns import columns
+from clients.recording.errors import RecordingError
+from clients.recording.reader import RecordedSensor, Recording, open_recording
+
+
+class SensorChoiceError(CompensationError):
+    """The recording does not hold the sensor that is asked for, or holds several."""
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    """Identify; returns the exit code."""
+    try:
+        return _identify(parse_options(argv))
+    except (CompensationError, RecordingError) as error:
+        _say(str(error))
+        return 1
+    except BrokenPipeError:
+        # Whoever read has had enough; Python would complain once more when it flushes at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _identify(options: IdentifyOptions) -> int:
+    with open_recording(options.path) as recording:
+        sensor = _choose(recording, options.sensor)
+        if recording.cut_off is not None:
+            _say(f"{options.path} was cut off ({recording.cut_off}): what is whole is used")
+        data = columns(recording, sensor.sensor, options.imu_units)
+    found = find_stills(data, options.least_seconds, options.limits)
+    if len(found.stills) > MOST_POSES:
+        longest = sorted(found.stills, key=lambda still: -still.seconds)[:MOST_POSES]
+        found = found._replace(stills=tuple(sorted(longest)))
+        _say(f"there are more than {MOST_POSES} rests: the longest are used")
+    result, error, taken, poses = _solve(found, options)
+    if options.json:
+        answer = as_json(found._replace(stills=tuple(taken)), poses, result, error)
+        sys.stdout.write(json.dumps(answer, indent=1) + "\n")
+        sys.stdout.flush()
+    else:
+        console = Console(highlight=False)
+        if poses:
+            show_poses(console, taken, poses, result)
+        if result is not None:
+            show_result(console, result)
+    for sentence in found.rejected if result is None or not options.json else ():
+        _say(f"not taken: {sentence}")
+    if result is None:
+        _say(error or "no answer")
+        return 1
+    if options.yaml is not None:
+        who = f"{sensor.name}, serial number {sensor.serial}, from {options.path.name}"
+        write_yaml(options.yaml, parameters_of(result), f"{who}\n{summary(result)}")
+        _say(f"written to {options.yaml}")
+    return 0
+
+
+def _choose(recording: Recording, place: int | None) -> RecordedSensor:
+    there = [sensor for sensor in recording.sensors if sensor.frames]
+    if not there:
+        raise SensorChoiceError(f"{recording.path} holds no samples")
+    if place is None and len(there) > 1:
+        places = ", ".join(str(sensor.sensor) for sensor in there)
+        raise SensorChoiceError(f"{recording.path} holds several sensors ({places}): say which with --sensor")
+    for sensor in there:
+        if place in (None, sensor.sensor):
+            return sensor
+    raise SensorChoiceError(f"{recording.path} holds no samples of sensor {place}")
+
+
+def _solve(
+    found: Stills, options: IdentifyOptions
+) -> tuple[Identified | None, str | None, list[Still], list[Pose]]:
+    """The answer or why there is none, and the rests that are poses."""
+    taken, poses = [], []
+    reason = None
+    for still in found.stills:
+        try:
+            poses.append(pose_of(still.means, magnitude=options.gravity))
+            taken.append(still)
+        except CompensationError as error:
+            reason = str(error)
+    try:
+        if not poses:
+            raise CompensationError(
+                reason
+                or f"the sensor is nowhere at rest for {options.least_seconds:g} s: hold it still, or widen "
+                "what counts as rest with --limit or --least-seconds"
+            )
+        return identify(poses, confidence=options.confidence, one_axis=options.one_axis), None, taken, poses
+    except CompensationError as error:
+        return None, str(error), taken, poses
+
+
+def _say(sentence: str) -> None:
+    sys.stderr.write(f"ethercat-identify: {sentence}\n")

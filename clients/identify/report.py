@@ -1,0 +1,99 @@
+"""What was found, as a table for people and as JSON for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from bridge.compensation.payload import Identified
+from bridge.compensation.poses import Pose
+from bridge.compensation.quantities import Wrench
+from clients.identify.stills import Still, Stills
+
+
+def show_poses(
+    console: Console, stills: Sequence[Still], poses: Sequence[Pose], result: Identified | None
+) -> None:
+    """The poses, with what the answer leaves of each."""
+    table = Table(title="poses", title_justify="left")
+    for head in ("", "at s", "for s", "samples", "up x", "up y", "up z", "left over N", "left over Nm"):
+        table.add_column(head, justify="right")
+    for number, (still, pose) in enumerate(zip(stills, poses, strict=True)):
+        left = ["", ""]
+        if result is not None:
+            residual = result.residuals[number]
+            left = [f"{_length(residual.force):.3f}", f"{_length(residual.torque):.5f}"]
+        table.add_row(
+            str(number + 1), f"{still.begin_s:.1f}", f"{still.seconds:.1f}", str(pose.samples),
+            *(f"{round(part, 2) + 0.0:.2f}" for part in pose.up), *left,
+        )  # fmt: skip
+    console.print(table)
+
+
+def show_result(console: Console, result: Identified) -> None:
+    """The ten numbers with their intervals, and what a person should know."""
+    table = Table(title="payload and bias", title_justify="left")
+    table.add_column("")
+    table.add_column("value", justify="right")
+    table.add_column(f"± ({100 * result.confidence:g} %)", justify="right")
+    table.add_column("unit")
+    table.add_row("mass", f"{result.payload.mass:.4f}", f"{result.mass_interval:.4f}", "kg")
+    for axis, value, interval in zip("xyz", result.payload.centre, result.centre_interval, strict=True):
+        table.add_row(f"centre of gravity {axis}", f"{1000 * value:.2f}", f"{1000 * interval:.2f}", "mm")
+    _add_bias(table, result.bias, result.bias_interval)
+    console.print(table)
+    console.print(
+        f"left over: {result.force_rms:.3g} N, {result.torque_rms:.3g} Nm; condition of the problem "
+        f"{result.condition:.2f} (1.2 is ideal)"
+    )
+    for note in result.notes:
+        console.print(f"note: {note}")
+
+
+def _add_bias(table: Table, bias: Wrench, interval: Wrench) -> None:
+    for axis, value, half in zip("xyz", bias.force, interval.force, strict=True):
+        table.add_row(f"bias force {axis}", f"{value:.3f}", f"{half:.3f}", "N")
+    for axis, value, half in zip("xyz", bias.torque, interval.torque, strict=True):
+        table.add_row(f"bias torque {axis}", f"{value:.5f}", f"{half:.5f}", "Nm")
+
+
+def as_json(
+    found: Stills, poses: Sequence[Pose], result: Identified | None, error: str | None
+) -> dict[str, Any]:
+    """Everything, in SI units; `ok` tells whether there is an answer."""
+    rows = [
+        {
+            "begin_s": still.begin_s, "seconds": still.seconds, "samples": pose.samples,
+            "force": pose.wrench.force, "torque": pose.wrench.torque, "gravity": pose.gravity,
+            "force_spread": pose.force_spread, "torque_spread": pose.torque_spread,
+        }
+        for still, pose in zip(found.stills, poses, strict=True)
+    ]  # fmt: skip
+    if result is None:
+        return {"ok": False, "error": error, "poses": rows, "rejected": list(found.rejected)}
+    for row, residual in zip(rows, result.residuals, strict=True):
+        row["residual_force"], row["residual_torque"] = residual.force, residual.torque
+    return {
+        "ok": True,
+        "tool_mass": result.payload.mass,
+        "tool_mass_interval": result.mass_interval,
+        "tool_center_of_gravity": result.payload.centre,
+        "tool_center_of_gravity_interval": result.centre_interval,
+        "bias": result.bias.values,
+        "bias_interval": result.bias_interval.values,
+        "confidence": result.confidence,
+        "force_rms": result.force_rms,
+        "torque_rms": result.torque_rms,
+        "condition": result.condition,
+        "gravity": result.gravity,
+        "notes": list(result.notes),
+        "poses": rows,
+        "rejected": list(found.rejected),
+    }
+
+
+def _length(values: Sequence[float]) -> float:
+    return float(sum(value * value for value in values) ** 0.5)

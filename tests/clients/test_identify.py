@@ -1,0 +1,228 @@
+"""`ethercat-identify` on recordings of the virtual sensor, made at simulated time."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridge.compensation.parameter_file import read_yaml
+from clients.identify.command import run
+from clients.identify.stills import find_stills
+from clients.recording.columns import columns
+from clients.recording.reader import open_recording
+from ethercat_server.virtual_sensor import scene
+from ethercat_server.virtual_sensor.motion import MOVE_LENGTH, POSE_LENGTH, POSES
+from protocol.framing import DataFlag, DataMessage
+from tests.clients.recordings import START_NS, record
+from tests.compensation.streaming import OFFSET, POSES_TAKE, process_data
+
+CYCLE = POSE_LENGTH + MOVE_LENGTH
+SINC = 512
+
+
+def frames(stream: Iterable[tuple[float, int, bytes]], sensor: int = 0) -> list[DataMessage]:
+    """What the server makes of samples."""
+    made = []
+    for time_s, number, data in stream:
+        moment = int(time_s * 1e9)
+        made.append(DataMessage(number, START_NS + moment, moment, sensor, 0, 3, data))
+    return made
+
+
+POSED = frames(process_data("poses", POSES_TAKE, sinc=SINC))
+"""Six poses, moves between."""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("identify") / "poses.mcap"
+    record(path, POSED)
+    return path
+
+
+def asked(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, Any, str]:
+    """Exit code, JSON and what was said, of a run with --json."""
+    code = run([*map(str, arguments), "--json"])
+    said = capsys.readouterr()
+    return code, json.loads(said.out), said.err
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one sentence of a run that fails."""
+    assert run([*map(str, arguments)]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert all(line.startswith("ethercat-identify: ") for line in said)
+    return said[-1]
+
+
+def test_it_finds_the_poses_by_itself(recording: Path) -> None:
+    with open_recording(recording) as opened:
+        found = find_stills(columns(opened))
+    assert len(found.stills) == len(POSES)
+    assert found.rejected == ()
+    for number, still in enumerate(found.stills):
+        assert number * CYCLE <= still.begin_s <= number * CYCLE + 0.3
+        assert POSE_LENGTH - 0.5 <= still.seconds <= POSE_LENGTH + 0.2
+
+
+def test_it_finds_the_tool_and_the_bias(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, answer, said = asked(capsys, recording)
+    assert (code, answer["ok"], said) == (0, True, "")
+    assert answer["tool_mass"] == pytest.approx(scene.TOOL_MASS, rel=0.01)
+    assert math.dist(answer["tool_center_of_gravity"], scene.TOOL_CENTRE) < 0.002
+    assert answer["bias"] == pytest.approx(OFFSET, abs=0.05)
+    assert abs(answer["tool_mass"] - scene.TOOL_MASS) < 3 * answer["tool_mass_interval"]
+    assert [len(pose["residual_force"]) for pose in answer["poses"]] == [3] * 6
+
+
+def test_a_person_sees_tables(
+    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run([str(recording)]) == 0
+    shown = capsys.readouterr().out
+    for words in (
+        "poses",
+        "left over N",
+        "mass",
+        "centre of gravity z",
+        "mm",
+        "± (95 %)",
+        "bias torque x",
+    ):
+        assert words in shown
+    assert max(map(len, shown.splitlines())) <= 100
+
+
+def test_the_yaml_is_what_the_node_takes(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "tool.yaml"
+    _, answer, said = asked(capsys, recording, "--yaml", out)
+    assert f"written to {out}" in said
+    assert "serial number 100, from poses.mcap" in out.read_text().splitlines()[0]
+    parameters = read_yaml(out)
+    assert parameters.payload.mass == pytest.approx(answer["tool_mass"], abs=1e-8)
+    assert parameters.bias.values == pytest.approx(answer["bias"], abs=1e-8)
+    assert "cannot be written" in refused(capsys, recording, "--yaml", tmp_path / "no" / "x.yaml")
+
+
+def test_other_frames_and_bad_samples_do_not_matter(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Repeated frames, another sensor, and a saturated sample within a pose."""
+    noise = random.Random(1)
+    mixed = []
+    for number, frame in enumerate(POSED):
+        mixed.append(frame)
+        if noise.random() < 0.1:
+            mixed.append(frame._replace(flags=int(DataFlag.REPEATED)))
+        if number == 150:
+            broken = bytearray(frame.process_data)
+            broken[29] = 0xFF  # force_torque_saturated
+            mixed[-1] = frame._replace(process_data=bytes(broken))
+        mixed.append(frame._replace(sensor=1))
+    path = tmp_path / "mixed.mcap"
+    record(path, mixed, sensors=(0, 1))
+    assert "several sensors (0, 1): say which with --sensor" in refused(capsys, path)
+    assert "no samples of sensor 7" in refused(capsys, path, "--sensor", 7)
+    code, answer, _ = asked(capsys, path, "--sensor", 0)
+    assert code == 0
+    assert answer["tool_mass"] == pytest.approx(scene.TOOL_MASS, rel=0.01)
+    for pose in answer["poses"]:
+        end = pose["begin_s"] + pose["seconds"]
+        assert not pose["begin_s"] <= 150 * SINC / 51200 <= end
+
+
+def test_too_few_poses_are_refused_with_what_to_do_and_the_poses_are_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "few.mcap"
+    record(path, [frame for frame in POSED if frame.monotonic_ns < 4 * CYCLE * 1e9])
+    code, answer, said = asked(capsys, path)
+    assert code == 1
+    assert len(answer["poses"]) == 4
+    assert "about one axis only: gravity never changed along the sensor's x axis" in answer["error"]
+    assert "x axis points up" in said
+    code, answer, _ = asked(capsys, path, "--one-axis")
+    assert code == 0
+    assert answer["tool_mass"] == pytest.approx(scene.TOOL_MASS, rel=0.01)
+
+
+def test_a_recording_that_never_rests_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "scene.mcap"
+    record(path, frames(process_data("scene", 4.0, sinc=SINC)))
+    assert "nowhere at rest for 1 s" in refused(capsys, path)
+
+
+def test_a_gap_or_a_restarted_server_ends_a_rest(tmp_path: Path) -> None:
+    one = [frame for frame in POSED if frame.monotonic_ns < 1.2e9]
+    later = [frame._replace(monotonic_ns=frame.monotonic_ns + 10 * 10**9) for frame in one]
+    before = [frame._replace(monotonic_ns=frame.monotonic_ns + 5 * 10**9) for frame in one]
+    path = tmp_path / "gaps.mcap"
+    record(path, [*one, *later, *before])
+    with open_recording(path) as opened:
+        found = find_stills(columns(opened), least_seconds=0.5)
+    assert len(found.stills) == 3
+
+
+def test_the_wrong_units_are_noticed(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wide = ("--limit", "angular_rate=10", "--limit", "angular_rate_spread=10")
+    assert "check imu_raw_units" in refused(capsys, recording, "--imu-raw-units", "si", *wide)
+
+
+def test_what_is_no_recording_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "cannot be read: No such file" in refused(capsys, tmp_path / "none.mcap")
+    (tmp_path / "text.mcap").write_text("hello")
+    assert "text.mcap" in refused(capsys, tmp_path / "text.mcap")
+    record(tmp_path / "empty.mcap", [])
+    assert "holds no samples" in refused(capsys, tmp_path / "empty.mcap")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["a.mcap", "b.mcap"], ["a.mcap", "--gravity", "1"], ["a.mcap", "--limit", "speed=1"],
+     ["a.mcap", "--limit", "force_spread=x"], ["a.mcap", "--confidence", "1"], ["a.mcap", "--sensor", "-1"]],
+)  # fmt: skip
+def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        run(arguments)
+    assert caught.value.code == 2
+    assert "usage: ethercat-identify" in capsys.readouterr().err
+
+
+def start(path: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "clients.identify.cli", str(path), "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def test_ctrl_c_is_no_traceback(tmp_path: Path) -> None:
+    pipe = tmp_path / "endless.mcap"
+    os.mkfifo(pipe)
+    with start(pipe) as program:
+        with pipe.open("wb"):  # waits until the program reads
+            program.send_signal(signal.SIGINT)
+            assert program.stderr is not None
+            assert program.stderr.read() == ""
+        assert program.wait(timeout=30) == -signal.SIGINT
+
+
+def test_a_reader_that_has_had_enough_is_no_traceback(recording: Path) -> None:
+    with start(recording) as program:
+        assert program.stdout is not None
+        program.stdout.close()
+        assert program.stderr is not None
+        assert program.stderr.read() == ""
+        assert program.wait(timeout=30) == 1

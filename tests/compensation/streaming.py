@@ -1,0 +1,78 @@
+"""The virtual sensor's own samples at simulated time, as they come off the bus."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator
+
+from bridge.compensation.session import IdentificationSession
+from bridge.compensation.still import StillMeans, StillWindow
+from ethercat_server.virtual_sensor import scene
+from ethercat_server.virtual_sensor.firmware import Firmware
+from ethercat_server.virtual_sensor.motion import MOVE_LENGTH, POSE_LENGTH, POSES
+from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.pdo import Sample, SampleDecoder
+
+Stream = Iterable[tuple[float, Sample]]
+"""Samples with their times, s since the signal began."""
+
+SINC = 128
+"""400 Hz: quick to simulate."""
+OFFSET = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)
+"""What the sensor adds to its readings (object 0x8000): the bias that is to be found. N, Nm."""
+POSES_TAKE = len(POSES) * (POSE_LENGTH + MOVE_LENGTH)
+_SETTLE = 0.3
+
+
+def process_data(
+    signal: str, seconds: float, seed: int = 0, sinc: int = SINC
+) -> Iterator[tuple[float, int, bytes]]:
+    """Time since the signal began (s), number and process data of every sample."""
+    options = SensorOptions(signal=signal, seed=seed)
+    flash = {(0x8006, 1): struct.pack("<H", sinc)}
+    firmware = Firmware(options, flash, 0, lambda *_: None)
+    for number, offset in enumerate(OFFSET, 1):
+        firmware.write(0x8000, number, struct.pack("<f", offset))
+    for number in range(int(seconds * 51200 / sinc)):
+        firmware.now = firmware.clock.instant(number)
+        yield firmware.now * 1e-9, number, firmware.inputs()
+
+
+def samples(signal: str, seconds: float, seed: int = 0, sinc: int = SINC) -> Iterator[tuple[float, Sample]]:
+    """The same, decoded."""
+    decode = SampleDecoder(61).decode
+    for time_s, _, data in process_data(signal, seconds, seed, sinc):
+        yield time_s, decode(data)
+
+
+def windows_of_poses(stream: Stream, seconds: float = 1.5) -> Iterator[StillMeans]:
+    """What a user takes of the signal `poses`: a window in each pose, a moment after the move has ended."""
+    window: StillWindow | None = None
+    for time_s, sample in stream:
+        within = time_s % (POSE_LENGTH + MOVE_LENGTH)
+        if within < _SETTLE:
+            window = StillWindow(seconds)
+        elif window is not None and window.add(sample, time_s):
+            yield window.means()
+            window = None
+
+
+def take_poses(stream: Stream) -> IdentificationSession:
+    """Take every pose of the signal `poses`."""
+    session = IdentificationSession()
+    for means in windows_of_poses(stream):
+        session.add(means)
+    return session
+
+
+def deviations(sinc: int = SINC) -> tuple[float, ...]:
+    """The standard deviation of the virtual sensor's noise, force (N) and torque (Nm)."""
+    signal = scene.Scene(0, noise=True)
+    signal.set_sinc_length(sinc)
+    return signal.deviations
+
+
+def contact(time_s: float) -> tuple[float, ...]:
+    """What the tool of `scene` is really touched with, force (N) and torque (Nm)."""
+    force = scene.contact_force(time_s)
+    return *force, *scene.cross(scene.CONTACT_POINT, force)

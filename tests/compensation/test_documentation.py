@@ -1,0 +1,87 @@
+"""docs/compensation.md: its example runs, its mistakes look as it says, its figure can be drawn."""
+
+from __future__ import annotations
+
+import doctest
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.compensation import equations
+from bridge.compensation.quantities import DEFAULT_GRAVITY
+from scripts import _compensation_figure as figure
+from tests.compensation.making import BIAS, TOOL
+
+ROOT = Path(__file__).parent.parent.parent
+PAGE = (ROOT / "docs" / "compensation.md").read_text()
+
+# Orientations of the sensor, x, y, z, w: upright, rolled by 90° and by 180°.
+POSES = ((0.0, 0.0, 0.0, 1.0), (0.5**0.5, 0.0, 0.0, 0.5**0.5), (1.0, 0.0, 0.0, 0.0))
+BASE_R_SENSOR = equations.matrix_from_quaternion(POSES)
+GRAVITY = equations.gravity_in_sensor_from_quaternion(POSES, DEFAULT_GRAVITY)
+WEIGHT = equations.gravity_force(TOOL.mass, GRAVITY)
+WEIGHT_TORQUE = equations.torque_of(TOOL.centre, WEIGHT)
+TARED = np.array(BIAS.values) + np.hstack([WEIGHT[0], WEIGHT_TORQUE[0]])
+"""The bias of a tare with the tool on, upright."""
+
+MISTAKES: dict[str, dict[str, object]] = {
+    "none": {},
+    "bias not subtracted": {"bias": np.zeros(6)},
+    "bias added instead of subtracted": {"bias": -np.array(BIAS.values)},
+    "tare with the tool on, no gravity compensation": {"bias": TARED, "mass": 0.0},
+    "tare with the tool on, and gravity compensation": {"bias": TARED},
+    "mass 25 % too small": {"mass": 0.75 * TOOL.mass},
+    "gravity with the wrong sign": {"gravity": -GRAVITY},
+    "rotation the wrong way round": {"gravity": equations.gravity_in_sensor(BASE_R_SENSOR, DEFAULT_GRAVITY)},
+    "frame turned by 90° about z": {"gravity": GRAVITY[:, [1, 0, 2]] * (1, -1, 1)},
+    "centre of gravity wrong": {"centre": (0.0, 0.0, 0.1)},
+}
+
+
+def left_over(mistake: str) -> equations.ArrayStages:
+    known = {"bias": BIAS.values, "mass": TOOL.mass, "centre": TOOL.centre, "gravity": GRAVITY}
+    measured = WEIGHT + np.array(BIAS.force), WEIGHT_TORQUE + np.array(BIAS.torque)
+    return equations.compensate(*measured, **(known | MISTAKES[mistake]))  # type: ignore[arg-type]
+
+
+def table_of_mistakes() -> dict[str, list[float]]:
+    rows = re.findall(r"^\| ([^|]+) \|((?: [\d.]+ N \|){3})", PAGE, re.MULTILINE)
+    return {name: [float(number) for number in re.findall(r"[\d.]+", cells)] for name, cells in rows}
+
+
+def test_the_worked_example_runs() -> None:
+    failed, tried = doctest.testfile(str(ROOT / "docs" / "compensation.md"), module_relative=False)
+    assert tried > 10
+    assert not failed
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_the_mistakes_look_as_the_page_says(mistake: str) -> None:
+    force = np.linalg.norm(left_over(mistake).final_force, axis=1)
+    assert table_of_mistakes()[mistake] == pytest.approx(force, abs=0.051)
+
+
+def test_every_mistake_of_the_page_is_tried() -> None:
+    assert table_of_mistakes().keys() == MISTAKES.keys()
+
+
+def test_a_wrong_centre_shows_in_the_torque_only() -> None:
+    left = left_over("centre of gravity wrong")
+    assert np.abs(left.final_force).max() < 1e-9
+    assert np.abs(left.final_torque).max() > 0.1
+
+
+def test_the_figure_can_be_drawn_and_shows_what_its_titles_say(tmp_path: Path) -> None:
+    data = figure.samples()
+    quiet = (data.times < 19.0) | (data.times > 25.0)
+    assert np.abs(figure.compensated(data)[quiet, :3]).mean() < 0.3
+    for name, left in figure.mistakes(data):
+        assert np.abs(left[quiet, :3]).max() > 1.5, name
+    out = tmp_path / "figure.svg"
+    figure.draw(out)
+    drawn, kept = out.read_text(), (ROOT / "docs" / "compensation.svg").read_text()
+    titles = re.findall(r">(mistake: [^<]+|[^<]*\(IV\.\d\))<", kept)
+    assert len(titles) == 8
+    assert all(title in drawn for title in titles)
