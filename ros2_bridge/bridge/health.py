@@ -1,6 +1,6 @@
 """What the diagnostics say: a snapshot of what is known, judged against the thresholds. No ROS, no threads.
 
-Four statuses. A message says what is wrong and what to do; the values are for those who look closer.
+Five statuses. A message says what is wrong and what to do; the values are for those who look closer.
 """
 
 from __future__ import annotations
@@ -58,8 +58,10 @@ class _Verdict:
 
 
 def judge(snapshot: Snapshot, thresholds: Thresholds) -> list[Status]:
-    """The four statuses, in the order in which one would look for a cause."""
-    judges: tuple[Callable[[Snapshot, Thresholds], Status], ...] = (_link, _stream, _sensor, _clock)
+    """The five statuses, in the order in which one would look for a cause."""
+    judges: tuple[Callable[[Snapshot, Thresholds], Status], ...] = (
+        _link, _stream, _sensor, _clock, _compensation,
+    )  # fmt: skip
     return [one(snapshot, thresholds) for one in judges]
 
 
@@ -213,6 +215,22 @@ def _clock(s: Snapshot, t: Thresholds) -> Status:
         name: clock.get(name, "") for name in ("mode", "period_us", "offset_ppm", "uncertainty_us")
     }
     return verdict.status("clock", "locked to the sensor's clock", values)
+
+
+def _compensation(s: Snapshot, t: Thresholds) -> Status:
+    verdict, c = _Verdict(), s.compensation
+    if not s.connected or s.lost is not None or s.silent_s > t.stale_after:
+        verdict.add(Level.STALE, "there are no new samples, see stream")
+    elif c.why_stopped is not None:
+        verdict.add(Level.ERROR, f"wrench_compensated has stopped: {c.why_stopped}")
+    elif s.new_withheld:
+        verdict.add(
+            Level.WARN,
+            f"{s.new_withheld} samples were not compensated, for want of a fresh orientation ({c.source})",
+        )
+    if c.problem:
+        verdict.add(Level.WARN, c.problem)
+    return verdict.status("compensation", c.good, c.values)
 
 
 def _rate_text(s: Snapshot) -> str:

@@ -21,7 +21,7 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 from bridge.parameter_row import Numbers
 from bridge.parameters import Parameters
 from bridge.serialized import SerializedMessage, axes
-from protocol.pdo import Sample
+from protocol.pdo import Sample, Vector3
 
 ARRAY_LABEL: Final = "Fx Fy Fz Mx My Mz Ax Ay Az Rx Ry Rz"
 """The label of the array's one dimension: what its values are, in order."""
@@ -32,9 +32,10 @@ _NO_ROTATION: Final = (0.0, 0.0, 0.0, 1.0)
 
 
 class Output(Protocol):
-    """One topic that is fed with every selected sample."""
+    """A topic, or some that belong together, fed with every selected sample."""
 
-    publisher: Any
+    def is_wanted(self) -> bool:
+        """Whether anybody is there for what `publish` does. Asked now and then, not by the reader."""
 
     @property
     def fields(self) -> Sequence[str]:
@@ -45,7 +46,7 @@ class Output(Protocol):
 
 
 class Outputs:
-    """All outputs. `wanted` are those that somebody has subscribed to, as of the last `refresh`."""
+    """All outputs. `wanted` are those that were so at the last `refresh`."""
 
     def __init__(self, outputs: Sequence[Output]) -> None:
         self.all = tuple(outputs)
@@ -53,7 +54,7 @@ class Outputs:
 
     def refresh(self) -> None:
         """Look who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
-        self.wanted = tuple(output for output in self.all if output.publisher.get_subscription_count())
+        self.wanted = tuple(output for output in self.all if output.is_wanted())
 
     def publish_finite(self, sample: Sample, stamp_ns: int) -> None:
         """Publish a sample that is not finite everywhere where it is."""
@@ -62,14 +63,15 @@ class Outputs:
                 output.publish(sample, stamp_ns)
 
 
-def make(node: Node, parameters: Parameters) -> Outputs:
-    """The node's outputs."""
+def make(node: Node, parameters: Parameters, *others: Output) -> Outputs:
+    """The node's outputs, `others` last."""
     return Outputs(
         [
             ArrayOutput(node, parameters.array_topic),
             WrenchOutput(node, "wrench", parameters.frame_id),
             ImuOutput(node, "imu/data_raw", parameters),
             TemperatureOutput(node, "temperature", parameters),
+            *others,
         ]
     )
 
@@ -82,13 +84,24 @@ def create_publisher(node: Node, message_type: Any, topic: str) -> Any:
     return node.create_publisher(message_type, topic, profile, qos_overriding_options=options)
 
 
-class ArrayOutput:
+class Topic:
+    """A publisher, and whether anybody has subscribed."""
+
+    def __init__(self, node: Node, message_type: Any, topic: str) -> None:
+        self.publisher = create_publisher(node, message_type, topic)
+
+    def is_wanted(self) -> bool:
+        """Whether anybody has subscribed."""
+        return bool(self.publisher.get_subscription_count())
+
+
+class ArrayOutput(Topic):
     """`std_msgs/Float64MultiArray`: N, Nm, m/s², rad/s, in the order of ARRAY_LABEL."""
 
     fields = ("force", "torque", "acceleration", "angular_rate")
 
     def __init__(self, node: Node, topic: str) -> None:
-        self.publisher = create_publisher(node, Float64MultiArray, topic)
+        super().__init__(node, Float64MultiArray, topic)
         message = Float64MultiArray()
         message.layout.dim = [
             MultiArrayDimension(label=ARRAY_LABEL, size=ARRAY_SIZE, stride=ARRAY_SIZE)
@@ -104,35 +117,43 @@ class ArrayOutput:
         self.publisher.publish(self._serialized.message())
 
 
-class WrenchOutput:
-    """`geometry_msgs/WrenchStamped`: N and Nm, in the sensor's frame, as measured."""
-
-    fields = ("force", "torque")
+class WrenchTopic(Topic):
+    """`geometry_msgs/WrenchStamped`: N and Nm, in the sensor's frame."""
 
     def __init__(self, node: Node, topic: str, frame_id: str) -> None:
-        self.publisher = create_publisher(node, WrenchStamped, topic)
+        super().__init__(node, WrenchStamped, topic)
         message = WrenchStamped()
         message.header.frame_id = frame_id
         wrench = message.wrench
         places = [axes(wrench.force), axes(wrench.torque)]
         self._serialized = SerializedMessage(message, places, message.header.stamp)
 
-    def publish(self, sample: Sample, stamp_ns: int) -> None:
-        """Publish force and torque."""
+    def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+        """Publish a force and a torque."""
         serialized = self._serialized
         serialized.stamp(stamp_ns)
-        serialized.fill(0, sample.force)
-        serialized.fill(1, sample.torque)
+        serialized.fill(0, force)
+        serialized.fill(1, torque)
         self.publisher.publish(serialized.message())
 
 
-class ImuOutput:
+class WrenchOutput(WrenchTopic):
+    """The wrench as measured."""
+
+    fields = ("force", "torque")
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish force and torque."""
+        self.send(sample.force, sample.torque, stamp_ns)
+
+
+class ImuOutput(Topic):
     """`sensor_msgs/Imu`: m/s², rad/s; the sensor's own orientation, if it estimates one."""
 
     fields = ("acceleration", "angular_rate", "orientation")
 
     def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
-        self.publisher = create_publisher(node, Imu, topic)
+        super().__init__(node, Imu, topic)
         self._message = Imu()
         self._message.header.frame_id = parameters.imu_frame_id
         self._message.angular_velocity_covariance = _covariance(parameters.angular_velocity_covariance)
@@ -166,13 +187,13 @@ class ImuOutput:
         self.publisher.publish(serialized.message())
 
 
-class TemperatureOutput:
+class TemperatureOutput(Topic):
     """`sensor_msgs/Temperature`: °C, inside the sensor."""
 
     fields = ("temperature",)
 
     def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
-        self.publisher = create_publisher(node, Temperature, topic)
+        super().__init__(node, Temperature, topic)
         message = Temperature(variance=parameters.temperature_variance)
         message.header.frame_id = parameters.frame_id
         self._serialized = SerializedMessage(message, [[(message, "temperature")]], message.header.stamp)

@@ -15,6 +15,7 @@ from typing import Final
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from bridge.compensation_state import CompensationState
 from bridge.health import Status, judge, text_of
 from bridge.messages import Outputs, create_publisher
 from bridge.observer import Observer
@@ -34,10 +35,11 @@ class Monitor:
         node: Node,
         thresholds: Thresholds,
         reader: Reader,
+        compensation: Callable[[], CompensationState],
         outputs: Outputs,
         on_failure: Callable[[str], object],
     ) -> None:
-        self._observer = Observer(reader)
+        self._observer = Observer(reader, compensation)
         self._thresholds, self._outputs, self._on_failure = thresholds, outputs, on_failure
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")

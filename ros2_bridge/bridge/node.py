@@ -15,6 +15,10 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
+from bridge.bias_services import BiasServices
+from bridge.compensated_output import CompensatedOutput
+from bridge.compensation_control import CompensationControl
+from bridge.identify_services import IdentifyServices
 from bridge.messages import make
 from bridge.monitor import Monitor
 from bridge.parameters import ParameterError, declare
@@ -36,13 +40,23 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         super().__init__("bridge")
         self.finished: Future = Future()
         parameters = declare(self)
-        outputs = make(self, parameters)
+        compensated = CompensatedOutput(self, parameters.frame_id)
+        outputs = make(self, parameters, compensated)
         self.reader = Reader(parameters, outputs, self.get_logger(), self._fail)
-        self.monitor = Monitor(self, parameters.thresholds, self.reader, outputs, self._fail)
-        self.requests = Requests(parameters, self.reader.link)
-        self.sensor_settings = SettingsParameters(self, self.reader.link, self.requests)
-        self.triggers = Services(self, self.reader.link, self.requests, self.sensor_settings)
-        self.reader.link.on_change = self.sensor_settings.changed
+        link = self.reader.link
+        self.compensation = CompensationControl(self, parameters, compensated, link, self._fail)
+        self.monitor = Monitor(
+            self, parameters.thresholds, self.reader, self.compensation.state, outputs, self._fail
+        )
+        self.requests = Requests(parameters, link)
+        self.sensor_settings = SettingsParameters(self, link, self.requests)
+        limit_hz = parameters.publishing_frequency
+        self.triggers = (
+            Services(self, link, self.requests, self.sensor_settings, self.compensation.after_sensor_tare),
+            BiasServices(self, self.compensation, limit_hz),
+            IdentifyServices(self, self.compensation, limit_hz),
+        )
+        link.on_change = self._on_link_change
         self.create_subscription(
             KeyValue,
             SUPERVISOR_TOPIC,
@@ -51,11 +65,16 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
+    def _on_link_change(self) -> None:
+        self.compensation.link_changed()
+        self.sensor_settings.changed()
+
     def finish(self, exit_code: int) -> None:
         """End the node, from any thread; the first call counts."""
         if not self.finished.done():
             self.finished.set_result(exit_code)
         self.requests.cancel()
+        self.compensation.cancel()
 
     def _fail(self, reason: str) -> None:
         self.get_logger().error(reason)
@@ -98,7 +117,7 @@ def _spin(node: BridgeNode) -> int:
         executor.spin_until_future_complete(node.finished)
         return int(node.finished.result() if node.finished.done() else 0)
     finally:
-        stopped = node.monitor.stop() & node.reader.stop()
+        stopped = node.monitor.stop() & node.reader.stop() & node.compensation.close()
         if not stopped:
             node.get_logger().error("a thread did not end in time")
         executor.shutdown()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+from bridge.compensation_state import CompensationState
 from bridge.connection import find_sensor
 from bridge.poll import Poll
 from bridge.reader import Reader
@@ -22,8 +23,9 @@ _SHORTEST_RATE_S: Final = 0.8
 class Observer:
     """Call `look` often; after a regular report call `begin_interval`."""
 
-    def __init__(self, reader: Reader) -> None:
-        self._reader, self._link = reader, reader.link
+    def __init__(self, reader: Reader, compensation: Callable[[], CompensationState]) -> None:
+        """`compensation` tells how it is."""
+        self._reader, self._link, self._compensation = reader, reader.link, compensation
         self._poll = Poll()
         self._flags = Flags()
         self._age_us: tuple[float, float] | None = None
@@ -33,7 +35,7 @@ class Observer:
         self._rate_fresh, self._rate_s = 0, self._fresh_s
         """Where the rate is measured from."""
         self._then, self._then_not_finite = FrameCounts(), 0
-        self._then_connects, self._then_server_lost = 0, -1
+        self._then_connects, self._then_server_lost, self._then_withheld = 0, -1, 0
 
     def look(self, now_s: float) -> Snapshot:
         """How things are now."""
@@ -51,7 +53,7 @@ class Observer:
         self._flags = self._flags.merge(reader.watch.take_flags())
         lost = server_lost(self._poll.status, link.sensor) if self._poll.status else self._then_server_lost
         silent_since_s = max(self._fresh_s, link.since_s)
-        sample = reader.watch.sample
+        sample, compensation = reader.watch.sample, self._compensation()
         return Snapshot(
             sensor=link.sensor,
             address=link.address,
@@ -75,6 +77,8 @@ class Observer:
             server=self._poll.status,
             new_server_lost=max(lost - self._then_server_lost, 0) if self._then_server_lost >= 0 else 0,
             answer_s=self._poll.owed_s(now_s),
+            compensation=compensation,
+            new_withheld=compensation.withheld - self._then_withheld,
         )
 
     def measure(self, now_s: float) -> None:
@@ -94,7 +98,7 @@ class Observer:
         """`reported` was a regular report: what is new counts from there on. Asks the server again."""
         self._flags = Flags()
         self._then, self._then_not_finite = reported.counts, reported.not_finite
-        self._then_connects = reported.connects
+        self._then_connects, self._then_withheld = reported.connects, reported.compensation.withheld
         if reported.server:
             self._then_server_lost = server_lost(reported.server, self._link.sensor)
         elif not reported.connected:

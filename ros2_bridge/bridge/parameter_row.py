@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from array import array
 from typing import Final, NamedTuple
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
 Numbers = tuple[float, ...]
 ParameterValue = bool | int | float | str | Numbers
-_LENGTHS: Final = (3, 9)
+_COVARIANCE_LENGTHS: Final = (3, 9)
 
 
 class ParameterError(Exception):
@@ -17,7 +18,11 @@ class ParameterError(Exception):
 
 
 class Row(NamedTuple):
-    """One parameter. The default's type is the parameter's; a tuple is a covariance, 3 or 9 numbers."""
+    """One parameter. The default's type is the parameter's; a tuple is numbers, `lengths` how many.
+
+    `low` and `high` bound a number, or the magnitude of each of several. `live`: can be set while the node
+    runs.
+    """
 
     name: str
     default: ParameterValue
@@ -25,6 +30,8 @@ class Row(NamedTuple):
     low: float | None = None
     high: float | None = None
     choices: tuple[str, ...] = ()
+    lengths: tuple[int, ...] = _COVARIANCE_LENGTHS
+    live: bool = False
 
     def check(self, value: object) -> ParameterValue:
         """Return `value`, a whole number as float where one is meant; ParameterError if it cannot be."""
@@ -32,6 +39,16 @@ class Row(NamedTuple):
         if checked is None:
             raise ParameterError(f"parameter {self.name} is {value!r}: it must be {self._choices_text()}")
         return checked
+
+    def convert(self, value: object) -> object:
+        """`value` with whole numbers made into the floats that this row means; otherwise as it is."""
+        if isinstance(self.default, float) and type(value) is int:
+            return float(value)
+        if isinstance(self.default, tuple) and isinstance(value, list | tuple | array):
+            items = list(value)
+            if items and all(type(item) in (int, float) for item in items):
+                return [float(item) for item in items]
+        return value
 
     def _one(self, value: object) -> ParameterValue | None:
         wanted = type(self.default)
@@ -48,7 +65,7 @@ class Row(NamedTuple):
     def _numbers(self, value: object) -> Numbers | None:
         # rclpy gives an array.array or a list, of whole numbers if all are.
         items = list(value) if hasattr(value, "__iter__") and not isinstance(value, str | bytes) else []
-        if len(items) not in _LENGTHS or not all(type(item) in (int, float) for item in items):
+        if len(items) not in self.lengths or not all(type(item) in (int, float) for item in items):
             return None
         if not all(math.isfinite(item) and self._in_range(abs(item)) for item in items):
             return None
@@ -62,18 +79,22 @@ class Row(NamedTuple):
             return " or ".join(self.choices)
         if isinstance(self.default, str):
             return "text that is not empty"
+        if isinstance(self.default, bool):
+            return "true or false"
         if isinstance(self.default, tuple):
-            return "3 numbers, the variances, or 9, the covariance row by row"
+            if self.lengths == _COVARIANCE_LENGTHS:
+                return "3 numbers, the variances, or 9, the covariance row by row"
+            return f"{self.lengths[0]} numbers, none beyond {self.high:g} either way"
         kind = "a whole number" if isinstance(self.default, int) else "a number"
         return f"{kind} from {self.low:g} to {self.high:g}"
 
     def descriptor(self) -> ParameterDescriptor:
         """What `ros2 param describe` shows."""
-        descriptor = ParameterDescriptor(description=self.description, read_only=True)
+        descriptor = ParameterDescriptor(description=self.description, read_only=not self.live)
         if self.choices or isinstance(self.default, tuple):
             descriptor.additional_constraints = self._choices_text()
         if self.low is not None and self.high is not None:
-            if isinstance(self.default, int):
+            if type(self.default) is int:
                 descriptor.integer_range = [
                     IntegerRange(from_value=int(self.low), to_value=int(self.high), step=1)
                 ]

@@ -1,7 +1,8 @@
 """The node's parameters: one table, from which they are declared, checked, described and documented.
 
-All are read-only: they say what the node is. A wrong value ends the node at start with one sentence. The
-sensor's settings are parameters too, but the server's business: `settings_parameters`.
+Those that say what the node is are read-only; those of the compensation, `compensation_parameters`, can be
+set while it runs (`live_parameters`). A wrong value ends the node at start with one sentence. The sensor's
+settings are parameters too, but the server's business: `settings_parameters`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from typing import Any, Final, NamedTuple
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
+from bridge.compensation_parameters import ROWS as COMPENSATION_ROWS
+from bridge.compensation_parameters import CompensationParameters, gather
 from bridge.parameter_row import Numbers, ParameterError, ParameterValue, Row
 from protocol.pdo import ImuUnits
 
@@ -45,6 +48,7 @@ PARAMETERS: Final = (
     Row("diagnostics.lost_warn", 1, "Samples lost or skipped in a second that are a warning", 1, 10**6),
     Row("diagnostics.temperature_warn", 60.0, "Temperature, °C, from which it is a warning", -40, 200),
     Row("diagnostics.temperature_error", 80.0, "Temperature, °C, from which it is an error", -40, 200),
+    *COMPENSATION_ROWS,
 )
 
 
@@ -76,6 +80,8 @@ class Parameters(NamedTuple):
     linear_acceleration_covariance: Numbers = _UNKNOWN
     temperature_variance: float = 0.0
     thresholds: Thresholds = Thresholds()
+    compensation: CompensationParameters = CompensationParameters()
+    """As they are at start."""
 
 
 def declare(node: Node) -> Parameters:
@@ -89,9 +95,10 @@ def declare(node: Node) -> Parameters:
                 f"parameters server_port is {port} and SERVER_PORT is {alias}: they are one thing, give one"
             )
         values["server_port"] = alias
+    compensation = gather({row.name: values.pop(row.name) for row in COMPENSATION_ROWS})
     thresholds = Thresholds(**{name: values.pop(f"diagnostics.{name}") for name in Thresholds._fields})
     units = ImuUnits(values.pop("imu_raw_units"))
-    return Parameters(**values, imu_units=units, thresholds=thresholds)
+    return Parameters(**values, imu_units=units, thresholds=thresholds, compensation=compensation)
 
 
 def _declare(node: Node, row: Row) -> ParameterValue:

@@ -1,18 +1,18 @@
-"""The node's services, all `std_srvs/Trigger`: the server does the work, the message says what came of it."""
+"""Services, all `std_srvs/Trigger`, that the server does the work for; the message says what came of it."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 from rclpy.node import Node
-from std_srvs.srv import Trigger
 
 from bridge.connection import find_sensor
 from bridge.link import Link
 from bridge.requests import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, RequestFailedError, Requests
 from bridge.settings_parameters import SettingsParameters
+from bridge.triggers import create_triggers
 from protocol.errors import ConnectionFailedError
 
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
@@ -27,29 +27,25 @@ _TARE_EXTRA_S: Final = 4.0
 class Services:
     """Each blocks the executor until the server has answered or a time-out, and never the stream."""
 
-    def __init__(self, node: Node, link: Link, requests: Requests, settings: SettingsParameters) -> None:
+    def __init__(
+        self,
+        node: Node,
+        link: Link,
+        requests: Requests,
+        settings: SettingsParameters,
+        after_tare: Callable[[], str],
+    ) -> None:
+        """`after_tare` says what a new offset in the sensor means for the rest of the node; "" if nothing."""
+        self._after_tare = after_tare
         self._link, self._requests, self._log = link, requests, node.get_logger()
         self._settings = settings
-        for name, act in (
-            ("sensor_tare", self._sensor_tare),
-            ("get_settings", self._get_settings),
-            ("apply_settings", self._apply_settings),
-            ("save_settings", self._save_settings),
-        ):
-            node.create_service(Trigger, f"~/{name}", self._answering(name, act))
-
-    def _answering(self, name: str, act: Callable[[], str]) -> Callable[[Any, Any], Any]:
-        def answer(_request: Any, response: Any) -> Any:
-            try:
-                response.message = act()
-                response.success = True
-            except RequestFailedError as error:
-                response.message = str(error)
-                response.success = False
-                self._log.warning(f"{name} failed: {error}")
-            return response
-
-        return answer
+        acts = {
+            "sensor_tare": self._sensor_tare,
+            "get_settings": self._get_settings,
+            "apply_settings": self._apply_settings,
+            "save_settings": self._save_settings,
+        }
+        create_triggers(node, acts, RequestFailedError)
 
     def _sensor_tare(self) -> str:
         rate_hz = self._link.rate_hz or 800.0
@@ -59,6 +55,8 @@ class Services:
         titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
         parts = [f"{title} {_wrench_text(reply.get(key))}" for key, title in titles]
         text = f"sensor {self._link.sensor} tared (N, Nm): " + "; ".join(parts)
+        if also := self._after_tare():
+            text += f". {also}"
         self._log.info(text)
         return text
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from bridge.compensation_state import CompensationState
 from bridge.connection import SensorInfo
 from bridge.selection import FrameCounts
 from bridge.watch import Flags
@@ -41,6 +42,9 @@ class Snapshot(NamedTuple):
     new_server_lost: int
     answer_s: float
     """How long the server has owed an answer; 0 if it owes none."""
+    compensation: CompensationState = CompensationState()
+    new_withheld: int = 0
+    """Samples that could not be compensated."""
 
     @property
     def server_row(self) -> Mapping[str, Any]:

@@ -53,6 +53,12 @@ class Stream:
         """The next frame, and no other, is so."""
         self._once.put(changes)
 
+    def forget_once(self) -> None:
+        """Forget what was to come once."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._once.get_nowait()
+
     def close(self) -> None:
         self._stop.set()
         self._thread.join()

@@ -34,7 +34,7 @@ def statuses(**changes: Any) -> dict[str, Status]:
 
 
 def test_good_is_good() -> None:
-    assert [status.level for status in statuses().values()] == [Level.OK] * 4
+    assert [status.level for status in statuses().values()] == [Level.OK] * 5
     assert statuses()["stream"].message == "800 samples a second"
 
 

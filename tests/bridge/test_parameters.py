@@ -11,6 +11,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
+from bridge.compensation_parameters import ROWS as COMPENSATION_ROWS
+from bridge.compensation_parameters import gather
 from bridge.parameters import PARAMETERS, ParameterError
 
 pytestmark = pytest.mark.ros
@@ -29,6 +31,16 @@ def test_defaults_are_the_contracts() -> None:
         "diagnostics.rate_tolerance": 0.05, "diagnostics.age_warn": 0.01, "diagnostics.age_error": 0.1,
         "diagnostics.lost_warn": 1, "diagnostics.temperature_warn": 60.0,
         "diagnostics.temperature_error": 80.0,
+        "tool_mass": 0.0, "tool_center_of_gravity": (0.0, 0.0, 0.0), "gravity": (0.0, 0.0, -9.80665),
+        "bias": (0.0,) * 6, "bias_ramp_time": 0.5, "bias_keep": False, "bias_directory": "auto",
+        "compensate_inertia": False, "imu_position": (0.0, 0.0, 0.0), "orientation_source": "accelerometer",
+        "orientation.topic": "orientation", "orientation.base_frame": "base_link",
+        "orientation.mounting": (0.0, 0.0, 0.0, 1.0), "orientation.stale_after": 0.1,
+        "accelerometer.stale_after": 0.5, "accelerometer.time_constant": 0.5, "accelerometer.gate": 0.5,
+        "accelerometer.gyroscope": True, "rest.duration": 1.0, "rest.force_spread": 0.8,
+        "rest.torque_spread": 0.02, "rest.force_wander": 0.3, "rest.torque_wander": 0.01,
+        "rest.angular_rate": 0.05, "rest.angular_rate_spread": 0.02, "rest.acceleration_spread": 0.3,
+        "rest.acceleration_wander": 0.05, "identify.file": "auto",
     }  # fmt: skip
     assert all(row.check(row.default) == row.default for row in PARAMETERS)
 
@@ -37,7 +49,13 @@ def test_the_configuration_file_says_the_same() -> None:
     pairs = (line.split("#")[0].partition(":") for line in CONFIG.read_text().splitlines())
     given = {name.strip(): value.strip() for name, _, value in pairs if value.strip()}
     defaults = {name: row.default for name, row in ROWS.items() if name != "SERVER_PORT"}
-    assert given == {name: str([*d] if isinstance(d, tuple) else d) for name, d in defaults.items()}
+    assert given == {name: _yaml(default) for name, default in defaults.items()}
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str([*value] if isinstance(value, tuple) else value)
 
 
 @pytest.mark.parametrize(
@@ -51,6 +69,10 @@ def test_the_configuration_file_says_the_same() -> None:
         ("orientation_covariance", 0.1), ("orientation_covariance", [0.1]),
         ("orientation_covariance", "abc"), ("orientation_covariance", [0.1, 0.1, math.nan]),
         ("linear_acceleration_covariance", [True, False, True]), ("diagnostics.stale_after", 0.0),
+        ("tool_mass", -0.1), ("tool_mass", "1"), ("tool_mass", True), ("bias", [0.0] * 5), ("bias", 0.0),
+        ("tool_center_of_gravity", [0.0] * 9), ("tool_center_of_gravity", [0.0, 0.0, math.nan]),
+        ("tool_center_of_gravity", [0.0, 0.0, -11.0]), ("bias_keep", 1), ("bias_keep", "yes"),
+        ("orientation_source", "imu"), ("orientation.mounting", [0.0] * 3), ("rest.duration", 0.0),
     ],
 )  # fmt: skip
 def test_wrong_values_are_named(name: str, value: Any) -> None:
@@ -64,6 +86,27 @@ def test_a_whole_number_is_a_number() -> None:
     assert isinstance(checked, float)
 
 
+def test_numbers_of_the_compensation_say_how_many() -> None:
+    with pytest.raises(ParameterError, match="it must be 6 numbers, none beyond 1e\\+06 either way"):
+        ROWS["bias"].check([1.0])
+    with pytest.raises(ParameterError, match="it must be true or false"):
+        ROWS["bias_keep"].check(0.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"gravity": (0.0, 0.05, 0.0)}, "set tool_mass to 0"),
+        ({"orientation.mounting": (0.5, 0.5, 0.5, 0.6)}, "a quaternion of length 1"),
+        ({"orientation.mounting": (0.0, 0.0, 0.0, 0.0)}, "a quaternion of length 1"),
+    ],
+)
+def test_values_that_do_not_go_together(changes: dict[str, Any], words: str) -> None:
+    values = {row.name: row.default for row in COMPENSATION_ROWS} | changes
+    with pytest.raises(ParameterError, match=words):
+        gather(values)
+
+
 @pytest.mark.parametrize("value", [[1, 2, 3], array("d", [1, 2, 3]), [0.5] * 9, [-0.5] * 9])
 def test_a_covariance_is_three_or_nine_numbers(value: Any) -> None:
     assert ROWS["orientation_covariance"].check(value) == tuple(map(float, value))
@@ -73,6 +116,6 @@ def test_every_parameter_describes_itself() -> None:
     for row in PARAMETERS:
         descriptor = row.descriptor()
         assert descriptor.description
-        assert descriptor.read_only
-        if isinstance(row.default, int | float):
+        assert descriptor.read_only is not row.live
+        if isinstance(row.default, int | float) and not isinstance(row.default, bool):
             assert descriptor.integer_range or descriptor.floating_point_range, row.name

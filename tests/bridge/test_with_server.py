@@ -24,7 +24,7 @@ from tests.server.running import Program, Server, needs_bus, virtual_sensor
 __all__ = ["listener"]
 pytestmark = [pytest.mark.ros, pytest.mark.bus, needs_bus]
 OK, WARN, ERROR, STALE = range(4)
-HEALTHY = {"link": OK, "stream": OK, "sensor": OK, "clock": OK}
+HEALTHY = {"link": OK, "stream": OK, "sensor": OK, "clock": OK, "compensation": OK}
 
 
 class Bench:

@@ -1,0 +1,306 @@
+"""What the compensation is to do: parameters made into a `Plan`, the bias with its history, the source.
+
+Lives in the executor's thread, but for `link_changed` and `cancel`. The parameter `bias` is the bias: every
+change goes through it, so that it always shows what is in force, or ramped in.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from rclpy.node import Node
+
+from bridge import kept_bias
+from bridge.compensated_output import CompensatedOutput, Plan
+from bridge.compensation.bias import BiasHistory
+from bridge.compensation.compensator import Compensator
+from bridge.compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
+from bridge.compensation.store import Stored, StoreError
+from bridge.compensation_parameters import TOPIC_SOURCES, CompensationParameters
+from bridge.compensation_state import CompensationState
+from bridge.gravity_sources import AccelerometerSource, ListenerSource, NoSource, SensorSource, Source
+from bridge.link import Link
+from bridge.live_parameters import LiveParameters
+from bridge.orientation_listener import OrientationListener
+from bridge.orientation_messages import check_tf
+from bridge.parameter_row import ParameterError
+from bridge.parameters import Parameters
+from protocol.pdo import Vector3
+
+FROM_PARAMETER: Final = "parameter"
+_LOOKING_UP: Final = "the bias of this sensor is being looked up"
+
+
+class CompensationControl:
+    """Wires parameters, bias and source to `output`."""
+
+    def __init__(
+        self,
+        node: Node,
+        parameters: Parameters,
+        output: CompensatedOutput,
+        link: Link,
+        on_failure: Callable[[str], object],
+    ) -> None:
+        """ParameterError if the parameters cannot be had here."""
+        self.parameters = parameters.compensation
+        self.output, self.link = output, link
+        self.origin = FROM_PARAMETER
+        """Where the bias in force comes from."""
+        self.keeping = ""
+        """Why the bias could not be kept or read, a sentence; empty if it could, or was not to be."""
+        self.ending = False
+        self._node, self._log = node, node.get_logger()
+        self._frame, self._on_failure = parameters.frame_id, on_failure
+        self._listener: OrientationListener | None = None
+        self._angular_rate_offset = ZERO
+        self._serial: str | None = None
+        """Of the sensor that the bias is for; None until there was one."""
+        self._kept: Wrench | None = None
+        """What the file has."""
+        self._next_origin = FROM_PARAMETER
+        self._check(self.parameters)
+        self._history = BiasHistory(self.parameters.bias, self.parameters.bias_ramp_time)
+        self.source = self._open_source(self.parameters)
+        self._live = LiveParameters(node, self._check, self._apply)
+        self._guard = node.create_guard_condition(self._follow_sensor)
+        self._make_plan()
+
+    def close(self) -> bool:
+        """Stop listening for orientations; False if that does not end in time."""
+        return self._listener is None or self._listener.close()
+
+    def cancel(self) -> None:
+        """Make whoever waits for samples give up; from any thread: the node ends."""
+        self.ending = True
+
+    def link_changed(self) -> None:
+        """There is another connection, or none; for the reader's thread."""
+        if not self._is_same_sensor():
+            # Not one sample of this sensor with what may be another's bias.
+            self.output.hold = _LOOKING_UP
+            self._guard.trigger()
+
+    @property
+    def bias(self) -> Wrench:
+        """The one in force, or being ramped in."""
+        return self._history.bias
+
+    def after_sensor_tare(self) -> str:
+        """What a new offset in the sensor itself means here, a sentence; "" if nothing."""
+        if self.bias == NO_WRENCH:
+            return ""
+        return "The node's own bias was for the old offset: call ~/tare or ~/clear_tare"
+
+    def conflict(self) -> str | None:
+        """What the sensor is set to that does not go with compensation, a sentence."""
+        settings = self.link.settings
+        if settings.get("calibration_matrix") is False:
+            return (
+                "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
+                "switch it on"
+            )
+        if settings.get("inertia_compensation") is True and self.parameters.payload.mass:
+            return (
+                "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
+                "or set tool_mass to 0"
+            )
+        return None
+
+    def state(self) -> CompensationState:
+        """How things are, for the diagnostics' thread."""
+        output, source = self.output, self.source
+        payload = self.parameters.payload
+        why = None
+        if output.is_stopped:
+            why = output.hold or source.why_none(output.time_s)
+        return CompensationState(
+            has_subscribers=output.has_subscribers,
+            published=output.published,
+            withheld=output.withheld,
+            why_stopped=why,
+            source=source.describe,
+            age_s=source.age_s(output.time_s),
+            payload=payload,
+            inertia=self.parameters.compensate_inertia,
+            bias=self.bias,
+            origin=self.origin,
+            is_ramping=self.is_ramping,
+            keep=self.parameters.bias_keep,
+            problem=self.conflict() or self.keeping,
+        )
+
+    @property
+    def is_ramping(self) -> bool:
+        """Whether it is on the way to `bias`, as of the latest sample."""
+        return not self._history.ramp.arrived(self.output.time_s)
+
+    def set_bias(self, bias: Wrench, origin: str) -> None:
+        """Put a bias in force, and keep it if that is asked for."""
+        with self._origin(origin):
+            self._live.put(bias=[*bias.values])
+
+    def undo_bias(self) -> Wrench:
+        """Go back to the bias before, and return it; CompensationError if there is none."""
+        before = self._history.undo(self.output.time_s)
+        self.set_bias(before, "undone")
+        self.origin = "undone"
+        return before
+
+    def set_payload(self, payload: Payload, bias: Wrench) -> None:
+        """Put an identified payload and its bias in force, both at once."""
+        with self._origin("identified"):
+            self._live.put(
+                tool_mass=payload.mass, tool_center_of_gravity=[*payload.centre], bias=[*bias.values]
+            )
+
+    def note_rest(self, angular_rate: Vector3) -> None:
+        """What the gyroscope read at rest, rad/s: its offset."""
+        self._angular_rate_offset = angular_rate
+        if isinstance(self.source, AccelerometerSource):
+            self.source.set_angular_rate_offset(angular_rate)
+
+    @contextlib.contextmanager
+    def _origin(self, origin: str) -> Iterator[None]:
+        self._next_origin = origin
+        try:
+            yield
+        finally:
+            self._next_origin = FROM_PARAMETER
+
+    def _check(self, wanted: CompensationParameters) -> None:
+        """ParameterError if that cannot be had on this machine."""
+        if wanted.orientation.source == "tf":
+            check_tf()
+        if wanted.orientation.source in TOPIC_SOURCES:
+            topic = wanted.orientation.topic
+            try:
+                self._node.resolve_topic_name(topic)
+            except RuntimeError as error:  # rclpy has no public name for it
+                reason = str(error).removeprefix("failed to resolve name: ").partition(", at /")[0]
+                raise ParameterError(f"parameter orientation.topic is {topic!r}: {reason}") from None
+
+    def _apply(self, wanted: CompensationParameters) -> None:
+        was, self.parameters = self.parameters, wanted
+        if _source_part(wanted) != _source_part(was):
+            self.source = self._open_source(wanted)
+        self._history.ramp.seconds = wanted.bias_ramp_time
+        if wanted.bias != self.bias:
+            self._history.set(wanted.bias, self.output.time_s)
+            self.origin = self._next_origin
+        self._make_plan()
+        if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
+            self._kept = None
+        self._keep()
+
+    def _make_plan(self) -> None:
+        wanted = self.parameters
+        compensator = Compensator(
+            wanted.payload, inertia=wanted.compensate_inertia, imu_position=wanted.imu_position
+        )
+        self.output.plan = Plan(self.source, compensator, self._history.ramp, wanted.payload.mass > 0.0)
+
+    def _open_source(self, wanted: CompensationParameters) -> Source:
+        listener, self._listener = self._listener, None
+        if listener is not None:
+            listener.close()
+        name = wanted.orientation.source
+        if name == "none":
+            return NoSource()
+        if name == "accelerometer":
+            return AccelerometerSource(wanted, self._angular_rate_offset)
+        if name == "sensor":
+            return SensorSource(wanted)
+        self._listener = OrientationListener(self._node, wanted.orientation, self._frame, self._on_failure)
+        return ListenerSource(wanted, self._listener)
+
+    def _keep(self) -> None:
+        if not self.parameters.bias_keep:
+            self.keeping = ""
+            return
+        if self._serial is None or self.bias == self._kept:
+            return
+        try:
+            path = kept_bias.save(
+                self.parameters.bias_directory, self._serial, self.bias, self.parameters.payload
+            )
+        except StoreError as error:
+            self._say_not_kept(str(error))
+            return
+        self._kept, self.keeping = self.bias, ""
+        self._log.info(f"the bias is kept in {path}")
+
+    def _say_not_kept(self, problem: str) -> None:
+        self.keeping = problem
+        self._log.warning(problem)
+
+    def _is_same_sensor(self) -> bool:
+        info = self.link.info
+        return self.link.connection is None or info is None or info.serial == self._serial
+
+    def _follow_sensor(self) -> None:
+        """Find the bias of the sensor that is there now."""
+        while not self._is_same_sensor():
+            info = self.link.info
+            if info is None:
+                break
+            is_first, self._serial = self._serial is None, info.serial
+            self._take_sensor(info.serial, is_first=is_first)
+        self.output.hold = None
+        if not self._is_same_sensor():
+            self.link_changed()
+
+    def _take_sensor(self, serial: str, *, is_first: bool) -> None:
+        self._kept = None
+        stored = self._look_up(serial)
+        if stored is not None and is_first and self.bias not in (NO_WRENCH, stored.bias):
+            self._log.warning(
+                f"the bias kept of sensor {serial} is not used, because the parameter bias is given; "
+                "it is replaced by it"
+            )
+        elif stored is not None:
+            self._kept = stored.bias
+            self._begin_with(stored.bias, f"kept since {stored.saved}")
+            self._log.info(f"sensor {serial} has the bias that was kept at {stored.saved}")
+            if stored.payload is not None and stored.payload != self.parameters.payload:
+                self._log.warning(
+                    f"the kept bias was taken with {_payload_text(stored.payload)}, and now there is "
+                    f"{_payload_text(self.parameters.payload)}: tare again"
+                )
+        elif not is_first and self.origin != FROM_PARAMETER:
+            self._begin_with(NO_WRENCH, FROM_PARAMETER)
+            self._log.warning(
+                f"another sensor is there now, serial number {serial}: the bias was the other's and is "
+                "zero now; tare"
+            )
+        if not self.keeping and (stored is not None or self.bias != NO_WRENCH):
+            self._keep()
+
+    def _look_up(self, serial: str) -> Stored | None:
+        self.keeping = ""
+        if not self.parameters.bias_keep:
+            return None
+        try:
+            return kept_bias.load(self.parameters.bias_directory, serial)
+        except StoreError as error:
+            self._say_not_kept(str(error))
+            return None
+
+    def _begin_with(self, bias: Wrench, origin: str) -> None:
+        """Put a bias in force at once, with nothing before it."""
+        keeping = self.keeping
+        with self._origin(origin):
+            self._history = BiasHistory(bias, self.parameters.bias_ramp_time)
+            self._live.put(bias=[*bias.values])
+        self.origin, self.keeping = origin, keeping
+        self._make_plan()
+
+
+def _source_part(parameters: CompensationParameters) -> tuple[object, ...]:
+    return parameters.orientation, parameters.accelerometer, parameters.gravity
+
+
+def _payload_text(payload: Payload) -> str:
+    return f"a tool of {payload.mass:.3g} kg" if payload.mass else "no tool_mass"

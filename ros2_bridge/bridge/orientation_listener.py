@@ -1,0 +1,107 @@
+"""Listens to a topic or to TF for the sensor's orientation, in a thread and with a hidden node of its own.
+
+A node of its own, because the executor of `bridge` stands still while a service waits for the server or for
+samples, and a pose that is not taken in is an old one. It exists only while such a source is chosen.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Final
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from bridge.compensation_parameters import OrientationParameters
+from bridge.orientation_messages import (
+    TOPIC_KINDS,
+    Oriented,
+    Tf,
+    UnusableError,
+    look_up,
+    multiply,
+    open_tf,
+    read_message,
+)
+
+TF_PERIOD_S: Final = 0.005
+"""How often TF is asked."""
+
+
+class OrientationListener:
+    """From construction to `close`. Read `latest` and `problem` from any thread: they are replaced."""
+
+    def __init__(
+        self,
+        node: Node,
+        chosen: OrientationParameters,
+        frame: str,
+        on_failure: Callable[[str], object],
+        open_buffer: Callable[[Node], Tf] = open_tf,
+    ) -> None:
+        """`chosen.source` is a key of TOPIC_KINDS, or `tf`: then `frame` is the sensor's."""
+        self.latest: Oriented | None = None
+        self.problem = "nothing has come yet"
+        """What was wrong with what came last; empty if nothing was."""
+        self._on_failure = on_failure
+        self._mounting = None if chosen.source == "tf" else chosen.mounting
+        name = f"_{node.get_name()}_orientation"
+        self._node = rclpy.create_node(
+            name,
+            context=node.context,
+            namespace=node.get_namespace(),
+            # Remapped as a name of `bridge`'s; what renames that node must not rename this one.
+            use_global_arguments=False,
+            start_parameter_services=False,
+            enable_rosout=False,
+        )
+        if chosen.source == "tf":
+            base, tf = chosen.base_frame, open_buffer(self._node)
+            self.describe = f"TF from {base} to {frame}"
+            self._node.create_timer(TF_PERIOD_S, lambda: self._take(lambda: look_up(tf, base, frame)))
+        else:
+            kind = TOPIC_KINDS[chosen.source]
+            resolved = node.resolve_topic_name(chosen.topic)
+            self.describe = f"topic {resolved}"
+            self.problem = "nothing has come on it yet"
+            profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+            self._node.create_subscription(
+                kind.type, resolved, lambda message: self._take(lambda: read_message(kind, message)), profile
+            )
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(self._node)
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="orientation", daemon=True)
+        self._thread.start()
+
+    def close(self, timeout_s: float = 5.0) -> bool:
+        """Stop listening; False if the thread does not end in time."""
+        self._closing = True
+        self._executor.shutdown(timeout_s)
+        self._thread.join(timeout_s)
+        if not self._thread.is_alive():
+            self._node.destroy_node()
+        return not self._thread.is_alive()
+
+    def _take(self, read: Callable[[], Oriented]) -> None:
+        try:
+            found = read()
+        except UnusableError as error:
+            self.problem = str(error)
+        else:
+            quaternion = found.quaternion
+            if self._mounting is not None:
+                quaternion = multiply(quaternion, self._mounting)
+            self.latest, self.problem = Oriented(quaternion, found.stamp_ns), ""
+
+    def _run(self) -> None:
+        try:
+            self._executor.spin()
+        except ExternalShutdownException:
+            return
+        except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a dead source
+            if not self._closing:
+                self._on_failure(f"the orientation's source failed: {type(error).__name__}: {error}")

@@ -1,0 +1,46 @@
+"""Takes the samples of a time at rest, for the services that need one."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from bridge.compensated_output import RestWindow
+from bridge.compensation.quantities import CompensationError
+from bridge.compensation_control import CompensationControl
+
+_PATIENCE_S: Final = 2.0
+"""A window may take this much longer than half as long again as it lasts."""
+_LOOK_S: Final = 0.05
+
+
+def take_window(control: CompensationControl, limit_hz: float) -> RestWindow:
+    """The samples of the next `rest.duration`, whole; blocks the caller and never the stream.
+
+    `limit_hz` is the parameter `publishing_frequency`. CompensationError if they do not come or mean nothing.
+    """
+    if (conflict := control.conflict()) is not None:
+        raise CompensationError(conflict)
+    link = control.link
+    if link.connection is None:
+        raise CompensationError(
+            f"there is no server at {link.address} ({link.problem}), so there are no samples"
+        )
+    seconds, limits = control.parameters.rest_duration, control.parameters.rest
+    window = RestWindow(seconds, limits, control.source)
+    if limit_hz > 0:
+        seconds = max(seconds, limits.least_samples / limit_hz)
+    patience_s = 1.5 * seconds + _PATIENCE_S
+    deadline_s = time.monotonic() + patience_s
+    control.output.window = window
+    try:
+        while not window.done.wait(_LOOK_S):
+            if control.ending:
+                raise CompensationError("the node ends")
+            if time.monotonic() > deadline_s:
+                raise CompensationError(
+                    f"only {window.count} samples came in {patience_s:.1f} s: see /diagnostics, stream"
+                )
+    finally:
+        control.output.window = None
+    return window

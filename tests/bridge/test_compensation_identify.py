@@ -1,0 +1,209 @@
+"""The services ~/identify/...: from the first pose to a parameter file. One node for all tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
+
+from bridge.compensation.parameter_file import read_yaml
+from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, sensed
+from tests.bridge.conftest import Listener, NodeProcess, starter
+from tests.bridge.scripted_server import ScriptedServer
+from tests.bridge.shared import listener, server, stream
+from tests.bridge.streaming import Stream
+from tests.compensation.making import AXES, BIAS, TOOL, load
+
+__all__ = ["listener", "server", "stream"]
+pytestmark = pytest.mark.ros
+Take = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("kept")
+
+
+@pytest.fixture(scope="module")
+def node(server: ScriptedServer, stream: Stream, listener: Listener, folder: Path) -> Iterator[NodeProcess]:
+    hold(stream, UP, bias=BIAS)
+    with starter(listener) as start:
+        yield start(server.port, **QUICK, bias_directory=folder / "deeper")
+
+
+@pytest.fixture(scope="module")
+def stages(listener: Listener, node: NodeProcess) -> Stages:
+    return Stages(listener)
+
+
+@pytest.fixture(autouse=True)
+def _whole(node: NodeProcess, stages: Stages, stream: Stream) -> Iterator[None]:
+    stages.forget()
+    assert stages.final.get(timeout=20)
+    yield
+    stream.forget_once()
+    assert node.process.poll() is None
+    assert "Traceback" not in node.log
+
+
+@pytest.fixture
+def started(listener: Listener) -> Listener:
+    done, text = listener.trigger("identify/start")
+    assert done
+    assert "gravity is known by accelerometer" in text
+    assert "turn the sensor so that its +z axis points up" in text
+    return listener
+
+
+@pytest.fixture
+def take(started: Listener, stream: Stream, stages: Stages) -> Take:
+    """Holds the sensor so, one after the other, and adds the poses; what the last one said."""
+
+    def take_poses(*ups: tuple[float, float, float]) -> str:
+        text = ""
+        for up in ups:
+            hold(stream, up, bias=BIAS)
+            stages.settle(load(up).values)
+            done, text = started.trigger("identify/add_pose")
+            assert done, text
+        return text
+
+    return take_poses
+
+
+def test_from_six_poses_to_a_compensated_wrench(
+    started: Listener, take: Take, stream: Stream, stages: Stages, folder: Path
+) -> None:
+    text = take(*AXES)
+    assert "pose 6 taken (up is -1.00, 0.00, 0.00 in the sensor's frame)" in text
+    assert "the poses suffice" in text
+    done, text = started.trigger("identify/solve")
+    assert done, text
+    for words in (
+        "mass 0.8000 ± ", "centre of gravity (4.0 ± ", "Bias Fx 3.0000 Fy -1.5000 Fz 7.2500",
+        "95 % confidence", "Residuals by pose, 1: ", "Condition 1.",
+        "One more pose would help most so: turn", "identify/apply",
+    ):  # fmt: skip
+        assert words in text, text
+    assert started.parameters("tool_mass") == [0.0]  # solving changes nothing
+    path = folder / "deeper" / "sensor-1-payload.yaml"
+    assert f"Written to {path}" in text
+    written = read_yaml(path)
+    assert written.payload.mass == pytest.approx(TOOL.mass, abs=1e-4)
+    assert "# mass 0.8000" in path.read_text()
+    done, text = started.trigger("identify/apply")
+    assert done
+    assert "in force: tool_mass 0.8000 kg" in text
+    (mass, centre, bias) = started.parameters("tool_mass", "tool_center_of_gravity", "bias")
+    assert mass == pytest.approx(TOOL.mass, abs=1e-4)
+    assert list(centre) == pytest.approx(TOOL.centre, abs=1e-5)
+    assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)
+    hold(stream, (1, -2, 1.5), bias=BIAS, force_z=-5.0)
+    stages.settle([0.0, 0.0, -5.0, 0.0, 0.0, 0.0], within=2e-3)
+    assert started.set_parameter("tool_mass", 0.0)[0]
+    assert started.trigger("clear_tare")[0]
+
+
+def test_the_file_is_one_that_the_node_starts_with(started: Listener, take: Take, folder: Path) -> None:
+    path = folder / "mine.yaml"
+    assert started.set_parameter("identify.file", str(path)) == (True, "")
+    take(*AXES)
+    done, text = started.trigger("identify/solve")
+    assert done, text
+    assert started.set_parameter("identify.file", "auto") == (True, "")
+    other = Listener()
+    try:
+        node = NodeProcess("--ros-args", "-r", f"__ns:=/{other.tag}", "--params-file", str(path))
+        try:
+            mass, bias = other.parameters("tool_mass", "bias")
+            assert mass == pytest.approx(TOOL.mass, abs=1e-4)
+            assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)
+        finally:
+            node.close()
+    finally:
+        other.close()
+
+
+def test_poses_that_do_not_suffice_are_refused_with_what_is_missing(started: Listener, take: Take) -> None:
+    done, text = started.trigger("identify/solve")
+    assert not done
+    assert "there is no pose yet" in text
+    take(UP, UP, UP, UP)
+    done, text = started.trigger("identify/solve")
+    assert not done
+    assert "all 4 poses had gravity in the same direction" in text
+    assert "points up" in text
+    text = take(OVER, SIDE, (-1, 0, 0))
+    assert "not enough yet: the sensor was turned about one axis only" in text
+    done, text = started.trigger("identify/solve")
+    assert not done
+    assert "gravity never changed along the sensor's y axis" in text
+    assert started.trigger("identify/apply") == (
+        False, "there is no result to apply: call identify/solve first",
+    )  # fmt: skip
+    take((0, 1, 0))
+    assert started.trigger("identify/solve")[0]
+
+
+def test_a_pose_that_is_no_good_is_not_taken(started: Listener, take: Take, stream: Stream) -> None:
+    take(UP)
+    for place in range(60):
+        stream.once(process_data=sensed(UP, force_x=9.0 * (place % 2)))
+    done, text = started.trigger("identify/add_pose")
+    assert not done
+    assert "the sensor is not at rest: force x moved by" in text
+    stream.forget_once()
+    assert "pose 2 taken" in take(SIDE)
+    done, text = started.trigger("identify/drop_pose")
+    assert done
+    assert "1 are left" in text
+    assert "pose 2 taken" in take(OVER)
+
+
+def test_a_result_is_of_the_poses_that_there_are(started: Listener, take: Take) -> None:
+    take(UP, SIDE, OVER, (0, 1, 0))
+    assert started.trigger("identify/solve")[0]
+    take((0, -1, 0))
+    assert not started.trigger("identify/apply")[0]
+
+
+def test_cancel_changes_nothing(started: Listener, take: Take) -> None:
+    take(UP, SIDE)
+    assert started.trigger("identify/cancel") == (
+        True, "identification cancelled, 2 poses dropped; nothing was changed",
+    )  # fmt: skip
+    for service in ("add_pose", "drop_pose", "solve", "cancel"):
+        done, text = started.trigger(f"identify/{service}")
+        assert not done
+        assert "call identify/start first" in text
+    assert not started.trigger("identify/apply")[0]
+    assert list(started.parameters("bias")[0]) == ZERO6
+
+
+def test_starting_again_drops_what_was_there(started: Listener, take: Take) -> None:
+    take(UP, SIDE)
+    done, text = started.trigger("identify/start")
+    assert done
+    assert "the 2 poses before are dropped" in text
+    assert "pose 1 taken" in take(UP)
+
+
+def test_it_does_not_start_without_an_orientation(listener: Listener) -> None:
+    assert listener.set_parameter("orientation_source", "none") == (True, "")
+    done, text = listener.trigger("identify/start")
+    assert not done
+    assert "orientation_source is none" in text
+    assert listener.set_parameter("orientation_source", "accelerometer") == (True, "")
+
+
+def test_a_file_that_cannot_be_written(started: Listener, take: Take) -> None:
+    assert started.set_parameter("identify.file", "/proc/no/such.yaml") == (True, "")
+    take(*AXES)
+    done, text = started.trigger("identify/solve")
+    assert done  # the answer stands
+    assert "Not written: " in text
+    assert "/proc/no" in text
+    assert started.set_parameter("identify.file", "auto") == (True, "")

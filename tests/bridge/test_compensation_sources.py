@@ -1,0 +1,495 @@
+"""Orientation from a topic and from TF: taken, refused, stale, back again. One node for the topics."""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+import time
+import types
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
+
+import rclpy
+from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped, TransformStamped
+from rclpy.node import Node
+from sensor_msgs.msg import Imu
+
+from bridge.compensation.quantities import length
+from bridge.compensation_parameters import CompensationParameters, OrientationParameters
+from bridge.gravity_sources import ListenerSource, SensorSource
+from bridge.orientation_listener import OrientationListener
+from bridge.orientation_messages import Oriented, Tf, UnusableError, check_tf, look_up, multiply, unit
+from bridge.parameters import ParameterError
+from tests.bridge.compensating import (
+    OVER,
+    QUICK,
+    SIDE,
+    UP,
+    ZERO6,
+    Stages,
+    comes_to_rest,
+    hold,
+    settle,
+    until_said,
+    weight,
+)
+from tests.bridge.conftest import Listener, NodeProcess, starter, wait_until
+from tests.bridge.scripted_server import ScriptedServer
+from tests.bridge.shared import listener, server, stream
+from tests.bridge.streaming import Diagnostics, Stream, values
+from tests.compensation.making import BIAS, TOOL, sample
+
+__all__ = ["listener", "server", "stream"]
+pytestmark = pytest.mark.ros
+OK, WARN, ERROR, STALE = range(4)
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+ROLLED = (1.0, 0.0, 0.0, 0.0)
+"""Half a turn about x: what was up is down."""
+TILTED = (0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5))
+"""A quarter of a turn about -y: the sensor's x axis points up."""
+
+
+class Robot:
+    """Publishes an orientation 50 times a second."""
+
+    def __init__(self, listener: Listener) -> None:
+        self._node = listener.node
+        self.quaternion = UPRIGHT
+        self.offset_s = 0.0
+        """What is added to the stamps; None: they are 0."""
+        self.stamped = self.sending = True
+        self.change: Callable[[Any], None] = lambda message: None
+        self._publisher: Any = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def use(self, message_type: Any, topic: str) -> None:
+        self._publisher, self._type = None, message_type
+        self._publisher = self._node.create_publisher(message_type, topic, 10)
+
+    def restore(self) -> None:
+        self.quaternion, self.offset_s, self.stamped, self.sending = UPRIGHT, 0.0, True, True
+        self.change = lambda message: None
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.02):
+            publisher = self._publisher
+            if publisher is None or not self.sending:
+                continue
+            message = self._type()
+            if self.stamped:
+                stamp = message.header.stamp
+                stamp.sec, stamp.nanosec = divmod(time.time_ns() + int(self.offset_s * 1e9), 10**9)
+            x, y, z, w = self.quaternion
+            quaternion = Quaternion(x=x, y=y, z=z, w=w)
+            if self._type is PoseStamped:
+                message.pose.orientation = quaternion
+            elif self._type is Imu:
+                message.orientation = quaternion
+            else:
+                message.quaternion = quaternion
+            self.change(message)
+            publisher.publish(message)
+
+
+@pytest.fixture(scope="module")
+def node(server: ScriptedServer, stream: Stream, listener: Listener) -> Iterator[NodeProcess]:
+    hold(stream, UP)
+    with starter(listener) as start:
+        yield start(
+            server.port,
+            tool_mass=TOOL.mass,
+            tool_center_of_gravity=[*TOOL.centre],
+            orientation_source="topic_pose",
+            # Patient: this machine may be busy.
+            **{**QUICK, "orientation.stale_after": 0.5, "orientation.topic": "arm/pose"},
+        )
+
+
+@pytest.fixture(scope="module")
+def _robot(listener: Listener, node: NodeProcess) -> Iterator[Robot]:
+    robot = Robot(listener)
+    yield robot
+    robot.close()
+
+
+@pytest.fixture(scope="module")
+def stages(listener: Listener, node: NodeProcess) -> Stages:
+    return Stages(listener)
+
+
+@pytest.fixture(scope="module")
+def _diagnostics(listener: Listener, node: NodeProcess) -> Diagnostics:
+    return Diagnostics(listener)
+
+
+@pytest.fixture
+def diagnostics(_diagnostics: Diagnostics) -> Diagnostics:
+    _diagnostics.forget()
+    return _diagnostics
+
+
+@pytest.fixture
+def robot(
+    _robot: Robot, stream: Stream, listener: Listener, stages: Stages, node: NodeProcess
+) -> Iterator[Robot]:
+    """The robot says where the sensor is; the sensor's own accelerometer would say something else."""
+    _robot.restore()
+    hold(stream, UP, acceleration_x=3.0)
+    yield _robot
+    assert node.process.poll() is None
+    assert "Traceback" not in node.log
+
+
+def test_before_anything_has_come(robot: Robot, diagnostics: Diagnostics, listener: Listener) -> None:
+    status = diagnostics.until(compensation=ERROR)["compensation"]
+    assert f"no orientation from topic /{listener.tag}/arm/pose: nothing has come" in status.message
+    done, text = listener.trigger("tare")
+    assert not done
+    assert "nothing has come" in text
+
+
+@pytest.mark.parametrize(
+    ("source", "message_type"),
+    [("topic_quaternion", QuaternionStamped), ("topic_imu", Imu), ("topic_pose", PoseStamped)],
+)
+def test_each_kind_of_message(
+    robot: Robot, stream: Stream, stages: Stages, listener: Listener, source: str, message_type: Any
+) -> None:
+    topic = f"arm/{source}"
+    assert listener.set_parameter("orientation.topic", topic) == (True, "")
+    assert listener.set_parameter("orientation_source", source) == (True, "")
+    robot.use(message_type, f"/{listener.tag}/{topic}")
+    for quaternion, up in ((UPRIGHT, UP), (ROLLED, OVER), (TILTED, SIDE)):
+        robot.quaternion = quaternion
+        hold(stream, up, acceleration_y=3.0)
+        stages.settle(ZERO6)
+
+
+def test_a_source_that_falls_silent_and_comes_back(
+    robot: Robot, stages: Stages, diagnostics: Diagnostics, stream: Stream
+) -> None:
+    stages.settle(ZERO6)
+    diagnostics.until(compensation=OK)
+    robot.sending = False
+    status = diagnostics.until(compensation=ERROR)["compensation"]
+    assert "older than the sample (limit 0.5 s): it has stopped" in status.message
+    comes_to_rest(stages.final)
+    for others in (stages.bias, stages.gravity, stages.inertia):
+        comes_to_rest(others, 0.1)
+    robot.quaternion = ROLLED  # it has moved in the meantime
+    hold(stream, OVER)
+    robot.sending = True
+    message = stages.final.get(timeout=20)
+    assert settle(stages.final, ZERO6)
+    assert [message.wrench.force.z] == pytest.approx([0.0], abs=1e-3)  # never with the old pose
+    diagnostics.until(compensation=OK)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        ({"stamped": False}, "its messages have no time stamp"),
+        (
+            {"offset_s": -30.0},
+            "older than the sample (limit 0.5 s): it has stopped, is slow, or has another clock",
+        ),
+        ({"offset_s": 30.0}, "after the sample (limit 0.5 s): the clocks of the two computers differ"),
+        ({"quaternion": (0.0, 0.0, 0.0, 0.0)}, "a quaternion of length 0 instead of 1"),
+        ({"quaternion": (0.0, math.nan, 0.0, 1.0)}, "a quaternion of length nan instead of 1"),
+    ],
+)
+def test_what_cannot_be_used(
+    robot: Robot, stages: Stages, diagnostics: Diagnostics, spoil: dict[str, Any], words: str
+) -> None:
+    stages.settle(ZERO6)
+    for name, value in spoil.items():
+        setattr(robot, name, value)
+    until_said(lambda: diagnostics.until(compensation=ERROR)["compensation"], words)
+    comes_to_rest(stages.final)
+    robot.restore()
+    stages.settle(ZERO6)
+    diagnostics.until(compensation=OK)
+
+
+def test_an_imu_without_orientation(
+    robot: Robot, stages: Stages, diagnostics: Diagnostics, listener: Listener
+) -> None:
+    assert listener.set_parameter("orientation_source", "topic_imu") == (True, "")
+    assert listener.set_parameter("orientation.topic", "arm/imu") == (True, "")
+
+    def unknown(message: Any) -> None:
+        message.orientation_covariance[0] = -1.0
+
+    robot.change = unknown
+    robot.use(Imu, f"/{listener.tag}/arm/imu")
+    words = f"no orientation from topic /{listener.tag}/arm/imu: its messages say that they have none"
+    until_said(lambda: diagnostics.until(compensation=ERROR)["compensation"], words)
+    robot.restore()
+    stages.settle(ZERO6)
+
+
+def test_a_sensor_mounted_askew(robot: Robot, stages: Stages, stream: Stream, listener: Listener) -> None:
+    """The arm hangs down and the sensor is turned about its own z axis in it."""
+    quarter = [0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
+    robot.quaternion = TILTED  # the arm's x axis points up; that is the sensor's -y
+    hold(stream, (0, -1, 0))
+    assert listener.set_parameter("orientation.mounting", quarter) == (True, "")
+    stages.settle(ZERO6)
+    assert listener.set_parameter("orientation.mounting", [0, 0, 0, 1]) == (True, "")
+
+
+def test_gravity_in_a_base_that_is_mounted_askew(
+    robot: Robot, stages: Stages, stream: Stream, listener: Listener
+) -> None:
+    hold(stream, SIDE)
+    assert listener.set_parameter("gravity", [-9.80665, 0.0, 0.0]) == (True, "")
+    stages.settle(ZERO6)
+    assert listener.set_parameter("gravity", [0.0, 0.0, -9.80665]) == (True, "")
+
+
+def test_a_tare_goes_by_the_topic(robot: Robot, stages: Stages, stream: Stream, listener: Listener) -> None:
+    robot.quaternion = ROLLED
+    hold(stream, OVER, bias=BIAS, acceleration_x=0.3)
+    stages.settle(list(BIAS.values))
+    done, text = listener.trigger("tare")
+    assert done, text
+    stages.settle(ZERO6)
+    robot.quaternion = TILTED
+    hold(stream, SIDE, bias=BIAS)
+    stages.settle(ZERO6)
+    assert listener.trigger("clear_tare")[0]
+
+
+def test_the_orientation_is_taken_in_while_a_service_waits(
+    robot: Robot, stages: Stages, server: ScriptedServer, stream: Stream, listener: Listener
+) -> None:
+    stages.settle(ZERO6)
+    server.answers["describe"] = lambda _: None
+    done: list[tuple[bool, str]] = []
+    caller = threading.Thread(target=lambda: done.append(listener.trigger("get_settings")))
+    caller.start()
+    time.sleep(0.8)  # longer than an orientation holds
+    stages.forget()
+    robot.quaternion = ROLLED
+    hold(stream, OVER)
+    stages.settle(ZERO6)
+    assert caller.is_alive()
+    caller.join()
+    del server.answers["describe"]
+    assert not done[0][0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        (
+            "orientation.topic",
+            "no such name!",
+            "'no such name!': topic name must not contain",
+        ),
+        ("orientation_source", "tf", "sudo apt install ros-$ROS_DISTRO-tf2-ros"),
+    ],
+)
+def test_a_source_that_cannot_be_had(
+    robot: Robot, stages: Stages, listener: Listener, name: str, value: str, words: str
+) -> None:
+    before = listener.parameters(name)
+    done, reason = listener.set_parameter(name, value)
+    assert not done
+    assert words in reason
+    assert listener.parameters(name) == before
+    stages.settle(ZERO6)
+
+
+def test_nothing_listens_where_no_source_is_chosen(
+    robot: Robot, stream: Stream, diagnostics: Diagnostics, listener: Listener
+) -> None:
+    hidden = ("_bridge_orientation", f"/{listener.tag}")
+
+    def is_there() -> bool:
+        return hidden in listener.node.get_node_names_and_namespaces()
+
+    wait_until(is_there, "the hidden node")
+    assert listener.set_parameter("orientation_source", "accelerometer") == (True, "")
+    wait_until(lambda: not is_there(), "the hidden node's end")
+    hold(stream, UP)
+    status = diagnostics.until(compensation=OK)["compensation"]
+    assert values(status)["orientation_source"] == "accelerometer"
+
+
+def test_tf_that_is_missing_ends_the_node_with_a_sentence(listener: Listener) -> None:
+    with starter(listener) as start:
+        node = start(1, orientation_source="tf")
+        assert node.ends() == 1
+        assert "parameter orientation_source is 'tf': it needs tf2_ros" in node.log
+        assert "Traceback" not in node.log
+
+
+# TF, by a buffer that is handed in: tf2_ros is not on PyPI.
+
+
+class FakeTfError(Exception):
+    """What a lookup raises."""
+
+
+class FakeBuffer:
+    """A `tf2_ros.Buffer` that knows one transform."""
+
+    def __init__(self) -> None:
+        self.quaternion = UPRIGHT
+        self.stamp_ns: int | None = None
+        """None: the time of the lookup."""
+        self.error: str | None = "frame does not exist"
+        self.asked: list[tuple[str, str, Any]] = []
+
+    def lookup_transform(self, target_frame: str, source_frame: str, time_: Any) -> Any:
+        self.asked.append((target_frame, source_frame, time_))
+        if self.error:
+            raise FakeTfError(self.error)
+        found = TransformStamped()
+        stamp_ns = time.time_ns() if self.stamp_ns is None else self.stamp_ns
+        found.header.stamp.sec, found.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        r = found.transform.rotation
+        r.x, r.y, r.z, r.w = self.quaternion
+        return found
+
+
+def test_tf_is_asked_for_the_sensor_in_the_base() -> None:
+    buffer = FakeBuffer()
+    tf = Tf(buffer, FakeTfError, "latest")
+    with pytest.raises(UnusableError, match="TF has none of ft_sensor in base_link: frame does not exist"):
+        look_up(tf, "base_link", "ft_sensor")
+    buffer.error, buffer.quaternion, buffer.stamp_ns = None, TILTED, 12_000_000_345
+    assert look_up(tf, "base_link", "ft_sensor") == Oriented(pytest.approx(TILTED), 12_000_000_345)  # type: ignore[arg-type]
+    assert buffer.asked[-1] == ("base_link", "ft_sensor", "latest")
+    buffer.stamp_ns = 0  # static transforms only: they have no time
+    assert abs(look_up(tf, "base_link", "ft_sensor").stamp_ns - time.time_ns()) < 60 * 10**9
+
+
+@pytest.fixture
+def ros_node(_ros: None) -> Iterator[Node]:
+    made = rclpy.create_node("bridge", namespace="/test_tf")
+    yield made
+    made.destroy_node()
+
+
+def test_the_source_tf(ros_node: Node) -> None:
+    buffer = FakeBuffer()
+    failures: list[str] = []
+    chosen = OrientationParameters("tf", base_frame="world", mounting=ROLLED, stale_after=0.5)
+    opened = OrientationListener(
+        ros_node,
+        chosen,
+        "ft",
+        failures.append,
+        open_buffer=lambda _node: Tf(buffer, FakeTfError, "latest"),
+    )
+    try:
+        source = ListenerSource(CompensationParameters(orientation=chosen), opened)
+        wait_until(lambda: buffer.asked, "a lookup")
+        assert source.gravity(sample(), time.time()) is None
+        words = "no orientation from TF from world to ft: TF has none of ft in world: frame does not exist"
+        wait_until(lambda: source.why_none(time.time()) == words, words)
+        buffer.error, buffer.quaternion = None, TILTED
+        wait_until(lambda: source.gravity(sample(), time.time()) is not None, "gravity")
+        # The frames say all, so `mounting` is not for TF.
+        assert source.gravity(sample(), time.time()) == pytest.approx((-9.80665, 0.0, 0.0))
+        buffer.stamp_ns = time.time_ns()
+        wait_until(lambda: source.gravity(sample(), time.time()) is None, "an old transform")
+        assert "older than the sample (limit 0.5 s)" in source.why_none(time.time())
+        buffer.error, buffer.stamp_ns = "the tree fell apart", None
+        wait_until(lambda: "the tree fell apart" in source.why_none(time.time()), "the reason")
+        buffer.error = None
+        wait_until(lambda: source.gravity(sample(), time.time()) is not None, "gravity again")
+    finally:
+        assert opened.close()
+    assert not failures
+
+
+def test_a_listener_that_fails_is_told(ros_node: Node) -> None:
+    class Broken:
+        def lookup_transform(self, target_frame: str, source_frame: str, time: Any) -> Any:
+            raise RuntimeError("unforeseen")
+
+    failures: list[str] = []
+    opened = OrientationListener(
+        ros_node,
+        OrientationParameters("tf"),
+        "ft",
+        failures.append,
+        open_buffer=lambda _node: Tf(Broken(), FakeTfError, None),
+    )
+    wait_until(lambda: failures, "the failure")
+    assert failures == ["the orientation's source failed: RuntimeError: unforeseen"]
+    opened.close()
+
+
+def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node: Node) -> None:
+    """What of tf2_ros is used, by its public names: a stand-in with the same signatures."""
+    made: list[Any] = []
+
+    class Buffer:
+        def __init__(self, cache_time: Any = None, node: Any = None) -> None:
+            made.append(node)
+
+    class TransformListener:
+        def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
+            made.append((buffer, node, spin_thread))
+
+    names = {"Buffer": Buffer, "TransformListener": TransformListener, "TransformException": FakeTfError}
+    module = types.ModuleType("tf2_ros")
+    vars(module).update(names)
+    monkeypatch.setitem(sys.modules, "tf2_ros", module)
+    from bridge.orientation_messages import open_tf
+
+    check_tf()
+    tf = open_tf(ros_node)
+    assert isinstance(tf.buffer, Buffer)
+    assert tf.errors is FakeTfError
+    assert tf.latest.nanoseconds == 0
+    assert made == [ros_node, (tf.buffer, ros_node, False)]
+
+
+def test_without_tf2_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tf2_ros", None)
+    with pytest.raises(ParameterError, match=r"sudo apt install ros-.*-tf2-ros and source ROS 2, or take"):
+        check_tf()
+
+
+# Time that goes back, and rotations.
+
+
+def test_a_clock_that_goes_back_does_not_stop_a_source_for_ever() -> None:
+    class Listening:
+        latest: Oriented | None = Oriented(UPRIGHT, 5_000 * 10**9)
+        problem = ""
+        describe = "topic /x"
+
+    listening = Listening()
+    source = ListenerSource(CompensationParameters(), listening)
+    assert source.gravity(sample(), 5000.0) == pytest.approx((0.0, 0.0, -9.80665))
+    listening.latest = Oriented(TILTED, 100 * 10**9)
+    assert source.gravity(sample(), 100.0) == pytest.approx((-9.80665, 0.0, 0.0))
+    own = SensorSource(CompensationParameters())
+    assert own.gravity(sample(orientation=UPRIGHT), 5000.0) == pytest.approx((0.0, 0.0, -9.80665))
+    assert own.gravity(sample(orientation=TILTED), 100.0) == pytest.approx((-9.80665, 0.0, 0.0))
+    assert own.gravity(sample(), 101.0) is None
+
+
+def test_rotations_multiply_in_the_order_that_is_said() -> None:
+    both = multiply(TILTED, (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))
+    assert length(both[:3]) ** 2 + both[3] ** 2 == pytest.approx(1.0)
+    assert multiply(UPRIGHT, TILTED) == multiply(TILTED, UPRIGHT) == pytest.approx(TILTED)
+    assert unit(Quaternion(x=0.0, y=0.0, z=0.0, w=0.995)) == UPRIGHT
+    assert weight(UP)[2] < 0
