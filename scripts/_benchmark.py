@@ -25,6 +25,7 @@ from ethercat_server.errors import ServerError
 from scripts import _benchmark_chains as chains
 from scripts._benchmark_chain import OVERSAMPLING_HZ, Setup, virtual_bus
 from scripts._benchmark_clients import measure_clients
+from scripts._benchmark_cpp import measure_cpp
 from scripts._benchmark_node import measure_node
 from scripts._benchmark_plot import Curves, draw
 from scripts._benchmark_records import may_be_real_time
@@ -42,6 +43,7 @@ _RATES: Final = tuple(OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512
 
 MODES: Final[dict[str, tuple[Callable[[Setup, Console], dict[str, Any]], str]]] = {
     "clients": (measure_clients, "only the server, eight clients against one"),
+    "cpp": (measure_cpp, "only the C++ client, against a bare read"),
     "node": (measure_node, "only the ROS 2 node: ages beside a TCP client, CPU, first message after a stop"),
 }
 """Options that measure one thing, by themselves."""
