@@ -25,6 +25,7 @@ from ethercat_server.errors import ServerError
 from scripts import _benchmark_chains as chains
 from scripts._benchmark_chain import OVERSAMPLING_HZ, Setup, virtual_bus
 from scripts._benchmark_clients import measure_clients
+from scripts._benchmark_cpp import measure_cpp
 from scripts._benchmark_node import measure_node
 from scripts._benchmark_plot import Curves, draw
 from scripts._benchmark_records import may_be_real_time
@@ -54,6 +55,7 @@ class Mode(NamedTuple):
 
 MODES: Final[dict[str, Mode]] = {
     "clients": Mode(measure_clients, "only the server, eight clients against one"),
+    "cpp": Mode(measure_cpp, "only the C++ client, against a bare read"),
     "sdo": Mode(measure_sdo, "only the server, without and with SDO traffic", SDO_SECONDS),
     "node": Mode(
         measure_node, "only the ROS 2 node: ages beside a TCP client, CPU, first message after a stop", 15.0
