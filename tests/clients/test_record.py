@@ -25,6 +25,7 @@ from tests.server.running import needs_bus, server
 
 CLI = [sys.executable, "-m", "clients.recording.cli"]
 SECOND = 800
+"""Frames of one sensor in a second."""
 OLD = DataFlag.REPEATED | DataFlag.INVALID
 
 
@@ -158,6 +159,25 @@ def test_what_the_server_withheld_is_said(out: Path, tmp_path: Path) -> None:
         code, said = run(out, served.port, "--no-reconnect")
     assert code == 0
     assert "3 frames of sensor 0 not read in time" in said
+
+
+def test_nothing_is_lost_while_it_does_not_run_for_a_moment(endless: Replay, out: Path) -> None:
+    recorder = Recorder(out, endless.port)
+    try:
+        wait_until(lambda: recorder.size() > 5000, "data")
+        recorder.signal(signal.SIGSTOP)
+        time.sleep(2)
+        recorder.signal(signal.SIGCONT)
+        time.sleep(0.3)
+        recorder.signal(signal.SIGINT)
+        assert recorder.wait() == 0
+        assert "nothing was lost" in recorder.said()
+    finally:
+        recorder.signal(signal.SIGCONT)
+        recorder.close()
+    frames = read(out)
+    assert is_whole(frames)
+    assert len(frames) > 2 * 2 * SECOND
 
 
 def killed(endless: Replay, out: Path, after_s: float) -> None:
