@@ -1,0 +1,1 @@
+"""`ethercat-replay`: serves a recording over the same protocol as `ethercat-server`."""
