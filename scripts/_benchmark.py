@@ -13,7 +13,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,6 +25,7 @@ from ethercat_server.errors import ServerError
 from scripts import _benchmark_chains as chains
 from scripts._benchmark_chain import OVERSAMPLING_HZ, Setup, virtual_bus
 from scripts._benchmark_clients import measure_clients
+from scripts._benchmark_node import measure_node
 from scripts._benchmark_plot import Curves, draw
 from scripts._benchmark_records import may_be_real_time
 from scripts._benchmark_report import print_configuration
@@ -38,6 +39,12 @@ _WIDTH: Final = 100
 _SECONDS: Final = 6.0
 _QUICK_SECONDS: Final = 3.0
 _RATES: Final = tuple(OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512))
+
+MODES: Final[dict[str, tuple[Callable[[Setup, Console], dict[str, Any]], str]]] = {
+    "clients": (measure_clients, "only the server, eight clients against one"),
+    "node": (measure_node, "only the ROS 2 node: ages beside a TCP client, CPU, first message after a stop"),
+}
+"""Options that measure one thing, by themselves."""
 
 
 @dataclass
@@ -107,11 +114,12 @@ def run(options: argparse.Namespace, console: Console) -> None:
         write_json(options.json, options, priority, soak=result)
         print(f"written: {options.json}")
         return
-    if options.clients:
-        result = measure_clients(setup(options.rates[0], options.sensors[0]), console)
-        write_json(options.json, options, priority, clients=result)
-        print(f"written: {options.json}")
-        return
+    for name, (measure_it, _) in MODES.items():
+        if getattr(options, name):
+            result = measure_it(setup(options.rates[0], options.sensors[0]), console)
+            write_json(options.json, options, priority, **{name: result})
+            print(f"written: {options.json}")
+            return
     wanted = [setup(rate, sensors) for rate in options.rates for sensors in options.sensors]
     ways = 2 if options.ros else 1
     progress = Progress(console, sum(1 + ways * (2 if one.sensors == 1 else 1) for one in wanted))
@@ -167,13 +175,14 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--sensors", type=_counts, metavar="N,...", help="sensors on the bus (1,2)")
     parser.add_argument("--ppm", type=float, default=150.0, help="the sensors' clock error (%(default)g)")
     parser.add_argument("--soak", type=float, metavar="MINUTES", help="only the server, for so long")
-    parser.add_argument("--clients", action="store_true", help="only the server, eight clients against one")
+    for name, (_, text) in MODES.items():
+        parser.add_argument(f"--{name}", action="store_true", help=text)
     parser.add_argument("--no-ros", dest="ros", action="store_false", help="TCP only")
     parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
                         help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip
     options = parser.parse_args(argv)
     options.json, options.plot = here / options.json, here / options.plot
-    only_one = options.quick or options.soak or options.clients
+    only_one = options.quick or options.soak or any(getattr(options, name) for name in MODES)
     options.rates = options.rates or ([800] if only_one else [800, 1600])
     options.sensors = options.sensors or ([1] if only_one else [1, 2])
     return options

@@ -1,4 +1,4 @@
-"""The ROS messages: each made once, then refilled and published.
+"""The ROS messages: each made and serialised once, then refilled and published.
 
 An output's `publish` runs in the reader's thread, for every selected sample and only while somebody has
 subscribed, so it must not block and should not allocate. To add a topic, add a class here and to `make`.
@@ -20,6 +20,7 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from bridge.parameter_row import Numbers
 from bridge.parameters import Parameters
+from bridge.serialized import SerializedMessage, axes
 from protocol.pdo import Sample
 
 ARRAY_LABEL: Final = "Fx Fy Fz Mx My Mz Ax Ay Az Rx Ry Rz"
@@ -27,7 +28,7 @@ ARRAY_LABEL: Final = "Fx Fy Fz Mx My Mz Ax Ay Az Rx Ry Rz"
 ARRAY_SIZE: Final = len(ARRAY_LABEL.split())
 _DEPTH: Final = 10
 """Short: what a subscriber is too slow for is replaced by newer samples."""
-_NS_PER_S: Final = 1_000_000_000
+_NO_ROTATION: Final = (0.0, 0.0, 0.0, 1.0)
 
 
 class Output(Protocol):
@@ -88,17 +89,19 @@ class ArrayOutput:
 
     def __init__(self, node: Node, topic: str) -> None:
         self.publisher = create_publisher(node, Float64MultiArray, topic)
-        self._message = Float64MultiArray()
-        self._message.layout.dim = [
+        message = Float64MultiArray()
+        message.layout.dim = [
             MultiArrayDimension(label=ARRAY_LABEL, size=ARRAY_SIZE, stride=ARRAY_SIZE)
         ]  # fmt: skip
-        self._message.data = array("d", bytes(8 * ARRAY_SIZE))
-        self._data: array[float] = self._message.data
+        message.data = array("d", bytes(8 * ARRAY_SIZE))
+        self._serialized = SerializedMessage(
+            message, [[(message.data, place) for place in range(ARRAY_SIZE)]]
+        )
 
     def publish(self, sample: Sample, stamp_ns: int) -> None:  # noqa: ARG002 - the message has no header
         """Publish the twelve values."""
-        self._data[:] = array("d", sample.array)
-        self.publisher.publish(self._message)
+        self._serialized.fill(0, sample.array)
+        self.publisher.publish(self._serialized.message())
 
 
 class WrenchOutput:
@@ -108,18 +111,19 @@ class WrenchOutput:
 
     def __init__(self, node: Node, topic: str, frame_id: str) -> None:
         self.publisher = create_publisher(node, WrenchStamped, topic)
-        self._message = WrenchStamped()
-        self._message.header.frame_id = frame_id
-        self._stamp = self._message.header.stamp
-        self._force, self._torque = self._message.wrench.force, self._message.wrench.torque
+        message = WrenchStamped()
+        message.header.frame_id = frame_id
+        wrench = message.wrench
+        places = [axes(wrench.force), axes(wrench.torque)]
+        self._serialized = SerializedMessage(message, places, message.header.stamp)
 
     def publish(self, sample: Sample, stamp_ns: int) -> None:
         """Publish force and torque."""
-        self._stamp.sec, self._stamp.nanosec = divmod(stamp_ns, _NS_PER_S)
-        force, torque = self._force, self._torque
-        force.x, force.y, force.z = sample.force
-        torque.x, torque.y, torque.z = sample.torque
-        self.publisher.publish(self._message)
+        serialized = self._serialized
+        serialized.stamp(stamp_ns)
+        serialized.fill(0, sample.force)
+        serialized.fill(1, sample.torque)
+        self.publisher.publish(serialized.message())
 
 
 class ImuOutput:
@@ -137,28 +141,29 @@ class ImuOutput:
         self._unknown = [-1.0, *[0.0] * 8]  # REP 145
         self._message.orientation_covariance = self._unknown
         self._has_orientation = False
-        self._stamp = self._message.header.stamp
-        self._orientation = self._message.orientation
-        self._rate, self._acceleration = self._message.angular_velocity, self._message.linear_acceleration
+        self._serialized = self._serialize()
+
+    def _serialize(self) -> SerializedMessage:
+        message = self._message
+        places = [
+            axes(message.linear_acceleration),
+            axes(message.angular_velocity),
+            axes(message.orientation, "xyzw"),
+        ]
+        return SerializedMessage(message, places, message.header.stamp)
 
     def publish(self, sample: Sample, stamp_ns: int) -> None:
         """Publish acceleration, angular rate and, where there is one, the orientation."""
-        self._stamp.sec, self._stamp.nanosec = divmod(stamp_ns, _NS_PER_S)
-        a, r, q = self._acceleration, self._rate, self._orientation
-        a.x, a.y, a.z = sample.acceleration
-        r.x, r.y, r.z = sample.angular_rate
-        if sample.orientation is not None:
-            q.x, q.y, q.z, q.w = sample.orientation
         if (sample.orientation is not None) is not self._has_orientation:
-            self._change_orientation(there=sample.orientation is not None)
-        self.publisher.publish(self._message)
-
-    def _change_orientation(self, *, there: bool) -> None:
-        self._has_orientation = there
-        self._message.orientation_covariance = self._known if there else self._unknown
-        if not there:
-            q = self._orientation
-            q.x, q.y, q.z, q.w = 0.0, 0.0, 0.0, 1.0
+            self._has_orientation = sample.orientation is not None
+            self._message.orientation_covariance = self._known if self._has_orientation else self._unknown
+            self._serialized = self._serialize()
+        serialized = self._serialized
+        serialized.stamp(stamp_ns)
+        serialized.fill(0, sample.acceleration)
+        serialized.fill(1, sample.angular_rate)
+        serialized.fill(2, sample.orientation or _NO_ROTATION)
+        self.publisher.publish(serialized.message())
 
 
 class TemperatureOutput:
@@ -168,15 +173,16 @@ class TemperatureOutput:
 
     def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
         self.publisher = create_publisher(node, Temperature, topic)
-        self._message = Temperature(variance=parameters.temperature_variance)
-        self._message.header.frame_id = parameters.frame_id
-        self._stamp = self._message.header.stamp
+        message = Temperature(variance=parameters.temperature_variance)
+        message.header.frame_id = parameters.frame_id
+        self._serialized = SerializedMessage(message, [[(message, "temperature")]], message.header.stamp)
 
     def publish(self, sample: Sample, stamp_ns: int) -> None:
         """Publish the temperature."""
-        self._stamp.sec, self._stamp.nanosec = divmod(stamp_ns, _NS_PER_S)
-        self._message.temperature = sample.temperature
-        self.publisher.publish(self._message)
+        serialized = self._serialized
+        serialized.stamp(stamp_ns)
+        serialized.fill(0, (sample.temperature,))
+        self.publisher.publish(serialized.message())
 
 
 def _covariance(values: Numbers) -> list[float]:

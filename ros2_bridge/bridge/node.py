@@ -40,8 +40,8 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.reader = Reader(parameters, outputs, self.get_logger(), self._fail)
         self.monitor = Monitor(self, parameters.thresholds, self.reader, outputs, self._fail)
         self.requests = Requests(parameters, self.reader.link)
-        self.triggers = Services(self, self.reader.link, self.requests)
         self.sensor_settings = SettingsParameters(self, self.reader.link, self.requests)
+        self.triggers = Services(self, self.reader.link, self.requests, self.sensor_settings)
         self.reader.link.on_change = self.sensor_settings.changed
         self.create_subscription(
             KeyValue,

@@ -12,6 +12,7 @@ from std_srvs.srv import Trigger
 from bridge.connection import find_sensor
 from bridge.link import Link
 from bridge.requests import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, RequestFailedError, Requests
+from bridge.settings_parameters import SettingsParameters
 from protocol.errors import ConnectionFailedError
 
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
@@ -26,11 +27,13 @@ _TARE_EXTRA_S: Final = 4.0
 class Services:
     """Each blocks the executor until the server has answered or a time-out, and never the stream."""
 
-    def __init__(self, node: Node, link: Link, requests: Requests) -> None:
+    def __init__(self, node: Node, link: Link, requests: Requests, settings: SettingsParameters) -> None:
         self._link, self._requests, self._log = link, requests, node.get_logger()
+        self._settings = settings
         for name, act in (
             ("sensor_tare", self._sensor_tare),
             ("get_settings", self._get_settings),
+            ("apply_settings", self._apply_settings),
             ("save_settings", self._save_settings),
         ):
             node.create_service(Trigger, f"~/{name}", self._answering(name, act))
@@ -66,6 +69,11 @@ class Services:
         except ConnectionFailedError as error:
             raise RequestFailedError(str(error)) from None
         return json.dumps({**info.settings, "rate_hz": info.rate})
+
+    def _apply_settings(self) -> str:
+        text = f"sensor {self._link.sensor} has these settings now: {json.dumps(self._settings.apply())}"
+        self._log.info(text)
+        return text
 
     def _save_settings(self) -> str:
         # `configure` wants at least one setting: one as it is.

@@ -2,6 +2,9 @@
 
 They have no value (NOT_SET) while there is no server, nor where this sensor lacks the setting. The server is
 asked for every change and must say that it is in force; otherwise the parameter stays as it was.
+
+Values given at start do not change the sensor by themselves: other nodes may share it. `apply` puts them, and
+what was set since, in force together.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from bridge.link import Link
+from bridge.parameter_row import ParameterError
 from bridge.requests import CONFIGURE_TIMEOUT_S, RequestFailedError, Requests
 from protocol.errors import SettingError
 from protocol.settings import SETTINGS, Setting, SettingValue, check_settings
@@ -26,10 +30,13 @@ class SettingsParameters:
 
     def __init__(self, node: Node, link: Link, requests: Requests) -> None:
         self._node, self._link, self._requests = node, link, requests
+        self._wanted: dict[str, SettingValue] = {}
+        """What this node's user gave at start or set since."""
         self._following = True
         for setting in SETTINGS.values():
             self._declare(setting)
         self._following = False
+        self._say_wanted()
         node.add_on_set_parameters_callback(self._on_set)
         self._guard = node.create_guard_condition(self._follow)
 
@@ -41,11 +48,33 @@ class SettingsParameters:
         name, descriptor = PREFIX + setting.name, _descriptor(setting)
         given = self._node.declare_parameter(name, None, descriptor).value
         if given is not None:
-            self._node.get_logger().warning(
-                f"parameter {name} is given at start and ignored: give it to ethercat-server "
-                f"(--set {setting.name}={given} or its configuration file), or set it while the node runs"
-            )
+            try:
+                self._wanted[setting.name] = setting.check(given)
+            except SettingError as error:
+                raise ParameterError(f"parameter {name}: {error}") from None
             self._unset(setting)
+
+    def _say_wanted(self) -> None:
+        if self._wanted:
+            self._node.get_logger().info(
+                f"settings given at start: {', '.join(self._wanted)}; "
+                "call ~/apply_settings to put them in force"
+            )
+
+    def apply(self) -> dict[str, SettingValue]:
+        """Put in force what was given at start or set since, and return it.
+
+        RequestFailedError if that is nothing or cannot be.
+        """
+        if not self._wanted:
+            raise RequestFailedError(
+                "no settings were given: give settings.NAME at start, or set one while the node runs"
+            )
+        try:
+            self._configure(check_settings(self._wanted))
+        except SettingError as error:
+            raise RequestFailedError(str(error)) from None
+        return dict(self._wanted)
 
     def _unset(self, setting: Setting) -> None:
         name = PREFIX + setting.name
@@ -75,6 +104,7 @@ class SettingsParameters:
             self._configure(check_settings(wanted))
         except (SettingError, RequestFailedError) as error:
             return SetParametersResult(successful=False, reason=str(error))
+        self._wanted.update(wanted)
         return SetParametersResult(successful=True)
 
     def _configure(self, wanted: dict[str, SettingValue]) -> None:

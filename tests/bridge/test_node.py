@@ -120,6 +120,14 @@ def test_a_wrong_parameter_is_one_sentence(start: Start) -> None:
     assert line == "bridge-client: parameter server_port is 70000: it must be a whole number from 1 to 65535"
 
 
+def test_a_wrong_setting_at_start_is_one_sentence(start: Start) -> None:
+    node = start(12001, **{"settings.acceleration_range_g": 3})
+    assert node.ends() == 1
+    (line,) = node.log.splitlines()
+    assert line.startswith("bridge-client: parameter settings.acceleration_range_g: ")
+    assert "2, 4, 8, 16" in line
+
+
 def test_arguments_that_are_not_understood() -> None:
     for arguments, code in ((("dance",), 2), (("--ros-args", "-p"), 1), (("--help",), 0)):
         node = NodeProcess(*arguments)

@@ -45,9 +45,32 @@ def refuse(message: str, code: str = ErrorCode.SENSOR) -> JsonObject:
 
 
 def test_settings_given_at_start_are_not_taken_in_silence(node: NodeProcess, server: ScriptedServer) -> None:
-    assert "parameter settings.sinc_length is given at start and ignored" in node.log
-    assert "--set sinc_length=64" in node.log
+    assert "settings given at start: sinc_length; call ~/apply_settings" in node.log
     assert not [r for r in server.requests if r["action"] == "configure"]
+
+
+def test_settings_given_at_start_or_set_since_are_applied_together(
+    node: NodeProcess, server: ScriptedServer, listener: Listener
+) -> None:
+    held = dict(SETTINGS)
+    asked: list[Any] = []
+
+    def answer(message: JsonObject) -> JsonObject:
+        asked.append(message["settings"])
+        held.update(message["settings"])
+        server.send_json(event(Event.RECONFIGURED, sensor=0, settings=held))
+        return {"ok": True, "settings": held}
+
+    server.answers["configure"] = answer
+    done, text = listener.trigger("apply_settings")
+    assert done, text
+    assert '"sinc_length": 64' in text
+    assert listener.set_parameter("settings.fir", True) == (True, "")
+    assert listener.trigger("apply_settings")[0]
+    assert asked == [{"sinc_length": 64}, {"fir": True}, {"sinc_length": 64, "fir": True}]
+    server.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
+    assert listener.trigger("apply_settings") == (False, "not for uid 7 (denied)")
+    server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS))
 
 
 def test_tare(server: ScriptedServer, listener: Listener) -> None:
