@@ -14,6 +14,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PROTOCOL = sorted((ROOT / "protocol").rglob("*.py"))
 SERVER = sorted((ROOT / "ethercat_server").rglob("*.py"))
+CLIENTS = sorted((ROOT / "clients").rglob("*.py"))
 BRIDGE = sorted((ROOT / "ros2_bridge" / "bridge").rglob("*.py"))
 OTHERS = [
     ROOT / "ros2_bridge" / "setup.py",
@@ -85,7 +86,28 @@ def test_connection_and_selection_need_no_ros() -> None:
         assert not imports(ROOT / "ros2_bridge" / "bridge" / f"{name}.py") & {"rclpy", "std_msgs"}, name
 
 
-@pytest.mark.parametrize("path", PROTOCOL + SERVER + BRIDGE + OTHERS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_nothing_imports_the_clients_and_they_need_neither_ros_nor_the_bus() -> None:
+    assert CLIENTS
+    assert not list(importers(PROTOCOL + SERVER + BRIDGE, "clients"))
+    for name in ("rclpy", "std_msgs", "sensor_msgs", "geometry_msgs", "pysoem"):
+        assert not list(importers(CLIENTS, name))
+
+
+def test_of_the_clients_only_the_replay_uses_the_server() -> None:
+    using = set(importers(CLIENTS, "ethercat_server"))
+    assert all(path.startswith("clients/replay/") for path in using), using
+
+
+def test_recordings_are_opened_in_one_place() -> None:
+    assert set(importers(PROTOCOL + SERVER + BRIDGE + CLIENTS, "mcap")) <= {
+        "clients/recording/container.py",
+        "clients/recording/writer.py",
+    }
+
+
+@pytest.mark.parametrize(
+    "path", PROTOCOL + SERVER + BRIDGE + CLIENTS + OTHERS, ids=lambda p: str(p.relative_to(ROOT))
+)
 def test_every_file_says_what_it_is_for(path: Path) -> None:
     text = path.read_text()
     assert not text or ast.get_docstring(ast.parse(text)), path

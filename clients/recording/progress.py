@@ -1,0 +1,84 @@
+"""What a person sees while it records: one line that is kept up to date, or a line now and then."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Final, Self
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from clients.recording.recorder import Recorder
+
+_LINE_EVERY_S: Final = 10.0
+_SHOW_EVERY_S: Final = 0.5
+
+
+class Progress:
+    """On standard error, so that it mixes with nothing."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._console = Console(stderr=True, highlight=False)
+        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._began = time.monotonic()
+        self._next = self._began + (_SHOW_EVERY_S if self._console.is_terminal else _LINE_EVERY_S)
+        self._seen: dict[int, int] = {}
+        self._seen_at = self._began
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._live.stop()
+
+    def say(self, sentence: str) -> None:
+        """Something happened."""
+        self._console.print(sentence, markup=False, soft_wrap=True)
+
+    def show(self, recorder: Recorder, *, connected: bool) -> None:
+        """Show how far it is, if it is time to."""
+        now = time.monotonic()
+        if now < self._next:
+            return
+        terminal = self._console.is_terminal
+        self._next = now + (_SHOW_EVERY_S if terminal else _LINE_EVERY_S)
+        line = self._line(recorder, now, connected=connected)
+        if terminal:
+            self._live.update(Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
+        else:
+            self.say(line)
+
+    def _line(self, recorder: Recorder, now: float, *, connected: bool) -> str:
+        rates = []
+        for place, sensor in sorted(dict(recorder.tally.sensors).items()):
+            rate = (sensor.frames - self._seen.get(place, 0)) / (now - self._seen_at)
+            self._seen[place] = sensor.frames
+            rates.append(f"{rate:.0f}")
+        self._seen_at = now
+        state = f"{' + '.join(rates) or '0'} frames/s" if connected else "no server, waiting for it"
+        missing = recorder.tally.missing
+        loss = f"{missing} lost" if missing else "nothing lost"
+        size = human_size(recorder.bytes_written)
+        return f"{self._name}: {clock(now - self._began)}, {recorder.saved} frames, {size}, {state}, {loss}"
+
+
+def clock(seconds: float) -> str:
+    """A duration as h:mm:ss or m:ss."""
+    whole = int(seconds)
+    hours, minutes = divmod(whole // 60, 60)
+    return f"{hours}:{minutes:02}:{whole % 60:02}" if hours else f"{minutes}:{whole % 60:02}"
+
+
+def human_size(size: int) -> str:
+    """Bytes as a person reads them."""
+    for unit, factor in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
+        if size >= factor:
+            return f"{size / factor:.1f} {unit}"
+    return f"{size} bytes"

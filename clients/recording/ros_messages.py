@@ -1,0 +1,125 @@
+"""ROS 2 messages of a frame, as the node publishes them, packed as CDR without ROS.
+
+Three messages of fixed form: a constant head (frame_id and its padding) and doubles. The tests decode them
+with two other libraries.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from typing import Final, NamedTuple
+
+from protocol.framing import DataFlag, DataMessage
+from protocol.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
+
+_OLD: Final = int(DataFlag.REPEATED | DataFlag.INVALID)
+_NS_PER_S: Final = 1_000_000_000
+_MAX_STAMP_NS: Final = 2**31 * _NS_PER_S
+"""From here on a ROS time has no room for it."""
+
+_SEPARATOR: Final = "=" * 80 + "\n"
+_PARTS: Final = {
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
+    "geometry_msgs/Wrench": "Vector3 force\nVector3 torque\n",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Quaternion": "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n",
+}
+
+
+def _definition(text: str, *parts: str) -> str:
+    """A whole definition as MCAP has it: the message, then everything that it is made of."""
+    used = ("std_msgs/Header", "builtin_interfaces/Time", *parts)
+    return text + "".join(f"{_SEPARATOR}MSG: {part}\n{_PARTS[part]}" for part in used)
+
+
+WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
+IMU: Final = "sensor_msgs/msg/Imu"
+TEMPERATURE: Final = "sensor_msgs/msg/Temperature"
+DEFINITIONS: Final = {
+    WRENCH: _definition(
+        "std_msgs/Header header\ngeometry_msgs/Wrench wrench\n",
+        "geometry_msgs/Wrench",
+        "geometry_msgs/Vector3",
+    ),
+    IMU: _definition(
+        "std_msgs/Header header\n"
+        "geometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n"
+        "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
+        "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\n",
+        "geometry_msgs/Quaternion",
+        "geometry_msgs/Vector3",
+    ),
+    TEMPERATURE: _definition("std_msgs/Header header\nfloat64 temperature\nfloat64 variance\n"),
+}
+
+_UNKNOWN: Final = (0.0,) * 9
+_NO_ORIENTATION: Final = (0.0, 0.0, 0.0, 1.0, -1.0, *(0.0,) * 8)
+"""REP 145: the first covariance is -1 where there is no estimate."""
+
+
+class Topic(NamedTuple):
+    """A ROS topic of one sensor."""
+
+    name: str
+    schema: str
+    pack: Callable[[int, Sample], bytes | None]
+    """The message of a stamp (ns since 1970) and a sample; None if a value is not finite."""
+
+
+class RosTopics:
+    """The topics of one sensor: `wrench`, `imu/data_raw` and `temperature` in a namespace."""
+
+    def __init__(self, namespace: str = "", imu_units: ImuUnits = ImuUnits.G_DPS) -> None:
+        """Without a namespace names and frames are the node's own; with one the frames begin with it too."""
+        head, frame = (f"/{namespace}", f"{namespace}_ft_sensor") if namespace else ("", "ft_sensor")
+        self._decoders = {size: SampleDecoder(size, imu_units) for size in LAYOUTS}
+        self._wrench = _Packer(frame, 6)
+        self._imu = _Packer(f"{frame}_imu", 37)
+        self._temperature = _Packer(frame, 2)
+        self.topics = (
+            Topic(f"{head}/wrench", WRENCH, self._pack_wrench),
+            Topic(f"{head}/imu/data_raw", IMU, self._pack_imu),
+            Topic(f"{head}/temperature", TEMPERATURE, self._pack_temperature),
+        )
+
+    def messages(self, frame: DataMessage) -> Iterator[tuple[int, bytes]]:
+        """The messages of a frame, each with its place in `topics`; none of what is no new sample."""
+        if frame.flags & _OLD or frame.stamp_ns >= _MAX_STAMP_NS:
+            return
+        sample = self._decoders[len(frame.process_data)].decode(frame.process_data)
+        for place, topic in enumerate(self.topics):
+            body = topic.pack(frame.stamp_ns, sample)
+            if body is not None:
+                yield place, body
+
+    def _pack_wrench(self, stamp_ns: int, sample: Sample) -> bytes | None:
+        return self._wrench.pack(stamp_ns, *sample.force, *sample.torque)
+
+    def _pack_imu(self, stamp_ns: int, sample: Sample) -> bytes | None:
+        orientation = _NO_ORIENTATION if sample.orientation is None else (*sample.orientation, *_UNKNOWN)
+        return self._imu.pack(
+            stamp_ns, *orientation, *sample.angular_rate, *_UNKNOWN, *sample.acceleration, *_UNKNOWN
+        )
+
+    def _pack_temperature(self, stamp_ns: int, sample: Sample) -> bytes | None:
+        return self._temperature.pack(stamp_ns, sample.temperature, 0.0)
+
+
+class _Packer:
+    """Packs a header with a fixed frame_id and `count` doubles."""
+
+    def __init__(self, frame_id: str, count: int) -> None:
+        text = frame_id.encode() + b"\0"
+        # Alignment counts from behind the four bytes of CDR's own: sec and nanosec are 8, the length is 4.
+        padded = len(text) + -(12 + len(text)) % 8
+        self._rest = struct.pack(f"<I{padded}s", len(text), text)
+        self._struct = struct.Struct(f"<4siI{len(self._rest)}s{count}d")
+
+    def pack(self, stamp_ns: int, *values: float) -> bytes | None:
+        if not math.isfinite(sum(values)):
+            return None
+        sec, nanosec = divmod(stamp_ns, _NS_PER_S)
+        return self._struct.pack(b"\x00\x01\x00\x00", sec, nanosec, self._rest, *values)

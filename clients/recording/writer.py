@@ -1,0 +1,126 @@
+"""Writes one recording file: frames, descriptions and events as MCAP messages, in chunks soon on disk.
+
+`flush` is to be called often; what was flushed survives this process. Not thread-safe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import IO, Any, Final, cast
+
+from mcap.writer import CompressionType, Writer
+
+from clients.recording.disk import DiskFile
+from clients.recording.file_format import (
+    DESCRIPTION_TOPIC,
+    ENCODING,
+    END_METADATA,
+    EVENTS_TOPIC,
+    FRAME_DEFINITION,
+    FRAME_SCHEMA,
+    METADATA,
+    PROFILE,
+    SCHEMA_ENCODING,
+    TEXT_DEFINITION,
+    TEXT_SCHEMA,
+    frame_topic,
+    pack_frame,
+    pack_json,
+)
+from clients.recording.ros_messages import DEFINITIONS, RosTopics
+from protocol.framing import DataMessage, JsonObject
+
+_CHUNK_SIZE: Final = 1024 * 1024
+_U32: Final = 0xFFFFFFFF
+
+
+class RecordingWriter:
+    """A recording file that is being written.
+
+    Attributes:
+        frames: how many frames it was given.
+    """
+
+    def __init__(
+        self, disk: DiskFile, library: str, notes: Mapping[str, str], ros: Mapping[int, RosTopics]
+    ) -> None:
+        """Begin the file: `notes` become its metadata, `ros` has the topics of the sensors that get any."""
+        self.frames = 0
+        self._disk = disk
+        self._ros = ros
+        self._mcap = Writer(
+            cast("IO[Any]", disk),
+            chunk_size=_CHUNK_SIZE,
+            compression=CompressionType.ZSTD,
+            enable_data_crcs=True,
+        )
+        self._mcap.start(PROFILE, library)
+        self._mcap.add_metadata(METADATA, dict(notes))
+        self._schemas: dict[str, int] = {}
+        self._descriptions = self._channel(DESCRIPTION_TOPIC, TEXT_SCHEMA, TEXT_DEFINITION)
+        self._events = self._channel(EVENTS_TOPIC, TEXT_SCHEMA, TEXT_DEFINITION)
+        self._notes = 0
+        self._frame_channels: dict[int, int] = {}
+        self._ros_channels: dict[int, list[int]] = {}
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file, without the chunk that is being filled."""
+        return self._disk.tell()
+
+    def describe(self, stamp_ns: int, description: JsonObject) -> None:
+        """Write a reply to `describe`."""
+        self._note(self._descriptions, stamp_ns, description)
+
+    def event(self, stamp_ns: int, event: JsonObject) -> None:
+        """Write an event that came at `stamp_ns`."""
+        self._note(self._events, stamp_ns, event)
+
+    def frame(self, frame: DataMessage) -> None:
+        """Write a frame, and its ROS messages."""
+        sensor, stamp_ns, sequence = frame.sensor, frame.stamp_ns, frame.sequence & _U32
+        add = self._mcap.add_message
+        channel = self._frame_channels.get(sensor)
+        if channel is None:
+            channel = self._open_sensor(sensor)
+        add(channel, stamp_ns, pack_frame(frame), stamp_ns, sequence)
+        self.frames += 1
+        ros = self._ros.get(sensor)
+        if ros is not None:
+            channels = self._ros_channels[sensor]
+            for place, body in ros.messages(frame):
+                add(channels[place], stamp_ns, body, stamp_ns, sequence)
+
+    def flush(self) -> None:
+        """End the chunk and write it to disk; DiskError if it cannot be written."""
+        self._mcap.flush()  # type: ignore[no-untyped-call]
+
+    def finish(self, notes: Mapping[str, str]) -> None:
+        """Write everything that is left, the index and the end, and have the disk keep it; DiskError."""
+        self.flush()
+        self._mcap.add_metadata(END_METADATA, dict(notes))
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+        self._disk.flush()
+        self._disk.sync()
+
+    def _note(self, channel: int, stamp_ns: int, message: JsonObject) -> None:
+        self._mcap.add_message(channel, stamp_ns, pack_json(message), stamp_ns, self._notes)
+        self._notes += 1
+
+    def _open_sensor(self, sensor: int) -> int:
+        if sensor not in self._frame_channels:
+            self._frame_channels[sensor] = self._channel(frame_topic(sensor), FRAME_SCHEMA, FRAME_DEFINITION)
+            if sensor in self._ros:
+                self._ros_channels[sensor] = [
+                    self._channel(topic.name, topic.schema, DEFINITIONS[topic.schema])
+                    for topic in self._ros[sensor].topics
+                ]
+        return self._frame_channels[sensor]
+
+    def _channel(self, topic: str, schema: str, definition: str) -> int:
+        number = self._schemas.get(schema)
+        if number is None:
+            number = self._mcap.register_schema(schema, SCHEMA_ENCODING, definition.encode())
+            self._schemas[schema] = number
+        # An empty profile: `ros2 bag play` uses its own, which is reliable, as the node's is.
+        return self._mcap.register_channel(topic, ENCODING, number, {"offered_qos_profiles": ""})

@@ -1,0 +1,58 @@
+"""Recordings for tests, made without a server."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from clients.recording.disk import DiskFile
+from clients.recording.file_format import FORMAT_VERSION
+from clients.recording.ros_messages import RosTopics
+from clients.recording.writer import RecordingWriter
+from protocol import pdo
+from protocol.framing import DataMessage, JsonObject
+
+START_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 1_250_000
+
+
+def describe(*sensors: int, **settings: object) -> JsonObject:
+    """A reply to `describe` with these sensors."""
+    rows = [
+        {
+            "sensor": sensor, "name": "BFT-SENS-ECAT-M8", "serial": 100 + sensor, "hardware": "H",
+            "firmware": "1.3.8", "pdo_size": 61, "rate_hz": 800, "state": "OP",
+            "settings": {"sinc_length": 64, **settings},
+        }
+        for sensor in sensors
+    ]  # fmt: skip
+    return {"reply": "describe", "ok": True, "protocol": 1, "version": "0.1.0", "sensors": rows}
+
+
+def frame(number: int, sensor: int = 0, flags: int = 0, size: int = 61, **values: float) -> DataMessage:
+    """Frame `number` of a sensor; its force x is `number`."""
+    data = pdo.encode(size, {"force.x": number, "temperature": 35.5, **values})
+    moment = number * PERIOD_NS
+    return DataMessage(number, START_NS + moment, moment, sensor, flags, 3, data)
+
+
+def writer(path: Path, ros: Mapping[int, RosTopics] | None = None, **notes: str) -> RecordingWriter:
+    """A new recording at `path`."""
+    disk = DiskFile(path, overwrite=True)
+    return RecordingWriter(disk, "test", {"format": FORMAT_VERSION, **notes}, ros or {})
+
+
+def record(
+    path: Path, frames: Iterable[DataMessage], chunk: int = 100, sensors: tuple[int, ...] = (0,)
+) -> list[DataMessage]:
+    """A whole recording of `frames`, with a chunk for so many of them; returns them."""
+    made = writer(path)
+    made.describe(START_NS, describe(*sensors))
+    written = []
+    for count, item in enumerate(frames, 1):
+        written.append(item)
+        made.frame(item)
+        if count % chunk == 0:
+            made.flush()
+    made.finish({})
+    return written

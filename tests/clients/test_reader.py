@@ -1,0 +1,270 @@
+"""What was recorded is read back; what was cut off is read as far as it goes; what is damaged is refused."""
+
+from __future__ import annotations
+
+import random
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zstandard
+
+from clients.recording.columns import columns
+from clients.recording.container import MAX_CHUNK, McapFile
+from clients.recording.file_format import DESCRIPTION_TOPIC, FORMAT_VERSION
+from clients.recording.reader import (
+    DamagedError,
+    Description,
+    Event,
+    NotARecordingError,
+    RecordingError,
+    open_recording,
+)
+from protocol.framing import DataFlag, DataMessage
+from protocol.pdo import SampleDecoder
+from tests.clients.recordings import START_NS, describe, frame, record, writer
+
+CHUNKS = 10
+PER_CHUNK = 100
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
+@pytest.fixture
+def frames(path: Path) -> list[DataMessage]:
+    return record(path, (frame(number) for number in range(CHUNKS * PER_CHUNK)), PER_CHUNK)
+
+
+def chunk_ends(path: Path) -> list[int]:
+    """Where the parts of a recording end that a flush wrote: behind the index of each chunk."""
+    data, position, ends = path.read_bytes(), 8, []
+    while data[position] != 0x0F:
+        opcode, length = struct.unpack_from("<BQ", data, position)
+        position += 9 + length
+        if opcode == 0x07 and data[position] != 0x07:
+            ends.append(position)
+    return ends
+
+
+def test_frames_come_back_byte_for_byte(path: Path, frames: list[DataMessage]) -> None:
+    with open_recording(path) as recording:
+        assert list(recording.frames()) == frames
+        assert recording.frame_count == len(frames)
+        assert recording.cut_off is None
+        assert recording.end == {}
+
+
+def test_all_of_a_frame_is_kept(path: Path) -> None:
+    extreme = DataMessage(2**64 - 1, 2**64 - 1, 2**64 - 1, 255, 255, 65535, bytes(range(77)))
+    record(path, [extreme], sensors=(255,))
+    with open_recording(path) as recording:
+        assert list(recording.frames(255)) == [extreme]
+
+
+def test_sensors_are_told_apart(path: Path) -> None:
+    record(path, (frame(n, sensor=n % 2) for n in range(100)), sensors=(0, 1))
+    with open_recording(path) as recording:
+        assert [f.sequence for f in recording.frames(1)] == list(range(1, 100, 2))
+        assert [(s.sensor, s.serial, s.frames) for s in recording.sensors] == [(0, 100, 50), (1, 101, 50)]
+        assert list(recording.frames(7)) == []
+
+
+def test_settings_are_known_over_time(path: Path) -> None:
+    made = writer(path)
+    made.describe(START_NS, describe(0, chop=False))
+    made.frame(frame(0))
+    made.event(START_NS + 10, {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}})
+    reply = describe(0)
+    reply["sensors"][0] |= {"settings": {"sinc_length": 32}, "rate_hz": 1600}
+    made.describe(START_NS + 20, reply)
+    made.frame(frame(1))
+    made.finish({"reason": "asked to"})
+    with open_recording(path) as recording:
+        (sensor,) = recording.sensors
+        assert sensor.settings == {"sinc_length": 64, "chop": False}
+        assert [(s.stamp_ns - START_NS, s.values["sinc_length"], s.rate_hz) for s in sensor.history] == [
+            (0, 64, 800), (10, 32, 800), (20, 32, 1600),
+        ]  # fmt: skip
+        assert [type(item) for item in recording.everything()] == [
+            Description, DataMessage, Event, Description, DataMessage,
+        ]  # fmt: skip
+        assert recording.events[0].name == "reconfigured"
+        assert not recording.events[0].by_recorder
+        assert recording.end == {"reason": "asked to"}
+
+
+def test_columns_are_what_the_decoder_gives(path: Path) -> None:
+    source = random.Random(1)
+    names = ("force.y", "torque.z", "acceleration.x", "acceleration.z", "angular_rate.y", "temperature")
+    values: dict[str, Any] = {name: source.uniform(-50, 50) for name in names}
+    orientation: dict[str, Any] = {"orientation.w": 1.0}
+    old = DataFlag.REPEATED
+    made = [
+        frame(0, **values, warnings=0x80000001, force_torque_saturated=0x21),
+        frame(1, flags=old, size=77, **values, **orientation),
+        frame(2, size=77, acceleration_saturated=4),
+    ]
+    record(path, made)
+    with open_recording(path) as recording:
+        table = columns(recording)
+    for row, item in enumerate(made):
+        sample = SampleDecoder(len(item.process_data)).decode(item.process_data)
+        for name in ("force", "torque", "acceleration", "angular_rate"):
+            assert tuple(getattr(table, name)[row]) == getattr(sample, name)
+        assert table.temperature[row] == sample.temperature
+        assert table.warnings[row] == sample.warnings
+        assert table.force_torque_saturated[row] == sample.force_torque_saturated
+        assert table.acceleration_saturated[row] == sample.acceleration_saturated
+        assert (table.sequence[row], table.stamp_ns[row]) == (item.sequence, item.stamp_ns)
+    assert list(table.orientation[:, 3] == 1.0) == [False, True, False]
+    assert list(table.fresh) == [True, False, True]
+    assert list(table.where(table.fresh).sequence) == [0, 2]
+
+
+def test_columns_of_nothing_are_empty(path: Path) -> None:
+    record(path, [])
+    with open_recording(path) as recording:
+        table = columns(recording)
+    assert len(table) == 0
+    assert table.force.shape == (0, 3)
+    assert table.orientation.shape == (0, 4)
+
+
+# -- cut off
+
+
+def test_cut_anywhere_everything_up_to_the_last_whole_chunk_is_read(
+    path: Path, frames: list[DataMessage], tmp_path: Path
+) -> None:
+    data, ends = path.read_bytes(), chunk_ends(path)
+    assert len(ends) == CHUNKS
+    source = random.Random(2)
+    cuts = {*ends, *(end + 1 for end in ends), *(end - 1 for end in ends), len(data) - 1}
+    cuts |= {source.randrange(ends[0], len(data)) for _ in range(60)}
+    for cut in cuts:
+        part = tmp_path / "part.mcap"
+        part.write_bytes(data[:cut])
+        whole = sum(end <= cut for end in ends)
+        with open_recording(part) as recording:
+            found = list(recording.frames())
+            assert found == frames[: len(found)], cut
+            assert whole * PER_CHUNK <= len(found) <= (whole + 1) * PER_CHUNK, cut
+            assert recording.cut_off, cut
+            assert recording.end is None or cut > ends[-1]
+
+
+def test_an_empty_tail_after_a_power_failure_is_left_out(path: Path, frames: list[DataMessage]) -> None:
+    data, ends = path.read_bytes(), chunk_ends(path)
+    path.write_bytes(data[: ends[4]] + bytes(4096))
+    with open_recording(path) as recording:
+        assert list(recording.frames()) == frames[: 5 * PER_CHUNK]
+        assert "4096 bytes" in str(recording.cut_off)
+    # The length is there, the blocks behind it are not.
+    path.write_bytes(data[: ends[4] + 100] + bytes(ends[5] - ends[4] - 100))
+    with open_recording(path) as recording:
+        assert list(recording.frames()) == frames[: 5 * PER_CHUNK]
+        assert recording.cut_off
+
+
+def test_what_was_cut_off_before_the_first_chunk_is_said(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    data = path.read_bytes()
+    for size in (0, 7, 8, 20):
+        path.write_bytes(data[:size])
+        with pytest.raises(NotARecordingError):
+            open_recording(path)
+
+
+# -- damaged and hostile
+
+
+@pytest.mark.parametrize("what", [b"", b"x", b"hello, I am no MCAP file at all", bytes(4096)])
+def test_other_files_are_refused(path: Path, what: bytes) -> None:
+    path.write_bytes(what)
+    with pytest.raises(NotARecordingError, match="not an MCAP file"):
+        open_recording(path)
+
+
+def test_what_is_not_there_is_said(path: Path) -> None:
+    with pytest.raises(RecordingError, match="No such file"):
+        open_recording(path)
+    with pytest.raises(RecordingError, match="directory"):
+        open_recording(path.parent)
+
+
+def test_another_format_is_refused(path: Path) -> None:
+    made = writer(path, format="99")
+    made.finish({})
+    with pytest.raises(NotARecordingError, match="'99'"):
+        open_recording(path)
+    assert FORMAT_VERSION == "1"
+
+
+def test_a_flipped_bit_in_a_chunk_is_found(path: Path, frames: list[DataMessage]) -> None:
+    data, ends = bytearray(path.read_bytes()), chunk_ends(path)
+    data[ends[3] + 200] ^= 0x10
+    path.write_bytes(data)
+    with open_recording(path) as recording:
+        found = recording.frames()
+        assert [next(found) for _ in range(4 * PER_CHUNK)] == frames[: 4 * PER_CHUNK]
+        with pytest.raises(DamagedError, match="damaged at byte"):
+            next(found)
+
+
+def test_no_flipped_byte_does_more_than_an_error(path: Path) -> None:
+    record(path, (frame(number) for number in range(40)), 20)
+    data = path.read_bytes()
+    source, sentences = random.Random(3), []
+    for _ in range(1500):
+        hostile = bytearray(data)
+        for _ in range(source.choice((1, 1, 2, 8))):
+            hostile[source.randrange(len(hostile))] = source.choice((0, 0xFF, 0x7F, source.randrange(256)))
+        path.write_bytes(hostile[: source.choice((len(data), source.randrange(len(data))))])
+        try:
+            with open_recording(path) as recording:
+                list(recording.everything())
+        except RecordingError as error:
+            sentences.append(str(error))
+    assert sentences
+    assert not any("\n" in sentence for sentence in sentences)
+
+
+def chunk(body: bytes, size: int, packed: bytes, compression: bytes = b"zstd") -> bytes:
+    head = struct.pack("<QQQII", 0, 0, size, zlib.crc32(body), len(compression)) + compression
+    record_body = head + struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", 6, len(record_body)) + record_body
+
+
+@pytest.mark.parametrize(
+    ("size", "packed"),
+    [
+        (MAX_CHUNK + 1, b"x"),
+        (2**63, b"x"),
+        (100, zstandard.compress(bytes(50_000_000))),
+        (50, zstandard.ZstdCompressor(write_content_size=False).compress(bytes(1_000_000))),
+    ],
+)
+def test_a_chunk_that_claims_more_than_it_may_is_refused(path: Path, size: int, packed: bytes) -> None:
+    record(path, [frame(0)])
+    data, end = path.read_bytes(), chunk_ends(path)[0]
+    path.write_bytes(data[:end] + chunk(b"", size, packed) + data[end:])
+    with pytest.raises(DamagedError):
+        open_recording(path)
+
+
+def test_a_text_that_is_no_json_is_refused(path: Path) -> None:
+    record(path, [frame(0)])
+    file = McapFile(path)
+    number = next(n for n, channel in file.channels.items() if channel.topic == DESCRIPTION_TOPIC)
+    file.close()
+    body = struct.pack("<HIQQ", number, 0, 0, 0) + b"\x00\x01\x00\x00" + struct.pack("<I", 2) + b"[\0"
+    body = struct.pack("<BQ", 5, len(body)) + body
+    data, end = path.read_bytes(), chunk_ends(path)[0]
+    path.write_bytes(data[:end] + chunk(body, len(body), zstandard.compress(body)) + data[end:])
+    with pytest.raises(DamagedError, match="not JSON"):
+        open_recording(path)
