@@ -14,6 +14,7 @@ import numpy as np
 from clients.report.channels import CHANNELS, Channel
 from clients.report.check import Check, Level
 from clients.report.series import Series
+from clients.report.timing import too_few
 from clients.report.words import figure, listing, seconds
 
 _LONGEST_S: Final = 0.1
@@ -65,10 +66,11 @@ def _longest(series: Series, place: int, channel: Channel) -> Run:
 
 def check(series: Series) -> Check:
     """Does every channel move?"""
-    if series.duration < _SHORTEST_S or not series.count:
-        return Check(NAME, Level.NOT_POSSIBLE, f"The recording has only {seconds(series.duration)} with "
-        f"samples.", "",
-                     "Record for at least 10 s.")  # fmt: skip
+    if not series.count:
+        return too_few(NAME, 0)
+    if series.duration < _SHORTEST_S:
+        found = f"The recording is only {seconds(series.duration)} long."
+        return Check(NAME, Level.NOT_POSSIBLE, found, "", "Record for at least 10 s.")
     runs = [run for run in longest_runs(series) if not (run.channel.group.is_imu and series.imu_off)]
     stuck = [run for run in runs if run.is_stuck(series.duration)]
     if stuck:

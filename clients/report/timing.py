@@ -223,7 +223,7 @@ def check_rate(timing: Timing) -> Check:
         return Check(
             name, Level.ATTENTION, found, "Filters and limits that follow from the settings are not "
             "those in force.",
-            "Read the settings from the sensor (`ethercat-sensor plan`) and set them again.",
+            "Read them from the sensor (`ethercat-sensor plan`) and set them again.",
         )  # fmt: skip
     return Check(name, Level.OK, found)
 
