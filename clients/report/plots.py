@@ -149,7 +149,7 @@ def spectra(series: Series, spectrum: Spectrum, name: str) -> str:
             panel.set_title(f"{group.title}, {group.unit}/√Hz")
             panel.set_xlim(float(spectrum.frequency[0]), highest)
             _cutoff(panel, cuts.get(group.name), highest)
-            if panel.lines:
+            if np.isfinite(spectrum.density[:, 3 * place : 3 * place + 3]).any():
                 panel.legend(loc="lower left", ncols=3, handlelength=2.2, columnspacing=1.2)
             if place >= 2:
                 panel.set_xlabel("frequency, Hz")

@@ -15,7 +15,7 @@ from clients.report.channels import CHANNELS, Channel
 from clients.report.check import Check, Level
 from clients.report.series import Series
 from clients.report.timing import too_few
-from clients.report.words import figure, listing, seconds
+from clients.report.words import count, figure, listing, seconds
 
 _LONGEST_S: Final = 0.1
 _LONGEST_SAMPLES: Final = 16
@@ -85,5 +85,5 @@ def check(series: Series) -> Check:
             "Switch the sensor off and on. If it is the same, it has to be repaired.",
         )  # fmt: skip
     longest = max((run for run in runs if not run.channel.group.is_imu), key=lambda run: run.samples)
-    return Check(NAME, Level.OK, f"No channel stands still; the longest the same force or torque came "
-                 f"{longest.samples} times in a row.")  # fmt: skip
+    run = count(longest.samples, "sample")
+    return Check(NAME, Level.OK, f"No channel stands still; the longest run of one force or torque is {run}.")
