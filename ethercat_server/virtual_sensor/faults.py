@@ -16,6 +16,7 @@ from typing import Final
 from ethercat_server.objects import MODELS
 from ethercat_server.virtual_sensor.al import AlState
 from ethercat_server.virtual_sensor.bus import Bus, Damage
+from ethercat_server.virtual_sensor.disturbance import CHANNELS, MOST_SKIPPED, Disturbances
 from ethercat_server.virtual_sensor.firmware import Firmware
 from ethercat_server.virtual_sensor.sensor import VirtualSensor
 from ethercat_server.virtual_sensor.signals import SIGNALS
@@ -151,6 +152,42 @@ def _unstick(call: _Call) -> None:
     call.life.stick(False)
 
 
+def _channel(call: _Call) -> tuple[str, Disturbances]:
+    name = call.arguments[0].lower()
+    if name not in CHANNELS:
+        raise CommandError(f"no channel {name[:40]!r}: the channels are {', '.join(CHANNELS)}")
+    life = call.life
+    if life.exact:
+        raise CommandError("the signal `clock` is always exact: use another one")
+    life.disturbed()
+    return name, life.disturbances
+
+
+def _noise(call: _Call) -> None:
+    channel, disturbances = _channel(call)
+    disturbances.set_noise(channel, real(call.arguments[1], 0, 1e6))
+
+
+def _limit(call: _Call) -> None:
+    channel, disturbances = _channel(call)
+    text = call.arguments[1]
+    disturbances.set_limit(channel, None if text == "off" else real(text, 0, 1e6))
+
+
+def _freeze(call: _Call) -> None:
+    channel, disturbances = _channel(call)
+    disturbances.freeze(channel, True)
+
+
+def _thaw(call: _Call) -> None:
+    channel, disturbances = _channel(call)
+    disturbances.freeze(channel, False)
+
+
+def _skip(call: _Call) -> None:
+    call.life.set_skip(real(call.arguments[0], 0, MOST_SKIPPED))
+
+
 def _swap(call: _Call) -> None:
     model, serial = call.arguments
     if not model.isascii() or not 1 <= len(model) <= 20:
@@ -241,6 +278,18 @@ COMMANDS: Final[tuple[FaultCommand, ...]] = (
     ),
     FaultCommand("stick", "stick [@N]", (0,), "give the same process data for ever", _stick),
     FaultCommand("unstick", "unstick [@N]", (0,), "end `stick`", _unstick),
+    FaultCommand(
+        "noise", "noise CHANNEL DEVIATION [@N]", (2,),
+        "add noise of this standard deviation to a channel; 0 ends it", _noise,
+    ),
+    FaultCommand(
+        "limit", "limit CHANNEL VALUE|off [@N]", (2,), "saturate a channel at plus and minus VALUE", _limit
+    ),
+    FaultCommand("freeze", "freeze CHANNEL [@N]", (1,), "keep a channel at what it reads next", _freeze),
+    FaultCommand("thaw", "thaw CHANNEL [@N]", (1,), "end `freeze`", _thaw),
+    FaultCommand(
+        "skip", "skip PERCENT [@N]", (1,), "withhold this share of the samples, at random; 0 ends it", _skip
+    ),
     FaultCommand("swap", "swap MODEL SERIAL [@N]", (2,), "put another sensor in its place", _swap),
     FaultCommand(
         "abort", "abort INDEX SUBINDEX CODE [@N]", (3,), "abort the next SDO on that entry", _abort

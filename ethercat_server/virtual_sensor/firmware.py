@@ -15,6 +15,7 @@ from ethercat_server.virtual_sensor.al import AlCode, AlState, AlStateMachine
 from ethercat_server.virtual_sensor.clock import SampleClock
 from ethercat_server.virtual_sensor.coe import CoeServer
 from ethercat_server.virtual_sensor.dictionary import Dictionary
+from ethercat_server.virtual_sensor.disturbance import NO_SATURATION, Disturbances
 from ethercat_server.virtual_sensor.esc import Esc
 from ethercat_server.virtual_sensor.flash import Flash
 from ethercat_server.virtual_sensor.layout import SYNC_MANAGERS, sync_manager_lengths
@@ -50,6 +51,7 @@ class Firmware:
 
     Attributes:
         now: CLOCK_MONOTONIC in ns; whoever hands over a frame sets it first.
+        disturbances: what is wrong with its channels; call `disturbed` after changing them.
     """
 
     def __init__(self, options: SensorOptions, flash: Flash, now: int, on_write: OnWrite) -> None:
@@ -73,6 +75,7 @@ class Firmware:
         self.made = 0
         self._warnings, self._warnings_until = 0, -1
         self._stuck = b""
+        self.disturbances = Disturbances(options.seed)
         self.aborts = AbortFaults()
         self._fed = 0  # when the process data watchdog was last triggered; 0 = not running
         self._number, self._data = -1, b""
@@ -86,7 +89,7 @@ class Firmware:
         """The newest process data at `now`."""
         if self._stuck:
             return self._stuck
-        number = self.clock.number_at(self.now)
+        number = self.disturbances.newest_given(self.clock.number_at(self.now))
         if number != self._number:
             if number == self._prepared_number:
                 self._data = self._prepared
@@ -97,7 +100,7 @@ class Firmware:
 
     def prepare(self, expected: int) -> None:
         """Make the sample that a frame at the time `expected` will ask for, while there is time."""
-        number = self.clock.number_at(expected)
+        number = self.disturbances.newest_given(self.clock.number_at(expected))
         if number not in (self._number, self._prepared_number) and not self._stuck:
             self._prepared = self._make(number)
             self._prepared_number = number
@@ -106,7 +109,11 @@ class Firmware:
         self.made += 1
         instant = self.clock.instant(number)
         reading = self._signal.reading(number, instant, (instant - self._signal_start) * 1e-9)
-        return self._measurement.pack(reading, self._warnings if number < self._warnings_until else 0)
+        saturated = NO_SATURATION
+        if not self._signal.exact:
+            reading, saturated = self.disturbances.apply(reading)
+        warnings = self._warnings if number < self._warnings_until else 0
+        return self._measurement.pack(reading, warnings, saturated)
 
     def _settings_changed(self) -> None:
         settings = self.dictionary.settings()
@@ -260,6 +267,20 @@ class Firmware:
         self._signal = make_signal(options)
         self._signal_start = self.clock.instant(self.clock.number_at(self.now) + 1)
         self._settings_changed()
+
+    @property
+    def exact(self) -> bool:
+        """Whether it measures a signal that nothing may change."""
+        return self._signal.exact
+
+    def disturbed(self) -> None:
+        """The disturbances were changed: they show from the next sample on."""
+        self._prepared_number = -1
+
+    def set_skip(self, percent: float) -> None:
+        """Withhold this share of the samples after the newest one."""
+        self.disturbances.set_skip(percent, self.clock.number_at(self.now))
+        self.disturbed()
 
     def set_ppm(self, ppm: float) -> None:
         """Another error of the clock, from the newest sample on."""

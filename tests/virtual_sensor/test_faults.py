@@ -2,6 +2,7 @@
 
 import json
 import struct
+from statistics import stdev
 from typing import Any
 
 import pytest
@@ -10,12 +11,14 @@ from hypothesis import strategies as st
 
 from ethercat_server.virtual_sensor.faults import COMMANDS, QuitCommand, obey
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import decode_clock
+from ethercat_server.virtual_sensor.signals import CONSTANT, decode_clock
 from ethercat_server.virtual_sensor.wire import Command
-from protocol.pdo import SampleDecoder
+from protocol.pdo import STANDARD_GRAVITY, Sample, SampleDecoder
+from protocol.warnings_register import WarningFlag
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, Abort, RawMaster, chain
 
 PERIOD = 1_250_000
+RAW = SampleDecoder(61)
 PING = (Command.BRD, 0, 0x0130, bytes(2))
 
 
@@ -123,6 +126,86 @@ def test_stick() -> None:
     assert master.inputs() == stuck
     do(master, "unstick")
     assert clock_of(master) >= 1000
+
+
+def samples(master: RawMaster, count: int) -> list[Sample]:
+    """The next samples, one each period."""
+    found = []
+    for _ in range(count):
+        master.wait(PERIOD)
+        found.append(RAW.decode(master.inputs()))
+    return found
+
+
+def test_noise_on_one_channel_only() -> None:
+    master = RawMaster(SensorOptions(signal="constant")).go(OP)
+    do(master, "noise torque.y 0.5")
+    found = samples(master, 2000)
+    torque = [sample.torque for sample in found]
+    assert stdev(t[1] for t in torque) == pytest.approx(0.5, rel=0.1)
+    assert {(t[0], t[2]) for t in torque} == {(CONSTANT[3], CONSTANT[5])}
+    assert {sample.force for sample in found} == {CONSTANT[:3]}
+    do(master, "noise torque.y 0")
+    assert {sample.torque for sample in samples(master, 10)} == {CONSTANT[3:]}
+
+
+def test_a_channel_saturates_before_the_offset_is_added() -> None:
+    master = RawMaster(SensorOptions(signal="constant")).go(OP)
+    master.download(0x8000, 3, struct.pack("<f", 100.0))
+    do(master, "limit force.z 4")
+    do(master, "limit torque.x 4")
+    do(master, "limit acceleration.z 0.5")
+    [sample] = samples(master, 1)
+    assert list(sample.force) == [*CONSTANT[:2], -4 + 100]
+    assert list(sample.torque) == list(CONSTANT[3:])
+    assert sample.acceleration[2] == STANDARD_GRAVITY / 2
+    assert sample.force_torque_saturated == 0b000100
+    assert (sample.acceleration_saturated, sample.angular_rate_saturated) == (0b100, 0)
+    assert sample.warnings == WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.ACCELERATION_SATURATED
+    do(master, "limit force.z off")
+    do(master, "limit acceleration.z off")
+    [sample] = samples(master, 1)
+    assert (sample.force[2], sample.warnings) == (CONSTANT[2] + 100, 0)
+
+
+def test_a_channel_freezes_and_thaws() -> None:
+    master = RawMaster(SensorOptions(signal="ramp")).go(OP)
+    do(master, "freeze force.x")
+    found = samples(master, 50)
+    assert len({sample.force[0] for sample in found}) == 1
+    assert len({sample.force[1] for sample in found}) == 50
+    do(master, "thaw force.x")
+    assert len({sample.force[0] for sample in samples(master, 50)}) == 50
+
+
+def test_skipped_samples_never_show() -> None:
+    master = RawMaster(SensorOptions(signal="clock")).go(OP)
+    master.wait(100 * PERIOD)
+    before = clock_of(master)
+    do(master, "skip 20")
+    assert clock_of(master) == before, "the newest sample stays as it is"
+    seen = []
+    for _ in range(5000):
+        master.wait(PERIOD - 2000)
+        seen.append(clock_of(master))
+        assert seen[-1] == clock_of(master), "a microsecond later"
+    assert sorted(seen) == seen
+    assert len(set(seen)) / 5000 == pytest.approx(0.8, abs=0.03)
+    do(master, "skip 0")
+    master.wait(PERIOD - 2000)
+    assert clock_of(master) == before + 5001
+
+
+def test_channel_faults_are_gone_with_the_power() -> None:
+    master = RawMaster(SensorOptions(signal="ramp")).go(OP)
+    for line in ("noise force.y 1", "limit force.z 0", "freeze force.x", "skip 50"):
+        do(master, line)
+    do(master, "power off")
+    do(master, "power on")
+    master.go(OP)
+    found = samples(master, 50)
+    assert len({sample.force[0] for sample in found}) == 50
+    assert all((sample.force[1] * 64).is_integer() and sample.warnings == 0 for sample in found)
 
 
 def test_swap() -> None:
@@ -292,6 +375,9 @@ def test_quit() -> None:
         "", "jump", "lose", "lose x", "lose -1", "lose 1 2", "power", "power maybe", "power cycle", "safeop",
         "safeop 0x10000", "deaf nan", "deaf -1", "ppm inf", "signal noise", "warn 1 0", "swap A", "swap é 1",
         "stick @1", "stick @x", "stick @0 @0", "abort 1 2", "abort 0x8000 256 0",
+        "noise force 1", "noise force.w 1", "noise force.x -1", "noise force.x", "limit force.x",
+        "limit force.x nan", "freeze", "freeze orientation.x", "thaw temperature",
+        "skip 91", "skip -1", "skip nan",
     ],
 )  # fmt: skip
 def test_bad_commands_are_answered_with_a_sentence(line: str) -> None:
@@ -301,10 +387,14 @@ def test_bad_commands_are_answered_with_a_sentence(line: str) -> None:
     assert "\n" not in answer
 
 
+def test_the_exact_signal_takes_no_channel_faults() -> None:
+    assert "always exact" in obey(RawMaster(SensorOptions(signal="clock")).bus, "noise force.x 1")
+
+
 def test_commands_to_a_sensor_without_power() -> None:
     master = RawMaster()
     do(master, "power off")
-    for line in ("safeop 1", "stick", "warn 1", "abort 1 1 1", "mute-mailbox 1"):
+    for line in ("safeop 1", "stick", "warn 1", "abort 1 1 1", "mute-mailbox 1", "noise force.x 1"):
         assert "power on" in obey(master.bus, line)
     do(master, "ppm 5")
     do(master, "stats")
