@@ -1,0 +1,1 @@
+"""Programs that are clients of the server or read recordings."""

@@ -1,0 +1,37 @@
+"""Values from a server's JSON: taken if they are of the right kind, else not there.
+
+Texts lose what a terminal would obey.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+_LONGEST: Final = 200
+
+
+def text(value: object) -> str:
+    """A printable text; empty if it is none."""
+    if not isinstance(value, str):
+        return ""
+    return "".join(c if c.isprintable() else "?" for c in value[:_LONGEST])
+
+
+def number(value: object) -> float | None:
+    """A number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None
+
+
+def whole(value: object) -> int | None:
+    """A whole number."""
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+def rows(value: object) -> list[dict[str, object]]:
+    """The objects in a list."""
+    return [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []
