@@ -15,6 +15,7 @@ ROOT = Path(__file__).parent.parent
 PROTOCOL = sorted((ROOT / "protocol").rglob("*.py"))
 SERVER = sorted((ROOT / "ethercat_server").rglob("*.py"))
 BRIDGE = sorted((ROOT / "ros2_bridge" / "bridge").rglob("*.py"))
+CLIENTS = sorted((ROOT / "clients").rglob("*.py"))
 OTHERS = [
     ROOT / "ros2_bridge" / "setup.py",
     *(
@@ -85,7 +86,25 @@ def test_connection_and_selection_need_no_ros() -> None:
         assert not imports(ROOT / "ros2_bridge" / "bridge" / f"{name}.py") & {"rclpy", "std_msgs"}, name
 
 
-@pytest.mark.parametrize("path", PROTOCOL + SERVER + BRIDGE + OTHERS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_nothing_imports_the_clients() -> None:
+    assert CLIENTS
+    assert not list(importers(PROTOCOL + SERVER + BRIDGE, "clients"))
+
+
+def test_the_monitor_knows_the_protocol_only() -> None:
+    monitor = [path for path in CLIENTS if path.is_relative_to(ROOT / "clients" / "monitor")]
+    allowed = set(sys.stdlib_module_names) | {"clients", "protocol", "rich", "textual"}
+    assert monitor
+    for path in monitor:
+        assert imports(path) <= allowed, path
+        others = {module for module in modules(path) if module.startswith("clients.")}
+        assert all(m == "clients.address" or m.startswith("clients.monitor") for m in others), path
+    assert [path.name for path in monitor if "textual" in imports(path)] == ["app.py"]
+
+
+@pytest.mark.parametrize(
+    "path", PROTOCOL + SERVER + BRIDGE + CLIENTS + OTHERS, ids=lambda p: str(p.relative_to(ROOT))
+)
 def test_every_file_says_what_it_is_for(path: Path) -> None:
     text = path.read_text()
     assert not text or ast.get_docstring(ast.parse(text)), path

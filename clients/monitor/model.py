@@ -1,6 +1,6 @@
 """The whole as the monitor knows it: the server, its sensors and its clients.
 
-One thread feeds it, another asks for its state; a lock keeps the two apart. It is told what time it is, except
+One thread feeds it, another asks for its state; a lock keeps the two apart. It is told what time it is, but
 for the time of day.
 """
 
@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from itertools import groupby
 from operator import attrgetter
-from typing import Final
+from typing import Any, Final
 
 from clients.monitor.sensor_model import SensorModel, spread
 from clients.monitor.state import Client, Message, ServerState, State
@@ -21,9 +21,6 @@ from clients.monitor.untrusted import number, rows, text, whole
 from protocol.control import Event
 from protocol.framing import DataMessage, JsonObject
 from protocol.pdo import ImuUnits
-
-SILENT_S: Final = 1.0
-"""A server that says nothing for so long is said to be silent: it sends a frame a sample period if it can."""
 
 _PLACE: Final = attrgetter("sensor")
 
@@ -35,7 +32,7 @@ class Model:
         self._lock = threading.Lock()
         self._address = address
         self._imu_units = imu_units
-        self._sensors: dict[int | None, SensorModel] = {}
+        self._sensors: dict[int, SensorModel] = {}
         self._connected = False
         self._since: tuple[float, str] | None = None
         self._reason = ""
@@ -95,9 +92,9 @@ class Model:
         with self._lock:
             self._heard_s = now_s
             last_10s = status.get("last_10s")
-            ages = last_10s.get("age_us") if isinstance(last_10s, dict) else None
+            ages: Any = last_10s.get("age_us") if isinstance(last_10s, dict) else None
             for position, row in enumerate(rows(status.get("sensors"))):
-                sensor = self._sensors.get(whole(row.get("sensor")))
+                sensor = self._sensor(row)
                 if sensor is not None:
                     known = isinstance(ages, list) and position < len(ages)
                     sensor.take_status(row, ages[position] if known else None)
@@ -110,7 +107,7 @@ class Model:
             self._heard_s = now_s
             place = whole(event.get("sensor"))
             name, said = text(event.get("event")), text(event.get("message"))
-            sensor = self._sensors.get(place)
+            sensor = self._sensor(event)
             if name == Event.SENSOR_LOST and sensor is not None:
                 sensor.lost(said or "The server has lost this sensor")
             elif name == Event.SENSOR_BACK and sensor is not None:
@@ -132,10 +129,10 @@ class Model:
     def state(self, now_s: float) -> State:
         """Everything now."""
         with self._lock:
-            silent_s = now_s - self._heard_s if self._connected else None
-            speaks = silent_s is not None and silent_s < SILENT_S
+            server = self._server(now_s)
+            speaks = server.connected and not server.silent
             return State(
-                server=self._server(now_s, silent_s),
+                server=server,
                 sensors=tuple(
                     self._sensors[place].state(now_s, server_speaks=speaks) for place in sorted(self._sensors)
                 ),
@@ -154,6 +151,10 @@ class Model:
                 found[place].describe(row, now_s)
         self._sensors = found
 
+    def _sensor(self, row: JsonObject) -> SensorModel | None:
+        place = whole(row.get("sensor"))
+        return None if place is None else self._sensors.get(place)
+
     def _take_clients(self, found: Iterable[JsonObject], seconds: float) -> None:
         before = {client.peer: client.sent for client in self._clients}
         clients = []
@@ -163,7 +164,7 @@ class Model:
             clients.append(Client(peer, peer == self._own_peer, rate, sent, whole(row.get("withheld")) or 0))
         self._clients = tuple(sorted(clients, key=lambda c: (not c.is_this, -c.withheld, -c.sent)))
 
-    def _server(self, now_s: float, silent_s: float | None) -> ServerState:
+    def _server(self, now_s: float) -> ServerState:
         status = self._status
         last_10s = status.get("last_10s")
         timing = last_10s if isinstance(last_10s, dict) else status
@@ -176,7 +177,7 @@ class Model:
             since_s=None if self._since is None else now_s - self._since[0],
             since_clock="" if self._since is None else self._since[1],
             reason=self._reason,
-            silent_s=silent_s,
+            heard_s=now_s - self._heard_s if self._connected else None,
             version=self._version,
             uptime_s=uptime_s,
             cycles=whole(status.get("cycles")),

@@ -19,8 +19,8 @@ from protocol.framing import DataMessage, JsonObject
 from protocol.pdo import LAYOUTS, ImuUnits, SampleDecoder
 from protocol.warnings_register import explain
 
-TRACE_STEP_S: Final = 0.2
-TRACE_STEPS: Final = 60
+TRACE_STEP_S: Final = 0.25
+TRACE_STEPS: Final = 40
 _PRESENT_S: Final = 1.0
 """A warning can be set for a single sample; it stays present for as long as a person needs to see it."""
 _SILENT_S: Final = 1.0
@@ -148,7 +148,7 @@ class SensorModel:
     def _traces(self, now_s: float) -> tuple[tuple[Range | None, ...], ...]:
         last = int(now_s / TRACE_STEP_S)
         rows = [self._trace.get(step) for step in range(last - TRACE_STEPS + 1, last + 1)]
-        return tuple(tuple(row and row[axis] for row in rows) for axis in range(len(AXES)))
+        return tuple(tuple(None if row is None else row[axis] for row in rows) for axis in range(len(AXES)))
 
     def _alerts(self, now_s: float, server_speaks: bool) -> list[Alert]:
         alerts: list[Alert] = []

@@ -14,6 +14,8 @@ WRENCH_FIELDS: Final = tuple(f.name for f in PDO_FIELDS if f.name.startswith(("f
 """The six axes of the wrench, as the process data names them."""
 AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """The same as people write them."""
+SILENT_S: Final = 1.0
+"""A server that says nothing for so long is said to be silent: it sends a frame a sample period if it can."""
 
 
 class Range(NamedTuple):
@@ -138,7 +140,7 @@ class ServerState:
     """The time of day of that."""
     reason: str = ""
     """Why it is not connected: one sentence."""
-    silent_s: float | None = None
+    heard_s: float | None = None
     """Time since anything came from it, while connected."""
     version: str = ""
     uptime_s: float | None = None
@@ -149,6 +151,11 @@ class ServerState:
     """How late its loop woke: p50 and p99 of the last ten seconds."""
     exchange_us: Spread | None = None
     """How long an exchange on the bus took: the same."""
+
+    @property
+    def silent(self) -> bool:
+        """Whether it is connected and says nothing."""
+        return self.heard_s is not None and self.heard_s >= SILENT_S
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,16 +5,12 @@ Texts lose what a terminal would obey.
 
 from __future__ import annotations
 
-from typing import Final
-
-_LONGEST: Final = 200
+from protocol.text import printable
 
 
 def text(value: object) -> str:
     """A printable text; empty if it is none."""
-    if not isinstance(value, str):
-        return ""
-    return "".join(c if c.isprintable() else "?" for c in value[:_LONGEST])
+    return printable(value) if isinstance(value, str) else ""
 
 
 def number(value: object) -> float | None:
