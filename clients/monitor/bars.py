@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -51,13 +52,13 @@ def bar(value: float, peak: Range | None, scale: float, width: int, glyphs: Glyp
 
 
 def trace(past: Sequence[Range | None], scale: float, width: int, glyphs: Glyphs) -> str:
-    """The last `width` pieces of time; of each the value furthest from the middle of them all."""
+    """The last `width` pieces of time; of each the value furthest from where most of them are."""
     shown = list(past[-width:]) if width else []
     known = [r for r in shown if r is not None]
     if not known:
         return " " * width
     low, high = min(r.low for r in known), max(r.high for r in known)
-    middle = (low + high) / 2
+    middle, usual = (low + high) / 2, statistics.median((r.low + r.high) / 2 for r in known)
     half = max((high - low) / 2, _QUIET * scale / 2)
     top = len(glyphs.levels) - 1
     drawn = []
@@ -65,7 +66,7 @@ def trace(past: Sequence[Range | None], scale: float, width: int, glyphs: Glyphs
         if piece is None:
             drawn.append(" ")
             continue
-        value = piece.high if piece.high - middle >= middle - piece.low else piece.low
+        value = piece.high if piece.high - usual >= usual - piece.low else piece.low
         drawn.append(glyphs.levels[round((value - middle + half) / (2 * half) * top)])
     return "".join(drawn).rjust(width)
 

@@ -22,11 +22,11 @@ class Glyphs(NamedTuple):
     """Marks the least value since the peaks were reset."""
     high: str
     levels: str
-    """Of a trace, lowest first."""
+    """Of a trace, lowest first; the highest leaves a gap to the row above."""
     separator: str
 
 
-UNICODE: Final = Glyphs("█", "▌", "▐", "─", "┼", "├", "┤", "▁▂▃▄▅▆▇█", "·")
+UNICODE: Final = Glyphs("█", "▌", "▐", "─", "┼", "├", "┤", "▁▂▃▄▅▆▇", "·")
 ASCII: Final = Glyphs("#", "", "", "-", "|", "[", "]", "_.,-=+*#", "|")
 
 LABEL: Final = "dim"

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clients.address import DEFAULT_HOST, DEFAULT_PORT, Address
+from clients.version import VERSION
 from protocol.pdo import ImuUnits
 
 
@@ -37,15 +38,16 @@ def parse(argv: Sequence[str] | None) -> Options:
     parser.add_argument("--json", action="store_true", help="print a JSON object a second; with --once, one")
     parser.add_argument("--seconds", type=_positive, metavar="S", help="end by itself after S seconds")
     parser.add_argument(
-        "--imu-raw-units", choices=[unit.value for unit in ImuUnits], default=ImuUnits.G_DPS.value,
-        help="what the sensor's firmware sends (default g_dps)",
+        "--imu-units", choices=[unit.value for unit in ImuUnits], default=ImuUnits.G_DPS.value,
+        help="what the sensor sends acceleration and angular rate in (default g_dps)",
     )  # fmt: skip
     parser.add_argument("--ascii", action="store_true", help="use ASCII characters only")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
     given = parser.parse_args(argv)
     if given.once and given.seconds is not None:
         parser.error("--seconds does not go with --once, which ends by itself")
     return Options(
-        given.address, given.once, given.json, given.seconds, ImuUnits(given.imu_raw_units), given.ascii
+        given.address, given.once, given.json, given.seconds, ImuUnits(given.imu_units), given.ascii
     )
 
 

@@ -55,7 +55,7 @@ def panel(sensor: SensorState, others: Sequence[SensorState], width: int, glyphs
         *_bars(sensor, "Torque", torque, range(3, 6), width, glyphs),
         *_imu(sensor),
         Row(3, field("Stream", _stream(sensor))),
-        Row(4, field("Lost", words.losses(sensor), bad=bool(sensor.stream.missed or sensor.stream.invalid))),
+        Row(4, _losses(sensor)),
         Row(5, _clock(sensor)),
     ]
 
@@ -97,6 +97,8 @@ def _identity(sensor: SensorState, others: Sequence[SensorState], width: int) ->
     lost = sensor.al_state not in {"OP", ""}
     row = Text(words.identity(sensor), BAD if lost else VALUE)
     rest = Text()
+    if sensor.old_s is not None:
+        rest.append(f" values {words.duration(sensor.old_s)} old ", ALARM)
     for other in others:
         present = any(alert.ago_s is None for alert in other.alerts)
         rest.append(f" {other.place}", LABEL)
@@ -116,6 +118,7 @@ def _bars(
     rows = [Row(4, _header(title, unit, scale, columns))]
     values = (*sensor.sample.force, *sensor.sample.torque) if sensor.sample else None
     digits = words.DIGITS[unit]
+    value_style = VALUE if sensor.old_s is None else LABEL
     for axis in axes:
         saturated = AXES[axis] in sensor.saturated
         label = f"{AXES[axis]}!" if saturated else AXES[axis]
@@ -123,7 +126,7 @@ def _bars(
         if values is None:
             rows.append(Row(0, row.append("--".rjust(_VALUE_WIDTH))))
             continue
-        row.append(words.quantity(values[axis], digits, _VALUE_WIDTH), VALUE)
+        row.append(words.quantity(values[axis], digits, _VALUE_WIDTH), value_style)
         row.append(" ")
         peak = None if peaks is None else peaks[axis]
         row.append_text(bar(values[axis], peak, scale, columns.bar, glyphs))
@@ -188,6 +191,13 @@ def _stream(sensor: SensorState) -> str:
         f"{words.rate(sensor)}   age {words.age(sensor.stream.age_us, 'worst')}   "
         f"jitter {words.jitter(sensor)}"
     )
+
+
+def _losses(sensor: SensorState) -> Text:
+    row = field("Lost", "")
+    for number, (text, bad) in enumerate(words.losses(sensor)):
+        row.append("   " if number else "").append(text, PEAK if bad else "")
+    return row
 
 
 def _clock(sensor: SensorState) -> Text:

@@ -65,9 +65,9 @@ class Reader:
             try:
                 self._read()
             except UnreachableError as error:
-                self._failed(f"no server answers at {self._address} ({error})")
+                self._failed(f"no server answers ({error})")
             except ProtocolError as error:
-                self._failed(f"the connection to {self._address} ended: {error}")
+                self._failed(f"the connection ended: {error}")
             self._closing.wait(_AGAIN_S)
 
     def _failed(self, reason: str) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Final
 
@@ -20,21 +21,25 @@ _STOP_TIMEOUT_S: Final = 20.0
 """A recording is finished by writing its summary, which takes a moment."""
 
 
-def program() -> str | None:
-    """Where the program is: beside the interpreter that runs us, or on PATH; None if it is not installed."""
+def program() -> list[str] | None:
+    """The command: what is beside the interpreter that runs us, or on PATH; None if it is not installed."""
     beside = Path(sys.executable).with_name(PROGRAM)
-    return str(beside) if beside.exists() else shutil.which(PROGRAM)
+    found = str(beside) if beside.exists() else shutil.which(PROGRAM)
+    return None if found is None else [found]
 
 
 class Recorder:
     """At most one recording at a time."""
 
-    def __init__(self, address: Address, directory: Path | None = None) -> None:
+    def __init__(
+        self, address: Address, directory: Path | None = None, command: Sequence[str] | None = None
+    ) -> None:
+        """Recordings go to `directory`, by default the current one; `command` stands in for `program()`."""
         self._address = address
         self._directory = directory or Path.cwd()
+        self._command = command
         self._process: subprocess.Popen[bytes] | None = None
         self._said: IO[bytes] | None = None
-        self._path = Path()
         self._since_s = 0.0
 
     @property
@@ -48,16 +53,16 @@ class Recorder:
 
     def start(self, now_s: float) -> tuple[str, bool]:
         """Begin one; what to say of it, and whether it is bad news."""
-        found = program()
-        if found is None:
+        command = self._command or program()
+        if command is None:
             return f"{PROGRAM} is not installed: pip install 'bota-ethercat-bridge[tools]'", True
-        self._path = self._directory / time.strftime("recording-%Y%m%d-%H%M%S.mcap")
+        name = time.strftime("recording-%Y%m%d-%H%M%S.mcap")
         said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
-        command = [found, str(self._path), "--server", str(self._address)]
         try:
             # A session of its own: Ctrl-C on our terminal is for us, and we stop it in order.
             self._process = subprocess.Popen(
-                command,
+                [*command, name, str(self._address)],
+                cwd=self._directory,
                 stdin=subprocess.DEVNULL,
                 stdout=said,
                 stderr=said,
@@ -67,7 +72,7 @@ class Recorder:
             said.close()
             return f"{PROGRAM} cannot be started: {error.strerror or error}", True
         self._said, self._since_s = said, now_s
-        return f"Recording to {self._path.name}", False
+        return f"Recording to {name}", False
 
     def stop(self) -> None:
         """Ask it to end; `ended` tells when it has."""
@@ -80,10 +85,10 @@ class Recorder:
         if self._process is None or self._process.poll() is None:
             return None
         code, self._process = self._process.returncode, None
-        last = self._last_words()
-        if code == 0 and self._path.exists():
-            return f"Recorded {self._path.name}, {self._path.stat().st_size / 1e6:.1f} MB", False
-        return f"{PROGRAM} failed: {last or f'exit code {code}'}", True
+        last = self._last_words().removeprefix(f"{PROGRAM}: ")
+        if code == 0:
+            return f"Recorded {last}" if last else "The recording has ended", False
+        return f"The recording failed: {last or f'exit code {code}'}", True
 
     def close(self) -> str | None:
         """End what is running and wait for it; what to say of it, if anything."""

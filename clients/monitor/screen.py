@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,9 +14,9 @@ from clients.monitor.panel import Row, alerts, field, panel
 from clients.monitor.state import State
 
 KEYS: Final = (
-    ("t", "tare", "the selected sensor's reading becomes zero, in the sensor; asks before"),
-    ("r", "record", "begin or end a recording with ethercat-record, into this folder"),
-    ("p", "pause", "hold the picture still; samples and peaks are counted on"),
+    ("t", "tare", "make this sensor's reading zero, in the sensor; asks first"),
+    ("r", "record", "begin or end a recording, by ethercat-record into this folder"),
+    ("p", "pause", "hold the picture; samples and peaks are counted on"),
     ("0", "reset", "peaks and past warnings begin anew"),
     ("n", "next", "the next sensor of the chain"),
     ("?", "help", "this page"),
@@ -23,7 +24,7 @@ KEYS: Final = (
 )
 """Key, its short name, what it does."""
 
-_SHARED_ROWS: Final = 6
+_MESSAGE_ROWS_FROM: Final = 12
 _PANEL_ROWS: Final = 18
 _LEAST_WIDTH: Final = 24
 _LEAST_HEIGHT: Final = 8
@@ -62,11 +63,11 @@ def _overview(state: State, look: Look, width: int, height: int) -> list[Text]:
     shared = [Row(3, _server(state)), Row(6, _clients(state, width))]
     if not state.server.connected and state.server.since_s is not None:
         shared[0] = Row(1, shared[0].text)
-    foot = [Row(1, _message(state, look)), Row(2, _keys(look, width))]
+    foot = [*_message(state, look, width, height), _keys(look, width)]
     body = _sensors(state, look, width, height - len(head) - len(shared) - len(foot))
     rows = _dropped([*head, *body, *shared], height - len(foot))
     blank = [Text()] * (height - len(foot) - len(rows))
-    return [*(row.text for row in rows), *blank, *(row.text for row in foot)]
+    return [*(row.text for row in rows), *blank, *foot]
 
 
 def _sensors(state: State, look: Look, width: int, height: int) -> list[Row]:
@@ -140,12 +141,15 @@ def _clients(state: State, width: int) -> Text:
     return field("Clients", text)
 
 
-def _message(state: State, look: Look) -> Text:
+def _message(state: State, look: Look, width: int, height: int) -> list[Text]:
+    """What was said last; the server's sentences may be longer than a row."""
+    text, style = state.events[-1] if state.events else "", LABEL
     if look.question:
-        return Text(f" {look.question} ", NOTICE)
-    if state.message is not None:
-        return Text(state.message.text, BAD if state.message.bad else "")
-    return Text(state.events[-1] if state.events else "", LABEL)
+        text, style = look.question, NOTICE
+    elif state.message is not None:
+        text, style = state.message.text, BAD if state.message.bad else ""
+    most = 3 if height >= _MESSAGE_ROWS_FROM else 1
+    return [Text(line, style) for line in textwrap.wrap(text, width)[:most]] or [Text()]
 
 
 def _keys(look: Look, width: int) -> Text:
@@ -169,8 +173,8 @@ def _help(state: State) -> list[Text]:
     rows += [
         Text(line)
         for line in (
-            "Bars are about zero; their scale grows with the peaks. ├ and ┤ mark the least",
-            "and the greatest value since the reset, of every sample.",
+            "Bars are about zero; their scale grows with the peaks, which are marked and",
+            "miss no sample. A trace has a scale of its own; a column of it is 0.25 s.",
             "age     of a sample as it comes here; only on the server's own machine",
             "jitter  of the intervals between the samples' stamps",
             "lost    on the bus since the server's start; on the way here since connecting",

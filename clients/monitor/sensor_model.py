@@ -12,28 +12,30 @@ import operator
 from collections.abc import Sequence
 from typing import Any, Final
 
-from clients.monitor.state import AXES, WRENCH_FIELDS, Alert, Clock, Range, SensorState, Spread
+from clients.monitor.state import AXES, SILENT_S, WRENCH_FIELDS, Alert, Clock, Range, SensorState, Spread
 from clients.monitor.stream_meter import StreamMeter
 from clients.monitor.untrusted import number, text, whole
 from protocol.framing import DataMessage, JsonObject
 from protocol.pdo import LAYOUTS, ImuUnits, SampleDecoder
-from protocol.warnings_register import explain
+from protocol.warnings_register import WarningFlag, explain
 
 TRACE_STEP_S: Final = 0.25
 TRACE_STEPS: Final = 40
 _PRESENT_S: Final = 1.0
 """A warning can be set for a single sample; it stays present for as long as a person needs to see it."""
-_SILENT_S: Final = 1.0
 
 _COMMON: Final = LAYOUTS[min(LAYOUTS)]
 """What every size of process data begins with."""
 _WRENCH: Final = tuple(_COMMON.index(name) for name in WRENCH_FIELDS)
 _WARNINGS: Final = _COMMON.index("warnings")
 _SATURATION: Final = (
-    (_COMMON.index("force_torque_saturated"), AXES),
-    (_COMMON.index("acceleration_saturated"), ("ax", "ay", "az")),
-    (_COMMON.index("angular_rate_saturated"), ("ωx", "ωy", "ωz")),
+    ("force_torque_saturated", AXES, WarningFlag.FORCE_TORQUE_SATURATED),
+    ("acceleration_saturated", ("ax", "ay", "az"), WarningFlag.ACCELERATION_SATURATED),
+    ("angular_rate_saturated", ("ωx", "ωy", "ωz"), WarningFlag.ANGULAR_RATE_SATURATED),
 )
+"""Field, the axis that each of its bits stands for, and the warning that goes with it."""
+_SATURATION_COLUMNS: Final = tuple((_COMMON.index(field), names) for field, names, _ in _SATURATION)
+_AXES_OF: Final = {int(flag): names for _, names, flag in _SATURATION}
 
 
 class SensorModel:
@@ -107,7 +109,7 @@ class SensorModel:
             bit = register & -register
             self._warned_s[bit] = now_s
             register ^= bit
-        for index, names in _SATURATION:
+        for index, names in _SATURATION_COLUMNS:
             bits = functools.reduce(operator.or_, set(columns[index]))
             if bits:
                 for place, name in enumerate(names):
@@ -123,6 +125,8 @@ class SensorModel:
         sample = None
         if self._newest is not None:
             sample = SampleDecoder(len(self._newest), self._imu_units).decode(self._newest)
+        stream = self.meter.state(now_s)
+        silent_s = 0.0 if stream.silent_s is None else stream.silent_s
         present = (name for name, at_s in self._saturated_s.items() if now_s - at_s < _PRESENT_S)
         return SensorState(
             place=self.place,
@@ -134,11 +138,12 @@ class SensorModel:
             raw_counts=settings.get("calibration_matrix") is False,
             imu_off=settings.get("imu_active") == 0,
             sample=sample,
+            old_s=silent_s if silent_s >= SILENT_S else None,
             peaks=self._peaks,
             traces=self._traces(now_s),
             saturated=frozenset(present),
             alerts=tuple(self._alerts(now_s, server_speaks)),
-            stream=self.meter.state(now_s),
+            stream=stream,
             clock=_clock(clock) if isinstance(clock, dict) else None,
             bus_lost=whole(self._status.get("lost_samples")),
             recoveries=whole(self._status.get("recoveries")),
@@ -160,11 +165,14 @@ class SensorModel:
             ago = _ago(self._not_finite_s, now_s)
             remedy = "Switch the sensor off and on; if it stays, contact support"
             alerts.append(Alert("error", "Force/torque is not a finite number", remedy, ago))
-        for bit, at_s in self._warned_s.items():
+        for bit in {**self._warned_s, **self._saturation_bits()}:
             (row,) = explain(bit)
-            alerts.append(Alert(row.severity.value, row.meaning, row.remedy, _ago(at_s, now_s)))
-        if self._saturated_s:
-            alerts.extend(self._saturations(now_s))
+            axes = [name for name in _AXES_OF.get(bit, ()) if name in self._saturated_s]
+            at_s = max(
+                self._warned_s.get(bit, -math.inf), *(self._saturated_s[name] for name in axes), -math.inf
+            )
+            meaning = f"{row.meaning}: {', '.join(axes)}" if axes else row.meaning
+            alerts.append(Alert(row.severity.value, meaning, row.remedy, _ago(at_s, now_s)))
         rank = {"fatal": 0, "error": 1, "warning": 2}
         return sorted(alerts, key=lambda a: (-1.0 if a.ago_s is None else a.ago_s, rank.get(a.severity, 3)))
 
@@ -173,19 +181,13 @@ class SensorModel:
         since_s = stream.silent_s
         if since_s is None and self._started_s is not None:
             since_s = now_s - self._started_s
-        if since_s is None or since_s < _SILENT_S:
+        if since_s is None or since_s < SILENT_S:
             return []
         return [Alert("error", f"No new sample for {since_s:.0f} s", "Check the sensor and its cable", None)]
 
-    def _saturations(self, now_s: float) -> list[Alert]:
-        alerts = []
-        for present in (True, False):
-            seen = {n: t for n, t in self._saturated_s.items() if (now_s - t < _PRESENT_S) is present}
-            if seen:
-                text = f"Saturated: {', '.join(seen)}"
-                remedy = "Do not use these axes while they are"
-                alerts.append(Alert("error", text, remedy, _ago(max(seen.values()), now_s)))
-        return alerts
+    def _saturation_bits(self) -> dict[int, None]:
+        """The warnings that saturated axes amount to, also where the sensor does not set them."""
+        return {bit: None for bit, names in _AXES_OF.items() if self._saturated_s.keys() & set(names)}
 
 
 def spread(values: Any, worst: str = "p99") -> Spread | None:

@@ -106,6 +106,8 @@ class SensorState:
     """Force and torque are counts, not N and Nm: the calibration matrix is off."""
     imu_off: bool = False
     sample: Sample | None = None
+    old_s: float | None = None
+    """How old its values are, if they are too old to be taken for present ones."""
     peaks: tuple[Range, ...] | None = None
     """Of the six axes, since the peaks were reset; every sample counts."""
     traces: tuple[tuple[Range | None, ...], ...] = ((),) * len(AXES)

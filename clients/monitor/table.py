@@ -98,7 +98,7 @@ def _sensor(sensor: SensorState) -> list[str]:
     rows += [
         f"  stream    {words.rate(sensor)}, age {words.age(stream.age_us, 'worst')}, "
         f"jitter {words.jitter(sensor)}",
-        f"  lost      {' '.join(words.losses(sensor).split())}, gaps {stream.gaps}",
+        f"  lost      {', '.join(text for text, _ in words.losses(sensor))}, gaps {stream.gaps}",
         f"  clock     {words.clock(sensor)}, age at hand-out {words.age(sensor.hand_out_us, 'p99')}",
     ]
     for alert in sensor.alerts:

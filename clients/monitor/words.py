@@ -68,7 +68,7 @@ def trouble(server: ServerState) -> str | None:
     if server.since_s is None:
         return None
     if not server.connected:
-        return f"gone since {server.since_clock}: {server.reason}; trying again"
+        return f"gone at {server.since_clock}: {server.reason}; trying again"
     if server.silent and server.heard_s is not None:
         return f"nothing came for {duration(server.heard_s)}: it may be stopped, or its machine too busy"
     return None
@@ -98,13 +98,15 @@ def jitter(sensor: SensorState) -> str:
     return f"{stream.jitter_us:.0f} µs, worst {stream.jitter_worst_us:.0f}"
 
 
-def losses(sensor: SensorState) -> str:
-    """What did not come, or came in vain."""
+def losses(sensor: SensorState) -> list[tuple[str, bool]]:
+    """What did not come, or came in vain: in words, and whether it did."""
     stream = sensor.stream
-    return (
-        f"{count(sensor.bus_lost)} on the bus, {stream.missed} on the way here   "
-        f"repeated {stream.repeated}   invalid {stream.invalid}"
-    )
+    return [
+        (f"{count(sensor.bus_lost)} on the bus", bool(sensor.bus_lost)),
+        (f"{stream.missed} on the way here", bool(stream.missed)),
+        (f"repeated {stream.repeated}", bool(stream.repeated)),
+        (f"invalid {stream.invalid}", bool(stream.invalid)),
+    ]
 
 
 def clock(sensor: SensorState) -> str:
