@@ -105,6 +105,7 @@ class Monitor(App[None]):
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGHUP):
             loop.add_signal_handler(number, self.exit)
+        self.app_resume_signal.subscribe(self, lambda _: self.repaint())
         self.set_interval(REFRESH_S, self.draw)
         if self._seconds is not None:
             self.set_timer(self._seconds, self.exit)
@@ -127,6 +128,10 @@ class Monitor(App[None]):
         look = replace(self._look, recording=recording)
         self._view.show(render(state, look, *self._view.size))
 
+    def repaint(self) -> None:
+        """Draw everything again: something else has written on the terminal."""
+        self._view.refresh()
+
     def action_help_quit(self) -> None:
         """Ctrl-C ends it: whoever presses that does not want to be taught another key."""
         self.exit()
@@ -136,7 +141,9 @@ class Monitor(App[None]):
         if event.key in {"ctrl+c", "ctrl+q", "ctrl+z"}:
             return
         event.stop()
-        if self._look.question:
+        if event.key == "ctrl+l":
+            self.repaint()
+        elif self._look.question:
             self._answer(event.character in {"y", "Y"})
         elif self._look.help:
             self._look = replace(self._look, help=False)

@@ -79,13 +79,12 @@ class Model:
                 if sensor is not None:
                     sensor.take(list(of_one), now_s)
 
-    def note_ages(self, frames: Sequence[DataMessage], now_ns: int) -> None:
-        """These frames came at this moment of CLOCK_MONOTONIC, and not before."""
+    def note_age(self, frame: DataMessage, now_ns: int) -> None:
+        """This frame came at this moment of CLOCK_MONOTONIC, and not before."""
         with self._lock:
-            for frame in frames:
-                sensor = self._sensors.get(frame.sensor)
-                if sensor is not None and not frame.flags & OLD:
-                    sensor.meter.note_age((now_ns - frame.monotonic_ns) * 1e-3, now_ns * 1e-9)
+            sensor = self._sensors.get(frame.sensor)
+            if sensor is not None and not frame.flags & OLD:
+                sensor.meter.note_age((now_ns - frame.monotonic_ns) * 1e-3, now_ns * 1e-9)
 
     def take_status(self, status: JsonObject, now_s: float) -> None:
         """A reply to `status`."""

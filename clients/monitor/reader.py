@@ -1,7 +1,7 @@
 """The thread that reads the server into the model, and connects again whenever it must.
 
 It wakes some twenty times a second, not for every sample: it takes all that has piled up, then waits for one
-sample more. That one was not waited with, so the moment it comes tells the age of a sample on arrival.
+sample more. For that one it was awake, so the moment it comes tells the age of a sample on arrival.
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ _NEXT_SAMPLE_S: Final = 0.1
 _AGAIN_S: Final = 0.5
 _ANSWER_TIMEOUT_S: Final = 10.0
 """A server that answers nothing for so long is as good as gone."""
-_MOST_AT_ONCE: Final = 4
-"""More frames than that together have waited somewhere: their age is not that of an arrival."""
 
 
 class Reader:
@@ -51,7 +49,7 @@ class Reader:
         self._closing.set()
         client = self._client
         if client is not None:
-            client.close()
+            client.connection.shutdown()  # not close: the thread may be waiting for it
         self._thread.join(timeout=2.0)
 
     def wait_for_answer(self, timeout_s: float) -> bool:
@@ -95,8 +93,10 @@ class Reader:
         fresh = client.receive(_NEXT_SAMPLE_S)
         now_ns = time.monotonic_ns()
         self._model.take(piled_up + fresh, now_ns * 1e-9)
-        if client.connection.same_machine and len(fresh) <= _MOST_AT_ONCE:
-            self._model.note_ages(fresh, now_ns)
+        if client.connection.same_machine:
+            first = {frame.sensor: frame for frame in reversed(fresh)}
+            for frame in first.values():
+                self._model.note_age(frame, now_ns)
         while client.events:
             event = client.events.popleft()
             self._model.take_event(event, now_ns * 1e-9)

@@ -20,7 +20,7 @@ KEYS: Final = (
     ("0", "reset", "peaks and past warnings begin anew"),
     ("n", "next", "the next sensor of the chain"),
     ("?", "help", "this page"),
-    ("q", "quit", "end; Ctrl-C too"),
+    ("q", "quit", "end; Ctrl-C too. Ctrl-L draws everything again"),
 )
 """Key, its short name, what it does."""
 

@@ -110,7 +110,8 @@ def fed(model: Model, sensors: int, frames: Mapping[int, Values] | None = None) 
             for place in range(sensors)
         ]
         model.take(batch, now(numbers[-1]))
-        model.note_ages(batch[-sensors:], batch[-1].monotonic_ns + 190_000 + first * first % 61_000)
+        for last in batch[-sensors:]:
+            model.note_age(last, last.monotonic_ns + 190_000 + first * first % 61_000)
     return now(count - 1)
 
 

@@ -189,8 +189,8 @@ def test_silence_is_the_sensors_only_if_the_server_speaks(model: Model) -> None:
 
 def test_the_age_is_that_of_a_new_sample_on_arrival(model: Model) -> None:
     for k, age_us in enumerate((300, 200, 900)):
-        model.note_ages([frame(k)], frame(k).monotonic_ns + age_us * 1000)
-    model.note_ages([frame(3, flags=DataFlag.REPEATED)], frame(3).monotonic_ns + 10**9)
+        model.note_age(frame(k), frame(k).monotonic_ns + age_us * 1000)
+    model.note_age(frame(3, flags=DataFlag.REPEATED), frame(3).monotonic_ns + 10**9)
     age = only(model, now(4)).stream.age_us
     assert age is not None
     assert tuple(age) == pytest.approx((300, 900), abs=0.01)

@@ -19,8 +19,8 @@ from typing import Any
 import pytest
 
 from clients.address import Address
-from clients.monitor.cli import main
 from clients.monitor.model import Model
+from clients.monitor.options import parse
 from clients.monitor.reader import Reader
 from clients.monitor.state import State
 from clients.monitor.tare import tare
@@ -131,7 +131,7 @@ def test_once_without_a_server_is_exit_1_and_one_sentence() -> None:
 )
 def test_wrong_usage_is_exit_2(arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        main(arguments)
+        parse(arguments)
     assert ended.value.code == 2
 
 
