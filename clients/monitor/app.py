@@ -119,7 +119,7 @@ class Monitor(App[None]):
         now_s = self._clock()
         ended = self.recorder.ended()
         if ended is not None:
-            self._model.say(ended[0], bad=ended[1])
+            self._say(*ended)
         state = self._model.state(now_s)
         if self._look.paused and self._state is not None:
             state = replace(self._state, message=state.message)
@@ -168,7 +168,7 @@ class Monitor(App[None]):
         return sensors[self._look.selected % len(sensors)] if sensors else None
 
     def _say(self, text: str, bad: bool = False) -> None:
-        self._model.say(text, bad=bad)
+        self._model.say(f"{clock_text()} {text}", bad=bad)
 
     def _ask_tare(self) -> None:
         sensor = self._selected()
@@ -204,7 +204,7 @@ class Monitor(App[None]):
 
     def _reset(self) -> None:
         self._model.reset()
-        self._say(f"Peaks and past warnings reset at {clock_text()}")
+        self._say("Peaks and past warnings are reset")
 
     def _next(self) -> None:
         count = len(self._state.sensors) if self._state else 0

@@ -149,7 +149,9 @@ def _message(state: State, look: Look, width: int, height: int) -> list[Text]:
     elif state.message is not None:
         text, style = state.message.text, BAD if state.message.bad else ""
     most = 3 if height >= _MESSAGE_ROWS_FROM else 1
-    return [Text(line, style) for line in textwrap.wrap(text, width)[:most]] or [Text()]
+    return [Text(line, style) for line in textwrap.wrap(text, width, break_on_hyphens=False)[:most]] or [
+        Text()
+    ]
 
 
 def _keys(look: Look, width: int) -> Text:

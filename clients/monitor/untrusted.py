@@ -24,8 +24,10 @@ def number(value: object) -> float | None:
 
 
 def whole(value: object) -> int | None:
-    """A whole number."""
-    return value if isinstance(value, int) and not isinstance(value, bool) else None
+    """A whole number of a size that counts have."""
+    if isinstance(value, bool) or not isinstance(value, int) or abs(value) >= 1 << 64:
+        return None
+    return value
 
 
 def rows(value: object) -> list[dict[str, object]]:

@@ -258,6 +258,12 @@ def test_odd_replies_are_borne(odd: Any) -> None:
     for key in status()["sensors"][0]:
         model.take_status({**status(), "sensors": [{**status()["sensors"][0], key: odd}]}, START_S)
         model.state(START_S)
+    for key in status()["clients"][0]:
+        for sent in (0, 1):
+            model.take_status(
+                {**status(sent=sent), "clients": [{**status()["clients"][0], key: odd}]}, START_S + sent
+            )
+            model.state(START_S)
     model.take_event({"event": odd, "sensor": odd, "message": odd}, START_S)
     model.take_event({"event": Event.SENSOR_LOST, "sensor": 0, "message": odd}, START_S)
     assert "\\x1b" not in repr(model.state(START_S))  # as repr would write it

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import random
 import re
 from dataclasses import replace
 
@@ -10,9 +12,13 @@ from rich.text import Text
 
 from clients.monitor.bars import bar, scale_for, trace
 from clients.monitor.glyphs import ASCII, UNICODE
+from clients.monitor.json_line import json_line
+from clients.monitor.model import Model
 from clients.monitor.screen import KEYS, Look, render
-from clients.monitor.state import Range, State
+from clients.monitor.state import Client, Range, State
+from clients.monitor.table import table
 from clients.monitor.words import duration, quantity
+from protocol.framing import DataMessage
 from tests.clients import monitor_states as made
 from tests.clients.captures import DOCS, captures
 
@@ -182,3 +188,27 @@ def test_text_from_the_server_is_shown_as_it_is() -> None:
     odd = replace(state, sensors=(replace(state.sensors[0], name="[bold]x[/]"),))
     assert "[bold]x[/]" in plain(odd)
     assert isinstance(render(odd, Look(), 80, 24)[1], Text)
+
+
+def test_whatever_a_sensor_sends_is_shown() -> None:
+    noise = random.Random(1)
+    model = Model(made.ADDRESS)
+    model.connected(made.description(), made.OWN_PEER, made.START_S)
+    for k in range(300):
+        data = noise.randbytes(77)
+        sequence, stamp_ns, monotonic_ns = (noise.getrandbits(64) for _ in range(3))
+        odd = DataMessage(sequence, stamp_ns, monotonic_ns, 0, noise.getrandbits(3), 0xFFFF, data)
+        model.take([odd], made.now(k))
+        state = model.state(made.now(k))
+        render(state, Look(glyphs=ASCII if k % 2 else UNICODE), 80, 24)
+        assert table(state)[-1].startswith(("Not fine: ", "Fine."))
+        json.loads(json_line(state, 0.0))
+
+
+def test_clients_that_do_not_fit_are_counted() -> None:
+    crowd = tuple(Client(f"127.0.0.1:{40000 + n}", n == 0, 800.0, 10, 0) for n in range(30))
+    text = plain(replace(made.healthy(), clients=crowd))
+    (row,) = (line for line in text.splitlines() if line.startswith("Clients"))
+    shown = row.count("800/s")
+    assert shown >= 2
+    assert row.endswith(f"and {30 - shown} more")
