@@ -91,6 +91,14 @@ def test_frames_that_did_not_come_are_counted_and_make_no_jitter(model: Model) -
     assert sensor.stream.jitter_worst_us == 0
 
 
+def test_the_time_that_a_sensor_was_silent_is_no_jitter(model: Model) -> None:
+    flags = dict.fromkeys(range(50, 60), DataFlag.REPEATED)
+    steady = [
+        frame(k, flags=flags.get(k, 0))._replace(monotonic_ns=10**12 + k * made.PERIOD_NS) for k in range(100)
+    ]
+    assert take(model, *steady).stream.jitter_worst_us == 0
+
+
 def test_jitter_is_the_spread_of_the_intervals(model: Model) -> None:
     shifted = [
         frame(k)._replace(monotonic_ns=10**12 + k * made.PERIOD_NS + (50_000 if k % 2 else 0))
@@ -259,10 +267,9 @@ def test_odd_replies_are_borne(odd: Any) -> None:
         model.take_status({**status(), "sensors": [{**status()["sensors"][0], key: odd}]}, START_S)
         model.state(START_S)
     for key in status()["clients"][0]:
-        for sent in (0, 1):
-            model.take_status(
-                {**status(sent=sent), "clients": [{**status()["clients"][0], key: odd}]}, START_S + sent
-            )
+        clients = [{**status()["clients"][0], key: odd}]
+        for seconds in (0, 1):
+            model.take_status({**status(), "clients": clients}, START_S + seconds)
             model.state(START_S)
     model.take_event({"event": odd, "sensor": odd, "message": odd}, START_S)
     model.take_event({"event": Event.SENSOR_LOST, "sensor": 0, "message": odd}, START_S)
