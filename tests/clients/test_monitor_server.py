@@ -246,7 +246,11 @@ def test_every_sample_is_counted_and_the_ages_are_below_a_period_or_so(shared: S
 
 
 def test_tare_says_what_is_left(shared: Server) -> None:
-    text, bad = tare(Address("localhost", shared.port), 1)
+    for _ in range(5):  # the virtual tool touches something every seven seconds
+        text, bad = tare(Address("localhost", shared.port), 1)
+        if not bad:
+            break
+        assert "not at rest" in text
     assert not bad
     assert re.fullmatch(r"Sensor 1 is tared; what is left is at most [0-9.]+ N and [0-9.]+ Nm", text)
 
