@@ -379,9 +379,9 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
 @pytest.mark.bus
 @needs_bus
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("ros", [(), ("--ros",)], ids=["frames", "ros"])
-def test_two_sensors_at_1600_hz_for_a_minute(out: Path, ros: tuple[str, ...]) -> None:
-    """Nothing lost between server and file, under 15 % of a core. On a quiet machine."""
+@pytest.mark.parametrize(("ros", "most"), [((), 0.15), (("--ros",), 0.25)], ids=["frames", "ros"])
+def test_two_sensors_at_1600_hz_for_a_minute(out: Path, ros: tuple[str, ...], most: float) -> None:
+    """Nothing lost between server and file, under 15 % of a core; with three ROS messages a frame, 25 %."""
     seconds = 60
     with server("virtual", "--virtual", "--sensors 2", "--set", "sinc_length=32") as running:
         recorder = Recorder(out, running.port, "--seconds", str(seconds), *ros)
@@ -402,7 +402,7 @@ def test_two_sensors_at_1600_hz_for_a_minute(out: Path, ros: tuple[str, ...]) ->
     assert "could not be written" not in said
     assert is_whole(frames)
     assert len(frames) > 0.95 * 2 * 1600 * seconds
-    assert spent < 0.15 * seconds
+    assert spent < most * seconds
     with Reader(out) as bag:  # another library's
         counts = {connection.topic: connection.msgcount for connection in bag.connections}
     assert counts[frame_topic(0)] + counts[frame_topic(1)] == len(frames)
