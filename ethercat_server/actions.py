@@ -1,15 +1,18 @@
-"""What the server does for each request: the control channel's actions."""
+"""What the server does for each request: the control channel's actions.
+
+It knows what produces the frames and what answers for the sensors only by what it asks of them, so that a
+replay, which has no bus, can be served by it too.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Container, Mapping, Sequence
+from typing import Any, Protocol
 
 from ethercat_server import __version__
 from ethercat_server.connection import Connection, Subscription
-from ethercat_server.cycle import Cycle
 from ethercat_server.hub import Hub
-from ethercat_server.sensor_actions import SensorActions
 from protocol.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
 from protocol.errors import RequestError
 from protocol.framing import JsonObject
@@ -17,12 +20,54 @@ from protocol.framing import JsonObject
 log = logging.getLogger(__name__)
 
 
+class Producer(Protocol):
+    """What produces the frames: the server's `Cycle`."""
+
+    def status(self) -> dict[str, Any]:
+        """Its part of the `status` reply."""
+        ...
+
+    def stop(self) -> None:
+        """End soon."""
+        ...
+
+
+class Described(Protocol):
+    """A sensor."""
+
+    def describe(self) -> dict[str, Any]:
+        """Its part of the `describe` reply."""
+        ...
+
+
+class OnSensors(Protocol):
+    """What answers for the sensors: the server's `SensorActions`."""
+
+    @property
+    def sensors(self) -> Sequence[Described]:
+        """All of them, by place."""
+        ...
+
+    @property
+    def handlers(self) -> Container[str]:
+        """The actions that it takes."""
+        ...
+
+    def handle(self, connection: Connection, request: Request) -> None:
+        """Take one, and answer later through the hub; RequestError refuses it."""
+        ...
+
+
 class Actions:
     """Answers requests. One method an action, found by its name."""
 
-    def __init__(self, hub: Hub, cycle: Cycle, on_sensors: SensorActions) -> None:
+    def __init__(
+        self, hub: Hub, cycle: Producer, on_sensors: OnSensors, extra: Mapping[str, Any] | None = None
+    ) -> None:
+        """`extra` is what `describe` says besides."""
         self._hub = hub
         self._cycle = cycle
+        self._extra = extra or {}
         self._on_sensors = on_sensors
         self._sensors = on_sensors.sensors
         self._handlers: dict[str, Callable[[Connection, Request], JsonObject]] = {
@@ -57,6 +102,7 @@ class Actions:
             protocol=PROTOCOL_VERSION,
             version=__version__,
             sensors=[sensor.describe() for sensor in self._sensors],
+            **self._extra,
         )
 
     def _subscribe(self, connection: Connection, request: Request) -> JsonObject:

@@ -100,6 +100,7 @@ def test_of_the_clients_only_the_replay_uses_the_server() -> None:
 
 def test_recordings_are_opened_in_one_place() -> None:
     assert set(importers(PROTOCOL + SERVER + BRIDGE + CLIENTS, "mcap")) <= {
+        "clients/recording/chunk.py",
         "clients/recording/container.py",
         "clients/recording/writer.py",
     }

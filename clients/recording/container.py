@@ -14,24 +14,20 @@ from __future__ import annotations
 
 import os
 import struct
-import zlib
 from collections.abc import Collection, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, TypeVar
 
-import lz4.frame
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema
 
+from clients.recording.chunk import HEAD_SIZE, MESSAGE, Chunk, records_in
 from clients.recording.errors import DamagedError, NotARecordingError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-MAX_CHUNK: Final = 64 * 1024 * 1024
-"""Bytes of a chunk, packed or unpacked. Ours have some hundred kilobytes."""
 MAX_SMALL_RECORD: Final = 1024 * 1024
 """Bytes of any other record that is read whole."""
 MAX_CHANNELS: Final = 4096
@@ -39,14 +35,10 @@ MAX_CHUNKS: Final = 2_000_000
 """Ten days at two a second."""
 
 _RECORD: Final = struct.Struct("<BQ")
-_CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _INDEX_ENTRY: Final = 16
-_MESSAGE: Final = struct.Struct("<HIQQ")
-_U64: Final = struct.Struct("<Q")
 _FOOTER: Final = struct.Struct("<BQQQI8s")
-_COMPRESSIONS: Final = {"": 0, "lz4": 3, "zstd": 4}
-"""The compressions there are, and the length of their names."""
+"""With the magic behind it: the last bytes of a file that was ended."""
 
 _Record = TypeVar("_Record", Channel, Header, Metadata, Schema)
 
@@ -57,17 +49,6 @@ class RawMessage(NamedTuple):
     channel: int
     log_time_ns: int
     body: memoryview
-
-
-class _Chunk(NamedTuple):
-    offset: int
-    """Where its packed data begins."""
-    packed_size: int
-    size: int
-    crc: int
-    compression: str
-    counts: dict[int, int]
-    """Messages in it by channel, as its index has it; filled in while the file is walked."""
 
 
 class McapFile:
@@ -89,7 +70,7 @@ class McapFile:
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, Schema] = {}
         self.cut_off: str | None = None
-        self._chunks: list[_Chunk] = []
+        self._chunks: list[Chunk] = []
         self._file: BinaryIO = path.open("rb")
         try:
             self._size = os.fstat(self._file.fileno()).st_size
@@ -176,22 +157,11 @@ class McapFile:
             raise NotARecordingError(f"{self.path} has messages outside of chunks: a recording has none")
         return end
 
-    def _chunk_at(self, body: int, length: int) -> _Chunk:
-        head = self._read_at(body, min(length, _CHUNK_HEAD.size + 16))
+    def _chunk_at(self, body: int, length: int) -> Chunk:
         try:
-            _, _, size, crc, name_length = _CHUNK_HEAD.unpack_from(head)
-            name = head[_CHUNK_HEAD.size : _CHUNK_HEAD.size + name_length].decode("ascii", "replace")
-            (packed,) = _U64.unpack_from(head, _CHUNK_HEAD.size + min(name_length, 16))
-        except struct.error:
-            raise self._damaged(body, "a chunk's head is not whole") from None
-        if _COMPRESSIONS.get(name) != name_length:
-            raise self._damaged(body, f"a chunk is compressed with {name[:8]!r}: zstd and lz4 are known")
-        if not max(size, packed) <= MAX_CHUNK:
-            raise self._damaged(body, f"a chunk claims {max(size, packed)} bytes, more than {MAX_CHUNK}")
-        offset = body + _CHUNK_HEAD.size + name_length + _U64.size
-        if offset + packed > body + length:
-            raise self._damaged(body, "a chunk claims more data than it has")
-        return _Chunk(offset, packed, size, crc, name, {})
+            return Chunk.of(self._read_at(body, min(length, HEAD_SIZE)), body, length)
+        except ValueError as error:
+            raise self._damaged(body, str(error)) from None
 
     def _take_index(self, body: int, length: int) -> None:
         try:
@@ -215,7 +185,7 @@ class McapFile:
 
     # -- chunks
 
-    def _learn(self, chunk: _Chunk) -> None:
+    def _learn(self, chunk: Chunk) -> None:
         """Get to know the channels of `chunk`, and count its messages if it has no index."""
         if chunk.counts and all(channel in self.channels for channel in chunk.counts):
             return
@@ -239,45 +209,21 @@ class McapFile:
             if channel not in self.channels:
                 raise self._damaged(chunk.offset, f"a message is on channel {channel}, which there is not")
 
-    def _unpack(self, chunk: _Chunk) -> memoryview:
-        packed = self._read_at(chunk.offset, chunk.packed_size)
+    def _unpack(self, chunk: Chunk) -> memoryview:
         try:
-            if chunk.compression == "zstd":
-                # The library would allocate whatever the data claims.
-                if zstandard.frame_content_size(packed) not in (-1, chunk.size):
-                    raise self._damaged(chunk.offset, "a chunk's size contradicts itself")
-                data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=chunk.size)
-            elif chunk.compression == "lz4":
-                data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=chunk.size)
-            else:
-                data = packed
-        except (zstandard.ZstdError, RuntimeError, EOFError):
-            raise self._damaged(chunk.offset, "a chunk cannot be decompressed") from None
-        if len(data) != chunk.size:
-            raise self._damaged(chunk.offset, f"a chunk has {len(data)} bytes and claims {chunk.size}")
-        if chunk.crc and zlib.crc32(data) != chunk.crc:
-            raise self._damaged(chunk.offset, "a chunk's CRC is wrong")
-        return memoryview(data)
+            return chunk.unpack(self._read_at(chunk.offset, chunk.packed_size))
+        except ValueError as error:
+            raise self._damaged(chunk.offset, str(error)) from None
 
     def _records_in(self, body: memoryview, offset: int) -> Iterator[tuple[int, int, int]]:
-        """Opcode, start and end of the body of every record in a chunk."""
-        position, size = 0, len(body)
-        while position < size:
-            if position + _RECORD.size > size:
-                raise self._damaged(offset, "a record in a chunk is not whole")
-            opcode, length = _RECORD.unpack_from(body, position)
-            position += _RECORD.size
-            if length > size - position or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
-                raise self._damaged(offset, f"a record in a chunk claims {length} bytes")
-            yield opcode, position, position + length
-            position += length
+        return records_in(body, lambda what: self._damaged(offset, what))
 
     def _messages_in(self, body: memoryview, wanted: frozenset[int], offset: int) -> Iterator[RawMessage]:
         for opcode, start, end in self._records_in(body, offset):
             if opcode == Opcode.MESSAGE:
-                channel, _, log_time_ns, _ = _MESSAGE.unpack_from(body, start)
+                channel, _, log_time_ns, _ = MESSAGE.unpack_from(body, start)
                 if channel in wanted:
-                    yield RawMessage(channel, log_time_ns, body[start + _MESSAGE.size : end])
+                    yield RawMessage(channel, log_time_ns, body[start + MESSAGE.size : end])
 
     # -- bytes
 

@@ -64,9 +64,7 @@ class DiskFile:
             with contextlib.suppress(OSError):
                 os.truncate(self._fd, self._written)
             self._position = self._written
-            raise DiskError(
-                f"{self.path} cannot be written: {(error.strerror or 'unknown error').lower()}"
-            ) from None
+            raise DiskError(f"{self.path} cannot be written: {error.strerror}") from None
         self._written = self._position
 
     def sync(self) -> None:

@@ -35,6 +35,7 @@ class RecordOptions:
     rotate_seconds: float | None
     force: bool
     wait: bool
+    reconnect: bool
 
 
 def parse_options(argv: Sequence[str] | None) -> RecordOptions:
@@ -64,15 +65,17 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add("--rotate-seconds", type=_rotate_seconds, metavar="S", help="begin a new file every S seconds")
     add("--force", action="store_true", help="replace files that exist")
     add("--wait", action="store_true", help="wait for a server that is not there yet")
+    add("--no-reconnect", action="store_false", dest="reconnect",
+        help="end when the server does, instead of waiting for its return")  # fmt: skip
     add("--version", action="version", version=f"%(prog)s {VERSION}")
-    given = parser.parse_args(argv)
+    given = parser.parse_intermixed_args(argv)
     if given.namespaces is not None and not given.ros:
         parser.error("--ros-namespace goes with --ros")
     sensors = tuple(sorted(set(given.sensors))) if given.sensors else None
     return RecordOptions(
         given.path, given.address, sensors, given.seconds, given.ros,
         tuple(given.namespaces) if given.namespaces else None, ImuUnits(given.imu_units),
-        given.rotate_size, given.rotate_seconds, given.force, given.wait,
+        given.rotate_size, given.rotate_seconds, given.force, given.wait, given.reconnect,
     )  # fmt: skip
 
 

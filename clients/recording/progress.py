@@ -48,6 +48,8 @@ class Progress:
         if now < self._next:
             return
         terminal = self._console.is_terminal
+        if not (connected or terminal):
+            return  # that the server is away was said once
         self._next = now + (_SHOW_EVERY_S if terminal else _LINE_EVERY_S)
         line = self._line(recorder, now, connected=connected)
         if terminal:

@@ -1,0 +1,25 @@
+"""`ethercat-replay`: hears signals from the first moment on, says what is not installed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from clients.signals import Signals
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the program; returns its exit code."""
+    signals = Signals()
+    try:
+        # Takes a moment, in which Ctrl-C is to be heard already.
+        from clients.replay.program import run  # noqa: PLC0415
+    except ImportError as error:
+        missing = f"{error.name} is not installed: pip install 'bota-ethercat-bridge[tools]'"
+        print(f"ethercat-replay: {missing}", file=sys.stderr)
+        return 1
+    return run(argv, signals)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,311 @@
+"""`ethercat-replay` as a process: a client cannot tell it from a server, but for its `describe`."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridge.connection import Connection
+from protocol.client import connect
+from protocol.control import ErrorCode
+from protocol.errors import RefusedError
+from protocol.framing import DataMessage
+from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
+from tests.clients.running import Client, Replay, free_port, replaying
+
+COUNT = 400
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
+@pytest.fixture
+def frames(path: Path) -> list[DataMessage]:
+    return record(
+        path, (frame(n // 2, sensor=n % 2, flags=4 if n == 50 else 0) for n in range(COUNT)), sensors=(0, 1)
+    )
+
+
+def play(path: Path, *arguments: str) -> list[DataMessage]:
+    """All that a client gets from a replay that runs once."""
+    with replaying(*arguments, path) as served, connect(served.port, fresh_only=False) as client:
+        frames = list(client.frames())
+        assert served.wait() == 0
+    return frames
+
+
+def samples(path: Path, *arguments: str) -> list[object]:
+    with replaying(*arguments, path) as served, connect(served.port) as client:
+        return list(client)
+
+
+def test_the_first_client_gets_everything_from_the_first_frame_on(
+    path: Path, frames: list[DataMessage]
+) -> None:
+    assert play(path, "--original-stamps") == frames
+
+
+def test_moved_stamps_are_near_now_and_keep_their_spacing(path: Path, frames: list[DataMessage]) -> None:
+    began = time.time_ns(), time.monotonic_ns()
+    played = play(path)
+    offset = played[0].stamp_ns - frames[0].stamp_ns
+    assert all(new.stamp_ns - old.stamp_ns == offset for old, new in zip(frames, played, strict=True))
+    assert began[0] < played[0].stamp_ns < time.time_ns()
+    assert began[1] < played[0].monotonic_ns < time.monotonic_ns()
+    for old, new in zip(frames, played, strict=True):
+        assert new._replace(stamp_ns=0, monotonic_ns=0) == old._replace(stamp_ns=0, monotonic_ns=0)
+
+
+def test_the_same_recording_gives_the_same_values_always(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    first, again, fast = samples(path), samples(path), samples(path, "--speed", "20")
+    assert first == again == fast
+    assert len(first) == COUNT
+
+
+def test_it_keeps_the_original_timing(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    with replaying(path) as served, connect(served.port) as client:
+        began = time.monotonic()
+        list(client.frames())
+        assert time.monotonic() - began >= (COUNT / 2 - 1) * PERIOD_NS / 1e9
+
+
+def test_it_loops_with_numbers_that_go_on(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    with replaying("--loop", "--speed", "50", path) as served, connect(served.port, sensors=[1]) as client:
+        played = []
+        for item in client.frames():
+            played.append(item)
+            if len(played) == COUNT:  # twice
+                break
+    numbers = [item.sequence for item in played]
+    assert all(b - a >= 1 for a, b in pairwise(numbers))
+    assert numbers[-1] >= COUNT - 1
+    assert all(b.stamp_ns > a.stamp_ns for a, b in pairwise(played))
+
+
+def test_several_recordings_are_played_one_after_the_other(tmp_path: Path) -> None:
+    first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    record(first, (frame(n) for n in range(10)))
+    record(second, (frame(n, **{"force.z": 1}) for n in range(10)))
+    with replaying("--speed", "max", first, second) as served, connect(served.port) as client:
+        played = list(client.frames())
+        assert client.description["replay"]["files"] == ["a.mcap", "b.mcap"]
+    assert [item.sequence for item in played] == list(range(20))
+
+
+def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(
+    path: Path, frames: list[DataMessage]
+) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with replaying("--original-stamps", path) as served, connect(served.port, fresh_only=False) as client:
+        played = list(client.frames())
+        assert "was cut off" in served.said()
+    assert 0 < len(played) < COUNT
+    assert played == frames[: len(played)]
+
+
+def test_step_by_step(path: Path, frames: list[DataMessage]) -> None:
+    with (
+        replaying("--step", "--original-stamps", path) as served,
+        connect(served.port, fresh_only=False) as client,
+    ):
+        stdin = served.process.stdin
+        assert stdin is not None
+        assert client.receive(0.2) == []
+        for line, count in (("\n", 1), ("3\n", 3), ("\n\n", 2)):
+            stdin.write(line)
+            stdin.flush()
+            got: list[DataMessage] = []
+            while len(got) < count:
+                got += client.receive(5)
+            assert got == frames[:count]
+            assert client.receive(0.1) == []
+            frames = frames[count:]
+        stdin.close()
+        assert list(client.frames()) == []
+        assert served.wait() == 0
+
+
+# -- what clients may ask
+
+
+def test_describe_says_that_it_is_a_replay(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    with replaying("--speed", "2", "--loop", path) as served, Client(served.port) as client:
+        reply = client.ask("describe")
+    assert reply["replay"] == {
+        "files": ["run.mcap"], "recorded": "?", "recorded_version": "?", "pace": 2.0, "loop": True,
+        "stamps": "moved",
+    }  # fmt: skip
+    assert reply["sensors"] == describe(0, 1)["sensors"]
+    assert reply["protocol"] == 1
+
+
+def test_status_has_what_a_server_s_has(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    with replaying("--loop", path) as served, connect(served.port) as client:
+        client.receive(2)
+        status = client.ask("status")
+    assert {
+        "cycles",
+        "missed_deadlines",
+        "lost_frames",
+        "wake_us",
+        "exchange_us",
+        "last_10s",
+        "clients",
+        "uptime_s",
+    } <= (status.keys())
+    assert {"p50", "p99", "p999", "max"} == status["wake_us"].keys()
+    assert [row["sensor"] for row in status["sensors"]] == [0, 1]
+    assert status["sensors"][0]["fresh"] > 0
+    assert status["sensors"][0]["clock"]["period_us"] == 1250
+    assert status["clients"][0]["sent"] > 0
+
+
+@pytest.mark.parametrize(
+    ("action", "values"),
+    [
+        ("configure", {"settings": {"sinc_length": 64}}),
+        ("tare", {}),
+        ("sdo_read", {"index": 0x8010, "subindex": 1}),
+        ("sdo_write", {"index": 0x8010, "subindex": 1, "hex": "00"}),
+    ],
+)
+def test_what_needs_a_sensor_is_refused_in_a_sentence(
+    path: Path, frames: list[DataMessage], action: str, values: dict[str, Any]
+) -> None:
+    del frames
+    with replaying("--loop", path) as served, connect(served.port) as client:
+        with pytest.raises(RefusedError, match="this is a replay of a recording") as refused:
+            client.ask(action, **values)
+        assert refused.value.code == ErrorCode.NOT_READY
+        assert client.receive(2)
+
+
+def test_the_node_takes_it_for_a_server(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    with replaying("--loop", path) as served:
+        connection = Connection("localhost", served.port)
+        info = connection.subscribe(1)
+        assert (info.sensor, info.serial, info.rate, info.settings) == (1, "101", 800, {"sinc_length": 64})
+        while not isinstance(connection.next_message(), DataMessage):
+            connection.receive()
+        connection.close()
+
+
+def test_shutdown_ends_it(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    with replaying("--loop", path) as served, connect(served.port) as client:
+        client.ask("shutdown")
+        assert served.wait() == 0
+        assert "stopped after" in served.said()
+
+
+def test_what_happened_happens_again(path: Path) -> None:
+    made = writer(path)
+    made.describe(START_NS, describe(0))
+    made.frame(frame(0))
+    made.event(START_NS, {"event": "sensor_lost", "sensor": 0, "reason": "gone", "message": "gone"})
+    made.event(START_NS, {"event": "shutting_down"})
+    made.event(START_NS, {"event": "connected", "source": "recorder"})
+    made.frame(frame(1, flags=2))
+    made.event(START_NS, {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}})
+    made.frame(frame(2))
+    made.finish({})
+    with replaying("--step", path) as served, connect(served.port, fresh_only=False) as client:
+        stdin = served.process.stdin
+        assert stdin is not None
+        stdin.write("2\n")
+        stdin.flush()
+        while not client.receive(5) or not client.events:
+            pass
+        assert client.ask("describe")["sensors"][0]["state"] == "lost"
+        stdin.write("\n")
+        stdin.flush()
+        stdin.close()
+        assert len(list(client.frames())) >= 1
+        assert [event["event"] for event in client.events] == ["sensor_lost", "reconfigured", "shutting_down"]
+
+
+# -- arguments and what is not there
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    command = [sys.executable, "-m", "clients.replay.cli", *map(str, arguments)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=30)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((), "required"),
+        (("x.mcap", "99999"), "out of range"),
+        (("x.mcap", "--speed", "0"), "it must be a number"),
+        (("x.mcap", "--speed", "nan"), "it must be a number"),
+        (("x.mcap", "--speed", "2", "--step"), "not allowed with"),
+        (("x.mcap", "--host", "nowhere"), "an IP address of this machine"),
+    ],
+)
+def test_wrong_arguments_are_exit_code_2(arguments: tuple[str, ...], sentence: str) -> None:
+    code, said = run(*arguments)
+    assert code == 2
+    assert sentence in said
+
+
+def test_a_file_that_is_no_recording_is_said(path: Path) -> None:
+    code, said = run(path)
+    assert (code, "No such file" in said) == (1, True)
+    path.write_text("hello")
+    code, said = run(path)
+    assert (code, "is not an MCAP file" in said) == (1, True)
+
+
+def test_a_port_that_is_taken_is_said(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    with replaying(path) as served:
+        code, said = run(path, served.port)
+    assert code == 1
+    assert "is taken by another program" in said
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_before_anybody_came(path: Path, frames: list[DataMessage], number: int) -> None:
+    del frames
+    served = Replay(path, port=free_port()).wait_listening()
+    try:
+        served.signal(number)
+        assert served.wait() == 0
+        assert "Traceback" not in served.said()
+    finally:
+        served.close()
+
+
+def test_a_damaged_recording_ends_it_with_a_sentence(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    data = bytearray(path.read_bytes())
+    position = data.index(b"zstd", 4000) + 100
+    data[position] ^= 0xFF
+    path.write_bytes(data)
+    with replaying("--speed", "max", path) as served, connect(served.port) as client:
+        list(client.frames())
+        assert served.wait() == 1
+        assert "is damaged at byte" in served.said()
+
+
+def test_it_needs_no_bus() -> None:
+    code = "import sys, clients.replay.program, clients.recording.program; sys.exit('pysoem' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
