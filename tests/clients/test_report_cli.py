@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from clients.report import cli
+from clients.report import cli, program
 from clients.report.live import Received
 from protocol.framing import DataMessage
 from tests.clients.recordings import writer
@@ -178,10 +180,22 @@ def test_ctrl_c_leaves_nothing(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "render", interrupted)
+    monkeypatch.setattr(program, "render", interrupted)
     code, _, err = ended(capsys, recording, "-o", tmp_path / "r.html")
     assert (code, err) == (1, "ethercat-report: stopped: no report was written\n")
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_not_installed_is_said(recording: Path) -> None:
+    script = (
+        "import sys; sys.modules['scipy'] = sys.modules['scipy.signal'] = None; "
+        "from clients.report.cli import main; "
+        f"sys.exit(main([{str(recording)!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "is not installed: pip install 'bota-ethercat-bridge[tools]'" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_received_frames_are_told_apart_by_sensor(frames: list[DataMessage]) -> None:

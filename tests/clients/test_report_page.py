@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from PIL import Image
 
@@ -247,12 +248,26 @@ def test_spans_of_time() -> None:
 # In a browser.
 
 
-def near(picture: Path, colour: str, within: int = 30) -> int:
-    """How many pixels of about this colour there are."""
-    wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)], dtype=np.int16)
+Floats32 = npt.NDArray[np.float32]
+
+
+def pixels_of(picture: Path) -> Floats32:
+    """(n, 3)"""
     with Image.open(picture) as image:
-        pixels = np.asarray(image.convert("RGB"), dtype=np.int16)
-    return int(np.sum(np.abs(pixels - wanted).max(axis=2) <= within))
+        return np.asarray(image.convert("RGB"), dtype=np.float32).reshape(-1, 3)
+
+
+def rgb(colour: str) -> Floats32:
+    return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)], dtype=np.float32)
+
+
+def drawn(pixels: Floats32, colour: str, paper: str) -> int:
+    """How many pixels are of this colour, or of it mixed with the paper: bands, and edges of thin lines."""
+    towards = rgb(colour) - rgb(paper)
+    off = pixels - rgb(paper)
+    part = off @ towards / float(towards @ towards)
+    aside = np.abs(off - part[:, None] * towards).max(axis=1)
+    return int(np.sum((part > 0.3) & (part < 1.1) & (aside < 16)))
 
 
 LIGHT = {"paper": "#ffffff", "x": "#c44601", "y": "#00795c", "z": "#1763c6", "bad": "#b3201b"}
@@ -267,10 +282,12 @@ def test_chromium_draws_it_in_the_light_and_in_the_dark(
     source, picture = tmp_path / "report.html", tmp_path / "drawn.png"
     source.write_text(page, encoding="utf-8")
     assert screenshot(source, picture, 700, 4200, *options) == "", "the console is silent"
-    for name, colour in theme.items():
-        assert colour in page
-        assert near(picture, colour) > (1_000_000 if name == "paper" else 500), name
-    assert near(picture, other["paper"], 3) < 5_000
+    pixels, paper = pixels_of(picture), theme["paper"]
+    assert np.sum(np.abs(pixels - rgb(paper)).max(axis=1) < 2) > len(pixels) // 2
+    assert np.sum(np.abs(pixels - rgb(other["paper"])).max(axis=1) < 2) < len(pixels) // 100
+    for name in ("x", "y", "z", "bad"):
+        assert theme[name] in page
+        assert drawn(pixels, theme[name], paper) > 2000, name
 
 
 @needs_chromium
