@@ -31,7 +31,7 @@ def test_garbage_in_every_file(tmp_path: Path, number: int) -> None:
     assert faults(machine(tmp_path, dict.fromkeys(GOOD, GARBAGE[number]))) == []
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.dictionaries(st.sampled_from(sorted(GOOD)), st.one_of(st.text(max_size=40), st.binary(max_size=40)))
 )
