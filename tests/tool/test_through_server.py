@@ -18,7 +18,10 @@ Bench = tuple[Veth, Program, Server]
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
     with (
-        virtual_sensor("--sensors", "2", "--serial", "10,20", "--pdo", "77", "--signal", "rest") as (veth, sensor),
+        virtual_sensor("--sensors", "2", "--serial", "10,20", "--pdo", "77", "--signal", "rest") as (
+            veth,
+            sensor,
+        ),
         server(veth.near, "--rt-priority", "0") as running,
     ):
         yield veth, sensor, running
