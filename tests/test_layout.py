@@ -77,7 +77,7 @@ def test_pysoem_is_used_in_at_most_one_file() -> None:
 
 
 def test_ros_is_used_by_the_bridge_only() -> None:
-    for name in ("rclpy", "std_msgs", "diagnostic_msgs", "sensor_msgs", "geometry_msgs"):
+    for name in ("rclpy", "std_msgs", "diagnostic_msgs", "sensor_msgs", "geometry_msgs", "tf2_ros"):
         assert not list(importers(PROTOCOL + SERVER, name))
 
 

@@ -34,7 +34,7 @@ _LOOKING_UP: Final = "the bias of this sensor is being looked up"
 
 
 class CompensationControl:
-    """Wires parameters, bias and source to `output`."""
+    """Wires parameters, bias and source to `output`, from `start` to `close`."""
 
     def __init__(
         self,
@@ -63,9 +63,13 @@ class CompensationControl:
         self._next_origin = FROM_PARAMETER
         self._check(self.parameters)
         self._history = BiasHistory(self.parameters.bias, self.parameters.bias_ramp_time)
-        self.source = self._open_source(self.parameters)
+        self.source: Source = NoSource()
         self._live = LiveParameters(node, self._check, self._apply)
         self._guard = node.create_guard_condition(self._follow_sensor)
+
+    def start(self) -> None:
+        """Open the orientation's source, which may take a thread; before any sample comes."""
+        self.source = self._open_source(self.parameters)
         self._make_plan()
 
     def close(self) -> bool:

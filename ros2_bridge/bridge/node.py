@@ -111,6 +111,7 @@ def _spin(node: BridgeNode) -> int:
     call_on_stop_signal(lambda _signal: node.finish(0))
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    node.compensation.start()
     node.reader.start()
     node.monitor.start()
     try:

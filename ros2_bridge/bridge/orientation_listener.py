@@ -29,6 +29,7 @@ from bridge.orientation_messages import (
 
 TF_PERIOD_S: Final = 0.005
 """How often TF is asked."""
+TF_TOPICS: Final = ("/tf", "/tf_static")
 
 
 class OrientationListener:
@@ -53,8 +54,12 @@ class OrientationListener:
             name,
             context=node.context,
             namespace=node.get_namespace(),
-            # Remapped as a name of `bridge`'s; what renames that node must not rename this one.
+            # Topics are remapped as `bridge`'s are, but what renames that node must not rename this one.
             use_global_arguments=False,
+            cli_args=[
+                "--ros-args",
+                *(word for tf in TF_TOPICS for word in ("-r", f"{tf}:={node.resolve_topic_name(tf)}")),
+            ],
             start_parameter_services=False,
             enable_rosout=False,
         )

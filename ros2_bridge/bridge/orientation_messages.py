@@ -114,7 +114,7 @@ def check_tf() -> None:
     except ImportError as error:
         raise ParameterError(
             f"parameter orientation_source is 'tf': it needs tf2_ros, which cannot be loaded ({error}): "
-            "sudo apt install ros-$ROS_DISTRO-tf2-ros and source ROS 2, or take another source"
+            "sudo apt install ros-$ROS_DISTRO-tf2-ros-py and source ROS 2, or take another source"
         ) from None
 
 
@@ -123,6 +123,6 @@ def open_tf(node: Any) -> Tf:
     from rclpy.time import Time  # noqa: PLC0415
     from tf2_ros import Buffer, TransformException, TransformListener  # noqa: PLC0415 - see check_tf
 
-    buffer = Buffer(node=node)
+    buffer = Buffer()
     node.transform_listener = TransformListener(buffer, node, spin_thread=False)
     return Tf(buffer, TransformException, Time())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -182,3 +184,31 @@ def test_a_kept_bias_that_was_taken_with_another_tool(bench: Bench) -> None:
     node = bench.start()
     assert bench.first() == pytest.approx(ZERO6, abs=1e-5)
     node.says("was taken with a tool of 1.5 kg, and now there is no tool_mass: tare again")
+
+
+def test_the_node_ends_while_a_tare_waits(bench: Bench, stream: Stream) -> None:
+    node = bench.start(**{"rest.duration": 30.0})
+    calling = threading.Thread(target=lambda: bench.listener.trigger("tare"), daemon=True)
+    calling.start()
+    diagnostics = Diagnostics(bench.listener)
+    diagnostics.next()  # the stream and the diagnostics do not wait for it
+    bench.stages.forget()
+    assert bench.stages.final.get(timeout=20)
+    time.sleep(1.0)
+    began = time.monotonic()
+    node.send_signal(signal.SIGINT)
+    assert node.ends() == 0
+    assert time.monotonic() - began < 10  # not the 30 s
+    assert "Traceback" not in node.log
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"settings.sinc_length": 1}, {"tool_mass": -1.0}, {"gravity": "[0.0, 0.0, 0.0]"}]
+)
+def test_a_wrong_parameter_ends_the_node_with_a_sentence(
+    server: ScriptedServer, start: Start, wrong: dict[str, Any]
+) -> None:
+    node = start(server.port, orientation_source="topic_imu", **wrong)
+    assert node.ends() == 1
+    assert f"bridge-client: parameter {next(iter(wrong))}" in node.log
+    assert "Traceback" not in node.log

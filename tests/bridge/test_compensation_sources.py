@@ -298,7 +298,7 @@ def test_the_orientation_is_taken_in_while_a_service_waits(
             "no such name!",
             "'no such name!': topic name must not contain",
         ),
-        ("orientation_source", "tf", "sudo apt install ros-$ROS_DISTRO-tf2-ros"),
+        ("orientation_source", "tf", "sudo apt install ros-$ROS_DISTRO-tf2-ros-py"),
     ],
 )
 def test_a_source_that_cannot_be_had(
@@ -417,6 +417,32 @@ def test_the_source_tf(ros_node: Node) -> None:
     assert not failures
 
 
+@pytest.mark.usefixtures("_ros")
+def test_topics_are_remapped_as_those_of_the_node_are() -> None:
+    """`-r /tf:=...` is meant for what listens to TF, whichever node it is; `-r __node:=...` is not."""
+    remaps = ["--ros-args", "-r", "__node:=left", "-r", "/tf:=/left/tf", "-r", "pose:=/left/pose"]
+    node = rclpy.create_node("bridge", namespace="/test_remap", cli_args=remaps)
+    hidden: list[Node] = []
+
+    def opened(listening: Node) -> Tf:
+        hidden.append(listening)
+        return Tf(FakeBuffer(), FakeTfError, None)
+
+    failures: list[str] = []
+    by_tf = OrientationListener(node, OrientationParameters("tf"), "ft", failures.append, opened)
+    by_topic = OrientationListener(node, OrientationParameters("topic_pose", "pose"), "ft", failures.append)
+    try:
+        assert hidden[0].get_name() == "_left_orientation"
+        assert hidden[0].resolve_topic_name("/tf") == "/left/tf"
+        assert hidden[0].resolve_topic_name("/tf_static") == "/tf_static"
+        assert by_topic.describe == "topic /left/pose"
+    finally:
+        assert by_tf.close()
+        assert by_topic.close()
+        node.destroy_node()
+    assert not failures
+
+
 def test_a_listener_that_fails_is_told(ros_node: Node) -> None:
     class Broken:
         def lookup_transform(self, target_frame: str, source_frame: str, time: Any) -> Any:
@@ -441,7 +467,7 @@ def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node
 
     class Buffer:
         def __init__(self, cache_time: Any = None, node: Any = None) -> None:
-            made.append(node)
+            made.append(self)
 
     class TransformListener:
         def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
@@ -458,12 +484,12 @@ def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node
     assert isinstance(tf.buffer, Buffer)
     assert tf.errors is FakeTfError
     assert tf.latest.nanoseconds == 0
-    assert made == [ros_node, (tf.buffer, ros_node, False)]
+    assert made == [tf.buffer, (tf.buffer, ros_node, False)]
 
 
 def test_without_tf2_ros(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tf2_ros", None)
-    with pytest.raises(ParameterError, match=r"sudo apt install ros-.*-tf2-ros and source ROS 2, or take"):
+    with pytest.raises(ParameterError, match=r"sudo apt install ros-.*-tf2-ros-py and source ROS 2, or take"):
         check_tf()
 
 

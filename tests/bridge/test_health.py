@@ -8,6 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
+from bridge.compensation_state import CompensationState
 from bridge.connection import SensorInfo
 from bridge.health import Level, Status, judge, text_of
 from bridge.parameters import Thresholds
@@ -17,6 +18,7 @@ from bridge.watch import Flags, Watch
 from protocol.framing import DataMessage
 from protocol.pdo import encode
 from protocol.warnings_register import WARNINGS, Severity
+from tests.compensation.making import BIAS, TOOL
 
 pytestmark = pytest.mark.ros
 SAFEOP = SensorInfo(0, "", "", "", "SAFEOP")
@@ -27,6 +29,10 @@ GOOD = Snapshot(
     flags=Flags(), temperature=30.0, server={"sensors": [{"clock": {"mode": "locked"}}]}, new_server_lost=0,
     answer_s=0.0,
 )  # fmt: skip
+
+
+STOPPED = CompensationState(has_subscribers=True, why_stopped="why")
+FULL = CompensationState(has_subscribers=True, payload=TOOL, inertia=True, bias=BIAS)
 
 
 def statuses(**changes: Any) -> dict[str, Status]:
@@ -46,6 +52,12 @@ def test_good_is_good() -> None:
         ("sensor", Level.STALE, "see link", {"connected": False}),
         ("clock", Level.STALE, "see stream", {"connected": False}),
         ("link", Level.WARN, "has not answered for 3 s", {"answer_s": 3.0}),
+        ("compensation", Level.STALE, "see stream", {"connected": False}),
+        ("compensation", Level.ERROR, "has stopped: why", {"compensation": STOPPED}),
+        ("compensation", Level.WARN, "3 samples were not compensated", {"new_withheld": 3}),
+        ("compensation", Level.WARN, "not kept", {"compensation": CompensationState(problem="not kept")}),
+        ("compensation", Level.OK, "bias, gravity and inertia are subtracted", {"compensation": FULL}),
+        ("compensation", Level.OK, "bias is subtracted", {"compensation": CompensationState(bias=BIAS)}),
         ("link", Level.WARN, "again", {"connects": 2, "new_connects": 1}),
         ("stream", Level.ERROR, "no new sample for 0.6 s", {"silent_s": 0.6}),
         ("stream", Level.ERROR, "stopped or overloaded", {"silent_s": 2.0, "answer_s": 1.5}),
