@@ -92,7 +92,7 @@ def test_frames_that_the_bus_loses_are_no_lost_samples() -> None:
         ("limit torque.y 0.3", "Saturation", "Torque y was saturated in"),
         ("limit angular_rate.x 5", "Saturation", "Angular rate x was saturated in"),
         ("freeze torque.x", "Stuck values", "Torque x stood at"),
-        ("freeze acceleration.y", "Stuck values", "Acceleration y stood at"),
+        ("freeze angular_rate.y", "Stuck values", "Angular rate y stood at"),
         ("skip 2", "Lost samples", "are missing, in"),
     ],
 )
