@@ -227,7 +227,7 @@ def _rows(description: JsonObject) -> list[JsonObject]:
 
 
 def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) and 0 < value <= 1e9 else 0.0
+    return float(value) if isinstance(value, int | float) and 0 < value < 2**32 else 0.0
 
 
 def _text(value: object) -> str:

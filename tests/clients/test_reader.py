@@ -75,6 +75,16 @@ def test_sensors_are_told_apart(path: Path) -> None:
         assert list(recording.frames(7)) == []
 
 
+def test_every_serial_number_is_read(path: Path) -> None:
+    made = writer(path)
+    described = describe(0)
+    described["sensors"][0]["serial"] = 2**32 - 1
+    made.describe(START_NS, described)
+    made.finish({})
+    with open_recording(path) as recording:
+        assert [s.serial for s in recording.sensors] == [2**32 - 1]
+
+
 def test_settings_are_known_over_time(path: Path) -> None:
     made = writer(path)
     made.describe(START_NS, describe(0, chop=False))
