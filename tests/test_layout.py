@@ -140,6 +140,15 @@ def test_one_version() -> None:
         assert found[1] == version, name
 
 
+def test_every_package_of_python_files_is_installed() -> None:
+    listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
+    setup = (ROOT / "ros2_bridge" / "setup.py").read_text()
+    for path in PROTOCOL + SERVER + BRIDGE + CLIENTS:
+        package = ".".join(path.relative_to(ROOT).parent.parts).removeprefix("ros2_bridge.")
+        assert package in listed, path
+        assert not package.startswith("bridge") or f'"{package}"' in setup, path
+
+
 def test_the_ros_package_is_whole() -> None:
     package = ROOT / "ros2_bridge"
     manifest = (package / "package.xml").read_text()

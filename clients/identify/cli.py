@@ -11,8 +11,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Identify; returns the exit code."""
     # It only reads, so Ctrl-C may end it anywhere, and at once.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from clients.identify.command import run  # noqa: PLC0415 - NumPy takes a while to load
-
+    try:
+        from clients.identify.program import run  # noqa: PLC0415 - NumPy takes a while to load
+    except ImportError as error:
+        missing = f"{error.name} is not installed: pip install 'bota-ethercat-bridge[tools]'"
+        print(f"ethercat-identify: {missing}", file=sys.stderr)
+        return 1
     return run(argv)
 
 

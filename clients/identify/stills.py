@@ -83,7 +83,7 @@ def _good(columns: Columns, rows: Floats) -> Bools:
 def _parts(times: Floats) -> Iterator[slice]:
     """Where the recording goes on without a gap; a server that was started again may have another clock."""
     steps = np.diff(times)
-    breaks = np.flatnonzero((steps <= 0.0) | (steps > _LONGEST_GAP_S)) + 1
+    breaks = np.flatnonzero((steps < -_BLOCK_S) | (steps > _LONGEST_GAP_S)) + 1
     bounds = [0, *breaks.tolist(), len(times)]
     for begin, end in itertools.pairwise(bounds):
         if end - begin >= 3 * _BLOCK_SAMPLES:

@@ -110,6 +110,8 @@ class Source:
             if isinstance(message, DataMessage):
                 batch.append(message)
             elif "event" in message:
+                if message.get("source") == RECORDER:
+                    del message["source"]  # what the recorder notes is its own
                 batch.append(Event(time.time_ns(), message))
                 if message["event"] in _CHANGES:
                     self._ask(client, "describe")

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from bridge.compensation.parameter_file import read_yaml
-from clients.identify.command import run
+from clients.identify.program import run
 from clients.identify.stills import find_stills
 from clients.recording.columns import columns
 from clients.recording.reader import open_recording
@@ -226,3 +226,15 @@ def test_a_reader_that_has_had_enough_is_no_traceback(recording: Path) -> None:
         assert program.stderr is not None
         assert program.stderr.read() == ""
         assert program.wait(timeout=30) == 1
+
+
+def test_what_is_not_installed_is_said(tmp_path: Path) -> None:
+    (tmp_path / "numpy.py").write_text("raise ModuleNotFoundError('no', name='numpy')")
+    hidden = subprocess.run(
+        [sys.executable, "-c", "import sys; sys.path.insert(0, sys.argv.pop(1)); "
+         "from clients.identify.cli import main; sys.exit(main(['x.mcap']))", str(tmp_path)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert hidden.returncode == 1
+    said = "ethercat-identify: numpy is not installed: pip install 'bota-ethercat-bridge[tools]'\n"
+    assert hidden.stderr == said

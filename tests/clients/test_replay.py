@@ -295,5 +295,5 @@ def test_a_damaged_recording_ends_it_with_a_sentence(path: Path, frames: list[Da
 
 
 def test_it_needs_no_bus() -> None:
-    code = "import sys, clients.replay.cli, clients.recording.cli; sys.exit('pysoem' in sys.modules)"
+    code = "import sys, clients.replay.program, clients.recording.program; sys.exit('pysoem' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

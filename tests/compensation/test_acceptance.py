@@ -70,6 +70,11 @@ def within_three_sigma(left: Rows, sinc: int = SINC) -> Rows:
     return share
 
 
+def truth(times: Rows) -> Rows:
+    """What the tool of `scene` is touched with, (n, 6)."""
+    return np.array([contact(float(time_s)) for time_s in times])
+
+
 def smooth(left: Rows, count: int = 40) -> Rows:
     """Means over 100 ms, which show what is not noise."""
     whole = len(left) // count * count
@@ -123,14 +128,14 @@ def test_contacts_of_the_scene_show_up_undistorted(identified: Identified, inert
     times, left = compensated(
         samples("scene", 27.0, seed=4), identified.payload, identified.bias, inertia=inertia
     )
-    truth = np.array([contact(time_s) for time_s in times])
-    error = left - truth
+    touch = truth(times)
+    error = left - touch
     # The wrist shakes with up to 0.2 m/s²: 0.16 N on this tool, which only the inertial term takes off.
     assert within_three_sigma(error).min() > WITHIN_3_SIGMA - (0.002 if inertia else 0.05)
-    touching = np.abs(truth[:, 2]) > 1.0
+    touching = np.abs(touch[:, 2]) > 1.0
     assert touching.sum() > 400
     for axis in (0, 1, 2, 3, 4):
-        real = truth[touching, axis]
+        real = touch[touching, axis]
         scale = float(left[touching, axis] @ real / (real @ real))
         assert scale == pytest.approx(1.0, abs=0.05), f"axis {axis} is scaled by {scale:.3f}"
 
@@ -193,7 +198,11 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 def check_contact(bench: Bench, payload: Payload, bias: Wrench) -> None:
     begin_s = bench.change("scene")
     times, left = compensated(bench.stream(begin_s, 6.0), payload, bias, inertia=True)
-    error = left - np.array([contact(time_s) for time_s in times])
+    # When the scene began is known to a few ms only, more on a busy machine: where the contact fits best.
+    near = (times > 4.5) & (times < 6.0)
+    shifts = np.arange(-0.1, 0.1, 0.002)
+    misfits = [np.square(left[near] - truth(times[near] + shift)).sum() for shift in shifts]
+    error = left - truth(times + shifts[int(np.argmin(misfits))])
     assert within_three_sigma(error, SINC_OVER_TCP).min() > WITHIN_3_SIGMA - 0.01
     assert left[:, 2].min() == pytest.approx(scene.CONTACT_FORCE[2], abs=4 * deviations(SINC_OVER_TCP)[2])
 

@@ -141,8 +141,11 @@ def test_a_sensor_without_imu_cannot_say_that_it_rests() -> None:
 
 def test_a_clock_that_jumps_back_ends_the_window() -> None:
     collected = StillWindow(1.0)
-    assert not collected.add(sample(), 100.0)
+    for number in range(30):
+        assert not collected.add(sample(), 100.0 + number / RATE)
     assert collected.add(sample(), 99.0)
+    with pytest.raises(NotStillError, match="clock of the samples was set back"):
+        collected.means()
 
 
 # The estimate.
@@ -214,6 +217,7 @@ def test_a_ramp_that_takes_no_time_jumps() -> None:
     ramp = BiasRamp(OLD)
     ramp.go(NEW, 10.0)
     assert ramp.at(10.0) == NEW
+    assert ramp.at(9.9) == NEW, "a sample that was on its way"
 
 
 def test_a_ramp_that_is_turned_round_does_not_jump() -> None:

@@ -163,6 +163,29 @@ def test_a_clock_that_jumps_back_begins_anew() -> None:
     assert source.gravity(100.0) is None
 
 
+def test_two_samples_of_one_time_and_one_a_hair_early_do_no_harm() -> None:
+    source = AccelerometerGravity()
+    for time_s in (1.0, 1.0, 1.2, 1.1999, 1.1999):
+        assert source.update(UPRIGHT, STILL, time_s)
+    assert source.gravity(1.2) == pytest.approx(down(UPRIGHT))
+    tilted = about_x(0.3)
+    source.update(tilted, STILL, 1.1998)
+    assert source.gravity(1.2) == pytest.approx(down(UPRIGHT)), "it does not begin anew"
+
+
+def test_directions_that_contradict_each_other_are_none() -> None:
+    source = AccelerometerGravity(gyroscope=False, time_constant_s=10.0)
+    for number in range(20):
+        source.update((0.0, 0.0, G if number % 2 else -G), STILL, number * 0.01)
+    assert source.gravity(0.19) is None
+
+
+@pytest.mark.parametrize("wrong", [{"time_constant_s": 0.0}, {"magnitude": 0.0}])
+def test_a_filter_without_time_constant_or_gravity_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="must be greater than 0"):
+        AccelerometerGravity(**wrong)  # type: ignore[arg-type]
+
+
 # Orientations.
 
 

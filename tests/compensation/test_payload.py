@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from bridge.compensation import equations
+from bridge.compensation.compensator import Compensator
 from bridge.compensation.parameter_file import (
     CompensationParameters,
     ParameterFileError,
@@ -121,6 +122,25 @@ def test_six_axes_are_nearly_as_good_as_poses_get() -> None:
     flat = [(0.35 * x, 0.35 * y, 1.0) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1), (0.2, 0.1))]
     upside_down = (0.0, 0.0, -1.0)
     assert identify([pose(up) for up in [*flat, upside_down]]).condition > 1.5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_accelerometer_with_an_offset_and_a_wrong_scale_hardly_matters(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    offset = draw.normal(size=3)
+    offset *= 0.2 / np.linalg.norm(offset)
+
+    def seen(up: Up) -> Pose:
+        x, y, z = (-1.005 * np.array(gravity_for(up)) + offset).tolist()
+        return pose_of(still(up)._replace(acceleration=(x, y, z)))
+
+    found = identify([seen(up) for up in AXES])
+    assert found.payload.mass == pytest.approx(TOOL.mass, rel=1e-4)
+    assert found.payload.centre == pytest.approx(TOOL.centre, abs=1e-5)
+    compensator = Compensator(found.payload, found.bias)
+    for x, y, z in draw.normal(size=(50, 3)).tolist():
+        final = compensator.compensate(*load((x, y, z)), seen((x, y, z)).gravity).final
+        assert math.hypot(*final.force) < 0.12
 
 
 # Refusals.

@@ -104,7 +104,7 @@ class BiasRamp:
         """The bias of the sample of time `now_s`."""
         start, target, begin_s, seconds = self._course
         passed_s = now_s - begin_s
-        if passed_s >= seconds:
+        if passed_s >= seconds or seconds <= 0.0:
             return target
         share = max(0.0, passed_s / seconds)
         (ax, ay, az), (au, av, aw) = start

@@ -7,10 +7,13 @@ goes on with an old pose. Times are seconds on one clock, the same for `update` 
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Final, Protocol
 
 from bridge.compensation.quantities import DEFAULT_GRAVITY, ZERO
 from protocol.pdo import STANDARD_GRAVITY, Vector3
+
+_NO_DIRECTION: Final = 0.5
+"""Of g: a mean shorter than this is one of directions that contradict each other."""
 
 
 class GravitySource(Protocol):
@@ -60,6 +63,8 @@ class AccelerometerGravity:
                 subtracted. What is
                 left of it tilts the estimate by `time_constant_s` times it.
         """
+        if not (magnitude > 0.0 and time_constant_s > 0.0):
+            raise ValueError("magnitude of gravity and time constant must be greater than 0")
         self.magnitude, self.time_constant_s, self.gate = magnitude, time_constant_s, gate
         self.stale_after_s, self.gyroscope = stale_after_s, gyroscope
         self.angular_rate_offset = angular_rate_offset
@@ -91,6 +96,8 @@ class AccelerometerGravity:
         counts = abs(size - self.magnitude) <= self.gate  # False for NaN
         down = self._down
         passed_s = time_s - self._time_s
+        if -self.stale_after_s <= passed_s < 0.0:
+            time_s, passed_s = self._time_s, 0.0  # a hair early; a clock that was set back is another matter
         if down is None or passed_s < 0.0 or time_s - self._accepted_s > self.stale_after_s:
             # Nothing to go on from: the filter begins here.
             if not counts:
@@ -118,7 +125,9 @@ class AccelerometerGravity:
         if counts:
             # Until a time constant has passed, the mean of what there was.
             since_s = time_s - self._began_s
-            share = max(1.0 - math.exp(-passed_s / self.time_constant_s), passed_s / (since_s + passed_s))
+            share = 1.0 - math.exp(-passed_s / self.time_constant_s)
+            if since_s < self.time_constant_s and passed_s > 0.0:
+                share = max(share, passed_s / (since_s + passed_s))
             x, y, z = x - share * (ax + x), y - share * (ay + y), z - share * (az + z)
             self._accepted_s = time_s
         else:
@@ -137,7 +146,10 @@ class AccelerometerGravity:
         if down is None or not abs(now_s - self._accepted_s) <= self.stale_after_s:
             return None
         x, y, z = down
-        scale = self.magnitude / math.sqrt(x * x + y * y + z * z)
+        size = math.sqrt(x * x + y * y + z * z)
+        if size < _NO_DIRECTION * self.magnitude:
+            return None
+        scale = self.magnitude / size
         return x * scale, y * scale, z * scale
 
 

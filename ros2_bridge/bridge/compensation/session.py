@@ -66,8 +66,8 @@ def summary(result: Identified) -> str:
     x, y, z = (1000.0 * part for part in result.payload.centre)
     ix, iy, iz = (1000.0 * part for part in result.centre_interval)
     text = (
-        f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, centre of gravity ({x:.1f} ± "
-        f"{ix:.1f}, {y:.1f} ± {iy:.1f}, {z:.1f} ± {iz:.1f}) mm ({100 * result.confidence:g} % confidence) "
+        f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, centre of gravity ({x:.2f} ± "
+        f"{ix:.2f}, {y:.2f} ± {iy:.2f}, {z:.2f} ± {iz:.2f}) mm ({100 * result.confidence:g} % confidence) "
         f"from {result.coverage.poses} poses; {result.force_rms:.2g} N and {result.torque_rms:.2g} Nm are "
         "left over"
     )

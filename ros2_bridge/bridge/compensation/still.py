@@ -101,6 +101,8 @@ class StillWindow:
         """
         if self._first_s is None:
             self._first_s = time_s
+        if time_s < self._first_s and self.spoiled is None:
+            self.spoiled = "the clock of the samples was set back"
         if self.spoiled is None:
             self.spoiled = _what_is_wrong(sample, flags)
             if self.spoiled is None and not flags & DataFlag.REPEATED:
@@ -109,7 +111,6 @@ class StillWindow:
         return (
             self.spoiled is not None
             or time_s - self._first_s >= self.seconds
-            or time_s < self._first_s
             or len(self._rows) >= _MOST_SAMPLES
         )
 

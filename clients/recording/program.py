@@ -1,0 +1,152 @@
+"""What `ethercat-record` does: connects, records until it is told to stop, says what it has and lost."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+
+from clients.recording.errors import RecordingError
+from clients.recording.file_format import FORMAT_VERSION
+from clients.recording.options import RecordOptions, parse_options
+from clients.recording.parts import Parts
+from clients.recording.progress import Progress, clock, human_size
+from clients.recording.reader import Event
+from clients.recording.recorder import Recorder
+from clients.recording.ros_messages import RosTopics
+from clients.recording.source import Batch, Source
+from clients.signals import Signals
+from clients.version import VERSION
+from protocol.errors import ConnectionFailedError, ProtocolError
+from protocol.text import printable
+
+_WAIT_S = 0.2
+
+
+def run(argv: Sequence[str] | None, signals: Signals) -> int:
+    """Record; returns the exit code."""
+    options = parse_options(argv)
+    parts = Parts(
+        options.path, size=options.rotate_size, seconds=options.rotate_seconds, overwrite=options.force
+    )
+    source = Source(options.address, options.sensors)
+    try:
+        parts.check()
+        first = _connect(source, options, signals)
+        if first is None:
+            _say("stopped before there was a server; nothing was recorded")
+            return 0
+        recorder = Recorder(
+            parts, f"ethercat-record {VERSION}", _notes(options, source), _ros(options, source)
+        )
+    except ConnectionFailedError as error:
+        _say(f"no server at {options.address}: {error}; start ethercat-server, or use --wait")
+        return 1
+    except (RecordingError, ProtocolError) as error:
+        _say(str(error))
+        return 1
+    return _record(source, recorder, first, options, parts, signals)
+
+
+def _connect(source: Source, options: RecordOptions, signals: Signals) -> Batch | None:
+    """The first batch; None if it was asked to stop before."""
+    told = False
+    while True:
+        try:
+            return source.connect()
+        except ConnectionFailedError:
+            if not options.wait:
+                raise
+        if not told:
+            _say(f"waiting for a server at {options.address}")
+            told = True
+        if signals.asked:
+            return None
+        time.sleep(_WAIT_S)
+
+
+def _record(
+    source: Source, recorder: Recorder, batch: Batch, options: RecordOptions, parts: Parts, signals: Signals
+) -> int:
+    began, reason, code = time.monotonic(), "asked to stop", 0
+    with Progress(options.path.name) as progress:
+        progress.say(f"recording {options.address} to {parts.made[0]}; Ctrl-C ends it")
+        try:
+            while True:
+                recorder.put(batch)
+                _tell(batch, progress)
+                if recorder.failed:
+                    break
+                if signals.asked:
+                    break
+                if options.seconds is not None and time.monotonic() - began >= options.seconds:
+                    reason = "time is up"
+                    break
+                if not (source.connected or options.reconnect):
+                    reason = "the server ended"
+                    break
+                progress.show(recorder, connected=source.connected)
+                batch = source.receive()
+        except ProtocolError as error:
+            reason, code = f"the server refused: {error}", 1
+            progress.say(reason)
+        seconds = time.monotonic() - began
+        source.close()
+        recorder.stop(reason)
+    if recorder.error is not None:
+        _say(f"{recorder.error}; what was written before is whole")
+        code = 1
+    _say(_summary(recorder, parts, seconds))
+    return code
+
+
+def _tell(batch: Batch, progress: Progress) -> None:
+    for item in batch:
+        if isinstance(item, Event):
+            row = item.event
+            words = row.get("message") or row.get("reason") or ""
+            place = f" {row['sensor']}" if "sensor" in row else ""
+            if item.name != "connected":
+                progress.say(printable(f"{item.name}{place}{': ' if words else ''}{words}", 300))
+
+
+def _summary(recorder: Recorder, parts: Parts, seconds: float) -> str:
+    files = str(parts.made[0]) if len(parts.made) == 1 else f"{parts.made[0]} to {parts.made[-1].name}"
+    count = len(recorder.tally.sensors)
+    frames = f"{recorder.saved} frames of {count} sensor{'' if count == 1 else 's'}"
+    losses = ", ".join(recorder.tally.losses()) or "nothing was lost"
+    return f"{files}: {clock(seconds)}, {frames}, {human_size(recorder.bytes_written)}; {losses}"
+
+
+def _notes(options: RecordOptions, source: Source) -> dict[str, str]:
+    assert source.description is not None
+    return {
+        "format": FORMAT_VERSION,
+        "recorder": f"ethercat-record {VERSION}",
+        "server": str(options.address),
+        "server_version": printable(source.description.get("version"), 40),
+        "host": socket.gethostname(),
+        "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
+    }
+
+
+def _ros(options: RecordOptions, source: Source) -> dict[int, RosTopics]:
+    if not options.ros:
+        return {}
+    assert source.description is not None
+    rows = source.description.get("sensors")
+    described = [row.get("sensor") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    places = options.sensors or sorted({place for place in described if isinstance(place, int)})
+    names = options.namespaces or ([""] if len(places) == 1 else [f"sensor_{place}" for place in places])
+    if len(names) != len(places):
+        raise RecordingError(
+            f"--ros-namespace is given {len(names)} times for {len(places)} sensors: give one each"
+        )
+    return {place: RosTopics(name, options.imu_units) for place, name in zip(places, names, strict=True)}
+
+
+def _say(sentence: str) -> None:
+    sys.stderr.write(f"ethercat-record: {sentence}\n")
+    sys.stderr.flush()
