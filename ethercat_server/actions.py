@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Container, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from ethercat_server import __version__
 from ethercat_server.connection import Connection, Subscription
@@ -16,6 +16,9 @@ from ethercat_server.hub import Hub
 from protocol.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
 from protocol.errors import RequestError
 from protocol.framing import JsonObject
+
+_MOST_EXPLAINED: Final = 32
+"""With more sensors `describe` leaves out what their settings mean: a reply has 65536 bytes at most."""
 
 log = logging.getLogger(__name__)
 
@@ -97,13 +100,11 @@ class Actions:
         return self._handlers[request.action](connection, request)
 
     def _describe(self, _: Connection, request: Request) -> JsonObject:
-        return reply(
-            request,
-            protocol=PROTOCOL_VERSION,
-            version=__version__,
-            sensors=[sensor.describe() for sensor in self._sensors],
-            **self._extra,
-        )
+        rows = [sensor.describe() for sensor in self._sensors]
+        if len(rows) > _MOST_EXPLAINED:
+            for row in rows:
+                row.pop("meaning", None)
+        return reply(request, protocol=PROTOCOL_VERSION, version=__version__, sensors=rows, **self._extra)
 
     def _subscribe(self, connection: Connection, request: Request) -> JsonObject:
         places = request.values["sensors"]

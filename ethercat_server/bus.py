@@ -1,202 +1,39 @@
-"""The EtherCAT bus: the only file that knows pysoem.
+"""The EtherCAT bus in OP: exchanges, and single datagrams between them. How it gets there is in `soem.py`.
 
-Everything pysoem raises is translated here, and its traps are kept in here: the descriptor it leaks on a
-failed open, its close that must happen once, its receive whose timeout the kernel rounds up to a jiffy and
-which takes an older exchange's frame for this one's, and its error ring, which can hand one call's error to
-the next.
+SOEM's traps on the way are kept in here: its receive whose timeout the kernel rounds up to a jiffy, and which
+takes an older exchange's frame for this one's.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
-import os
-import socket
-import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator
+from typing import Final
 
-import pysoem
+from ethercat_server.errors import BusError
+from ethercat_server.raw_socket import APRD, APWR, BRD, FPRD, FPWR, SOEM_INDICES
+from ethercat_server.soem import Master
 
-from ethercat_server.al import AlState, AlStatus
-from ethercat_server.errors import BusError, SdoAbortError
-from ethercat_server.raw_socket import FPRD, FPWR, SOEM_INDICES, RawSocket, packet_sockets
-
-_SDO_ATTEMPTS: Final = 3
-_OP_TIMEOUT_S: Final = 10.0
 _DATAGRAM_TIMEOUT_S: Final = 0.002
 _PATIENT_TIMEOUT_S: Final = 0.02
 _LEAST_TIMEOUT_S: Final = 0.0003
-_STATION_ADDRESS: Final = 0x0010
+_ANSWER_ATTEMPTS: Final = 3
 _MOST_DOUBTS: Final = 4
 _COLLECT_US: Final = 100
-_SCAN_TIMEOUT_S: Final = 15.0
-_STATE_ATTEMPTS: Final = {AlState.PREOP: 80, AlState.SAFEOP: 200}
-"""Of 50 ms each."""
-_PYSOEM_ERRORS: Final = (
-    pysoem.SdoError,
-    pysoem.Emergency,
-    pysoem.MailboxError,
-    pysoem.PacketError,
-    pysoem.WkcError,
-    pysoem.ConfigMapError,
-    pysoem.EepromError,
-    pysoem.NetworkInterfaceNotOpenError,
-)
-log = logging.getLogger(__name__)
 
 
-class SlaveIdentity(NamedTuple):
-    """What the SII of a slave says."""
-
-    vendor: int
-    product: int
-    revision: int
-    name: str
-
-
-class Bus:
+class Bus(Master):
     """An EtherCAT bus on one network interface. Used by one thread."""
 
     def __init__(self, ifname: str) -> None:
-        self.ifname = ifname
-        self.ifindex = 0
-        self.expected_wkc = 0
-        self._master: Any = pysoem.Master()
-        self._slaves: list[Any] = []
-        self._opened = False
-        self._abandoned = False
-        """A thread that never ended still uses the socket: it must not be closed."""
-        self._stations: list[int] = []
+        super().__init__(ifname)
         self._careful = True
         """The last answer did not come in time, so an older frame may be on its way."""
         self._index: int | None = None
         """SOEM's number of the last exchange's frame, if it is known."""
         self._doubts = 0
         self._datagram_timeout_s = _PATIENT_TIMEOUT_S
-
-    def open(self) -> None:
-        """Open the raw socket. BusError if that fails; `interface.check_interface` says why beforehand."""
-        before = packet_sockets()
-        try:
-            self._master.open(self.ifname)
-        except ConnectionError:
-            for fd in packet_sockets() - before:
-                os.close(fd)
-            raise BusError(
-                f"cannot open {self.ifname} for EtherCAT: it went away or may not be opened; "
-                "check 'ip link' and the permissions"
-            ) from None
-        self._opened = True
-        self.ifindex = socket.if_nametoindex(self.ifname)
-        self._socket = RawSocket((packet_sockets() - before).pop())
-        # Until SOEM had bound it to the interface, it took in the EtherCAT frames of all others.
-        self._socket.set_blocking(False)
-        self._socket.drop(0)
-        self._socket.set_blocking(True)
-
-    def scan(self, check_interrupt: Callable[[], None]) -> list[SlaveIdentity]:
-        """Find the slaves and take them to PREOP; BusError if none answers.
-
-        `check_interrupt` is called while waiting and may raise to give up.
-        """
-        if self._config_init(check_interrupt) <= 0:
-            raise BusError(
-                f"no EtherCAT slave answers on {self.ifname}: check the cable, that the sensor has power and "
-                "that this is the interface it is connected to"
-            )
-        self._slaves = list(self._master.slaves)
-        for slave in self._slaves:
-            slave.add_emergency_callback(_log_emergency)
-        try:
-            self._stations = [int.from_bytes(s._fprd(_STATION_ADDRESS, 2), "little") for s in self._slaves]
-        except pysoem.WkcError:
-            raise BusError(
-                f"a slave on {self.ifname} stopped answering in the middle of the scan: check cable and power"
-            ) from None
-        return [SlaveIdentity(s.man, s.id, s.rev, s.name) for s in self._slaves]
-
-    def _config_init(self, check_interrupt: Callable[[], None]) -> int:
-        # SOEM tries every byte of the SII for long if a slave goes away meanwhile, two minutes in all, and no
-        # signal is noticed before it returns. So it runs in a thread, which can be left behind.
-        counts: list[int] = []
-        thread = threading.Thread(
-            target=lambda: counts.append(self._master.config_init(release_gil=True)), daemon=True
-        )
-        thread.start()
-        deadline = time.monotonic() + _SCAN_TIMEOUT_S
-        self._abandoned = True
-        while thread.is_alive():
-            thread.join(0.05)
-            check_interrupt()
-            if time.monotonic() > deadline:
-                raise BusError(
-                    f"the scan of {self.ifname} does not end: a slave stopped answering in its middle; "
-                    "check cable and power, then start again"
-                )
-        self._abandoned = False
-        return counts[0] if counts else 0
-
-    def check_preop(self) -> None:
-        """Wait until every slave is in PREOP or above; BusError names one that is not."""
-        self._wait_state(AlState.PREOP)
-
-    def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
-        """Upload an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
-        what = f"reading object 0x{index:04X}:{subindex}"
-        data: bytes = self._sdo(slave, index, subindex, what, None)
-        return data
-
-    def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
-        """Download an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
-        self._sdo(slave, index, subindex, f"writing {data.hex()} to object 0x{index:04X}:{subindex}", data)
-
-    def sii_words(self, slave: int, word: int) -> bytes:
-        """The two words of the SII at `word` and after it, four bytes; BusError if it cannot be read."""
-        try:
-            data: bytes = self._slaves[slave].eeprom_read(word)
-        except _PYSOEM_ERRORS as error:
-            raise BusError(
-                f"the SII of slave {slave} cannot be read at word 0x{word:04x}: {_texts([error])}"
-            ) from None
-        return data
-
-    def map_process_data(self) -> list[int]:
-        """Map the process data and take the slaves to SAFEOP; returns each slave's input size in bytes."""
-        try:
-            self._master.config_map()
-        except pysoem.ConfigMapError as error:
-            raise BusError(
-                f"the process data of {self.ifname} cannot be mapped: {_texts(error.error_list)}; "
-                "power the sensor off and on, then start again"
-            ) from None
-        except _PYSOEM_ERRORS as error:
-            raise BusError(f"the process data of {self.ifname} cannot be mapped: {_texts([error])}") from None
-        self.expected_wkc = self._master.expected_wkc
-        for slave in self._slaves:
-            slave.output = bytes(len(slave.output))
-        return [len(slave.input) for slave in self._slaves]
-
-    def check_answers(self, slave: int) -> None:
-        """BusError if `slave` does not answer any more."""
-        if all(self.read_register(slave, 0, 1) is None for _ in range(_SDO_ATTEMPTS)):
-            raise BusError(f"sensor {slave} stopped answering while it was set up: check cable and power")
-
-    def go_operational(self) -> None:
-        """Take every slave to OP, exchanging process data all the while; BusError names one that refuses."""
-        self._wait_state(AlState.SAFEOP)
-        self._master.state = pysoem.OP_STATE
-        self._master.write_state()
-        deadline = time.monotonic() + _OP_TIMEOUT_S
-        while time.monotonic() < deadline:
-            for _ in range(5):
-                self._master.send_processdata()
-                self._master.receive_processdata(2000)
-            if self._master.state_check(pysoem.OP_STATE, 2000) == pysoem.OP_STATE:
-                self._socket.set_blocking(False)
-                return
-        raise BusError(self._state_complaint(AlState.OP))
 
     def send(self) -> None:
         """Send the process data; `receive` must follow. Only after `go_operational`."""
@@ -263,6 +100,24 @@ class Bus:
         """Write ESC registers or a mailbox of `slave` with one datagram; False if it did not do it."""
         return self._datagram(FPWR, slave, address, data)[0] == 1
 
+    def count_slaves(self, size: int, timeout_s: float) -> int:
+        """How many slaves answer a broadcast read of `size` bytes from register 0 on; -1 if it is lost.
+
+        Needs no scan and changes nothing, so it also tells how long a frame of that size takes.
+        """
+        answer = self._socket.datagram(BRD, 0, 0, bytes(size), timeout_s)
+        return -1 if answer is None else answer[0]
+
+    def read_at(self, place: int, address: int, size: int) -> bytes | None:
+        """Read ESC registers of the slave at `place` on the bus, scanned or not; None if it did not do it."""
+        answer = self._socket.datagram(APRD, -place & 0xFFFF, address, bytes(size), _PATIENT_TIMEOUT_S)
+        return answer[1] if answer is not None and answer[0] == 1 else None
+
+    def write_at(self, place: int, address: int, data: bytes) -> bool:
+        """Write ESC registers of the slave at `place` on the bus, scanned or not; False if it did not."""
+        answer = self._socket.datagram(APWR, -place & 0xFFFF, address, data, _PATIENT_TIMEOUT_S)
+        return answer is not None and answer[0] == 1
+
     def _datagram(self, command: int, slave: int, address: int, data: bytes) -> tuple[int, bytes]:
         station = self._stations[slave]
         answer = self._socket.datagram(command, station, address, data, self._datagram_timeout_s)
@@ -270,6 +125,11 @@ class Bus:
             self._careful = True  # it may still come
             return -1, b""
         return answer
+
+    def check_answers(self, slave: int) -> None:
+        """BusError if `slave` does not answer any more."""
+        if all(self.read_register(slave, 0, 1) is None for _ in range(_ANSWER_ATTEMPTS)):
+            raise BusError(f"sensor {slave} stopped answering while it was set up: check cable and power")
 
     @contextlib.contextmanager
     def in_time(self, until_ns: int) -> Iterator[None]:
@@ -292,72 +152,3 @@ class Bus:
         recovered = self._slaves[slave].recover(int(self._datagram_timeout_s * 1e6)) > 0
         self._socket.set_blocking(False)
         return bool(recovered)
-
-    def close(self) -> None:
-        """Take the slaves to INIT and close the socket. May be called at any time, any number of times."""
-        if not self._opened or self._abandoned:
-            return
-        self._opened = False
-        with contextlib.suppress(*_PYSOEM_ERRORS):
-            self._socket.set_blocking(True)
-            self._master.state = pysoem.INIT_STATE
-            self._master.write_state()
-        self._socket.close()
-        self._master.close()
-
-    def _sdo(self, slave: int, index: int, subindex: int, what: str, data: bytes | None) -> Any:
-        target, last = self._slaves[slave], "no answer"
-        for _ in range(_SDO_ATTEMPTS):
-            try:
-                if data is None:
-                    return target.sdo_read(index, subindex)
-                return target.sdo_write(index, subindex, data)
-            except pysoem.SdoError as error:
-                # Another object's abort is a stale entry of the error ring, not an answer to this call.
-                if (error.index, error.subindex) == (index, subindex):
-                    code = error.abort_code & 0xFFFFFFFF
-                    text = f"sensor {slave} refused {what}: {error.desc.strip()} (abort 0x{code:08X})"
-                    raise SdoAbortError(text, code) from None
-                last = "an answer about another object"
-            except Exception as error:
-                # pysoem raises a plain Exception for an entry of its error ring that it does not know.
-                if not isinstance(error, _PYSOEM_ERRORS) and type(error) is not Exception:
-                    raise
-                last = _texts([error])
-        raise BusError(f"sensor {slave} did not answer {what}: {last}; check cable and power")
-
-    def _wait_state(self, state: AlState) -> None:
-        for _ in range(_STATE_ATTEMPTS[state]):
-            if self._master.state_check(int(state), 50_000) == state:
-                return
-            # state_check wants the state itself; a slave that is above it is fine as well.
-            self._master.read_state()
-            if any(_al_status(s).error or s.state == pysoem.NONE_STATE for s in self._slaves):
-                break
-        raise BusError(self._state_complaint(state))
-
-    def _state_complaint(self, state: AlState) -> str:
-        self._master.read_state()
-        for place, slave in enumerate(self._slaves):
-            if slave.state != state:
-                return (
-                    f"sensor {place} does not reach {state.name}: it stays in {_al_status(slave)}; "
-                    "power it off and on, then start again"
-                )
-        return f"the bus on {self.ifname} does not reach {state.name}: start again"
-
-
-def _al_status(slave: Any) -> AlStatus:
-    return AlStatus.of(slave.state, slave.al_status)
-
-
-def _log_emergency(emergency: Any) -> None:
-    log.warning(
-        "sensor %d reports an emergency: error code 0x%04X", emergency.slave_pos - 1, emergency.error_code
-    )
-
-
-def _texts(errors: list[Any]) -> str:
-    texts = [str(getattr(error, "desc", None) or error).strip() for error in errors]
-    meant = [text for text in texts if text and text != "No error"]
-    return "; ".join(dict.fromkeys(meant)) or "no answer"

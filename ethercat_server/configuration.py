@@ -10,12 +10,17 @@ from collections.abc import Mapping
 from typing import Final
 
 from ethercat_server import objects
-from ethercat_server.errors import BusError
+from ethercat_server.errors import BusError, CutOffError, SdoAbortError, extended
 from ethercat_server.sdo import Sdo, Steps
 from ethercat_server.sensor import Sensor, read_settings, write_setting
 from protocol.settings import SETTINGS, SettingValue, check_combination
 
 _SAVE_TIMEOUT_S: Final = 5.0
+
+IN_FORCE: Final = "; the former settings are in force"
+LATER: Final = "; it gets its former settings when it is back"
+_AGAIN: Final = "configure it again"
+"""How the sentence of a change that failed goes on."""
 
 
 class Change:
@@ -35,7 +40,7 @@ class Change:
 
 
 def apply_in_op(sdo: Sdo, sensor: Sensor, change: Change) -> Steps[None]:
-    """Write what has changed; on failure write back what there was, then raise BusError or SdoAbortError."""
+    """Write what has changed and verify it; BusError if it fails, which says that the former is in force."""
     before, asked = sensor.wanted, sensor.asked
     sensor.wanted, sensor.asked = change.wanted, asked | set(change.names)
     written = []
@@ -43,32 +48,40 @@ def apply_in_op(sdo: Sdo, sensor: Sensor, change: Change) -> Steps[None]:
         for name in change.names:
             written.append(name)
             yield from write_setting(sdo, sensor, name)
+        yield from read_settings(sdo, sensor)
     except BusError as error:
-        sensor.wanted, sensor.asked = before, asked
+        sensor.wanted, sensor.asked, sensor.unsettled = before, asked, True
+        if isinstance(error, CutOffError):
+            raise extended(error, LATER) from None
         try:
             for name in written:
                 if name in sensor.settings:
                     yield from write_setting(sdo, sensor, name, sensor.settings[name])
         except BusError as worse:
-            raise BusError(
-                f"{error}; putting back what was in force failed too: {worse}; configure it again"
-            ) from None
-        raise
-    yield from read_settings(sdo, sensor)
+            raise extended(error, f"; putting back what was in force failed too: {worse}; {_AGAIN}") from None
+        sensor.unsettled = False
+        raise extended(error, IN_FORCE) from None
 
 
 def save(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     """Have the sensor write what it holds to its flash; BusError if it does not report success."""
     command, status = objects.CONTROL_COMMAND, objects.CONTROL_STATUS
-    yield from sdo.write(*command, bytes((objects.SAVE_PARAMETERS,)))
     deadline = time.monotonic() + _SAVE_TIMEOUT_S
-    while True:
-        answer = int.from_bytes((yield from sdo.read(*status)), "little")
-        if answer == 0:
-            return
-        if time.monotonic() > deadline:
-            raise BusError(
-                f"sensor {sensor.place} did not save its settings (status {answer}): they are in force until "
-                "its power goes; save again"
-            )
-        yield
+    try:
+        yield from sdo.write(*command, bytes((objects.SAVE_PARAMETERS,)))
+        while True:
+            answer = int.from_bytes((yield from sdo.read(*status)), "little")
+            if answer == 0:
+                return
+            if time.monotonic() > deadline:
+                raise BusError(
+                    f"sensor {sensor.place} did not save its settings (status {answer}): they are in force "
+                    "until its power goes; save again"
+                )
+            yield
+    except SdoAbortError as error:
+        raise extended(error, "; its settings are in force until its power goes, but not saved") from None
+    except CutOffError as error:
+        raise extended(
+            error, "; whether it saved all, some or none of its settings is not known: save again"
+        ) from None

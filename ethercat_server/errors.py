@@ -5,6 +5,8 @@ ServerError
 +-- InterfaceError    the network interface cannot be used
 +-- BusError          the bus or a sensor on it does not do what it must
 |   +-- SdoAbortError      the sensor refused an SDO, with its abort code
+|   +-- CutOffError        the sensor was lost in the middle of work on it
++-- ForbiddenWriteError      a write that is never done
 +-- StopRequestedError       asked to stop while starting up
 """
 
@@ -39,8 +41,22 @@ class SdoAbortError(BusError):
         self.abort_code = abort_code
 
 
+class CutOffError(BusError):
+    """The sensor went away in the middle of work on it."""
+
+
+def extended(error: BusError, addition: str) -> BusError:
+    """The same error, its sentence going on with `addition`."""
+    text = f"{error}{addition}"
+    return SdoAbortError(text, error.abort_code) if isinstance(error, SdoAbortError) else type(error)(text)
+
+
 OBJECT_MISSING = frozenset({0x06020000, 0x06090011})
 """Abort codes of an object or sub-index that this firmware does not have."""
+
+
+class ForbiddenWriteError(ServerError):
+    """A write of the factory calibration, which is never done."""
 
 
 class StopRequestedError(ServerError):

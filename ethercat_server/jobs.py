@@ -9,10 +9,10 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from ethercat_server.bus import Bus
-from ethercat_server.errors import BusError, SdoAbortError
+from ethercat_server.errors import BusError, CutOffError, SdoAbortError
 from ethercat_server.sdo import Steps
 from ethercat_server.stream import SensorStream
 from protocol.control import ErrorCode
@@ -23,9 +23,18 @@ _STEP_NS: Final = 300_000
 _AT_LEAST_EVERY_NS: Final = 20_000_000
 """On a bus that leaves no time, a step is taken all the same now and then."""
 _MOST_WAITING: Final = 32
+_AWAY: Final = "is lost, or was taken out of OP to be set up"
 
 Done = Callable[[Any, RequestError | None], None]
 """Called with the job's result, or with why there is none."""
+
+
+class _Job(NamedTuple):
+    """What is to be done on a sensor; whether it changes how the sensor is set or tared."""
+
+    steps: Steps[Any]
+    done: Done
+    changes: bool
 
 
 class Jobs:
@@ -34,29 +43,36 @@ class Jobs:
     def __init__(self, bus: Bus, streams: Sequence[SensorStream]) -> None:
         self._bus = bus
         self._streams = streams
-        self._queues: list[deque[tuple[Steps[Any], Done]]] = [deque() for _ in streams]
+        self._queues: list[deque[_Job]] = [deque() for _ in streams]
         self._turn = 0
         self._stepped_ns = 0
         self.waiting = 0
         """Jobs that are not done."""
 
-    def start(self, place: int, steps: Steps[Any], done: Done, most: int = _MOST_WAITING) -> None:
-        """Have `steps` done on the sensor at `place`.
+    def start(
+        self, place: int, steps: Steps[Any], done: Done, *, changes: bool = False, most: int = _MOST_WAITING
+    ) -> None:
+        """Have `steps` done on the sensor at `place`; `changes` is for `is_changing`.
 
-        RequestError if it is lost, or if `most` jobs wait for it already.
+        If the sensor is lost meanwhile, CutOffError is raised in `steps`: nothing more can be done on it.
+        RequestError if it is lost already, or if `most` jobs wait for it.
         """
         self.check_present(place)
         if len(self._queues[place]) >= most:
             raise RequestError(
                 ErrorCode.BUSY, f"sensor {place} has {most} requests to do already: ask again later"
             )
-        self._queues[place].append((steps, done))
+        self._queues[place].append(_Job(steps, done, changes))
         self.waiting += 1
+
+    def is_changing(self, place: int) -> bool:
+        """Whether a job that changes the sensor at `place` is under way or waits."""
+        return any(job.changes for job in self._queues[place])
 
     def check_present(self, place: int) -> None:
         """RequestError if the sensor at `place` cannot be talked to."""
         if not self._streams[place].alive:
-            raise RequestError(ErrorCode.NOT_READY, f"sensor {place} is lost: ask again when it is back")
+            raise RequestError(ErrorCode.NOT_READY, f"sensor {place} {_AWAY}: ask again when it is back")
 
     def step(self, until_ns: int) -> None:
         """Take a step if there is time for one before `until_ns`. To be called only while jobs wait."""
@@ -71,14 +87,16 @@ class Jobs:
                 return
 
     def _step(self, place: int, until_ns: int) -> None:
-        steps, done = self._queues[place][0]
+        steps, done, _ = self._queues[place][0]
         result: Any = None
         error: RequestError | None = None
         try:
-            self.check_present(place)
-            with self._bus.in_time(until_ns):
-                next(steps)
-            return
+            if self._streams[place].alive:
+                with self._bus.in_time(until_ns):
+                    next(steps)
+                return
+            steps.throw(CutOffError(f"sensor {place} {_AWAY}"))
+            raise CutOffError(f"sensor {place} {_AWAY}")
         except StopIteration as stop:
             result = stop.value
         except RequestError as refused:
@@ -92,9 +110,8 @@ class Jobs:
         done(result, error)
 
 
-def refusal(error: BusError, addition: str = "") -> RequestError:
-    """What a client is told when its work on a sensor fails; `addition` follows the error's own text."""
-    text = f"{error}{addition}"
+def refusal(error: BusError) -> RequestError:
+    """What a client is told when its work on a sensor fails."""
     if isinstance(error, SdoAbortError):
-        return RequestError(ErrorCode.SENSOR, text, abort_code=error.abort_code)
-    return RequestError(ErrorCode.NOT_READY, text)
+        return RequestError(ErrorCode.SENSOR, str(error), abort_code=error.abort_code)
+    return RequestError(ErrorCode.NOT_READY, str(error))

@@ -14,7 +14,8 @@ from ethercat_server.al import AL_CONTROL, AL_STATUS, AL_STATUS_SIZE, AlState, A
 from ethercat_server.bus import Bus
 from ethercat_server.errors import BusError
 from ethercat_server.sdo import CyclicSdo, Steps
-from ethercat_server.sensor import Identity, Sensor, identify, set_up
+from ethercat_server.sensor import Identity, Sensor, identify, put_right, set_up
+from ethercat_server.sii import SII_OWNER
 
 _STATE_TIMEOUT_S: Final = 2.0
 _ABSENT_PAUSE_S: Final = 0.005
@@ -23,7 +24,6 @@ _REMEMBER_TIMEOUT_S: Final = 1.0
 
 _COUNTS: Final = 0x0004
 """Two bytes: how many FMMUs and how many sync managers the slave has."""
-_SII_OWNER: Final = 0x0500
 _FMMU: Final = 0x0600
 _FMMU_SIZE: Final = 16
 _SM: Final = 0x0800
@@ -73,6 +73,8 @@ class Ladder:
                 if not self._bus.reclaim(self._place):
                     yield from pause(_ABSENT_PAUSE_S)
             elif status.is_op:
+                if self._sensor.unsettled:
+                    yield from put_right(self.sdo, self._sensor)
                 return left_op
             elif status.state is AlState.SAFEOP:
                 left_op = True
@@ -103,7 +105,7 @@ class Ladder:
     def _set_up_anew(self) -> Steps[None]:
         sensor, rows = self._sensor, self._sync_managers
         yield from self._go(AlState.INIT)
-        self._write(_SII_OWNER, b"\x01")  # the sensor reads its SII on the way to PREOP
+        self._write(SII_OWNER, b"\x01")  # the sensor reads its SII on the way to PREOP
         self._write(_SM, rows[:_MAILBOXES_END])
         yield from self._go(AlState.PREOP)
         found = yield from identify(self.sdo, sensor.identity.name)

@@ -16,10 +16,17 @@ import struct
 import time
 from typing import Final
 
+APRD: Final = 1
+"""EtherCAT command: auto increment physical read, addressed by minus the place on the bus."""
+APWR: Final = 2
+"""EtherCAT command: auto increment physical write."""
 FPRD: Final = 4
 """EtherCAT command: configured address physical read."""
 FPWR: Final = 5
 """EtherCAT command: configured address physical write."""
+
+BRD: Final = 7
+"""EtherCAT command: broadcast read."""
 
 SOEM_INDICES: Final = 16
 """SOEM numbers its frames modulo this."""

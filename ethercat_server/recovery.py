@@ -6,14 +6,15 @@ The steps are `ladder.py`'s, one for each exchange, so that neither the other se
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 from ethercat_server.al import AlState
 from ethercat_server.bus import Bus
-from ethercat_server.configuration import Change
-from ethercat_server.errors import BusError
+from ethercat_server.configuration import IN_FORCE, LATER, Change
+from ethercat_server.errors import BusError, extended
 from ethercat_server.interface import check_present
 from ethercat_server.ladder import DifferentSensorError, GoneError, Ladder
 from ethercat_server.sdo import CyclicSdo, Steps
@@ -27,9 +28,14 @@ _SHORT_EXCHANGES: Final = 2
 """So many exchanges in a row with a short working counter are looked into."""
 _SILENCE_NS: Final = 50_000_000
 """So long with no frame coming back, and all sensors are lost; single lost frames are not."""
+_SILENT: Final = "no frame comes back: check cable and power"
+_SILENT_CHANGE_NS: Final = 1_000_000_000
+"""So long it may be in the middle of a change, which goes on when the frames do."""
 _WATCH_EVERY_NS: Final = 100_000_000
 """A sensor can leave OP and still be counted, so its AL status is read this often."""
 _FAILED_PAUSE_S: Final = 0.25
+_TAKING_BACK_S: Final = 2.0
+"""So long a sensor whose change failed may take until it is back in OP."""
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +47,8 @@ class _Reconfiguration(NamedTuple):
     asked: frozenset[str]
     done: Callable[[BusError | None], None]
     failed: BusError | None = None
+    until: float = math.inf
+    """Once it has failed: when whoever asked is told, even if the sensor is not back."""
 
 
 class Recovery:
@@ -74,13 +82,18 @@ class Recovery:
     def reconfigure(self, place: int, change: Change, done: Callable[[BusError | None], None]) -> None:
         """Take a sensor out of OP to change its settings. `done` is called once it gives samples again.
 
-        If it fails the former settings come back into force, and `done` gets the reason.
+        If it fails the former settings come back into force, and `done` gets the reason; at once if the
+        sensor is lost over it.
         """
         sensor = self._sensors[place]
         self._changing[place] = _Reconfiguration(sensor.wanted, sensor.asked, done)
         sensor.wanted, sensor.asked = change.wanted, sensor.asked | set(change.names)
         sensor.state = AlState.PREOP.name
         self._take_out(place, self._ladders[place].reconfigure())
+
+    def is_changing(self, place: int) -> bool:
+        """Whether the sensor at `place` is out of OP to have its settings changed."""
+        return place in self._changing
 
     def sdo(self, place: int) -> CyclicSdo:
         """SDO transfers to a sensor that is not lost, in steps."""
@@ -97,9 +110,12 @@ class Recovery:
                 if now_ns >= self._watch_ns:
                     self._watch_ns = now_ns + _WATCH_EVERY_NS
                     check_present(self._bus.ifname, self._bus.ifindex)
+                    if now_ns - self._frame_ns > _SILENT_CHANGE_NS:
+                        for place in list(self._changing):
+                            self._lose_in_change(place, _SILENT)
             elif now_ns - self._frame_ns > _SILENCE_NS:
                 for place in range(len(self._sensors)):
-                    self._lose(place, "no frame comes back: check cable and power")
+                    self._lose(place, _SILENT)
             return
         self._frame_ns = now_ns
         self._short = self._short + 1 if wkc < self.alive_wkc else 0
@@ -128,12 +144,14 @@ class Recovery:
                 self._lose(place, f"it is in {status}")
 
     def _lose(self, place: int, reason: str) -> None:
-        if place in self._climbing:
-            return
+        if place not in self._climbing:
+            self._take_out(place, self._ladders[place].climb())
+            self._tell_lost(place, reason)
+
+    def _tell_lost(self, place: int, reason: str) -> None:
         sensor = self._sensors[place]
         sensor.state = "LOST"
         self._lost_at[place] = time.monotonic()
-        self._take_out(place, self._ladders[place].climb())
         log.warning("sensor %d (%s) is lost: %s", place, sensor.identity, reason)
         self._announce(
             event(Event.SENSOR_LOST, sensor=place, reason=reason, message=f"sensor {place} is lost: {reason}")
@@ -151,30 +169,51 @@ class Recovery:
         self._bus.be_patient(self.all_lost)
 
     def _step(self, place: int) -> None:
+        change = self._changing.get(place)
         try:
             next(self._climbing[place])
+            if change is not None and time.monotonic() > change.until:
+                self._lose_in_change(place, "it does not come back to OP")
         except StopIteration as stop:
             self._bring_back(place, left_op=stop.value)
-        except (GoneError, BusError) as error:
-            if place in self._changing and self._changing[place].failed is None:
-                self._give_up_change(place, error)
-                return
-            if isinstance(error, BusError):
+        except GoneError:
+            if change is not None:
+                self._lose_in_change(place, f"sensor {place} went away while its settings were changed")
+            else:
+                self._climbing[place] = self._ladders[place].climb()
+        except BusError as error:
+            if change is None:
                 log.warning("sensor %d is not back yet: %s", place, error)
                 self._climbing[place] = self._ladders[place].climb(_FAILED_PAUSE_S)
-                return
-            self._climbing[place] = self._ladders[place].climb()
+            elif change.failed is not None:
+                self._lose_in_change(place, f"putting back what was in force failed too: {error}")
+            else:
+                self._climbing[place] = self._ladders[place].climb()
+                self._take_back(place, error)
+                if self._ladders[place].al_status() is None:
+                    self._lose_in_change(place, "it does not answer any more")
         except DifferentSensorError as error:
             self._refuse(place, error.found)
 
-    def _give_up_change(self, place: int, error: GoneError | BusError) -> None:
+    def _take_back(self, place: int, error: BusError) -> None:
+        """The change failed: the former settings are what is wanted again."""
         sensor, change = self._sensors[place], self._changing[place]
-        if isinstance(error, GoneError):
-            error = BusError(f"sensor {place} stopped answering while its settings were changed")
         log.warning("sensor %d keeps its former settings: %s", place, error)
-        self._changing[place] = change._replace(failed=error)
+        self._changing[place] = change._replace(failed=error, until=time.monotonic() + _TAKING_BACK_S)
         sensor.wanted, sensor.asked = change.wanted, change.asked
-        self._climbing[place] = self._ladders[place].climb()
+
+    def _lose_in_change(self, place: int, reason: str) -> None:
+        """The sensor has gone, or does not take its former settings either: whoever asked is told now."""
+        failed = self._changing[place].failed
+        if failed is None:
+            self._take_back(place, BusError(reason))
+            error = BusError(reason)
+        else:
+            error = extended(failed, f"; {reason}")
+        change = self._changing.pop(place)
+        self._climbing[place] = self._ladders[place].climb(_FAILED_PAUSE_S)
+        self._tell_lost(place, reason)
+        change.done(extended(error, LATER))
 
     def _bring_back(self, place: int, *, left_op: bool) -> None:
         sensor, stream = self._sensors[place], self._streams[place]
@@ -185,7 +224,7 @@ class Recovery:
         if (change := self._changing.pop(place, None)) is not None:
             if change.failed is None:
                 self._announce(event(Event.RECONFIGURED, sensor=place, settings=dict(sensor.settings)))
-            change.done(change.failed)
+            change.done(change.failed and extended(change.failed, IN_FORCE))
         if place not in self._lost_at:
             return
         lost_s = round(time.monotonic() - self._lost_at.pop(place), 3)
@@ -195,6 +234,7 @@ class Recovery:
     def _refuse(self, place: int, found: Identity) -> None:
         sensor = self._sensors[place]
         sensor.state = "REFUSED"
+        self._lost_at.setdefault(place, time.monotonic())
         if (change := self._changing.pop(place, None)) is not None:
             change.done(BusError(f"sensor {place} was replaced by a {found} meanwhile"))
         message = (

@@ -29,7 +29,7 @@ _SLACK_NS: Final = 500.0
 """How far a period may differ from the estimate: the expected bracket grows by this at each end."""
 _SILENT: Final = 8
 """A sensor that has given nothing new for this many periods is no longer followed."""
-_AIM_NS: Final = 25_000.0
+AIM_NS: Final = 25_000.0
 """How long after the expected instant a poll is aimed: the spread of wake-ups, about."""
 _EARLY_NS: Final = 50_000.0
 """A poll this much before its aim was another sensor's, and is not counted as this one's first."""
@@ -124,7 +124,7 @@ class SampleClock:
         # Polls that only ever see the change do not say how late they are: with each in a row the next is
         # aimed earlier by more, until one is early and bounds the instant from below again.
         creep_ns = min(_CREEP_NS * self._hits * self._hits, _MAX_CREEP * self.period_ns)
-        first = (self._low + self._high - self._flight_ns) / 2 + _AIM_NS - creep_ns
+        first = (self._low + self._high - self._flight_ns) / 2 + AIM_NS - creep_ns
         if tried_ns < first - _EARLY_NS:
             return first
         if tried_ns < self._high:

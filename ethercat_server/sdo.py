@@ -13,7 +13,8 @@ from collections.abc import Generator
 from typing import Final, Protocol, TypeVar
 
 from ethercat_server.bus import Bus
-from ethercat_server.errors import BusError, SdoAbortError
+from ethercat_server.errors import BusError, ForbiddenWriteError, SdoAbortError
+from ethercat_server.objects import FACTORY_CALIBRATION
 
 T = TypeVar("T")
 Steps = Generator[None, None, T]
@@ -48,7 +49,7 @@ class Sdo(Protocol):
         ...
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
-        """Download an object; raises as `read`."""
+        """Download an object; raises as `read`, and ForbiddenWriteError for the factory calibration."""
         ...
 
 
@@ -56,15 +57,23 @@ class _AnswerLostError(Exception):
     """The answer was taken from the mailbox and lost on its way."""
 
 
-def finish(steps: Steps[T]) -> T:
-    """Run `steps` to the end, a millisecond apart; returns their result."""
+def finish(steps: Steps[T], pause_s: float = 0.001) -> T:
+    """Run `steps` to the end, so far apart; returns their result."""
     while True:
         try:
             next(steps)
         except StopIteration as stop:
             result: T = stop.value
             return result
-        time.sleep(0.001)
+        time.sleep(pause_s)
+
+
+def check_writable(index: int) -> None:
+    """ForbiddenWriteError for the factory calibration. Every write there is comes by here."""
+    if index == FACTORY_CALIBRATION:
+        raise ForbiddenWriteError(
+            "object 0x2000 holds the factory calibration, which is never written: leave it as it is"
+        )
 
 
 class BlockingSdo:
@@ -80,6 +89,7 @@ class BlockingSdo:
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """See `Sdo`."""
+        check_writable(index)
         yield from ()
         self._bus.sdo_write(self._slave, index, subindex, data)
 
@@ -110,6 +120,7 @@ class CyclicSdo:
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """See `Sdo`; at most what fits the mailbox in one piece."""
+        check_writable(index)
         if len(data) <= _LONGEST_EXPEDITED:
             command = _DOWNLOAD | _EXPEDITED | (_LONGEST_EXPEDITED - len(data)) << 2
         else:

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import logging
 import re
+import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 from ethercat_server import objects
 from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError
 from ethercat_server.sdo import Sdo, Steps
+from protocol.meaning import value_meaning
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue
 
 _MODEL_NAME: Final = re.compile(r"BFT-[A-Z]{4}-ECAT-M8")
@@ -56,14 +58,23 @@ class Sensor:
     rate_hz: int = 0
     state: str = "PREOP"
     settings: dict[str, SettingValue] = field(default_factory=dict)
-    """The settings in force."""
+    """The settings in force; `hold` changes them."""
+    meaning: dict[str, str] = field(default_factory=dict)
+    """What each of them means. Kept, so that telling it takes no time from the samples."""
     offset: tuple[float, ...] | None = None
     """The force/torque offset that was set while streaming; written again when the sensor has lost it."""
+    unsettled: bool = False
+    """A change was cut off: it may hold neither what was in force nor what is wanted, until `put_right`."""
 
     @property
     def period_ns(self) -> float:
         """Nominal sample period; 0x8011 rounds the rate to whole Hz, so it follows from the SINC length."""
         return 1e9 * self.wanted["sinc_length"] / BASE_SAMPLING_RATE_HZ
+
+    def hold(self, settings: Mapping[str, SettingValue]) -> None:
+        """These settings are in force now."""
+        self.settings = dict(settings)
+        self.meaning = {name: value_meaning(name, value) for name, value in settings.items()}
 
     def describe(self) -> dict[str, Any]:
         """The sensor's part of the `describe` reply."""
@@ -76,7 +87,8 @@ class Sensor:
             "pdo_size": self.pdo_size,
             "rate_hz": self.rate_hz,
             "state": self.state,
-            "settings": dict(self.settings),
+            "settings": self.settings,
+            "meaning": self.meaning,
         }
 
 
@@ -100,25 +112,47 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     The sensor must be in PREOP. Afterwards `settings` and `rate_hz` are what is in force. BusError says which
     setting did not take.
     """
-    written = []
+    held: dict[str, str] = {}
+    written = False
     for name in objects.SETTING_WRITE_ORDER:
         if name not in sensor.wanted or name == _LAST:
             continue
         entry = objects.BY_SETTING[name]
-        if (yield from _read(sdo, entry.address)) != entry.encode_setting(sensor.wanted[name]):
+        found = yield from _read(sdo, entry.address)
+        if found != entry.encode_setting(sensor.wanted[name]):
             yield from write_setting(sdo, sensor, name)
-            written.append(name)
+            written = True
+            if found is not None:
+                held[name] = _setting_text(name, found)
     # What SINC may be follows from the filters before it, and only the rate tells what it is.
-    if written or not (yield from _rate_is_right(sdo, sensor)):
+    right = yield from _rate_is_right(sdo, sensor)
+    rate_hz = sensor.rate_hz
+    if written or not right:
         yield from write_setting(sdo, sensor, _LAST)
         yield from _check_rate(sdo, sensor)
-        log.info(
-            "sensor %d did not hold what is wanted; written and verified: %s", sensor.place,
-            ", ".join(f"{name} = {sensor.wanted[name]}" for name in (*written, _LAST)),
-        )  # fmt: skip
+    texts = [f"{name} = {text} (wanted: {_text(sensor.wanted[name])})" for name, text in held.items()]
+    if not right:
+        texts.append(f"a sampling rate of {rate_hz} Hz (wanted: {sensor.rate_hz} Hz)")
+    if texts:
+        log.info("sensor %d held %s: what is wanted was written and verified", sensor.place, ", ".join(texts))
     yield from read_settings(sdo, sensor)
     if sensor.offset is not None:
         yield from write_offset(sdo, sensor.offset)
+    sensor.unsettled = False
+
+
+def put_right(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+    """After a change that was cut off in OP: write what is wanted, as far as OP takes it; see `set_up`."""
+    for name in objects.SETTING_WRITE_ORDER:
+        if name not in sensor.wanted or SETTINGS[name].preop_only:
+            continue
+        entry = objects.BY_SETTING[name]
+        if (yield from _read(sdo, entry.address)) != entry.encode_setting(sensor.wanted[name]):
+            yield from write_setting(sdo, sensor, name)
+    if sensor.offset is not None:
+        yield from write_offset(sdo, sensor.offset)
+    yield from read_settings(sdo, sensor)
+    sensor.unsettled = False
 
 
 def write_setting(sdo: Sdo, sensor: Sensor, name: str, value: SettingValue | None = None) -> Steps[None]:
@@ -141,6 +175,18 @@ def write_setting(sdo: Sdo, sensor: Sensor, name: str, value: SettingValue | Non
             f"the setting {name} = {value} did not take: sensor {sensor.place} holds {held.hex()} after "
             f"{data.hex()} was written; power it off and on, then start again"
         )
+
+
+def _setting_text(name: str, data: bytes) -> str:
+    """For people: the setting in what was read of its object."""
+    try:
+        return _text(objects.BY_SETTING[name].decode_setting(data, SETTINGS[name].is_bool))
+    except (ValueError, struct.error):
+        return f"0x{data.hex()}"
+
+
+def _text(value: SettingValue) -> str:
+    return str(value).lower()
 
 
 def read_offset(sdo: Sdo) -> Steps[tuple[float, ...]]:
@@ -190,7 +236,7 @@ def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
         except ValueError as error:
             log.warning("sensor %d: %s", sensor.place, error)
     held["sinc_length"] = sensor.wanted["sinc_length"]
-    sensor.settings = held
+    sensor.hold(held)
 
 
 def _read(sdo: Sdo, address: tuple[int, int]) -> Steps[bytes | None]:

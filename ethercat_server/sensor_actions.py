@@ -6,22 +6,24 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from ethercat_server import objects
+from ethercat_server.bus import Bus
 from ethercat_server.configuration import Change, apply_in_op, save
 from ethercat_server.connection import Connection
 from ethercat_server.errors import BusError
 from ethercat_server.hub import Hub
 from ethercat_server.jobs import Done, Jobs, refusal
+from ethercat_server.object_access import bytes_to_write, entry_named, read, read_named, write
 from ethercat_server.recovery import Recovery
-from ethercat_server.sdo import Sdo, Steps
-from ethercat_server.sensor import Sensor, read_offset
+from ethercat_server.sdo import Steps
+from ethercat_server.sensor import Sensor
+from ethercat_server.sii import read_sii
 from ethercat_server.stream import SensorStream
 from ethercat_server.tare import tare
 from protocol.control import ErrorCode, Event, Request, error_reply, event, reply
 from protocol.errors import RequestError, SettingError
 from protocol.framing import JsonObject
-from protocol.sdo_types import SdoType
 from protocol.sensor_choice import SensorChoice
-from protocol.settings import SETTINGS, SettingValue
+from protocol.settings import SettingValue
 
 _MOST_READS: Final = 8
 """Everyone may read objects: with so many jobs waiting no more reads, so that changes have their turn."""
@@ -32,6 +34,7 @@ class SensorActions:
 
     def __init__(
         self,
+        bus: Bus,
         hub: Hub,
         recovery: Recovery,
         jobs: Jobs,
@@ -39,15 +42,15 @@ class SensorActions:
         streams: Sequence[SensorStream],
     ) -> None:
         self.sensors = sensors
+        self._bus = bus
         self._hub = hub
         self._recovery = recovery
         self._jobs = jobs
         self._streams = streams
-        self._changing: set[int] = set()
-        """Sensors that are being configured or tared: one at a time each."""
         self.handlers: Mapping[str, Callable[[Connection, Request], None]] = {
             "sdo_read": self._sdo_read,
             "sdo_write": self._sdo_write,
+            "sii_read": self._sii_read,
             "configure": self._configure,
             "tare": self._tare,
         }
@@ -84,31 +87,42 @@ class SensorActions:
         return done
 
     def _start_change(self, place: int, steps: Steps[Mapping[str, Any]], done: Done) -> None:
-        self._begin_change(place)
+        self._check_unchanging(place)
+        self._jobs.start(place, steps, done, changes=True)
 
-        def ended(values: Mapping[str, Any], error: RequestError | None) -> None:
-            self._changing.discard(place)
-            done(values, error)
-
-        try:
-            self._jobs.start(place, steps, ended)
-        except RequestError:
-            self._changing.discard(place)
-            raise
-
-    def _begin_change(self, place: int) -> None:
-        if place in self._changing:
+    def _check_unchanging(self, place: int) -> None:
+        if self._jobs.is_changing(place) or self._recovery.is_changing(place):
             raise RequestError(
                 ErrorCode.BUSY, f"sensor {place} is being configured or tared: ask again when that is done"
             )
-        self._changing.add(place)
 
     def _sdo_read(self, connection: Connection, request: Request) -> None:
         values = request.values
         sdo = self._recovery.sdo(values["sensor"])
-        steps = _read(sdo, values["index"], values["subindex"], values["type"])
+        if (values["index"] is None) == (values["name"] is None):
+            raise RequestError(
+                ErrorCode.BAD_REQUEST, "sdo_read needs the key 'index', or the key 'name' in its place"
+            )
+        if values["name"] is not None:
+            steps = read_named(sdo, entry_named(values["name"]), values["type"])
+        else:
+            steps = read(sdo, values["index"], values["subindex"], values["type"])
+        self._start_reading(connection, request, steps)
+
+    def _sii_read(self, connection: Connection, request: Request) -> None:
+        word, words = request.values["word"], request.values["words"]
+
+        def steps() -> Steps[Mapping[str, Any]]:
+            data = yield from read_sii(self._bus, request.values["sensor"], word, words)
+            return {"word": word, "words": words, "hex": data.hex()}
+
+        self._start_reading(connection, request, steps())
+
+    def _start_reading(
+        self, connection: Connection, request: Request, steps: Steps[Mapping[str, Any]]
+    ) -> None:
         done = self._answering(connection, request)
-        self._jobs.start(values["sensor"], steps, done, most=_MOST_READS)
+        self._jobs.start(request.values["sensor"], steps, done, most=_MOST_READS)
 
     def _sdo_write(self, connection: Connection, request: Request) -> None:
         values = request.values
@@ -118,8 +132,8 @@ class SensorActions:
             )
         sensor = self.sensors[values["sensor"]]
         sdo = self._recovery.sdo(sensor.place)
-        data = _bytes_to_write(values)
-        self._start(connection, request, _write(sdo, sensor, values["index"], values["subindex"], data))
+        data = bytes_to_write(values)
+        self._start(connection, request, write(sdo, sensor, values["index"], values["subindex"], data))
 
     def _tare(self, connection: Connection, request: Request) -> None:
         values = request.values
@@ -148,12 +162,11 @@ class SensorActions:
         if not change.needs_preop:
             self._start_change(place, self._change_in_op(sensor, change, save_too), done)
             return
-        self._begin_change(place)
+        self._check_unchanging(place)
 
         def changed(error: BusError | None) -> None:
-            self._changing.discard(place)
             if error is not None:
-                done({}, refusal(error, "; the former settings are in force"))
+                done({}, refusal(error))
                 return
             try:
                 self._start_change(place, self._finish_change(sensor, save_too), done)
@@ -189,49 +202,3 @@ def _answer(request: Request, values: Mapping[str, Any], error: RequestError | N
     if request.has_id:
         message["id"] = request.id
     return error_reply(message, error.code, str(error), **error.extra)
-
-
-def _read(sdo: Sdo, index: int, subindex: int, kind: SdoType | None) -> Steps[Mapping[str, Any]]:
-    data = yield from sdo.read(index, subindex)
-    values: dict[str, Any] = {"index": index, "subindex": subindex, "hex": data.hex()}
-    if kind is not None:
-        try:
-            values |= {"type": kind.name, "value": kind.unpack(data)}
-        except ValueError as error:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST, f"the key 'type' does not fit object 0x{index:04X}:{subindex}: {error}"
-            ) from None
-    return values
-
-
-def _bytes_to_write(values: Mapping[str, Any]) -> bytes:
-    kind: SdoType | None = values["type"]
-    data: bytes | None = values["hex"]
-    if (kind is None) == (data is None) or (kind is None) != (values["value"] is None):
-        raise RequestError(
-            ErrorCode.BAD_REQUEST, "sdo_write needs either the keys 'type' and 'value' or the key 'hex'"
-        )
-    if data is not None:
-        return data
-    assert kind is not None
-    try:
-        return kind.pack(values["value"])
-    except ValueError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, f"the key 'value' must be {error}") from None
-
-
-def _write(sdo: Sdo, sensor: Sensor, index: int, subindex: int, data: bytes) -> Steps[Mapping[str, Any]]:
-    yield from sdo.write(index, subindex, data)
-    # What was written is to be in force after a power cut too, if it is one of what the server looks after.
-    entry = objects.BY_ADDRESS.get((index, subindex))
-    if entry is not None and entry.setting is not None:
-        try:
-            value = entry.decode_setting(data, SETTINGS[entry.setting].is_bool)
-        except ValueError:
-            value = None
-        if value is not None:
-            sensor.wanted = {**sensor.wanted, entry.setting: value}
-            sensor.settings[entry.setting] = value
-    if index == objects.FORCE_TORQUE_OFFSET:
-        sensor.offset = yield from read_offset(sdo)
-    return {"index": index, "subindex": subindex, "hex": data.hex()}

@@ -48,7 +48,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]
         recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast), Jobs(bus, streams)
         cycle = Cycle(bus, streams, hub, recovery, jobs, notifier)
-        on_sensors = SensorActions(hub, recovery, jobs, sensors, streams)
+        on_sensors = SensorActions(bus, hub, recovery, jobs, sensors, streams)
         service = Service(argv, policy, hub, on_sensors, notifier)
         cycle.every_second = service.every_second
         signals.call(cycle.stop, service.reload)

@@ -5,16 +5,21 @@ What the sensors must be is checked before anything is written to one of them.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 from ethercat_server import objects
-from ethercat_server.bus import Bus, SlaveIdentity
-from ethercat_server.errors import BusError, UsageError
+from ethercat_server.bus import Bus
+from ethercat_server.errors import BusError, SdoAbortError, UsageError
 from ethercat_server.options import ServerOptions
-from ethercat_server.sdo import BlockingSdo, finish
-from ethercat_server.sensor import Sensor, identify, is_known_model, set_up
+from ethercat_server.sdo import BlockingSdo, Sdo, finish
+from ethercat_server.sensor import Sensor, identify, is_known_model, read_offset, set_up
+from ethercat_server.sii import has_coe
+from ethercat_server.soem import SlaveIdentity
 from protocol.errors import PdoSizeError
 from protocol.pdo import layout_for
+
+log = logging.getLogger(__name__)
 
 
 def bring_up(bus: Bus, options: ServerOptions, check_interrupt: Callable[[], None]) -> list[Sensor]:
@@ -26,7 +31,9 @@ def bring_up(bus: Bus, options: ServerOptions, check_interrupt: Callable[[], Non
     sensors = find_sensors(bus, options, check_interrupt)
     for sensor in sensors:
         check_interrupt()
-        finish(set_up(BlockingSdo(bus, sensor.place), sensor))
+        sdo = BlockingSdo(bus, sensor.place)
+        finish(set_up(sdo, sensor))
+        _tell_offset(sdo, sensor)
     check_interrupt()
     enter_op(bus, sensors, check_interrupt)
     return sensors
@@ -57,7 +64,29 @@ def enter_op(bus: Bus, sensors: list[Sensor], check_interrupt: Callable[[], None
         sensor.state = "OP"
 
 
+def _tell_offset(sdo: Sdo, sensor: Sensor) -> None:
+    """A tare that was saved, or a part of one, is in all samples: it is to be known."""
+    try:
+        offset = finish(read_offset(sdo))
+    except SdoAbortError:
+        return
+    rows = [objects.BY_ADDRESS[objects.FORCE_TORQUE_OFFSET, sub] for sub in range(1, 7)]
+    texts = [f"{row.name} {value:g} {row.unit}" for row, value in zip(rows, offset, strict=True) if value]
+    if texts:
+        log.info("sensor %d has a tare in its flash: %s", sensor.place, ", ".join(texts))
+
+
+def check_sii(ifname: str, place: int, slave: SlaveIdentity) -> None:
+    """BusError if the slave's SII could not be read: nothing is known of it, its mailbox is not set up."""
+    if not slave.vendor and not slave.product:
+        raise BusError(
+            f"the SII (EEPROM) of the slave at place {place} of {ifname} cannot be read, so it does not say "
+            "what it is: power it off and on; if that does not help, its EEPROM is damaged"
+        )
+
+
 def _check_vendor(ifname: str, place: int, slave: SlaveIdentity) -> None:
+    check_sii(ifname, place, slave)
     if (slave.vendor, slave.product) != (objects.VENDOR_ID, objects.PRODUCT_CODE):
         raise BusError(
             f"the slave at place {place} of {ifname} is {slave.name or 'nameless'!r} (vendor "
@@ -67,7 +96,15 @@ def _check_vendor(ifname: str, place: int, slave: SlaveIdentity) -> None:
 
 
 def _find(bus: Bus, place: int, slave: SlaveIdentity, options: ServerOptions) -> Sensor:
-    identity = finish(identify(BlockingSdo(bus, place), slave.name))
+    try:
+        identity = finish(identify(BlockingSdo(bus, place), slave.name))
+    except BusError:
+        if finish(has_coe(bus, place)):
+            raise
+        raise BusError(
+            f"sensor {place} on {bus.ifname} has no CoE mailbox, and so no objects to set it up by: it is "
+            "no Bota Gen-0 sensor, or its EEPROM is damaged"
+        ) from None
     if not is_known_model(identity.name):
         raise BusError(
             f"sensor {place} on {bus.ifname} is a {identity.name!r}, a model this server does not know: "

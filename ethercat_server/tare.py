@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from typing import Any, Final
 
-from ethercat_server.errors import BusError
+from ethercat_server.errors import BusError, CutOffError, extended
 from ethercat_server.sdo import Sdo, Steps
 from ethercat_server.sensor import Sensor, read_offset, write_offset
 from ethercat_server.stream import SensorStream
@@ -45,18 +45,36 @@ def tare(
     new = tuple(t - m + o for t, m, o in zip(target, mean, old, strict=True))
     try:
         yield from write_offset(sdo, new)
-    except BusError:
-        yield from write_offset(sdo, old)
-        raise
+        yield from _wait(sensor, stream, _SETTLING)
+        mean, _ = yield from _average(sensor, stream, samples)
+    except (BusError, RequestError) as error:
+        raise (yield from _take_back(sdo, sensor, old, error)) from None
     sensor.offset = new
-    yield from _wait(sensor, stream, _SETTLING)
-    mean, _ = yield from _average(sensor, stream, samples)
     return {
         "old_offset": list(old),
         "new_offset": list(new),
         "residual": [m - t for m, t in zip(mean, target, strict=True)],
         "deviation": deviation[:6],
     }
+
+
+def _take_back(
+    sdo: Sdo, sensor: Sensor, old: tuple[float, ...], error: BusError | RequestError
+) -> Steps[BusError | RequestError]:
+    """Write the old offset again; returns `error` with what came of that."""
+    addition = "; the old offset is in force"
+    if isinstance(error, CutOffError):
+        sensor.offset, sensor.unsettled = old, True
+        addition = "; it gets its old offset when it is back"
+    else:
+        try:
+            yield from write_offset(sdo, old)
+        except BusError as worse:
+            sensor.offset, sensor.unsettled = old, True
+            addition = f"; putting back the old offset failed too: {worse}; tare it again"
+    if isinstance(error, RequestError):
+        return RequestError(error.code, f"{error}{addition}", **error.extra)
+    return extended(error, addition)
 
 
 def _average(sensor: Sensor, stream: SensorStream, samples: int) -> Steps[tuple[list[float], list[float]]]:

@@ -199,7 +199,7 @@ class Client:
     def _wait(self, timeout_s: float) -> bool:
         try:
             return bool(select.select((self.connection,), (), (), max(timeout_s, 0.0))[0])
-        except ValueError:
+        except (ValueError, OSError):  # closed before, or by another thread at this very moment
             raise ConnectionFailedError("this client has been closed") from None
 
     def _take(self) -> None:

@@ -22,6 +22,8 @@ PROTOCOL_VERSION: Final = 1
 MAX_SDO_BYTES: Final = 112
 """What fits a mailbox of 128 bytes in one piece."""
 MAX_TARE_SAMPLES: Final = 20_000
+_LONGEST_NAME: Final = 80
+MAX_SII_WORDS: Final = 128
 
 
 class ErrorCode(StrEnum):
@@ -148,10 +150,17 @@ def _hex_bytes(value: object) -> bytes:
     raise ValueError(f"1 to {MAX_SDO_BYTES} bytes as hexadecimal digits, two each")
 
 
+def _object_name(value: object) -> str:
+    if isinstance(value, str) and 0 < len(value) <= _LONGEST_NAME:
+        return value
+    raise ValueError(f"a text of 1 to {_LONGEST_NAME} characters, such as 'Sampling rate'")
+
+
 _SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(place=0))
+_INDEX: Final = _object_number(0xFFFF)
 _ENTRY: Final = {
     "sensor": _SENSOR,
-    "index": Parameter(_object_number(0xFFFF), required=True),
+    "index": Parameter(_INDEX, required=True),
     "subindex": Parameter(_object_number(0xFF), default=0),
     "type": Parameter(sdo_type),
 }
@@ -184,9 +193,16 @@ ACTIONS: Final[Mapping[str, Action]] = {
         },
         controls=True,
     ),
-    "sdo_read": Action(_ENTRY),
+    "sdo_read": Action({**_ENTRY, "index": Parameter(_INDEX), "name": Parameter(_object_name)}),
     "sdo_write": Action(
         {**_ENTRY, "value": Parameter(_anything), "hex": Parameter(_hex_bytes)}, controls=True
+    ),
+    "sii_read": Action(
+        {
+            "sensor": _SENSOR,
+            "word": Parameter(_object_number(0xFFFF), required=True),
+            "words": Parameter(whole_number(1, MAX_SII_WORDS), default=2),
+        }
     ),
     "shutdown": Action({}, controls=True),
 }

@@ -26,6 +26,7 @@ from protocol.pdo import LAYOUTS
 MAX_JSON_LENGTH: Final = 65536
 """Longest JSON text, bytes, that either side accepts in one message."""
 MAX_JSON_DEPTH: Final = 32
+"""Most objects and arrays in each other."""
 BARE_JSON_FIRST_BYTE: Final = b"{"
 """A connection that starts with this byte is a bare JSON connection."""
 
@@ -149,16 +150,11 @@ def _json_kind(value: object) -> str:
 
 
 def _depth(value: object) -> int:
+    """How many containers are in each other."""
     level, depth = [value], 0
-    while level:
+    while level := [item for item in level if isinstance(item, dict | list)]:
         depth += 1
-        below: list[object] = []
-        for item in level:
-            if isinstance(item, dict):
-                below.extend(item.values())
-            elif isinstance(item, list):
-                below.extend(item)
-        level = below
+        level = [inner for item in level for inner in (item.values() if isinstance(item, dict) else item)]
     return depth
 
 

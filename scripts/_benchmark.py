@@ -14,10 +14,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 
@@ -25,10 +25,13 @@ from ethercat_server.errors import ServerError
 from scripts import _benchmark_chains as chains
 from scripts._benchmark_chain import OVERSAMPLING_HZ, Setup, virtual_bus
 from scripts._benchmark_clients import measure_clients
+from scripts._benchmark_cpp import measure_cpp
 from scripts._benchmark_node import measure_node
 from scripts._benchmark_plot import Curves, draw
 from scripts._benchmark_records import may_be_real_time
 from scripts._benchmark_report import print_configuration
+from scripts._benchmark_sdo import SECONDS as SDO_SECONDS
+from scripts._benchmark_sdo import measure_sdo
 from scripts._benchmark_soak import soak
 from scripts._demo import DemoError, Stopped, ignore_signals, loopback_up, on_signal
 
@@ -40,11 +43,24 @@ _SECONDS: Final = 6.0
 _QUICK_SECONDS: Final = 3.0
 _RATES: Final = tuple(OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512))
 
-MODES: Final[dict[str, tuple[Callable[[Setup, Console], dict[str, Any]], str]]] = {
-    "clients": (measure_clients, "only the server, eight clients against one"),
-    "node": (measure_node, "only the ROS 2 node: ages beside a TCP client, CPU, first message after a stop"),
+
+class Mode(NamedTuple):
+    """An option that measures one thing, by itself."""
+
+    measure: Callable[[Setup, Console], dict[str, Any]]
+    help: str
+    seconds: float = _SECONDS
+    """Unless told otherwise."""
+
+
+MODES: Final[dict[str, Mode]] = {
+    "clients": Mode(measure_clients, "only the server, eight clients against one"),
+    "cpp": Mode(measure_cpp, "only the C++ client, against a bare read"),
+    "sdo": Mode(measure_sdo, "only the server, without and with SDO traffic", SDO_SECONDS),
+    "node": Mode(
+        measure_node, "only the ROS 2 node: ages beside a TCP client, CPU, first message after a stop", 15.0
+    ),
 }
-"""Options that measure one thing, by themselves."""
 
 
 @dataclass
@@ -114,9 +130,12 @@ def run(options: argparse.Namespace, console: Console) -> None:
         write_json(options.json, options, priority, soak=result)
         print(f"written: {options.json}")
         return
-    for name, (measure_it, _) in MODES.items():
+    for name, mode in MODES.items():
         if getattr(options, name):
-            result = measure_it(setup(options.rates[0], options.sensors[0]), console)
+            one = replace(
+                setup(options.rates[0], options.sensors[0]), seconds=options.seconds or mode.seconds
+            )
+            result = mode.measure(one, console)
             write_json(options.json, options, priority, **{name: result})
             print(f"written: {options.json}")
             return
@@ -175,8 +194,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--sensors", type=_counts, metavar="N,...", help="sensors on the bus (1,2)")
     parser.add_argument("--ppm", type=float, default=150.0, help="the sensors' clock error (%(default)g)")
     parser.add_argument("--soak", type=float, metavar="MINUTES", help="only the server, for so long")
-    for name, (_, text) in MODES.items():
-        parser.add_argument(f"--{name}", action="store_true", help=text)
+    for name, mode in MODES.items():
+        parser.add_argument(f"--{name}", action="store_true", help=mode.help)
     parser.add_argument("--no-ros", dest="ros", action="store_false", help="TCP only")
     parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
                         help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip

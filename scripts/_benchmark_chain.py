@@ -41,6 +41,7 @@ class Setup:
     warm_up_s: float
     priority: int
     ppm: float
+    signal: str = "clock"
     step: Callable[[], None] = lambda: None
     """Called some times a second."""
 
@@ -58,7 +59,7 @@ class Setup:
     def sensor_arguments(self) -> str:
         """The virtual sensors' clocks differ from nominal to opposite sides, so that they pass each other."""
         errors = ",".join(str(self.ppm if place % 2 == 0 else -self.ppm) for place in range(self.sensors))
-        return f"--sensors {self.sensors} --signal clock --sinc {self.sinc} --ppm={errors}"
+        return f"--sensors {self.sensors} --signal {self.signal} --sinc {self.sinc} --ppm={errors}"
 
 
 @dataclass

@@ -124,6 +124,18 @@ def test_recordings_are_opened_in_one_place() -> None:
     }
 
 
+def test_the_monitor_knows_the_protocol_only() -> None:
+    monitor = [path for path in CLIENTS if path.is_relative_to(ROOT / "clients" / "monitor")]
+    allowed = set(sys.stdlib_module_names) | {"clients", "protocol", "rich", "textual"}
+    assert monitor
+    for path in monitor:
+        assert imports(path) <= allowed, path
+        others = {module for module in modules(path) if module.startswith("clients.")}
+        shared = {"clients.address", "clients.version"}
+        assert all(m.startswith("clients.monitor") for m in others - shared), path
+    assert [path.name for path in monitor if "textual" in imports(path)] == ["app.py"]
+
+
 @pytest.mark.parametrize(
     "path", PROTOCOL + SERVER + BRIDGE + CLIENTS + OTHERS, ids=lambda p: str(p.relative_to(ROOT))
 )

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from clients.recording.reader import Recording
-from protocol.framing import DataFlag
+from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import LAYOUTS, STANDARD_GRAVITY, ImuUnits, PdoLayout
 
 Floats = npt.NDArray[np.float64]
@@ -76,7 +76,14 @@ class Columns:
         return Columns(*(getattr(self, name)[mask] for name in self.__slots__))
 
 
-def columns(recording: Recording, sensor: int = 0, imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
+class FrameSource(Protocol):
+    """What has frames: a `clients.recording.reader.Recording`, or what was received just now."""
+
+    def frames(self, sensor: int | None = None) -> Iterable[DataMessage]:
+        """The frames of the sensor at this place, or of all, in the order in which they came."""
+
+
+def columns(recording: FrameSource, sensor: int = 0, imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
     """All frames of the sensor at this place. DamagedError as `Recording.frames`.
 
     `imu_units` is what the sensor's firmware sends acceleration and angular rate in.

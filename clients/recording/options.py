@@ -68,7 +68,7 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add("--no-reconnect", action="store_false", dest="reconnect",
         help="end when the server does, instead of waiting for its return")  # fmt: skip
     add("--version", action="version", version=f"%(prog)s {VERSION}")
-    given = parser.parse_args(argv)
+    given = parser.parse_intermixed_args(argv)
     if given.namespaces is not None and not given.ros:
         parser.error("--ros-namespace goes with --ros")
     sensors = tuple(sorted(set(given.sensors))) if given.sensors else None

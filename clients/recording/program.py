@@ -78,6 +78,7 @@ def _record(
                 recorder.put(batch)
                 _tell(batch, progress)
                 if recorder.failed:
+                    code = 1
                     break
                 if signals.asked:
                     break

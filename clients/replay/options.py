@@ -61,7 +61,7 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
         help="user who may shut it down, beside root and its own user")  # fmt: skip
     add("--control-group", action="append", default=[], metavar="NAME", help="group whose members may")
     add("--version", action="version", version=f"%(prog)s {VERSION}")
-    given = parser.parse_args(argv)
+    given = parser.parse_intermixed_args(argv)
     names: list[str] = given.arguments
     port = DEFAULT_PORT
     if len(names) > 1 and names[-1].isascii() and names[-1].isdecimal():

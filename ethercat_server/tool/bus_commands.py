@@ -7,13 +7,15 @@ import contextlib
 import functools
 from typing import Any
 
-from ethercat_server.errors import InterfaceError
+from ethercat_server.sdo import finish
 from ethercat_server.sensor import Identity
+from ethercat_server.sii import read_sii
 from ethercat_server.tool import sii
-from ethercat_server.tool.command import DONE, Command
+from ethercat_server.tool.command import DONE, Command, add_link_arguments
 from ethercat_server.tool.direct import scan_only
 from ethercat_server.tool.holder import find_holder
 from ethercat_server.tool.link import Found, choose
+from ethercat_server.tool.reach import find_server
 from ethercat_server.tool.show import columns, say, say_json
 
 
@@ -55,21 +57,26 @@ def _adapters(args: argparse.Namespace) -> int:
 
 
 def _eeprom_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("iface", metavar="IFACE", help="interface the sensors are connected to")
-    parser.add_argument(
-        "--sensor", metavar="WHICH", help="place on the bus from 0, serial:1234, or name (default: all)"
-    )
+    add_link_arguments(parser, all_if_none=True)
+
+
+def _images(args: argparse.Namespace) -> list[bytes]:
+    """The SII of every slave, by place."""
+    with contextlib.ExitStack() as cleanup:
+        link = find_server(args.iface, args.server)
+        if link is not None:
+            cleanup.callback(link.close)
+            return [sii.read_image(functools.partial(link.sii, sensor.place)) for sensor in link.sensors]
+        bus, slaves = scan_only(args.iface, cleanup)
+
+        def read(place: int, word: int, words: int) -> bytes:
+            return finish(read_sii(bus, place, word, words), pause_s=0)
+
+        return [sii.read_image(functools.partial(read, place)) for place in range(len(slaves))]
 
 
 def _eeprom(args: argparse.Namespace) -> int:
-    holder = find_holder(args.iface)
-    if holder is not None:
-        raise InterfaceError(
-            f"{args.iface} is in use by {holder}, but the SII is read on the interface itself: stop it first"
-        )
-    with contextlib.ExitStack() as cleanup:
-        bus, slaves = scan_only(args.iface, cleanup)
-        images = [sii.read_image(functools.partial(bus.sii_words, n)) for n in range(len(slaves))]
+    images = _images(args)
     decoded = [sii.decode(image) for image in images]
     found = [Found(n, Identity(row["name"], row["serial"], "", "")) for n, row in enumerate(decoded)]
     places = [choose(found, args.sensor).place] if args.sensor is not None else range(len(found))

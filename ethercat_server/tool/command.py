@@ -42,9 +42,9 @@ def add_link_arguments(parser: argparse.ArgumentParser, *, all_if_none: bool = F
 
 
 @contextlib.contextmanager
-def link(args: argparse.Namespace) -> Iterator[Link]:
-    """The link that the arguments ask for; closed at the end."""
-    opened = open_link(args.iface, args.server)
+def link(args: argparse.Namespace, *, any_slave: bool = False) -> Iterator[Link]:
+    """The link that the arguments ask for (see `open_link`); closed at the end."""
+    opened = open_link(args.iface, args.server, any_slave=any_slave)
     try:
         yield opened
     finally:

@@ -9,7 +9,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from ethercat_server import realtime
-from ethercat_server.bus import Bus, SlaveIdentity
+from ethercat_server.bus import Bus
 from ethercat_server.configuration import Change, save
 from ethercat_server.cycle import Cycle
 from ethercat_server.errors import BusError, UsageError
@@ -19,9 +19,11 @@ from ethercat_server.notify import Notifier
 from ethercat_server.options import VIRTUAL_INTERFACE, ServerOptions
 from ethercat_server.recovery import Recovery
 from ethercat_server.sdo import BlockingSdo, Sdo, Steps, finish
-from ethercat_server.sensor import Sensor, set_up
+from ethercat_server.sensor import Identity, Sensor, identify, set_up
 from ethercat_server.server_settings import DEFAULT_RT_PRIORITY
-from ethercat_server.start_up import enter_op, find_sensors
+from ethercat_server.sii import has_coe
+from ethercat_server.soem import SlaveIdentity
+from ethercat_server.start_up import check_sii, enter_op, find_sensors
 from ethercat_server.stream import SensorStream
 from ethercat_server.tare import tare
 from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, failed_change, signals_held_back
@@ -53,14 +55,16 @@ def scan_only(ifname: str, cleanup: contextlib.ExitStack) -> tuple[Bus, list[Sla
 class DirectLink(Link):
     """All sensors in PREOP; `watch` and `tare` take them to OP, set as they are."""
 
-    def __init__(self, ifname: str) -> None:
+    def __init__(self, ifname: str, *, any_slave: bool = False) -> None:
         with contextlib.ExitStack() as cleanup:
             self._bus = open_bus(ifname, cleanup)
-            self._options = ServerOptions(ifname, port=0)
-            self._found = find_sensors(self._bus, self._options, _no_check)
+            if any_slave:
+                self.sensors = _identify_all(self._bus)
+            else:
+                found = find_sensors(self._bus, ServerOptions(ifname, port=0), _no_check)
+                self.sensors = [Found(sensor.place, sensor.identity) for sensor in found]
             self._cleanup = cleanup.pop_all()
         self.used = f"the interface {ifname}"
-        self.sensors = [Found(sensor.place, sensor.identity) for sensor in self._found]
 
     def close(self) -> None:
         """Take the bus to INIT and let the interface go."""
@@ -204,6 +208,25 @@ def _change(sdo: Sdo, sensor: Sensor, change: Change, and_save: bool) -> Steps[N
         raise failed_change(error) from None
     if and_save:
         yield from save(sdo, sensor)
+
+
+def _identify_all(bus: Bus) -> list[Found]:
+    """All slaves, whatever they are and however little they say."""
+    found = []
+    slaves = bus.scan(_no_check)
+    for place, slave in enumerate(slaves):
+        check_sii(bus.ifname, place, slave)
+    bus.check_preop()
+    for place, slave in enumerate(slaves):
+        try:
+            identity = finish(identify(GuardedSdo(BlockingSdo(bus, place)), slave.name))
+        except BusError:
+            if finish(has_coe(bus, place)):
+                raise
+            found.append(Found(place, Identity(slave.name or "nameless", 0, "", ""), has_objects=False))
+        else:
+            found.append(Found(place, identity))
+    return found
 
 
 def _check_rate_known(sensor: Sensor) -> None:

@@ -32,26 +32,39 @@ class Holder(NamedTuple):
         return "another EtherCAT master" if self.pid is None else f"process {self.pid} ({self.name})"
 
 
+class Listener(NamedTuple):
+    """A packet socket: whoever has it gets a copy of frames."""
+
+    protocol: int
+    """Ethernet type; 3 for all."""
+    ifindex: int
+    """Interface; 0 for all."""
+    inode: int
+
+
 def find_holder(ifname: str) -> Holder | None:
     """Who has the EtherCAT socket on `ifname`; None if nobody has, or there is no such interface."""
     try:
         index = socket.if_nametoindex(ifname)
     except OSError:
         return None
-    inodes = {
-        int(columns[-1])
-        for columns in _table("/proc/self/net/packet")
-        if int(columns[3], 16) == _ETHERCAT and int(columns[4]) == index
-    }
-    if not inodes:
-        return None
-    for process in Path("/proc").iterdir():
+    inodes = {row.inode for row in packet_sockets() if (row.protocol, row.ifindex) == (_ETHERCAT, index)}
+    return next(iter(owners(inodes)), Holder(None, "", None)) if inodes else None
+
+
+def packet_sockets(table: str | Path = "/proc/self/net/packet") -> list[Listener]:
+    """The packet sockets of this network namespace, from the kernel's `table` of them."""
+    return [Listener(int(row[3], 16), int(row[4]), int(row[-1])) for row in _table(table)]
+
+
+def owners(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Holder]:
+    """The processes that may be seen and have one of these sockets."""
+    for process in processes.iterdir():
         if process.name.isdecimal() and (sockets := set(_sockets(process))) & inodes:
             name = ""
             with contextlib.suppress(OSError):  # it has just ended
                 name = (process / "comm").read_text().strip()
-            return Holder(int(process.name), name, _listening(process, sockets))
-    return Holder(None, "", None)
+            yield Holder(int(process.name), name, _listening(process, sockets))
 
 
 def _table(path: str | Path) -> Iterator[list[str]]:

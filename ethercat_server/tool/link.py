@@ -8,18 +8,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
-from ethercat_server.objects import BY_SETTING, FACTORY_CALIBRATION, SAMPLING_RATE
-from ethercat_server.sdo import Sdo, Steps, finish
+from ethercat_server.errors import BusError, SdoAbortError, UsageError
+from ethercat_server.objects import BY_SETTING, SAMPLING_RATE
+from ethercat_server.sdo import Sdo, Steps, check_writable, finish
 from ethercat_server.sensor import Identity, Sensor, read_settings
 from protocol.filters import FORCE_TORQUE_FILTERS
 from protocol.framing import DataMessage
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue
-
-
-class ForbiddenWriteError(ServerError):
-    """A write that the tool never does."""
 
 
 class GuardedSdo:
@@ -34,10 +30,7 @@ class GuardedSdo:
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """See `Sdo`; ForbiddenWriteError for the factory calibration."""
-        if index == FACTORY_CALIBRATION:
-            raise ForbiddenWriteError(
-                "object 0x2000 holds the factory calibration, which is never written: leave it as it is"
-            )
+        check_writable(index)
         yield from self._sdo.write(index, subindex, data)
 
 
@@ -46,6 +39,8 @@ class Found(NamedTuple):
 
     place: int
     identity: Identity
+    has_objects: bool = True
+    """False for a slave without a CoE mailbox."""
 
     def __str__(self) -> str:
         """As a person names it."""
@@ -136,7 +131,7 @@ def read_in_force(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     sensor.wanted = {"sinc_length": held or 0}
     yield from read_settings(sdo, sensor)
     if not held:
-        del sensor.settings["sinc_length"]
+        sensor.hold({name: value for name, value in sensor.settings.items() if name != "sinc_length"})
     sensor.wanted = dict(sensor.settings)
 
 

@@ -1,19 +1,23 @@
-"""`objects`: every object of the dictionary, read and decoded; what cannot be read, and why."""
+"""`objects` and `read`: all objects of the dictionary, or some by name, read and decoded; else why not."""
 
 from __future__ import annotations
 
 import argparse
 import struct
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
-from ethercat_server.errors import OBJECT_MISSING, SdoAbortError
+from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError, UsageError
 from ethercat_server.known_objects import KNOWN_OBJECTS
+from ethercat_server.object_names import find_objects, similar_names
 from ethercat_server.objects import FACTORY_CALIBRATION, ObjectEntry
 from ethercat_server.sdo import Sdo, Steps, finish
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.show import columns, say, say_json, value_text
 from protocol.meaning import value_meaning
 
+_MOST_SILENT: Final = 3
+"""So many objects in a row may go unanswered before a slave is given up."""
 _HEAD: Final = ("object", "name", "value", "access", "meaning")
 
 
@@ -42,14 +46,56 @@ def _meaning(row: ObjectEntry, value: float | str) -> str:
     return row.allowed.get(int(value), "" if row.setting is None else "means nothing")
 
 
+def _read_rows(sdo: Sdo, rows: Sequence[ObjectEntry]) -> Iterator[tuple[ObjectEntry, dict[str, Any]]]:
+    """Each of `rows` with what reading it gives; BusError once the sensor answers nothing any more."""
+    silent = 0
+    for row in rows:
+        try:
+            yield row, finish(read_object(sdo, row))
+            silent = 0
+        except BusError as error:
+            silent += 1
+            if silent == _MOST_SILENT:
+                raise
+            yield row, {"error": str(error)}
+
+
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add_link_arguments(parser, all_if_none=True)
 
 
+def _read_arguments(parser: argparse.ArgumentParser) -> None:
+    add_link_arguments(parser, all_if_none=True)
+    parser.add_argument(
+        "names", nargs="+", metavar="NAME",
+        help="what to read: a name, such as 'Sampling rate' or 'Force/Torque Offset', a setting, or 0x8006:1",
+    )  # fmt: skip
+
+
+def _read(args: argparse.Namespace) -> int:
+    names: list[str] = args.names
+    if args.server is not None and args.iface is not None:
+        # With --server there is no interface: what came first is a name too.
+        names, args.iface = [args.iface, *names], None
+    rows: dict[tuple[int, int], ObjectEntry] = {}
+    for name in names:
+        found = find_objects(name)
+        if not found:
+            near = " or ".join(similar_names(name))
+            hint = f"did you mean {near}?" if near else "the command objects shows them all"
+            raise UsageError(f"no object is called {name!r}: {hint}")
+        rows |= {row.address: row for row in found}
+    return _show(args, list(rows.values()))
+
+
 def _objects(args: argparse.Namespace) -> int:
-    with link(args) as opened:
+    return _show(args, KNOWN_OBJECTS)
+
+
+def _show(args: argparse.Namespace, rows: Sequence[ObjectEntry]) -> int:
+    with link(args, any_slave=True) as opened:
         found = [
-            (sensor, [(row, finish(read_object(opened.sdo(sensor.place), row))) for row in KNOWN_OBJECTS])
+            (sensor, list(_read_rows(opened.sdo(sensor.place), rows)) if sensor.has_objects else [])
             for sensor in opened.chosen(args.sensor)
         ]
     if args.json:
@@ -61,6 +107,9 @@ def _objects(args: argparse.Namespace) -> int:
         return DONE
     for sensor, objects in found:
         say(str(sensor))
+        if not objects:
+            say("  it has no CoE mailbox, and so no objects")
+            continue
         say(columns([_HEAD, *(_line(row, read) for row, read in objects)], indent=2))
     return DONE
 
@@ -94,4 +143,7 @@ def _line(row: ObjectEntry, read: dict[str, Any]) -> tuple[str, ...]:
     )
 
 
-COMMANDS = (Command("objects", "read and decode every object of the dictionary", _arguments, _objects),)
+COMMANDS = (
+    Command("objects", "read and decode every object of the dictionary", _arguments, _objects),
+    Command("read", "read and decode some objects by name", _read_arguments, _read),
+)

@@ -11,11 +11,21 @@ from ethercat_server.tool.link import Link
 from ethercat_server.tool.remote import ServerLink, parse_address
 
 
-def open_link(ifname: str | None, server: str | None) -> Link:
+def open_link(ifname: str | None, server: str | None, *, any_slave: bool = False) -> Link:
     """The link to the sensors on `ifname`, or behind `server`; UsageError unless exactly one is given.
 
-    If a server holds the interface it goes through that, and says so.
+    If a server holds the interface it goes through that, and says so. With `any_slave`, slaves on the
+    interface that are no sensors are there too: for what only looks.
     """
+    link = find_server(ifname, server)
+    if link is not None:
+        return link
+    assert ifname is not None
+    return DirectLink(ifname, any_slave=any_slave)
+
+
+def find_server(ifname: str | None, server: str | None) -> ServerLink | None:
+    """The server that is named, or that holds the interface; None if nobody holds it."""
     if (ifname is None) == (server is None):
         raise UsageError("name either an interface, such as ens5, or a server with --server HOST:PORT")
     if server is not None:
@@ -23,7 +33,7 @@ def open_link(ifname: str | None, server: str | None) -> Link:
     assert ifname is not None
     holder = find_holder(ifname)
     if holder is None:
-        return DirectLink(ifname)
+        return None
     if holder.address is None:
         if holder.pid is None:
             hint = "run as root, or name its server with --server HOST:PORT"

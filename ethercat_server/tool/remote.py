@@ -86,6 +86,10 @@ class ServerLink(Link):
         """See `Link`."""
         return GuardedSdo(_ServerSdo(self, place))
 
+    def sii(self, place: int, word: int, words: int) -> bytes:
+        """So many words of a sensor's SII from `word` on."""
+        return bytes.fromhex(self.ask("sii_read", sensor=place, word=word, words=words)["hex"])
+
     def configure(self, place: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """See `Link`."""
         with signals_held_back():

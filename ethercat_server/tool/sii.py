@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from ethercat_server.virtual_sensor.sii import checksum
+from protocol.control import MAX_SII_WORDS
 
 _HEADER_WORDS: Final = 0x40
 """The categories begin here."""
@@ -21,13 +22,13 @@ _PROTOCOLS: Final = ((0x01, "AoE"), (0x02, "EoE"), (0x04, "CoE"), (0x08, "FoE"),
 _SM_KINDS: Final = ("unused", "mailbox out", "mailbox in", "outputs", "inputs")
 
 
-def read_image(read: Callable[[int], bytes]) -> bytes:
-    """The SII up to the end of its categories; `read` gives the four bytes at a word."""
+def read_image(read: Callable[[int, int], bytes]) -> bytes:
+    """The SII up to the end of its categories; `read` gives so many words from a word on, two bytes each."""
     image = bytearray()
 
     def have(words: int) -> None:
-        while len(image) < words * 2:
-            image.extend(read(len(image) // 2))
+        while (lacking := words - len(image) // 2) > 0:
+            image.extend(read(len(image) // 2, min(lacking, MAX_SII_WORDS)))
 
     have(_RAW_WORDS)
     word = _HEADER_WORDS

@@ -6,8 +6,10 @@ No sockets: bytes in, bytes out, with the time handed in.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
+from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor import wire
 from ethercat_server.virtual_sensor.commands import execute
 from ethercat_server.virtual_sensor.firmware import Firmware
@@ -17,6 +19,17 @@ from ethercat_server.virtual_sensor.sensor import VirtualSensor
 _LONGEST_PERIOD_NS = 50_000_000
 
 
+@dataclass(slots=True)
+class Damage:
+    """Frames that arrive damaged at one port of one sensor."""
+
+    sensor: VirtualSensor
+    port: int
+    """0: on the way out; 1: on the way back, from the sensor behind."""
+    frames: int
+    """How many more."""
+
+
 class Bus:
     """Sensors in the order in which frames reach them.
 
@@ -24,6 +37,7 @@ class Bus:
         lose: so many frames more will be lost.
         deaf_until: no frame comes back before this time (ns); None for not at all deaf.
         deaf_after: deaf for ever after so many frames more; None for never.
+        damage: what is to happen to the next frames on the cable; None for nothing.
     """
 
     def __init__(self, options: BusOptions, now: int) -> None:
@@ -32,6 +46,7 @@ class Bus:
         self.lose = 0
         self.deaf_until: float | None = None
         self.deaf_after: int | None = None
+        self.damage: Damage | None = None
         self.frames = self.frames_lost = 0
         self._power_events: list[tuple[int, VirtualSensor]] = []
         self._alive: list[Firmware] = []
@@ -88,11 +103,51 @@ class Bus:
             self.lose = max(self.lose - 1, 0)
             self.frames_lost += 1
             return False
-        for life in self._alive:
+        place = self._damaged_at()
+        for life in self._alive[:place]:
             for datagram in datagrams:
                 execute(life.esc, frame, datagram)
+        if place is not None:  # the network card of the master throws it away
+            self.frames_lost += 1
+            return False
         frame[wire.SOURCE_ADDRESS] |= wire.PROCESSED_BIT
+        for sensor in self.sensors:
+            while sensor.due:
+                sensor.due.pop(0)()
         return True
+
+    def _damaged_at(self) -> int | None:
+        """Count what a damaged frame makes the controllers count; how many sensors got it whole, None: all.
+
+        The one that finds it damaged marks it; those it then passes, on the way out at port 0 and on the way
+        back at port 1, count it as forwarded.
+        """
+        damage = self.damage
+        if damage is None or damage.sensor.life not in self._alive:
+            return None
+        damage.frames -= 1
+        if damage.frames <= 0:
+            self.damage = None
+        place = self._alive.index(damage.sensor.life)
+        self._alive[place].esc.count(reg.RX_ERRORS + 2 * damage.port)
+        self._alive[place].esc.count(reg.RX_ERRORS + 2 * damage.port + 1)
+        if damage.port == 1:
+            back = self._alive[:place]
+        else:
+            for life in self._alive[place + 1 :]:
+                life.esc.count(reg.FORWARDED_ERRORS)
+            back = self._alive[:-1]
+        for life in back:
+            life.esc.count(reg.FORWARDED_ERRORS + 1)
+        return len(self._alive) if damage.port == 1 else place
+
+    def flap(self, sensor: VirtualSensor, port: int) -> None:
+        """The link at a port goes away and comes back: the controllers at both its ends count it."""
+        place = self.sensors.index(sensor)
+        ends = ((place, 0), (place - 1, 1)) if port == 0 else ((place, 1), (place + 1, 0))
+        for end, its_port in ends:
+            if 0 <= end < len(self._alive):
+                self._alive[end].esc.count(reg.LOST_LINKS + its_port)
 
     def prepare(self) -> None:
         """The frames that waited are answered: look at the watchdogs, and work ahead.

@@ -9,6 +9,7 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from ethercat_server.object_names import TITLES
 from ethercat_server.objects import (
     BY_SETTING,
     CONTROL_COMMAND,
@@ -24,6 +25,7 @@ from ethercat_server.objects import (
     ObjectType,
 )
 from ethercat_server.virtual_sensor.al import AlState
+from ethercat_server.virtual_sensor.flash import Address, Flash
 from ethercat_server.virtual_sensor.layout import RXPDO, SYNC_MANAGERS, TXPDO
 from ethercat_server.virtual_sensor.sdo_abort import Abort, SdoAbortError
 from protocol.pdo import INPUT_OBJECT, LAYOUTS
@@ -32,26 +34,16 @@ from protocol.settings import SETTINGS, SettingValue, sampling_rate_hz
 STRING_SIZES: Final = {0x1008: 20, 0x1009: 12, 0x100A: 13}
 """Declared length of each string; the device fills up with NUL."""
 OBJECT_NAMES: Final = {
-    0x1018: "Identity",
+    **TITLES,
     0x1600: "Outputs mapping",
     0x1A00: "Inputs mapping",
     0x1C00: "Sync manager communication type",
     0x1C12: "Outputs assignment",
     0x1C13: "Inputs assignment",
-    0x2000: "Factory calibration",
-    0x6000: "Measurement",
-    0x8000: "Force torque offset",
-    0x8001: "Acceleration offset",
-    0x8002: "Angular rate offset",
-    0x8006: "Force torque filter",
-    0x8010: "Configuration",
-    0x8030: "Control",
 }
 _UNKNOWN_COMMAND = 1
 _SAVED = range(0x8000, 0x8011)
 """Objects that the save command puts into the flash; the factory calibration is kept in any case."""
-
-Address = tuple[int, int]
 
 
 def _mapping_rows(pdo_size: int) -> list[ObjectEntry]:
@@ -87,7 +79,8 @@ def entries_of(pdo_size: int) -> dict[Address, ObjectEntry]:
 class Dictionary:
     """Values of all entries of one sensor.
 
-    `process_data` gives the newest process data (for 0x6000); `changed` is called after a write.
+    `process_data` gives the newest process data (for 0x6000); `changed` is called after a write; `now` gives
+    CLOCK_MONOTONIC in ns.
     """
 
     def __init__(
@@ -95,19 +88,23 @@ class Dictionary:
         model: str,
         serial: int,
         pdo_size: int,
-        flash: dict[Address, bytes],
+        flash: Flash,
         process_data: Callable[[], bytes],
         changed: Callable[[], None],
+        now: Callable[[], int],
     ) -> None:
         self.entries: Mapping[Address, ObjectEntry] = entries_of(pdo_size)
         self._flash = flash
         self._layout = LAYOUTS[pdo_size]
         self._process_data = process_data
         self._changed = changed
+        self._now = now
+        self._saved = False
+        """The last command was a save: the flash says how it went."""
         self._values = {address: self._initial(row) for address, row in self.entries.items()}
         self._values[DEVICE_NAME] = model.encode("ascii").ljust(STRING_SIZES[DEVICE_NAME[0]], b"\0")
         self._values[SERIAL_NUMBER] = struct.pack("<I", serial)
-        self._values.update(flash)
+        self._values.update(flash.entries)
         self._follow_sinc()
 
     @staticmethod
@@ -136,6 +133,8 @@ class Dictionary:
             field = next(f for f in self._layout.fields if f.subindex == subindex)
             start = self._layout.offsets[field.name]
             return self._process_data()[start : start + field.type.size]
+        if row.address == CONTROL_STATUS and self._saved:
+            return bytes([self._flash.status(self._now())])
         return self._values[row.address]
 
     def write(self, index: int, subindex: int, data: bytes, state: AlState) -> None:
@@ -146,7 +145,7 @@ class Dictionary:
             _check_range(row, data)
         self._values[row.address] = data
         if index == FACTORY_CALIBRATION:
-            self._flash[row.address] = data
+            self._flash.entries[row.address] = data
         if row.address == CONTROL_COMMAND:
             self._command(data[0])
         self._follow_sinc()
@@ -190,7 +189,7 @@ class Dictionary:
     def set_sinc_length(self, sinc_length: int) -> None:
         """Set the SINC length as if it had been saved before power-on."""
         address = BY_SETTING["sinc_length"].address
-        self._values[address] = self._flash[address] = struct.pack("<H", sinc_length)
+        self._values[address] = self._flash.entries[address] = struct.pack("<H", sinc_length)
         self._follow_sinc()
 
     def _follow_sinc(self) -> None:
@@ -198,8 +197,9 @@ class Dictionary:
         self._values[SAMPLING_RATE] = struct.pack("<H", sampling_rate_hz(sinc_length))
 
     def _command(self, command: int) -> None:
-        if command == SAVE_PARAMETERS:
-            self._flash.update({a: v for a, v in self._values.items() if a[0] in _SAVED})
+        self._saved = command == SAVE_PARAMETERS
+        if self._saved:
+            self._flash.save({a: v for a, v in self._values.items() if a[0] in _SAVED}, self._now())
         status = 0 if command in (0, SAVE_PARAMETERS) else _UNKNOWN_COMMAND
         self._values[CONTROL_STATUS] = bytes([status])
         self._values[CONTROL_COMMAND] = b"\0"

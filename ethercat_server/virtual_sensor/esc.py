@@ -15,6 +15,8 @@ from ethercat_server.virtual_sensor.sii import SiiInterface
 from ethercat_server.virtual_sensor.sync_manager import SyncManager
 
 _U16 = struct.Struct("<H")
+_LINE_GOES_ON, _LINE_ENDS = 0x5A33, 0x5613
+"""DL status: ports 0 and 1 have a link, or only port 0."""
 
 
 class Pdi(Protocol):
@@ -60,10 +62,17 @@ class Esc:
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
         self._events = 0
 
+    def count(self, counter: int) -> None:
+        """Add one to the error counter at this register; it stays at 255."""
+        self.memory[counter] = min(self.memory[counter] + 1, 0xFF)
+
     def set_ports(self, next_slave: bool) -> None:
         """Port 0 is always open; port 1 is open if another slave follows."""
-        status = 0x5A33 if next_slave else 0x5613
-        if _U16.unpack_from(self.memory, reg.DL_STATUS)[0] != status:
+        status = _LINE_GOES_ON if next_slave else _LINE_ENDS
+        before = _U16.unpack_from(self.memory, reg.DL_STATUS)[0]
+        if before == _LINE_GOES_ON and not next_slave:
+            self.count(reg.LOST_LINKS + 1)
+        if before != status:
             _U16.pack_into(self.memory, reg.DL_STATUS, status)
             self._events |= reg.EVENT_DL_STATUS
 

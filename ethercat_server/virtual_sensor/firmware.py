@@ -10,11 +10,14 @@ from collections.abc import Callable
 from typing import Final
 
 from ethercat_server.virtual_sensor import registers as reg
+from ethercat_server.virtual_sensor.abort_faults import AbortFaults
 from ethercat_server.virtual_sensor.al import AlCode, AlState, AlStateMachine
 from ethercat_server.virtual_sensor.clock import SampleClock
 from ethercat_server.virtual_sensor.coe import CoeServer
-from ethercat_server.virtual_sensor.dictionary import Address, Dictionary
+from ethercat_server.virtual_sensor.dictionary import Dictionary
+from ethercat_server.virtual_sensor.disturbance import NO_SATURATION, Disturbances
 from ethercat_server.virtual_sensor.esc import Esc
+from ethercat_server.virtual_sensor.flash import Flash
 from ethercat_server.virtual_sensor.layout import SYNC_MANAGERS, sync_manager_lengths
 from ethercat_server.virtual_sensor.mailbox import Mailbox
 from ethercat_server.virtual_sensor.measurement import Measurement
@@ -48,19 +51,19 @@ class Firmware:
 
     Attributes:
         now: CLOCK_MONOTONIC in ns; whoever hands over a frame sets it first.
+        disturbances: what is wrong with its channels; call `disturbed` after changing them.
     """
 
-    def __init__(
-        self, options: SensorOptions, flash: dict[Address, bytes], now: int, on_write: OnWrite
-    ) -> None:
+    def __init__(self, options: SensorOptions, flash: Flash, now: int, on_write: OnWrite) -> None:
         self.now = now
         self._on_write = on_write
         self._options = options
         self._layout = layout_for(options.pdo_size)
         self._signal = make_signal(options)
         self.dictionary = Dictionary(
-            options.model, options.serial, options.pdo_size, flash, self.inputs, self._settings_changed
-        )
+            options.model, options.serial, options.pdo_size,
+            flash, self.inputs, self._settings_changed, lambda: self.now,
+        )  # fmt: skip
         sinc_length = int(self.dictionary.settings()["sinc_length"])
         self._signal_start = self.now
         self.clock = SampleClock(self.now, sinc_length, options.ppm)
@@ -72,7 +75,8 @@ class Firmware:
         self.made = 0
         self._warnings, self._warnings_until = 0, -1
         self._stuck = b""
-        self.aborts: dict[Address, int] = {}
+        self.disturbances = Disturbances(options.seed)
+        self.aborts = AbortFaults()
         self._fed = 0  # when the process data watchdog was last triggered; 0 = not running
         self._number, self._data = -1, b""
         self._prepared_number, self._prepared = -1, b""
@@ -85,7 +89,7 @@ class Firmware:
         """The newest process data at `now`."""
         if self._stuck:
             return self._stuck
-        number = self.clock.number_at(self.now)
+        number = self.disturbances.newest_given(self.clock.number_at(self.now))
         if number != self._number:
             if number == self._prepared_number:
                 self._data = self._prepared
@@ -96,7 +100,7 @@ class Firmware:
 
     def prepare(self, expected: int) -> None:
         """Make the sample that a frame at the time `expected` will ask for, while there is time."""
-        number = self.clock.number_at(expected)
+        number = self.disturbances.newest_given(self.clock.number_at(expected))
         if number not in (self._number, self._prepared_number) and not self._stuck:
             self._prepared = self._make(number)
             self._prepared_number = number
@@ -105,7 +109,11 @@ class Firmware:
         self.made += 1
         instant = self.clock.instant(number)
         reading = self._signal.reading(number, instant, (instant - self._signal_start) * 1e-9)
-        return self._measurement.pack(reading, self._warnings if number < self._warnings_until else 0)
+        saturated = NO_SATURATION
+        if not self._signal.exact:
+            reading, saturated = self.disturbances.apply(reading)
+        warnings = self._warnings if number < self._warnings_until else 0
+        return self._measurement.pack(reading, warnings, saturated)
 
     def _settings_changed(self) -> None:
         settings = self.dictionary.settings()
@@ -211,14 +219,9 @@ class Firmware:
         """The last reply was lost on the way."""
         self.mailbox.repeat()
 
-    def _fault_on(self, index: int, subindex: int) -> None:
-        code = self.aborts.pop((index, subindex), None)
-        if code is not None:
-            raise SdoAbortError(code)
-
     def read(self, index: int, subindex: int) -> bytes:
         """An SDO upload."""
-        self._fault_on(index, subindex)
+        self.aborts.check_read((index, subindex))
         return self.dictionary.read(index, subindex)
 
     def check_download(self, index: int, subindex: int, length: int) -> None:
@@ -237,7 +240,7 @@ class Firmware:
         """An SDO download."""
         abort = 0
         try:
-            self._fault_on(index, subindex)
+            self.aborts.check_write((index, subindex), data, self.now)
             self.dictionary.write(index, subindex, data, self.al.state)
         except SdoAbortError as error:
             abort = error.code
@@ -264,6 +267,20 @@ class Firmware:
         self._signal = make_signal(options)
         self._signal_start = self.clock.instant(self.clock.number_at(self.now) + 1)
         self._settings_changed()
+
+    @property
+    def exact(self) -> bool:
+        """Whether it measures a signal that nothing may change."""
+        return self._signal.exact
+
+    def disturbed(self) -> None:
+        """The disturbances were changed: they show from the next sample on."""
+        self._prepared_number = -1
+
+    def set_skip(self, percent: float) -> None:
+        """Withhold this share of the samples after the newest one."""
+        self.disturbances.set_skip(percent, self.clock.number_at(self.now))
+        self.disturbed()
 
     def set_ppm(self, ppm: float) -> None:
         """Another error of the clock, from the newest sample on."""

@@ -10,10 +10,10 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
+from ethercat_server.virtual_sensor.disturbance import NO_SATURATION, Saturation
 from ethercat_server.virtual_sensor.signals import Reading
 from protocol.pdo import PdoLayout
 from protocol.settings import SettingValue
-from protocol.warnings_register import WarningFlag
 
 COUNTS_PER_NEWTON: Final = 10_000.0
 COUNTS_PER_NEWTON_METRE: Final = 500_000.0
@@ -64,11 +64,14 @@ class Measurement:
         self._acceleration_range = float(settings["acceleration_range_g"])
         self._angular_rate_range = float(settings["angular_rate_range_dps"])
 
-    def pack(self, reading: Reading, warnings: int) -> bytes:
-        """Process data of one sample; `warnings` is ORed into the register."""
+    def pack(self, reading: Reading, warnings: int, saturated: Saturation = NO_SATURATION) -> bytes:
+        """Process data of one sample.
+
+        `warnings` is ORed into the register, `saturated` into the saturation fields.
+        """
         load: tuple[float, ...]
         load, acceleration, rate, temperature, quaternion = reading
-        acceleration_bits = rate_bits = 0
+        force_torque_bits, acceleration_bits, rate_bits = saturated
         if not self._exact:
             load = tuple(a + b for a, b in zip(load, self._offset, strict=True))
             if not self._calibrated:
@@ -77,19 +80,21 @@ class Measurement:
                 a if -_LARGEST_REAL32 < a < _LARGEST_REAL32 else math.copysign(math.inf, a) for a in load
             )
             if self._imu:
-                acceleration, acceleration_bits = _limit(
+                acceleration, beyond = _limit(
                     _plus(acceleration, self._acceleration_offset), self._acceleration_range
                 )
-                rate, rate_bits = _limit(_plus(rate, self._angular_rate_offset), self._angular_rate_range)
-                if acceleration_bits:
-                    warnings |= WarningFlag.ACCELERATION_SATURATED
-                if rate_bits:
-                    warnings |= WarningFlag.ANGULAR_RATE_SATURATED
+                acceleration_bits |= beyond
+                rate, beyond = _limit(_plus(rate, self._angular_rate_offset), self._angular_rate_range)
+                rate_bits |= beyond
             else:
                 acceleration = rate = (0.0, 0.0, 0.0)
+                acceleration_bits = rate_bits = 0
+        if force_torque_bits or acceleration_bits or rate_bits:
+            warnings |= Saturation(force_torque_bits, acceleration_bits, rate_bits).warnings
         tail: tuple[float, ...] = ()
         if self._layout.has_orientation:
             tail = quaternion if self._orientation else (0.0, 0.0, 0.0, 0.0)
         return self._layout.struct.pack(
-            0, warnings, *load, 0, *acceleration, acceleration_bits, *rate, rate_bits, temperature, *tail
-        )
+            0, warnings, *load, force_torque_bits, *acceleration, acceleration_bits, *rate, rate_bits,
+            temperature, *tail,
+        )  # fmt: skip

@@ -21,7 +21,15 @@ PDI_CONTROL: Final = 0x0140
 EVENT_MASK: Final = 0x0200
 EVENT_REQUEST: Final = 0x0210
 AL_EVENT_REQUEST: Final = 0x0220
-ERROR_COUNTERS: Final = 0x0300
+RX_ERRORS: Final = 0x0300
+"""Two bytes a port: frames that were not valid, and errors that the physical layer reported."""
+FORWARDED_ERRORS: Final = 0x0308
+"""A byte a port: frames that another slave before this one found to be damaged."""
+PROCESSING_UNIT_ERRORS: Final = 0x030C
+PDI_ERRORS: Final = 0x030D
+LOST_LINKS: Final = 0x0310
+"""A byte a port."""
+PORT_COUNT: Final = 4
 WATCHDOG_DIVIDER: Final = 0x0400
 WATCHDOG_TIME_PDI: Final = 0x0410
 WATCHDOG_TIME: Final = 0x0420
@@ -60,6 +68,16 @@ PDI_TYPE: Final = 0x05
 """SPI slave, as word 0 of the SII says too."""
 
 
+CLEARED_BY_WRITE: Final = (
+    range(RX_ERRORS, FORWARDED_ERRORS + PORT_COUNT),
+    range(PROCESSING_UNIT_ERRORS, PROCESSING_UNIT_ERRORS + 1),
+    range(PDI_ERRORS, PDI_ERRORS + 1),
+    range(LOST_LINKS, LOST_LINKS + PORT_COUNT),
+    range(WATCHDOG_COUNTER, WATCHDOG_COUNTER + 2),
+)
+"""Counters: a write of any value to one of a group sets the whole group to zero."""
+
+
 def _write_mask() -> bytes:
     mask = bytearray(REGISTERS_END)
 
@@ -70,11 +88,11 @@ def _write_mask() -> bytes:
     allow(DL_CONTROL, 4)
     allow(AL_CONTROL, 2)
     allow(EVENT_MASK, 2)
-    allow(ERROR_COUNTERS, 0x14)
+    for counters in CLEARED_BY_WRITE:
+        allow(counters.start, len(counters))
     allow(WATCHDOG_DIVIDER, 2)
     allow(WATCHDOG_TIME_PDI, 2)
     allow(WATCHDOG_TIME, 2)
-    allow(WATCHDOG_COUNTER, 2)
     allow(SII_CONFIGURATION, 1, 0x03)
     allow(SII_CONTROL, 1, 0x01)
     allow(SII_CONTROL + 1, 1, 0x07)
@@ -91,12 +109,6 @@ def _write_mask() -> bytes:
 
 WRITE_MASK: Final = _write_mask()
 """For every register byte, the bits that a master may write."""
-
-CLEARED_BY_WRITE: Final = (
-    range(ERROR_COUNTERS, ERROR_COUNTERS + 0x14),
-    range(WATCHDOG_COUNTER, WATCHDOG_COUNTER + 2),
-)
-"""Counters: a write of any value sets them to zero."""
 
 
 def power_on_values() -> bytearray:

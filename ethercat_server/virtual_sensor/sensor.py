@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from ethercat_server.objects import FACTORY_CALIBRATION
 from ethercat_server.virtual_sensor.al import AlState
-from ethercat_server.virtual_sensor.dictionary import Address
 from ethercat_server.virtual_sensor.firmware import Firmware
+from ethercat_server.virtual_sensor.flash import Address, Flash
 from ethercat_server.virtual_sensor.options import SensorOptions
 
 _WRITES_REMEMBERED: Final = 1000
@@ -35,16 +36,19 @@ class VirtualSensor:
     def __init__(self, options: SensorOptions, now: int) -> None:
         self.now = now
         self._options = options
-        self._flash: dict[Address, bytes] = {}
+        self.flash = Flash()
         self._writes: deque[SdoWrite] = deque(maxlen=_WRITES_REMEMBERED)
         self.sdo_write_count = self.calibration_writes = 0
+        self._on_write: dict[Address, Callable[[], None]] = {}
+        self.due: list[Callable[[], None]] = []
+        """What is to be done once the frame that is being answered is out of the way."""
         self.life: Firmware | None = None
         self._apply_sinc()
         self.power(True)
 
     def _apply_sinc(self) -> None:
         if self._options.sinc_length is not None:
-            self._flash[0x8006, 1] = struct.pack("<H", self._options.sinc_length)
+            self.flash.entries[0x8006, 1] = struct.pack("<H", self._options.sinc_length)
 
     @property
     def options(self) -> SensorOptions:
@@ -61,6 +65,13 @@ class VirtualSensor:
         self.sdo_write_count += 1
         if index == FACTORY_CALIBRATION:
             self.calibration_writes += 1
+        action = self._on_write.pop((index, subindex), None)
+        if action is not None:
+            self.due.append(action)
+
+    def on_write(self, address: Address, action: Callable[[], None]) -> None:
+        """Do `action` right after the next SDO write to this entry."""
+        self._on_write[address] = action
 
     def set_time(self, now: int) -> None:
         """It is `now`, CLOCK_MONOTONIC in ns."""
@@ -72,13 +83,14 @@ class VirtualSensor:
         """Switch it off, or on (again: nothing happens)."""
         if not on:
             self.life = None
+            self.flash.power_cut(self.now)
         elif self.life is None:
-            self.life = Firmware(self._options, self._flash, self.now, self._remember)
+            self.life = Firmware(self._options, self.flash, self.now, self._remember)
 
     def swap(self, model: str, serial: int) -> None:
         """Put a new sensor of another model or serial number in its place, just switched on."""
         self._options = replace(self._options, model=model, serial=serial)
-        self._flash.clear()
+        self.flash = Flash()
         self._apply_sinc()
         self.life = None
         self.power(True)

@@ -1,4 +1,4 @@
-"""What the sensor measures: `clock`, `ramp`, `sine` and `constant`, each exact for a sample number.
+"""What the sensor measures: `clock`, `ramp`, `sine`, `constant` and `rest`, each exact for a sample number.
 
 The physical ones, `scene`, `poses` and `turn`, are in `scene.py`. Formulas are in docs/virtual-sensor.md.
 """
@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple, Protocol
 
-SIGNALS: Final = ("scene", "poses", "turn", "clock", "ramp", "sine", "constant")
+SIGNALS: Final = ("scene", "poses", "turn", "clock", "ramp", "sine", "constant", "rest")
 
 
 class Reading(NamedTuple):
@@ -44,6 +44,10 @@ _TEMPERATURE: Final = 35.0
 
 CONSTANT: Final = (1.5, -2.25, -9.75, 0.125, -0.0625, 0.03125)
 """Force (N) and torque (Nm) of the signal `constant`; exact in REAL32."""
+REST_LENGTH: Final = 2**22
+_REST_STEPS: Final = 2**18
+_REST_TEMPERATURE: Final = 32
+"""From here to 48 °C, steps of 2**-18 °C are exact in REAL32."""
 RAMP_LENGTH: Final = 1024
 SINE_LENGTH: Final = 1000
 SINE_AMPLITUDES: Final = (10.0, 20.0, 30.0, 1.0, 2.0, 3.0)
@@ -57,6 +61,17 @@ class ConstantSignal:
     def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
         """See `Signal`."""
         return Reading(CONSTANT, _LEVEL, _STILL, _TEMPERATURE, _UPRIGHT)
+
+
+class RestSignal:
+    """The load of `constant`, the sample's number in the temperature: it can be tared and followed."""
+
+    exact = False
+
+    def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
+        """See `Signal`."""
+        temperature = _REST_TEMPERATURE + number % REST_LENGTH / _REST_STEPS
+        return Reading(CONSTANT, _LEVEL, _STILL, temperature, _UPRIGHT)
 
 
 class RampSignal:
@@ -106,8 +121,14 @@ FORMULAS: Final[Mapping[str, Callable[[], Signal]]] = {
     "ramp": RampSignal,
     "sine": SineSignal,
     "constant": ConstantSignal,
+    "rest": RestSignal,
 }
 """The signals of this file, by name."""
+
+
+def decode_rest(temperature: float) -> int:
+    """The number of a sample of the signal `rest`, modulo REST_LENGTH, from its temperature."""
+    return int((temperature - _REST_TEMPERATURE) * _REST_STEPS)
 
 
 class ClockReading(NamedTuple):

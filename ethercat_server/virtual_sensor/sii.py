@@ -23,6 +23,7 @@ COE_SDO_INFORMATION: Final = 0x02
 IMAGE_SIZE: Final = 2048
 
 _EIGHT_BYTE_READS = 0x0040
+_BUSY = 0x8000
 _ERROR_COMMAND = 0x2000
 _ERROR_WRITE_ENABLE = 0x4000
 _NO_OPERATION, _READ, _WRITE, _RELOAD = 0, 1, 2, 4
@@ -106,15 +107,24 @@ def build_image(model: str, serial: int, pdo_size: int) -> bytes:
 
 
 class SiiInterface:
-    """The registers 0x0500 to 0x050F. A command is done at once: the busy bit is never seen."""
+    """The registers 0x0500 to 0x050F. A command is done at once: the busy bit is seen with a fault only."""
+
+    FAULTS: Final = {"ok": 0, "error": _ERROR_COMMAND, "busy": _BUSY}
+    """By name: an EEPROM that answers, refuses, never answers."""
 
     def __init__(self, memory: bytearray, image: bytes) -> None:
         self._memory = memory
         self.image = image
+        self._faults = 0
         self._set_status(0)
 
     def _set_status(self, bits: int) -> None:
         struct.pack_into("<H", self._memory, reg.SII_CONTROL, bits | _EIGHT_BYTE_READS)
+
+    def fail(self, bits: int) -> None:
+        """From now on reading ends with these bits of the control register; 0: it works."""
+        self._faults = bits
+        self._set_status(0)
 
     def command(self) -> None:
         """Do what the control register asks for, at the word in the address register."""
@@ -124,7 +134,9 @@ class SiiInterface:
             self._set_status(_ERROR_COMMAND)
             return
         operation = control >> 8 & 0x07
-        if operation == _READ:
+        if operation == _READ and self._faults:
+            self._set_status(self._faults)
+        elif operation == _READ:
             data = self.image[word * 2 : word * 2 + 8].ljust(8, b"\xff")
             self._memory[reg.SII_DATA : reg.SII_DATA + 8] = data
             self._set_status(0)

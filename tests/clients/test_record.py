@@ -25,6 +25,7 @@ from tests.server.running import needs_bus, server
 
 CLI = [sys.executable, "-m", "clients.recording.cli"]
 SECOND = 800
+"""Frames of one sensor in a second."""
 OLD = DataFlag.REPEATED | DataFlag.INVALID
 
 
@@ -158,6 +159,25 @@ def test_what_the_server_withheld_is_said(out: Path, tmp_path: Path) -> None:
         code, said = run(out, served.port, "--no-reconnect")
     assert code == 0
     assert "3 frames of sensor 0 not read in time" in said
+
+
+def test_nothing_is_lost_while_it_does_not_run_for_a_moment(endless: Replay, out: Path) -> None:
+    recorder = Recorder(out, endless.port)
+    try:
+        wait_until(lambda: recorder.size() > 5000, "data")
+        recorder.signal(signal.SIGSTOP)
+        time.sleep(2)
+        recorder.signal(signal.SIGCONT)
+        time.sleep(0.3)
+        recorder.signal(signal.SIGINT)
+        assert recorder.wait() == 0
+        assert "nothing was lost" in recorder.said()
+    finally:
+        recorder.signal(signal.SIGCONT)
+        recorder.close()
+    frames = read(out)
+    assert is_whole(frames)
+    assert len(frames) > 2 * 2 * SECOND
 
 
 def killed(endless: Replay, out: Path, after_s: float) -> None:
@@ -359,9 +379,9 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
 @pytest.mark.bus
 @needs_bus
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("ros", [(), ("--ros",)], ids=["frames", "ros"])
-def test_two_sensors_at_1600_hz_for_a_minute(out: Path, ros: tuple[str, ...]) -> None:
-    """Nothing lost between server and file, under 15 % of a core. On a quiet machine."""
+@pytest.mark.parametrize(("ros", "most"), [((), 0.15), (("--ros",), 0.25)], ids=["frames", "ros"])
+def test_two_sensors_at_1600_hz_for_a_minute(out: Path, ros: tuple[str, ...], most: float) -> None:
+    """Nothing lost between server and file, under 15 % of a core; with three ROS messages a frame, 25 %."""
     seconds = 60
     with server("virtual", "--virtual", "--sensors 2", "--set", "sinc_length=32") as running:
         recorder = Recorder(out, running.port, "--seconds", str(seconds), *ros)
@@ -382,7 +402,7 @@ def test_two_sensors_at_1600_hz_for_a_minute(out: Path, ros: tuple[str, ...]) ->
     assert "could not be written" not in said
     assert is_whole(frames)
     assert len(frames) > 0.95 * 2 * 1600 * seconds
-    assert spent < 0.15 * seconds
+    assert spent < most * seconds
     with Reader(out) as bag:  # another library's
         counts = {connection.topic: connection.msgcount for connection in bag.connections}
     assert counts[frame_topic(0)] + counts[frame_topic(1)] == len(frames)

@@ -26,6 +26,13 @@ def test_every_option_is_described(program: object, capsys: pytest.CaptureFixtur
     assert not {option for option in options if f"`{option}" not in DOCS}
 
 
+def test_arguments_and_options_may_stand_in_any_order() -> None:
+    recording = record_options.parse_options(["a.mcap", "--seconds", "5", "host:1"])
+    assert (recording.path, str(recording.address), recording.seconds) == (Path("a.mcap"), "host:1", 5)
+    replay = replay_options.parse_options(["a.mcap", "--loop", "b.mcap", "12002"])
+    assert (replay.paths, replay.port, replay.loop) == ((Path("a.mcap"), Path("b.mcap")), 12002, True)
+
+
 def test_every_topic_and_schema_is_described() -> None:
     for name in (
         file_format.frame_topic(0).replace("0", "N"), file_format.DESCRIPTION_TOPIC, file_format.EVENTS_TOPIC,

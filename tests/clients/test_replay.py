@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from bridge.connection import Connection
 from protocol.client import connect
 from protocol.control import ErrorCode
 from protocol.errors import RefusedError
@@ -192,6 +193,17 @@ def test_what_needs_a_sensor_is_refused_in_a_sentence(
             client.ask(action, **values)
         assert refused.value.code == ErrorCode.NOT_READY
         assert client.receive(2)
+
+
+def test_the_node_takes_it_for_a_server(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    with replaying("--loop", path) as served:
+        connection = Connection("localhost", served.port)
+        info = connection.subscribe(1)
+        assert (info.sensor, info.serial, info.rate, info.settings) == (1, "101", 800, {"sinc_length": 64})
+        while not isinstance(connection.next_message(), DataMessage):
+            connection.receive()
+        connection.close()
 
 
 def test_shutdown_ends_it(path: Path, frames: list[DataMessage]) -> None:

@@ -9,6 +9,7 @@ from bridge.compensation.session import IdentificationSession
 from bridge.compensation.still import StillMeans, StillWindow
 from ethercat_server.virtual_sensor import scene
 from ethercat_server.virtual_sensor.firmware import Firmware
+from ethercat_server.virtual_sensor.flash import Flash
 from ethercat_server.virtual_sensor.motion import MOVE_LENGTH, POSE_LENGTH, POSES
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.pdo import Sample, SampleDecoder
@@ -29,7 +30,8 @@ def process_data(
 ) -> Iterator[tuple[float, int, bytes]]:
     """Time since the signal began (s), number and process data of every sample."""
     options = SensorOptions(signal=signal, seed=seed)
-    flash = {(0x8006, 1): struct.pack("<H", sinc)}
+    flash = Flash()
+    flash.entries[0x8006, 1] = struct.pack("<H", sinc)
     firmware = Firmware(options, flash, 0, lambda *_: None)
     for number, offset in enumerate(OFFSET, 1):
         firmware.write(0x8000, number, struct.pack("<f", offset))

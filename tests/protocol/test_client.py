@@ -150,6 +150,14 @@ def test_another_thread_may_close_it(scripted: ScriptedServer) -> None:
         client.receive(1.0)
 
 
+def test_another_thread_may_close_it_in_the_very_moment_of_waiting(scripted: ScriptedServer) -> None:
+    client = connect(scripted.port)
+    os.close(client.fileno())
+    with pytest.raises(ConnectionFailedError, match="closed"):
+        client.receive(1.0)
+    client.connection.sock.detach()
+
+
 @needs_bus
 @pytest.mark.bus
 def test_every_sample_of_a_real_server_once_and_in_order() -> None:

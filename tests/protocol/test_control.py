@@ -52,7 +52,7 @@ def test_the_actions_are_there(action: str) -> None:
 
 
 def test_only_what_changes_something_needs_authority() -> None:
-    free = {"describe", "subscribe", "unsubscribe", "status", "sdo_read"}
+    free = {"describe", "subscribe", "unsubscribe", "status", "sdo_read", "sii_read"}
     assert {name for name, action in ACTIONS.items() if not action.controls} <= free
     assert ACTIONS["shutdown"].controls
 

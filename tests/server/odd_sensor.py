@@ -75,7 +75,42 @@ def refusing() -> None:
     dictionary.Dictionary.write = refuse  # type: ignore[method-assign]
 
 
+FOREIGN_LACKS = frozenset({0x1009, 0x1018, 0x2000, 0x7000, 0x8000, 0x8001, 0x8006, 0x8010, 0x8030})
+
+
+def foreign() -> None:
+    """No sensor of Bota's, which has only some of the objects."""
+    from ethercat_server.virtual_sensor import dictionary
+    from ethercat_server.virtual_sensor.sdo_abort import Abort, SdoAbortError
+
+    other_vendor()
+    read = dictionary.Dictionary.read
+
+    def read_some(self: dictionary.Dictionary, index: int, subindex: int) -> bytes:
+        if index in FOREIGN_LACKS:
+            raise SdoAbortError(Abort.NO_OBJECT)
+        return read(self, index, subindex)
+
+    dictionary.Dictionary.read = read_some  # type: ignore[method-assign]
+
+
+def no_mailbox() -> None:
+    """No mailbox at all, as a simple slave."""
+    from ethercat_server.virtual_sensor import firmware, sii
+
+    build = sii.build_image
+
+    def without(model: str, serial: int, pdo_size: int) -> bytes:
+        image = build(model, serial, pdo_size)
+        return image[:0x30] + bytes(10) + image[0x3A:]
+
+    firmware.build_image = without  # type: ignore[attr-defined]
+    firmware.Firmware._mailbox_fault = lambda self: 0  # type: ignore[method-assign]
+
+
 WAYS = {
+    "foreign": foreign,
+    "mailbox": no_mailbox,
     "size": odd_size,
     "rate": wrong_rate,
     "vendor": other_vendor,

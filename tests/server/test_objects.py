@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from ethercat_server.known_objects import BY_ADDRESS
-from ethercat_server.objects import BY_SETTING, FACTORY_CALIBRATION, OBJECTS, Access
+from ethercat_server.known_objects import BY_ADDRESS, KNOWN_OBJECTS
+from ethercat_server.object_names import NOTE_NAMES, find_objects, full_name, similar_names
+from ethercat_server.objects import BY_SETTING, FACTORY_CALIBRATION, OBJECTS, Access, ObjectType
 from protocol.settings import SETTINGS
 
 TABLE_III_1 = (
@@ -39,3 +40,24 @@ def test_what_may_be_written_in_which_state() -> None:
 
 def test_no_setting_is_held_by_the_factory_calibration() -> None:
     assert not [row for row in OBJECTS if row.index == FACTORY_CALIBRATION and row.setting]
+
+
+def test_objects_have_every_name_that_people_know_them_by() -> None:
+    for index, subindex, name in NOTE_NAMES:
+        found = [row.address for row in find_objects(name)]
+        assert (index, subindex) in found, name
+        assert find_objects(name.upper().replace(" ", "_")) == find_objects(name)
+    for name, row in BY_SETTING.items():
+        assert find_objects(name) == [row]
+    assert [row.subindex for row in find_objects("Force/Torque Offset")] == list(range(7))
+    assert [row.address for row in find_objects("Status")] == [(0x6000, 1), (0x8030, 2)], "two are called so"
+    for row in KNOWN_OBJECTS:
+        assert find_objects(full_name(row)) == [row]
+        assert find_objects(f"0x{row.index:04X}:{row.subindex}") == [row]
+
+
+def test_what_no_object_is_called() -> None:
+    assert find_objects("colour") == find_objects("") == find_objects("0x8006:256") == []
+    assert similar_names("sampling rte") == ["Sampling rate"]
+    (unknown,) = find_objects("0x1C12:1")
+    assert (unknown.address, unknown.type) == ((0x1C12, 1), ObjectType.OCTETS)

@@ -58,6 +58,40 @@ def test_objects_are_read_by_index_in_any_notation(streaming: tuple[Server, Clie
     assert error(asking.ask("sdo_read", index=RATE, sensor=3))["code"] == "bad_request"
 
 
+def test_objects_are_read_by_name(streaming: tuple[Server, Client, Client]) -> None:
+    _, _, asking = streaming
+    rate = asking.ask("sdo_read", name="Sampling Rate")
+    assert (rate["index"], rate["subindex"], rate["type"], rate["value"]) == (RATE, 0, "u16", 800)
+    assert asking.ask("sdo_read", name="sinc_length")["value"] == 64
+    assert asking.ask("sdo_read", name="control status")["name"] == "Control Status"
+    assert asking.ask("sdo_read", name="Device name")["value"] == "BFT-SENS-ECAT-M8"
+    assert asking.ask("sdo_read", name="FIR disable", type="bool")["value"] is True
+    for name, said in (
+        ("Status", "2 objects: Measurement Status, Control Status"),
+        ("Calibration", "58 objects: "),
+        ("colour", "no object's"),
+        ("", "a text of 1 to 80 characters"),
+        ("x" * 81, "a text of 1 to 80 characters"),
+    ):
+        refused = error(asking.ask("sdo_read", name=name))
+        assert refused["code"] == "bad_request"
+        assert said in refused["message"]
+    for keys in ({}, {"index": RATE, "name": "Sampling rate"}):
+        assert "needs the key 'index', or" in error(asking.ask("sdo_read", **keys))["message"]
+
+
+def test_the_eeprom_is_read_and_the_stream_goes_on(streaming: tuple[Server, Client, Client]) -> None:
+    _, listener, asking = streaming
+    assert asking.ask("sii_read", word=8)["hex"] == "7ab00000"
+    image = bytes.fromhex(asking.ask("sii_read", word="0x0", words=128)["hex"])
+    assert (len(image), image[16:20]) == (256, b"\x7a\xb0\0\0")
+    assert asking.ask("sii_read", word=9, words=1)["hex"] == "0000"
+    for keys in ({}, {"word": -1}, {"word": 65536}, {"word": 0, "words": 0}, {"word": 0, "words": 129}):
+        assert error(asking.ask("sii_read", **keys))["code"] == "bad_request"
+    assert len(listener.fresh(100)) == 100
+    assert not listener.events, "it was not lost"
+
+
 def test_objects_are_written_but_never_the_factory_calibration(
     streaming: tuple[Server, Client, Client],
 ) -> None:
@@ -146,6 +180,7 @@ def test_filters_are_changed_by_way_of_preop_and_the_stream_goes_on(
     assert (last[-1].monotonic_ns - last[0].monotonic_ns) / 99 == pytest.approx(2.5e6, rel=0.02)
     described = asking.ask("describe")["sensors"][0]
     assert (described["state"], described["rate_hz"]) == ("OP", 400)
+    assert described["meaning"]["sinc_length"].startswith("400 Hz; cut-off 105 Hz")
     assert asking.ask("status")["sensors"][0]["recoveries"] == 0, "it was not lost"
     assert [event["event"] for event in listener.events] == ["reconfigured"]
 

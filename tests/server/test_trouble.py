@@ -13,6 +13,7 @@ import time
 import pytest
 
 from tests.server.running import Server, Veth, free_port, needs_bus, virtual_sensor
+from tests.tool.running import command
 
 pytestmark = [pytest.mark.bus, needs_bus]
 
@@ -114,6 +115,27 @@ def test_a_slave_that_is_wrong_in_one_way(way: str, arguments: tuple[str, ...], 
         sensor.wait_for('"INIT"')
 
 
+def test_a_slave_without_a_coe_mailbox() -> None:
+    with virtual_sensor(module="tests.server.odd_sensor", first=("mailbox",)) as (veth, _):
+        assert re.search(
+            "sensor 0 on .* has no CoE mailbox, and so no objects to set it up by", fails(veth.near)
+        )
+
+
+@pytest.mark.parametrize("how", ["error", "busy"])
+def test_an_eeprom_that_cannot_be_read(how: str) -> None:
+    with virtual_sensor() as (veth, sensor):
+        command(sensor, f"sii {how}")
+        said = fails(veth.near)
+        assert re.search(r"the SII .EEPROM. of the slave at place 0 of .* cannot be read", said)
+        command(sensor, "sii ok")
+        running = Server(veth.near)
+        try:
+            running.wait_streaming()
+        finally:
+            running.close()
+
+
 def test_name_on_the_command_line_must_be_the_sensors() -> None:
     with virtual_sensor("--model", "BFT-ROKS-ECAT-M8") as (veth, _):
         said = fails(veth.near, name="BFT-SENS-ECAT-M8")
@@ -195,5 +217,7 @@ def test_a_slave_that_vanishes_during_the_scan_does_not_hang_the_server() -> Non
             sensor.wait_for("ok")
             assert running.wait() == 1
             assert "Traceback" not in running.said()
+            # SOEM would try on for two minutes.
+            assert re.search("the scan of .* does not end: a slave stopped answering", running.said())
         finally:
             running.close()

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from ethercat_server.errors import ForbiddenWriteError
 from ethercat_server.objects import FACTORY_CALIBRATION
 from ethercat_server.sdo import Steps, finish
 from ethercat_server.tool.holder import find_holder
-from ethercat_server.tool.link import ForbiddenWriteError, GuardedSdo, sinc_length_in_force
+from ethercat_server.tool.link import GuardedSdo, sinc_length_in_force
 from ethercat_server.tool.snapshot_file import RESTORABLE
 from tests.server.running import needs_bus
 from tests.tool.running import one_sentence, tool

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 import pytest
 
 from ethercat_server.known_objects import KNOWN_OBJECTS
+from ethercat_server.object_names import NOTE_NAMES
+from tests.server.odd_sensor import FOREIGN_LACKS
 from tests.server.running import Program, Veth, needs_bus, virtual_sensor
 from tests.tool.running import command, complaints, one_sentence, stats, tool, written
 
@@ -97,6 +99,54 @@ def test_objects_that_cannot_be_read_have_a_line_with_the_reason(bench: Bench) -
     assert "this firmware does not have it (abort 0x06020000)" in missing
     assert "refused" in next(line for line in lines if "0x8002:1" in line)
     assert any("Sampling rate" in line and "800" in line for line in lines)
+
+
+@pytest.mark.parametrize(("size", "missing"), [("61", 5), ("77", 1)])
+def test_the_full_dump_has_a_line_for_every_object(size: str, missing: int) -> None:
+    with virtual_sensor("--pdo", size) as (veth, _):
+        lines = tool("objects", veth.near).out.splitlines()
+    assert len(lines) == 2 + len(KNOWN_OBJECTS)
+    assert sum("this firmware does not have it" in line for line in lines) == missing
+
+
+def test_a_foreign_slave_is_dumped_as_far_as_it_goes() -> None:
+    with virtual_sensor(module="tests.server.odd_sensor", first=("foreign",)) as (veth, sensor):
+        rows = tool("objects", veth.near, "--json").json["sensors"][0]["objects"]
+        lacking = {int(row["index"], 16) for row in rows if "error" in row}
+        assert lacking >= FOREIGN_LACKS
+        assert [row["value"] for row in rows if row["index"] == "0x8011"] == [800]
+        lines = tool("objects", veth.near).out.splitlines()
+        assert len(lines) == 2 + len(KNOWN_OBJECTS)
+        assert "800" in tool("read", veth.near, "sampling rate").out
+        assert tool("eeprom", veth.near, "--json").json["slaves"][0]["vendor"] == 0xDEAD
+        assert "not a Bota Gen-0 sensor" in one_sentence(tool("watch", veth.near, code=1))
+        assert written(sensor) == []
+
+
+def test_a_slave_without_a_mailbox_has_no_objects() -> None:
+    with virtual_sensor(module="tests.server.odd_sensor", first=("mailbox",)) as (veth, _):
+        assert "it has no CoE mailbox, and so no objects" in tool("objects", veth.near).out
+        assert tool("eeprom", veth.near, "--json").json["slaves"][0]["protocols"] == []
+        assert "has no CoE mailbox" in one_sentence(tool("plan", veth.near, "--set", "fir=on", code=1))
+
+
+def test_an_eeprom_that_cannot_be_read_says_so() -> None:
+    with virtual_sensor() as (veth, sensor):
+        command(sensor, "sii error")
+        said = one_sentence(tool("eeprom", veth.near, code=1))
+        assert "the SII of slave 0 cannot be read at word 0x0000: it refuses" in said
+        assert "cannot be read" in one_sentence(tool("objects", veth.near, code=1))
+        command(sensor, "sii ok")
+        assert tool("eeprom", veth.near, "--json").json["slaves"][0]["check_byte_right"]
+
+
+def test_every_row_of_table_iii_1_is_read_by_name(bench: Bench) -> None:
+    names = [name for _, _, name in NOTE_NAMES]
+    found = tool("read", bench[0].near, *names, "--json").json["sensors"][0]["objects"]
+    read = {(int(row["index"], 16), row["subindex"]) for row in found}
+    assert {(index, subindex) for index, subindex, _ in NOTE_NAMES} <= read
+    unreadable = {row["index"] for row in found if "error" in row}
+    assert unreadable == {"0x8003", "0x6000"}, "no range, and no quaternion in 61 bytes"
 
 
 def test_objects_of_a_chain_by_place_serial_and_name(chain: Bench) -> None:

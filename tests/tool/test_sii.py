@@ -7,10 +7,15 @@ from hypothesis import strategies as st
 
 from ethercat_server.tool.sii import decode, raw_lines, read_image
 from ethercat_server.virtual_sensor.sii import build_image
+from protocol.control import MAX_SII_WORDS
 
 
 def reader(image: bytes) -> bytes:
-    return read_image(lambda word: image[word * 2 : word * 2 + 4].ljust(4, b"\xff"))
+    def read(word: int, words: int) -> bytes:
+        assert 1 <= words <= MAX_SII_WORDS
+        return image[word * 2 : (word + words) * 2].ljust(words * 2, b"\xff")
+
+    return read_image(read)
 
 
 def test_an_image_is_read_to_the_end_of_its_categories_and_no_further() -> None:

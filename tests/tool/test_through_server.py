@@ -18,7 +18,10 @@ Bench = tuple[Veth, Program, Server]
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
     with (
-        virtual_sensor("--sensors", "2", "--serial", "10,20", "--pdo", "77") as (veth, sensor),
+        virtual_sensor("--sensors", "2", "--serial", "10,20", "--pdo", "77", "--signal", "rest") as (
+            veth,
+            sensor,
+        ),
         server(veth.near, "--rt-priority", "0") as running,
     ):
         yield veth, sensor, running
@@ -41,10 +44,35 @@ def test_a_server_that_holds_the_interface_is_found_and_said(bench: Bench) -> No
 
 
 def test_a_master_that_is_no_server_is_named(bench: Bench) -> None:
-    veth, sensor, running = bench
+    veth, sensor, _ = bench
     said = one_sentence(tool("objects", veth.far, code=1))
     assert f"{veth.far} is in use by process {sensor.process.pid}" in said
-    assert f"process {running.process.pid}" in one_sentence(tool("eeprom", veth.near, code=1))
+
+
+def test_the_eeprom_is_read_while_the_server_streams(bench: Bench) -> None:
+    veth, _, running = bench
+    with running.connect() as client:
+        before = client.ask("status")["sensors"]
+        found = tool("eeprom", *address(running), "--json").json["slaves"]
+        assert [(row["serial"], row["check_byte_right"]) for row in found] == [(10, True), (20, True)]
+        assert [row["name"] for row in found] == ["BFT-SENS-ECAT-M8"] * 2
+        assert [row["sync_managers"][3]["size"] for row in found] == [77, 77]
+        only = tool("eeprom", veth.near, "--sensor", "20")
+        assert f"process {running.process.pid}" in one_sentence(only)
+        assert "\n000e: 14|00|00|00\n" in only.out
+        after = client.ask("status")["sensors"]
+        assert [row["recoveries"] for row in after] == [row["recoveries"] for row in before]
+
+
+def test_objects_are_read_by_name(bench: Bench) -> None:
+    _, _, running = bench
+    found = tool("read", *address(running), "Sampling Rate", "Force/Torque Offset", "--json").json["sensors"]
+    assert [row["serial"] for row in found] == [10, 20]
+    rows = [(row["index"], row["subindex"]) for row in found[0]["objects"]]
+    assert rows == [("0x8011", 0), *(("0x8000", sub) for sub in range(7))]
+    assert "did you mean Sampling rate" in one_sentence(
+        tool("read", *address(running), "sampling rte", code=2)
+    )
 
 
 def test_objects_and_watch(bench: Bench) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from statistics import stdev
 from typing import Any
 
 import pytest
@@ -10,12 +11,14 @@ from hypothesis import strategies as st
 
 from ethercat_server.virtual_sensor.faults import COMMANDS, QuitCommand, obey
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import decode_clock
+from ethercat_server.virtual_sensor.signals import CONSTANT, decode_clock
 from ethercat_server.virtual_sensor.wire import Command
-from protocol.pdo import SampleDecoder
+from protocol.pdo import STANDARD_GRAVITY, Sample, SampleDecoder
+from protocol.warnings_register import WarningFlag
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, Abort, RawMaster, chain
 
 PERIOD = 1_250_000
+RAW = SampleDecoder(61)
 PING = (Command.BRD, 0, 0x0130, bytes(2))
 
 
@@ -125,6 +128,86 @@ def test_stick() -> None:
     assert clock_of(master) >= 1000
 
 
+def samples(master: RawMaster, count: int) -> list[Sample]:
+    """The next samples, one each period."""
+    found = []
+    for _ in range(count):
+        master.wait(PERIOD)
+        found.append(RAW.decode(master.inputs()))
+    return found
+
+
+def test_noise_on_one_channel_only() -> None:
+    master = RawMaster(SensorOptions(signal="constant")).go(OP)
+    do(master, "noise torque.y 0.5")
+    found = samples(master, 2000)
+    torque = [sample.torque for sample in found]
+    assert stdev(t[1] for t in torque) == pytest.approx(0.5, rel=0.1)
+    assert {(t[0], t[2]) for t in torque} == {(CONSTANT[3], CONSTANT[5])}
+    assert {sample.force for sample in found} == {CONSTANT[:3]}
+    do(master, "noise torque.y 0")
+    assert {sample.torque for sample in samples(master, 10)} == {CONSTANT[3:]}
+
+
+def test_a_channel_saturates_before_the_offset_is_added() -> None:
+    master = RawMaster(SensorOptions(signal="constant")).go(OP)
+    master.download(0x8000, 3, struct.pack("<f", 100.0))
+    do(master, "limit force.z 4")
+    do(master, "limit torque.x 4")
+    do(master, "limit acceleration.z 0.5")
+    [sample] = samples(master, 1)
+    assert list(sample.force) == [*CONSTANT[:2], -4 + 100]
+    assert list(sample.torque) == list(CONSTANT[3:])
+    assert sample.acceleration[2] == STANDARD_GRAVITY / 2
+    assert sample.force_torque_saturated == 0b000100
+    assert (sample.acceleration_saturated, sample.angular_rate_saturated) == (0b100, 0)
+    assert sample.warnings == WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.ACCELERATION_SATURATED
+    do(master, "limit force.z off")
+    do(master, "limit acceleration.z off")
+    [sample] = samples(master, 1)
+    assert (sample.force[2], sample.warnings) == (CONSTANT[2] + 100, 0)
+
+
+def test_a_channel_freezes_and_thaws() -> None:
+    master = RawMaster(SensorOptions(signal="ramp")).go(OP)
+    do(master, "freeze force.x")
+    found = samples(master, 50)
+    assert len({sample.force[0] for sample in found}) == 1
+    assert len({sample.force[1] for sample in found}) == 50
+    do(master, "thaw force.x")
+    assert len({sample.force[0] for sample in samples(master, 50)}) == 50
+
+
+def test_skipped_samples_never_show() -> None:
+    master = RawMaster(SensorOptions(signal="clock")).go(OP)
+    master.wait(100 * PERIOD)
+    before = clock_of(master)
+    do(master, "skip 20")
+    assert clock_of(master) == before, "the newest sample stays as it is"
+    seen = []
+    for _ in range(5000):
+        master.wait(PERIOD - 2000)
+        seen.append(clock_of(master))
+        assert seen[-1] == clock_of(master), "a microsecond later"
+    assert sorted(seen) == seen
+    assert len(set(seen)) / 5000 == pytest.approx(0.8, abs=0.03)
+    do(master, "skip 0")
+    master.wait(PERIOD - 2000)
+    assert clock_of(master) == before + 5001
+
+
+def test_channel_faults_are_gone_with_the_power() -> None:
+    master = RawMaster(SensorOptions(signal="ramp")).go(OP)
+    for line in ("noise force.y 1", "limit force.z 0", "freeze force.x", "skip 50"):
+        do(master, line)
+    do(master, "power off")
+    do(master, "power on")
+    master.go(OP)
+    found = samples(master, 50)
+    assert len({sample.force[0] for sample in found}) == 50
+    assert all((sample.force[1] * 64).is_integer() and sample.warnings == 0 for sample in found)
+
+
 def test_swap() -> None:
     master = RawMaster(*chain(2)).go(OP)
     do(master, "swap BFT-MEDS-ECAT-M8 4711 @1")
@@ -146,7 +229,81 @@ def test_abort_once() -> None:
     assert master.upload(0x8010, 3) == b"\1"
     with pytest.raises(Abort, match="0x6040043"):
         master.download(0x8006, 1, b"\x40\0")
+    with pytest.raises(Abort, match="0x6040043"):
+        master.download(0x8006, 1, b"\x40\0")  # its answer could have been lost on the way
+    master.download(0x8006, 1, b"\x80\0")
+    master.wait(300_000_000)
     master.download(0x8006, 1, b"\x40\0")
+
+
+def test_a_command_waits_for_a_write() -> None:
+    master = RawMaster(SensorOptions(serial=1), SensorOptions(serial=2)).go(PREOP)
+    do(master, "on-write 0x8010 3 error 0x1B")
+    master.download(0x8010, 2, b"\1")
+    assert [row["al_error"] for row in stats(master)["sensors"]] == [False, False]
+    master.download(0x8010, 3, b"\1")
+    assert [row["al_error"] for row in stats(master)["sensors"]] == [True, False]
+    for line in ("on-write 0x8010 3", "on-write 0x8010 3 dance", "on-write 0x8010 3 lose"):
+        assert obey(master.bus, line).startswith("error: ")
+
+
+SAVE, STATUS = (0x8030, 1), (0x8030, 2)
+
+
+def test_saving_takes_its_time_and_a_power_cut_leaves_the_rest() -> None:
+    master = RawMaster().go(PREOP)
+    do(master, "saving 0.37")  # ten milliseconds each
+    for subindex, data in ((1, b"\x80\0"), (2, b"\0"), (4, b"\1")):
+        master.download(0x8006, subindex, data)
+    master.download(*SAVE, b"\1")
+    assert master.upload(*STATUS) == b"\xff"
+    master.wait(265_000_000)
+    do(master, "power off")
+    do(master, "power on")
+    master.go(PREOP)
+    assert [master.upload(0x8006, n) for n in (1, 2, 3, 4)] == [b"\x80\0", b"\0", b"\0", b"\0"]
+    assert master.upload(*STATUS) == b"\0"
+    master.download(*SAVE, b"\1")
+    master.wait(371_000_000)
+    assert master.upload(*STATUS) == b"\0"
+
+
+def test_a_save_may_end_with_a_status_or_with_the_power() -> None:
+    master = RawMaster().go(PREOP)
+    do(master, "saving 0 7")
+    master.download(0x8006, 4, b"\1")
+    master.download(*SAVE, b"\1")
+    assert master.upload(*STATUS) == b"\x07"
+    do(master, "power cycle 0")
+    master.go(PREOP)
+    assert master.upload(0x8006, 4) == b"\0"
+    do(master, "saving 0")
+    master.download(0x8006, 2, b"\0")
+    master.download(0x8006, 4, b"\1")
+    do(master, "cut-save 27")
+    with pytest.raises(AssertionError):
+        master.download(*SAVE, b"\1")
+    assert answering(master) == 0
+    do(master, "power on")
+    master.go(PREOP)
+    assert [master.upload(0x8006, n) for n in (2, 4)] == [b"\0", b"\0"]
+
+
+def test_an_eeprom_that_cannot_be_read() -> None:
+    master = RawMaster()
+
+    def status() -> int:
+        master.write(0x0502, struct.pack("<HI", 0x0100, 8))
+        return master.read16(0x0502) & 0xE000
+
+    assert status() == 0
+    do(master, "sii error")
+    assert status() == 0x2000
+    do(master, "sii busy")
+    assert status() == 0x8000
+    do(master, "sii ok")
+    assert status() == 0
+    assert obey(master.bus, "sii sometimes").startswith("error: ")
 
 
 def test_mute_mailbox() -> None:
@@ -218,6 +375,9 @@ def test_quit() -> None:
         "", "jump", "lose", "lose x", "lose -1", "lose 1 2", "power", "power maybe", "power cycle", "safeop",
         "safeop 0x10000", "deaf nan", "deaf -1", "ppm inf", "signal noise", "warn 1 0", "swap A", "swap é 1",
         "stick @1", "stick @x", "stick @0 @0", "abort 1 2", "abort 0x8000 256 0",
+        "noise force 1", "noise force.w 1", "noise force.x -1", "noise force.x", "limit force.x",
+        "limit force.x nan", "freeze", "freeze orientation.x", "thaw temperature",
+        "skip 91", "skip -1", "skip nan",
     ],
 )  # fmt: skip
 def test_bad_commands_are_answered_with_a_sentence(line: str) -> None:
@@ -227,10 +387,14 @@ def test_bad_commands_are_answered_with_a_sentence(line: str) -> None:
     assert "\n" not in answer
 
 
+def test_the_exact_signal_takes_no_channel_faults() -> None:
+    assert "always exact" in obey(RawMaster(SensorOptions(signal="clock")).bus, "noise force.x 1")
+
+
 def test_commands_to_a_sensor_without_power() -> None:
     master = RawMaster()
     do(master, "power off")
-    for line in ("safeop 1", "stick", "warn 1", "abort 1 1 1", "mute-mailbox 1"):
+    for line in ("safeop 1", "stick", "warn 1", "abort 1 1 1", "mute-mailbox 1", "noise force.x 1"):
         assert "power on" in obey(master.bus, line)
     do(master, "ppm 5")
     do(master, "stats")
@@ -242,3 +406,82 @@ def test_any_line_gets_one_line(line: str) -> None:
         answer = obey(RawMaster().bus, line)
         assert answer.startswith(("ok", "error: "))
         assert "\n" not in answer
+
+
+def counters(master: RawMaster, place: int = 0) -> dict[str, tuple[int, int]]:
+    """What the controller at `place` has counted, at port 0 and at port 1."""
+    found = master.read(0x0300, 0x14, place)
+    assert not any(found[4:8] + found[10:16] + found[18:20]), "no ports 2 and 3, no other errors"
+    return {
+        "invalid": (found[0], found[2]),
+        "physical": (found[1], found[3]),
+        "forwarded": (found[8], found[9]),
+        "lost links": (found[16], found[17]),
+    }
+
+
+CLEAN = {"invalid": (0, 0), "physical": (0, 0), "forwarded": (0, 0), "lost links": (0, 0)}
+
+
+def test_a_damaged_frame_is_lost_and_counted_where_it_was_damaged() -> None:
+    master = RawMaster(*chain(3))
+    do(master, "damage 2 @1")
+    assert [answering(master) for _ in range(4)] == [0, 0, 3, 3]
+    assert stats(master)["frames_lost"] == 2
+    assert counters(master, 0) == {**CLEAN, "forwarded": (0, 2)}, "on its way back"
+    assert counters(master, 1) == {**CLEAN, "invalid": (2, 0), "physical": (2, 0), "forwarded": (0, 2)}
+    assert counters(master, 2) == {**CLEAN, "forwarded": (2, 0)}, "the end of the line"
+
+
+def test_a_frame_damaged_on_its_way_back_has_done_its_work() -> None:
+    master = RawMaster(*chain(3))
+    do(master, "damage 1 1 @1")
+    assert master.frame((Command.BWR, 0, 0x0F80, b"!")) is None
+    assert [master.read(0x0F80, 1, place) for place in range(3)] == [b"!"] * 3
+    assert counters(master, 0) == {**CLEAN, "forwarded": (0, 1)}
+    assert counters(master, 1) == {**CLEAN, "invalid": (0, 1), "physical": (0, 1)}
+    assert counters(master, 2) == CLEAN
+
+
+def test_a_damaged_frame_reaches_only_those_before_the_damage() -> None:
+    master = RawMaster(*chain(3))
+    do(master, "damage 1 @1")
+    assert master.frame((Command.BWR, 0, 0x0F80, b"!")) is None
+    assert [master.read(0x0F80, 1, place) for place in range(3)] == [b"!", b"\0", b"\0"]
+
+
+def test_a_link_that_flaps_is_counted_at_both_ends() -> None:
+    master = RawMaster(*chain(2))
+    do(master, "flap")
+    assert [counters(master, n)["lost links"] for n in range(2)] == [(1, 0), (0, 0)]
+    do(master, "flap 1")
+    do(master, "flap @1")
+    assert [counters(master, n)["lost links"] for n in range(2)] == [(1, 2), (2, 0)]
+    do(master, "power off @1")
+    assert counters(master)["lost links"] == (1, 3)
+
+
+def test_error_counters_stop_at_255_and_a_write_clears_their_group() -> None:
+    master = RawMaster(*chain(2))
+    do(master, "damage 300 @1")
+    do(master, "flap @1")
+    assert sum(answering(master) == 0 for _ in range(310)) == 300
+    assert counters(master, 1)["invalid"] == (255, 0)
+    assert master.write(0x0303, b"\x55", 1) == 1
+    assert counters(master, 1) == {**CLEAN, "lost links": (1, 0)}
+    assert master.write(0x0310, b"\0", 1) == 1
+    assert counters(master, 1) == CLEAN
+    assert counters(master, 0)["forwarded"] == (0, 255)
+    assert master.write(0x030E, b"\0\0", 1) == 0, "nothing there"
+
+
+def test_hear_ends_damage_and_the_last_port_is_open() -> None:
+    master = RawMaster(*chain(2))
+    do(master, "damage 5")
+    do(master, "hear")
+    assert answering(master) == 2
+    assert obey(master.bus, "damage 1 1 @1").startswith("error: port 1 of the last sensor")
+    assert obey(master.bus, "damage 1 2").startswith("error: ")
+    do(master, "power off @1")
+    do(master, "damage 1 @1")
+    assert answering(master) == 1, "nobody there to find it damaged"

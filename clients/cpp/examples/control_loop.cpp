@@ -1,0 +1,110 @@
+// A control loop at 1 kHz: a velocity that follows the force felt at the sensor, and zero when the force is not known.
+//
+//     control_loop [--host HOST] [--port PORT] [--hz 1000] [--seconds N]
+//
+// What to copy: one `latest` a cycle, `fresh` asked before the sample is used, a command that goes to zero otherwise.
+// The robot is left out: `send_to_robot` stands for it.
+#include <bota_ethercat.hpp>
+
+#include <sched.h>
+#include <sys/mman.h>
+
+#include <csignal>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+
+namespace {
+
+volatile std::sig_atomic_t ending = 0;
+
+using bota_ethercat::Vector3;
+
+/// m/s, along the sensor's axes.
+void send_to_robot(const Vector3& /*velocity*/) {}
+
+/// An admittance without mass: so many m/s for each N beyond a dead band, limited.
+Vector3 follow(const Vector3& force) {
+    constexpr double kDeadBand = 2.0, kGain = 0.01, kLimit = 0.1;  // N, m/s per N, m/s
+    Vector3 velocity{};
+    for (std::size_t axis = 0; axis < 3; ++axis) {
+        const double beyond = std::fabs(force[axis]) - kDeadBand;
+        const double speed = beyond > 0.0 ? kGain * beyond : 0.0;
+        velocity[axis] = std::copysign(speed < kLimit ? speed : kLimit, force[axis]);
+    }
+    return velocity;
+}
+
+/// Steadier where the system lets us: memory that stays, a real-time priority. Both are refused to most users.
+void become_real_time() {
+    if (mlockall(MCL_CURRENT | MCL_FUTURE) != 0) std::fprintf(stderr, "control_loop: memory is not locked\n");
+    sched_param priority{};
+    priority.sched_priority = 70;
+    if (sched_setscheduler(0, SCHED_FIFO, &priority) != 0)
+        std::fprintf(stderr, "control_loop: ordinary scheduling, no real-time priority\n");
+}
+
+void sleep_until(std::int64_t due_ns) {
+    const timespec due{static_cast<time_t>(due_ns / 1'000'000'000), static_cast<long>(due_ns % 1'000'000'000)};
+    clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, nullptr);
+}
+
+/// A number from `low` to `high`, or the program ends with 2.
+double number(const char* option, const char* text, double low, double high) {
+    char* end = nullptr;
+    const double value = text ? std::strtod(text, &end) : 0.0;
+    if (text && *text != '\0' && *end == '\0' && value >= low && value <= high) return value;
+    std::fprintf(stderr, "control_loop: %s needs a number from %g to %g\n", option, low, high);
+    std::exit(2);
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    bota_ethercat::Options options;
+    options.max_age = std::chrono::milliseconds(5);  // four samples at 800 Hz: older is not acted on
+    double hz = 1000.0, seconds = 1e9;
+    for (int i = 1; i < argc; i += 2) {
+        const char* const value = i + 1 < argc ? argv[i + 1] : nullptr;
+        if (std::strcmp(argv[i], "--host") == 0 && value) options.host = value;
+        else if (std::strcmp(argv[i], "--port") == 0) options.port = static_cast<std::uint16_t>(number("--port", value, 1, 65535));
+        else if (std::strcmp(argv[i], "--hz") == 0) hz = number("--hz", value, 1, 10000);
+        else if (std::strcmp(argv[i], "--seconds") == 0) seconds = number("--seconds", value, 0, 1e9);
+        else return std::fprintf(stderr, "usage: control_loop [--host HOST] [--port PORT] [--hz N] [--seconds N]\n"), 2;
+    }
+    std::signal(SIGINT, [](int) { ending = 1; });
+    std::signal(SIGTERM, [](int) { ending = 1; });
+
+    bota_ethercat::Client sensor(options);
+    if (!sensor.connect()) return std::fprintf(stderr, "control_loop: %s\n", sensor.error()), 1;
+    std::printf("%s, %.0f Hz\n", sensor.description().sensors[0].name.c_str(), sensor.description().sensors[0].rate_hz);
+    become_real_time();
+
+    long cycles = 0, used = 0, held = 0;
+    std::int64_t oldest_ns = 0;
+    auto before = bota_ethercat::Condition::fresh;
+    const auto period_ns = static_cast<std::int64_t>(1e9 / hz);
+    std::int64_t due_ns = bota_ethercat::monotonic_now_ns();
+    const std::int64_t end_ns = due_ns + static_cast<std::int64_t>(seconds * 1e9);
+    for (; !ending && due_ns < end_ns; due_ns += period_ns, ++cycles) {
+        sleep_until(due_ns);
+        const bota_ethercat::Reading reading = sensor.latest();
+        Vector3 velocity{};  // stands still unless the force is known
+        if (reading.fresh() && reading.sample.is_finite()) {
+            velocity = follow(reading.sample.force);
+            ++(reading.is_new ? used : held);  // a loop faster than the sensor holds each sample for a while
+            if (reading.age_ns > oldest_ns) oldest_ns = reading.age_ns;
+        }
+        send_to_robot(velocity);
+        if (reading.condition != before)  // in a real controller another thread prints
+            std::fprintf(stderr, "control_loop: %s %s\n", to_string(reading.condition), sensor.error());
+        before = reading.condition;
+    }
+    send_to_robot({});
+    const bota_ethercat::Counters counters = sensor.counters();
+    std::printf("%ld cycles: %ld with a new sample, %ld with the one before, %ld without; oldest used %.0f us; "
+                "%llu gaps, %llu samples passed over\n",
+                cycles, used, held, cycles - used - held, static_cast<double>(oldest_ns) * 1e-3,
+                static_cast<unsigned long long>(counters.gaps), static_cast<unsigned long long>(counters.passed_over));
+    return 0;
+}

@@ -1,0 +1,217 @@
+"""The live view. The only file that knows Textual: it has the terminal, the keys and the clock.
+
+Ten times a second the state becomes rows of text, and only the rows that changed are drawn again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import ClassVar, Final
+
+from rich.text import Text
+from textual import events
+from textual.app import App, ComposeResult
+from textual.geometry import Region
+from textual.strip import Strip
+from textual.widget import Widget
+
+from clients.address import Address
+from clients.monitor import words
+from clients.monitor.glyphs import Glyphs
+from clients.monitor.model import Model, clock_text
+from clients.monitor.recorder import Recorder
+from clients.monitor.screen import Look, render
+from clients.monitor.state import SensorState, State
+from clients.monitor.tare import start_tare
+
+REFRESH_S: Final = 0.1
+
+
+class View(Widget):
+    """Rows of text; what has not changed is not drawn again."""
+
+    can_focus = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._rows: list[Text] = []
+        self._strips: list[Strip] = []
+
+    def show(self, rows: list[Text]) -> None:
+        """Show these rows instead."""
+        width = self.size.width
+        if len(rows) != len(self._rows):
+            self._rows, self._strips = [], []
+            self.refresh()
+        for y, row in enumerate(rows):
+            if y < len(self._rows):
+                if row == self._rows[y]:
+                    continue
+                self._strips[y] = self._strip(row, width)
+                self.refresh(Region(0, y, width, 1))
+            else:
+                self._strips.append(self._strip(row, width))
+        self._rows = rows
+
+    def _strip(self, row: Text, width: int) -> Strip:
+        return Strip(row.render(self.app.console)).adjust_cell_length(width)
+
+    def render_line(self, y: int) -> Strip:
+        """One row, as Textual asks for it."""
+        return self._strips[y] if y < len(self._strips) else Strip.blank(self.size.width)
+
+
+class Monitor(App[None]):
+    """Keys on one side, the model on the other."""
+
+    TITLE = "ethercat-monitor"
+    CSS = "Screen, View { background: ansi_default; color: ansi_default; width: 100%; height: 100%; }"
+    ENABLE_COMMAND_PALETTE = False
+    BINDINGS: ClassVar = [("ctrl+z", "suspend_process", "suspend")]
+
+    def __init__(
+        self,
+        model: Model,
+        address: Address,
+        glyphs: Glyphs,
+        *,
+        seconds: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`seconds` ends it by itself."""
+        # The terminal's own ground and no colour but ours: with NO_COLOR there is none.
+        super().__init__(ansi_color=True)
+        self._model = model
+        self._address = address
+        self._clock = clock
+        self._look = Look(glyphs=glyphs)
+        self._view = View()
+        self._seconds = seconds
+        self.recorder = Recorder(address)
+        """To be closed by who runs the app, when the terminal is the shell's again."""
+        self._state: State | None = None
+        self._confirmed: Callable[[], None] | None = None
+
+    def compose(self) -> ComposeResult:
+        """The one widget."""
+        yield self._view
+
+    def on_mount(self) -> None:
+        """Begin."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            loop.add_signal_handler(number, self.exit)
+        self.app_resume_signal.subscribe(self, lambda _: self.repaint())
+        self.set_interval(REFRESH_S, self.draw)
+        if self._seconds is not None:
+            self.set_timer(self._seconds, self.exit)
+
+    def on_resize(self) -> None:
+        """Draw for the new size at once."""
+        self.call_after_refresh(self.draw)
+
+    def draw(self) -> None:
+        """Show how it is now, or what it was when it was paused."""
+        now_s = self._clock()
+        ended = self.recorder.ended()
+        if ended is not None:
+            self._say(*ended)
+        state = self._model.state(now_s)
+        if self._look.paused and self._state is not None:
+            state = replace(self._state, message=state.message)
+        self._state = state
+        recording = f"REC {words.duration(self.recorder.seconds(now_s))}" if self.recorder.running else ""
+        look = replace(self._look, recording=recording)
+        self._view.show(render(state, look, *self._view.size))
+
+    def repaint(self) -> None:
+        """Draw everything again: something else has written on the terminal."""
+        self._view.refresh()
+
+    def action_help_quit(self) -> None:
+        """Ctrl-C ends it: whoever presses that does not want to be taught another key."""
+        self.exit()
+
+    def on_key(self, event: events.Key) -> None:
+        """A key was pressed."""
+        if event.key in {"ctrl+c", "ctrl+q", "ctrl+z"}:
+            return
+        event.stop()
+        if event.key == "ctrl+l":
+            self.repaint()
+        elif self._look.question:
+            self._answer(event.character in {"y", "Y"})
+        elif self._look.help:
+            self._look = replace(self._look, help=False)
+        else:
+            action = {
+                "t": self._ask_tare,
+                "r": self._record,
+                "p": self._pause,
+                " ": self._pause,
+                "0": self._reset,
+                "n": self._next,
+                "?": self._help,
+                "h": self._help,
+                "q": self.exit,
+            }.get((event.character or "").lower())
+            if action is not None:
+                action()
+        self.draw()
+
+    def _selected(self) -> SensorState | None:
+        sensors = self._state.sensors if self._state else ()
+        return sensors[self._look.selected % len(sensors)] if sensors else None
+
+    def _say(self, text: str, bad: bool = False) -> None:
+        self._model.say(f"{clock_text()} {text}", bad=bad)
+
+    def _ask_tare(self) -> None:
+        sensor = self._selected()
+        if sensor is None or self._state is None or not self._state.server.connected:
+            self._say("There is no sensor to tare: the server is not there", True)
+            return
+
+        def confirmed() -> None:
+            self._say(f"Taring sensor {sensor.place}: leave it at rest")
+            start_tare(self._address, sensor.place, self._say)
+
+        self._confirmed = confirmed
+        question = f"Tare sensor {sensor.place}? Its reading becomes zero. y: yes, any other key: no"
+        self._look = replace(self._look, question=question)
+
+    def _answer(self, yes: bool) -> None:
+        confirmed, self._confirmed = self._confirmed, None
+        self._look = replace(self._look, question="")
+        if yes and confirmed is not None:
+            confirmed()
+        else:
+            self._say("Not tared")
+
+    def _record(self) -> None:
+        if self.recorder.running:
+            self.recorder.stop()
+            self._say("Ending the recording")
+        else:
+            self._say(*self.recorder.start(self._clock()))
+
+    def _pause(self) -> None:
+        self._look = replace(self._look, paused="" if self._look.paused else clock_text())
+
+    def _reset(self) -> None:
+        self._model.reset()
+        self._say("Peaks and past warnings are reset")
+
+    def _next(self) -> None:
+        count = len(self._state.sensors) if self._state else 0
+        if count < 2:
+            self._say("There is only one sensor" if count else "There is no sensor")
+        else:
+            self._look = replace(self._look, selected=(self._look.selected + 1) % count)
+
+    def _help(self) -> None:
+        self._look = replace(self._look, help=True)

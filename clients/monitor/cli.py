@@ -1,0 +1,36 @@
+"""`ethercat-monitor`: makes ends and errors exit codes: 0 ended or fine, 1 not, 2 wrong usage."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Sequence
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the monitor; returns its exit code."""
+    try:
+        # SIGTERM ends what prints lines as Ctrl-C does; the live view takes it over.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        from clients.monitor.options import parse  # noqa: PLC0415 - Ctrl-C is heard while this loads
+        from clients.monitor.program import hush, run  # noqa: PLC0415
+
+        options = parse(argv)
+        try:
+            return run(options)
+        except BrokenPipeError:
+            hush()
+            return 0
+        except KeyboardInterrupt:
+            return 1 if options.once else 0
+    except KeyboardInterrupt:
+        return 0
+    except ImportError as error:
+        sys.stderr.write(
+            f"ethercat-monitor: {error.name} is not installed: pip install 'bota-ethercat-bridge[tools]'\n"
+        )
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

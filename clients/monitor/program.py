@@ -1,0 +1,136 @@
+"""Chooses the view and runs it: the live one on a terminal, else a line a second; or once; or JSON."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from clients.monitor.glyphs import ASCII, UNICODE, can_show, to_ascii
+from clients.monitor.json_line import json_line
+from clients.monitor.model import Model
+from clients.monitor.options import Options
+from clients.monitor.reader import Reader
+from clients.monitor.state import State
+from clients.monitor.table import line, problems, table, time_of_day
+from clients.monitor.words import trouble
+
+_PERIOD_S: Final = 1.0
+_ONCE_S: Final = 1.0
+_ANSWER_S: Final = 6.0
+
+
+def run(options: Options) -> int:
+    """Do what was asked for; returns the exit code."""
+    model = Model(str(options.address), options.imu_units)
+    reader = Reader(options.address, model)
+    reader.start()
+    try:
+        if options.once:
+            return _once(options, model, reader)
+        if options.json:
+            return _every_second(options, reader, lambda: _json(model))
+        if not _has_screen():
+            return _every_second(options, reader, _Lines(options, model).show)
+        return _live(options, model)
+    finally:
+        reader.close()
+
+
+def _has_screen() -> bool:
+    return sys.stdin.isatty() and sys.stdout.isatty() and os.environ.get("TERM", "dumb") not in {"", "dumb"}
+
+
+def _once(options: Options, model: Model, reader: Reader) -> int:
+    if not reader.wait_for_answer(_ANSWER_S):
+        state = model.state(time.monotonic())
+        reason = state.server.reason or "it does not answer"
+        if options.json:
+            _say(json_line(state, time.time()))
+        sys.stderr.write(
+            f"ethercat-monitor: {options.address}: {reason}: start ethercat-server, or give its HOST:PORT\n"
+        )
+        return 1
+    time.sleep(_ONCE_S)
+    state = model.state(time.monotonic())
+    if options.json:
+        _say(json_line(state, time.time()))
+    else:
+        _say(*table(state), spelled=_spelled(options))
+    return 1 if problems(state) else 0
+
+
+def _live(options: Options, model: Model) -> int:
+    from clients.monitor.app import Monitor  # noqa: PLC0415 - takes a moment that the other views do without
+
+    app = Monitor(model, options.address, ASCII if _spelled(options) else UNICODE, seconds=options.seconds)
+    app.run(mouse=False)
+    if app.recorder.running:
+        _say("Finishing the recording")
+    ended = app.recorder.close()
+    if ended:
+        _say(ended)
+    return app.return_code or 0
+
+
+def _every_second(options: Options, reader: Reader, show: Callable[[], None]) -> int:
+    reader.wait_for_answer(_ANSWER_S)
+    for _ in _seconds(options.seconds):
+        show()
+    return 0
+
+
+def _seconds(limit_s: float | None) -> Iterator[None]:
+    """Once a second, until the limit."""
+    start_s = due_s = time.monotonic()
+    while True:
+        due_s = max(due_s + _PERIOD_S, time.monotonic())
+        if limit_s is not None and due_s > start_s + limit_s + 0.5 * _PERIOD_S:
+            return
+        time.sleep(max(0.0, due_s - time.monotonic()))
+        yield
+
+
+def _json(model: Model) -> None:
+    _say(json_line(model.state(time.monotonic()), time.time()))
+    # What the next line says of peaks and warnings is of its own second.
+    model.reset()
+
+
+class _Lines:
+    """A line a sensor and second; what is wrong with the server is said once."""
+
+    def __init__(self, options: Options, model: Model) -> None:
+        self._model = model
+        self._spelled = _spelled(options)
+        self._troubled = False
+
+    def show(self) -> None:
+        """One second's lines."""
+        state: State = self._model.state(time.monotonic())
+        wrong = trouble(state.server)
+        if wrong is None:
+            now = time_of_day()
+            _say(*(line(sensor, now) for sensor in state.sensors), spelled=self._spelled)
+        elif not self._troubled:
+            _say(f"{time_of_day()}  server {wrong}", spelled=self._spelled)
+        self._troubled = wrong is not None
+
+
+def _spelled(options: Options) -> bool:
+    return options.ascii or not can_show(sys.stdout.encoding)
+
+
+def _say(*lines: str, spelled: bool = False) -> None:
+    text = "".join(f"{line}\n" for line in lines)
+    sys.stdout.write(to_ascii(text) if spelled else text)
+    sys.stdout.flush()
+
+
+def hush() -> None:
+    """Nobody reads our output any more: let nothing complain of it at the end."""
+    with contextlib.suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,116 @@
+"""The thread that reads the server into the model, and connects again whenever it must.
+
+It wakes some twenty times a second, not for every sample: it takes all that has piled up, then waits for one
+sample more. For that one it was awake, so the moment it comes tells the age of a sample on arrival.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from typing import Final
+
+from clients.address import Address
+from clients.monitor.model import Model
+from protocol.client import Client
+from protocol.control import Event
+from protocol.errors import ProtocolError, RefusedError, UnreachableError
+
+BATCH_S: Final = 0.05
+_STATUS_EVERY_S: Final = 1.0
+_NEXT_SAMPLE_S: Final = 0.1
+_AGAIN_S: Final = 0.5
+_ANSWER_TIMEOUT_S: Final = 10.0
+"""A server that answers nothing for so long is as good as gone."""
+
+
+class Reader:
+    """Reads until it is closed."""
+
+    def __init__(self, address: Address, model: Model) -> None:
+        self._address = address
+        self._model = model
+        self._closing = threading.Event()
+        self._client: Client | None = None
+        self._changed = threading.Condition()
+        self.attempts = 0
+        """Connections tried and failed so far."""
+        self.statuses = 0
+        """Replies to `status` so far."""
+        self._thread = threading.Thread(target=self._run, name="reader", daemon=True)
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the connection and the thread."""
+        self._closing.set()
+        client = self._client
+        if client is not None:
+            client.connection.shutdown()  # not close: the thread may be waiting for it
+        self._thread.join(timeout=2.0)
+
+    def wait_for_answer(self, timeout_s: float) -> bool:
+        """Wait until the server has answered `status`, or could not be reached; whether it has answered."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.statuses or self.attempts, timeout_s)
+            return self.statuses > 0
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._read()
+            except UnreachableError as error:
+                self._failed(f"no server answers ({error})")
+            except ProtocolError as error:
+                self._failed(f"the connection ended: {error}")
+            self._closing.wait(_AGAIN_S)
+
+    def _failed(self, reason: str) -> None:
+        if not self._closing.is_set():
+            self._model.gone(reason, time.monotonic())
+            with self._changed:
+                self.attempts += 1
+                self._changed.notify_all()
+
+    def _read(self) -> None:
+        with Client(self._address.port, self._address.host) as client:
+            self._client = client
+            # REPEATED frames too: then a jump of the sequence is a loss and nothing else.
+            client.subscribe(fresh_only=False)
+            self._model.connected(client.description, _own_peer(client), time.monotonic())
+            status_at_s = 0.0
+            while not self._closing.wait(BATCH_S):
+                self._take(client)
+                if time.monotonic() >= status_at_s:
+                    status_at_s = time.monotonic() + _STATUS_EVERY_S
+                    self._ask_status(client)
+
+    def _take(self, client: Client) -> None:
+        piled_up = client.receive(0.0)
+        fresh = client.receive(_NEXT_SAMPLE_S)
+        now_ns = time.monotonic_ns()
+        self._model.take(piled_up + fresh, now_ns * 1e-9)
+        if client.connection.same_machine:
+            first = {frame.sensor: frame for frame in reversed(fresh)}
+            for frame in first.values():
+                self._model.note_age(frame, now_ns)
+        while client.events:
+            event = client.events.popleft()
+            self._model.take_event(event, now_ns * 1e-9)
+            if event.get("event") in {Event.SENSOR_BACK, Event.RECONFIGURED}:
+                self._model.described(client.ask("describe", _ANSWER_TIMEOUT_S), time.monotonic())
+
+    def _ask_status(self, client: Client) -> None:
+        with contextlib.suppress(RefusedError):
+            self._model.take_status(client.ask("status", _ANSWER_TIMEOUT_S), time.monotonic())
+        with self._changed:
+            self.statuses += 1
+            self._changed.notify_all()
+
+
+def _own_peer(client: Client) -> str:
+    host, port = client.connection.sock.getsockname()[:2]
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -1,0 +1,113 @@
+"""Runs `ethercat-record` beside the monitor: starts it, stops it, says how it went."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Final
+
+from clients.address import Address
+from protocol.text import printable
+
+PROGRAM: Final = "ethercat-record"
+_STOP_TIMEOUT_S: Final = 20.0
+"""A recording is finished by writing its summary, which takes a moment."""
+
+
+def program() -> list[str] | None:
+    """The command: what is beside the interpreter that runs us, or on PATH; None if it is not installed."""
+    beside = Path(sys.executable).with_name(PROGRAM)
+    found = str(beside) if beside.exists() else shutil.which(PROGRAM)
+    return None if found is None else [found]
+
+
+class Recorder:
+    """At most one recording at a time."""
+
+    def __init__(
+        self, address: Address, directory: Path | None = None, command: Sequence[str] | None = None
+    ) -> None:
+        """Recordings go to `directory`, by default the current one; `command` stands in for `program()`."""
+        self._address = address
+        self._directory = directory or Path.cwd()
+        self._command = command
+        self._process: subprocess.Popen[bytes] | None = None
+        self._said: IO[bytes] | None = None
+        self._since_s = 0.0
+
+    @property
+    def running(self) -> bool:
+        """Whether a recording was started and has not been seen to end."""
+        return self._process is not None
+
+    def seconds(self, now_s: float) -> float:
+        """How long it has been running."""
+        return now_s - self._since_s
+
+    def start(self, now_s: float) -> tuple[str, bool]:
+        """Begin one; what to say of it, and whether it is bad news."""
+        command = self._command or program()
+        if command is None:
+            return f"{PROGRAM} is not installed: pip install 'bota-ethercat-bridge[tools]'", True
+        name = time.strftime("recording-%Y%m%d-%H%M%S.mcap")
+        said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
+        try:
+            # A session of its own: Ctrl-C on our terminal is for us, and we stop it in order.
+            self._process = subprocess.Popen(
+                [*command, name, str(self._address)],
+                cwd=self._directory,
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=said,
+                start_new_session=True,
+            )
+        except OSError as error:
+            said.close()
+            return f"{PROGRAM} cannot be started: {error.strerror or error}", True
+        self._said, self._since_s = said, now_s
+        return f"Recording to {name}", False
+
+    def stop(self) -> None:
+        """Ask it to end; `ended` tells when it has."""
+        if self._process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.send_signal(signal.SIGINT)
+
+    def ended(self) -> tuple[str, bool] | None:
+        """What to say of a recording that has ended, and whether it is bad news; None if none has."""
+        if self._process is None or self._process.poll() is None:
+            return None
+        code, self._process = self._process.returncode, None
+        last = self._last_words().removeprefix(f"{PROGRAM}: ")
+        if code == 0:
+            return f"Recorded {last}" if last else "The recording has ended", False
+        return f"The recording failed: {last or f'exit code {code}'}", True
+
+    def close(self) -> str | None:
+        """End what is running and wait for it; what to say of it, if anything."""
+        if self._process is None:
+            return None
+        self.stop()
+        try:
+            self._process.wait(_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        found = self.ended()
+        return found[0] if found else None
+
+    def _last_words(self) -> str:
+        if self._said is None:
+            return ""
+        self._said.seek(0)
+        lines = self._said.read()[-4096:].decode(errors="replace").strip().splitlines()
+        self._said.close()
+        self._said = None
+        return printable(lines[-1]) if lines else ""

@@ -1,0 +1,35 @@
+"""Values from a server's JSON: taken if they are of the right kind, else not there.
+
+Texts lose what a terminal would obey.
+"""
+
+from __future__ import annotations
+
+from protocol.text import printable
+
+
+def text(value: object) -> str:
+    """A printable text; empty if it is none."""
+    return printable(value) if isinstance(value, str) else ""
+
+
+def number(value: object) -> float | None:
+    """A number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None
+
+
+def whole(value: object) -> int | None:
+    """A whole number of a size that counts have."""
+    if isinstance(value, bool) or not isinstance(value, int) or abs(value) >= 1 << 64:
+        return None
+    return value
+
+
+def rows(value: object) -> list[dict[str, object]]:
+    """The objects in a list."""
+    return [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []

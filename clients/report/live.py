@@ -1,0 +1,111 @@
+"""Subjects from some seconds of a server's stream."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+from clients.address import Address
+from clients.recording.columns import columns
+from clients.report.errors import ReportError
+from clients.report.recorded import event_remarks, no_sensor
+from clients.report.subject import Subject, subject
+from protocol.client import Client, connect
+from protocol.errors import ConnectionFailedError
+from protocol.framing import DataMessage, JsonObject
+from protocol.pdo import ImuUnits
+from protocol.sensor_choice import MOST_PLACES, SensorChoice
+
+_BATCH_S: Final = 0.05
+
+MOST_FRAMES: Final = 4_000_000
+"""About half an hour at 1600 Hz; more than that is what a recording is for."""
+
+
+class Received:
+    """Frames as they came."""
+
+    def __init__(self) -> None:
+        self.all: deque[DataMessage] = deque(maxlen=MOST_FRAMES)
+
+    def frames(self, sensor: int | None = None) -> Iterable[DataMessage]:
+        """Those of the sensor at this place, or all."""
+        return (frame for frame in self.all if sensor in (None, frame.sensor))
+
+
+def subjects(
+    address: Address,
+    seconds: float,
+    choice: SensorChoice | None,
+    imu_units: ImuUnits,
+    progress: Callable[[float], None] = lambda _: None,
+) -> list[Subject]:
+    """The server's sensors, or those that are meant, after `seconds`.
+
+    ConnectionFailedError or RefusedError where there is no stream; ReportError if there is no such sensor.
+    """
+    with connect(address.port, address.host, fresh_only=False) as client:
+        rows = _chosen(client.description, address, choice)
+        received, ended = _listen(client, seconds, progress)
+        names = [str(event.get("event")) for event in client.events]
+        changed = "" if ended else _changed(client, rows)
+    remarks = [*([ended] if ended else []), *([changed] if changed else []), *event_remarks(names)]
+    return [
+        subject(
+            row, row.get("settings"), columns(received, place, imu_units), str(address), place
+        ).with_remarks(remarks)
+        for place, row in rows.items()
+    ]
+
+
+def _rows(description: JsonObject) -> dict[int, dict[str, Any]]:
+    sensors = description.get("sensors")
+    rows = [row for row in sensors if isinstance(row, dict)] if isinstance(sensors, list) else []
+    return {
+        row["sensor"]: row
+        for row in rows
+        if type(row.get("sensor")) is int and 0 <= row["sensor"] < MOST_PLACES
+    }
+
+
+def _chosen(
+    description: JsonObject, address: Address, choice: SensorChoice | None
+) -> dict[int, dict[str, Any]]:
+    rows = _rows(description)
+    found = {
+        place: row
+        for place, row in rows.items()
+        if choice is None or choice.matches(place, str(row.get("name")), row.get("serial", -1))
+    }
+    if not found:
+        there = [(place, row.get("name"), row.get("serial")) for place, row in rows.items()]
+        raise no_sensor(str(address), choice, there)
+    return found
+
+
+def _listen(client: Client, seconds: float, progress: Callable[[float], None]) -> tuple[Received, str]:
+    """What came in `seconds`, and why it ended before, if it did."""
+    received = Received()
+    begin = time.monotonic()
+    while (passed := time.monotonic() - begin) < seconds:
+        progress(passed)
+        try:
+            received.all.extend(client.receive(min(_BATCH_S, seconds - passed)))
+        except ConnectionFailedError as error:
+            if not received.all:
+                raise
+            return received, f"The connection ended after {passed:.1f} s of {seconds:g}: {error}."
+    if not received.all:
+        raise ReportError(
+            f"nothing came in {seconds:g} s: look at `ethercat-sensor watch` and the server's log"
+        )
+    return received, ""
+
+
+def _changed(client: Client, rows: dict[int, dict[str, Any]]) -> str:
+    now = _rows(client.ask("describe"))
+    if any(now.get(place, {}).get("settings") != row.get("settings") for place, row in rows.items()):
+        return "The settings were changed meanwhile: limits and filters here follow from those at the start."
+    return ""

@@ -1,0 +1,206 @@
+"""Noise of each channel against what a healthy sensor shows, although the sensor may move and touch things.
+
+How: the samples are cut into windows of half a second (at least 32 samples). In each a cubic is fitted and
+taken off, which removes slow motion and drift; what remains, by its degrees of freedom, gives the window's
+standard deviation. Of all windows the calmer half is kept, by how far the fitted cubics of force and torque
+range: contacts and quick motion go. The noise is the median over those windows. If the accelerometer shows
+that the sensor was shaken even then, vibration cannot be told from noise and no judgement is made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from clients.report.channels import ACCELERATION, ANGULAR_RATE, CHANNELS, Channel, noise_limit
+from clients.report.check import Check, Level
+from clients.report.series import Bools, Floats, Series
+from clients.report.words import figure, listing
+
+WINDOW_S: Final = 0.5
+FEWEST_SAMPLES: Final = 32
+"""In a window."""
+ORDER: Final = 3
+FEWEST_WINDOWS: Final = 8
+"""That a judgement is made from."""
+_FILLED: Final = 0.8
+"""A window must have this part of its samples."""
+_ODD: Final = 4.0
+"""One IMU axis with so many times the noise of the other two is odd."""
+_ODD_FLOOR: Final = {ACCELERATION.name: 0.02, ANGULAR_RATE.name: 0.0035}
+"""m/s² and rad/s below which it does not matter."""
+NAME: Final = "Noise of force and torque"
+IMU_NAME: Final = "Noise of the IMU"
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What was measured."""
+
+    deviation: Floats
+    """(12,) standard deviation; NaN where it cannot be told."""
+    limit: Floats
+    """(12,) of a healthy sensor; NaN where it is not known."""
+    windows: int
+    """How many were found."""
+    calm: int
+    """How many of them were used."""
+    window_s: float
+
+    @property
+    def shaken(self) -> bool:
+        """Whether at least two axes of the accelerometer are above their limit: that is motion."""
+        first = 3 * 2
+        return bool(np.sum(self.deviation[first : first + 3] > self.limit[first : first + 3]) >= 2)
+
+
+def measure(series: Series) -> Noise:
+    """The noise of all channels."""
+    length = max(WINDOW_S, FEWEST_SAMPLES * series.period)
+    limits = np.array([_limit(series, channel) for channel in CHANNELS])
+    usable = series.finite & ~series.saturated
+    number = np.floor(series.time / length).astype(np.int64)
+    # A clock that jumps back must not make windows of samples that are far apart.
+    edges = np.flatnonzero(np.diff(number) != 0) + 1
+    starts, ends = np.concatenate(([0], edges)), np.concatenate((edges, [series.count]))
+    fewest = max(FEWEST_SAMPLES // 2, int(_FILLED * length / series.period))
+    deviations, ranges = [], []
+    for start, end in zip(starts, ends, strict=True):
+        if end - start < fewest:
+            continue
+        deviation, reach = _window(series.time[start:end], series.values[start:end], usable[start:end])
+        deviations.append(deviation)
+        ranges.append(reach)
+    if len(deviations) < FEWEST_WINDOWS:
+        return Noise(np.full(len(CHANNELS), np.nan), limits, len(deviations), 0, length)
+    all_deviations, reaches = np.array(deviations), np.array(ranges)[:, :6]
+    # A channel that cannot be used in a window has a part in its unrest as large as can be.
+    reaches = np.where(np.isfinite(reaches), reaches, np.inf)
+    usual = np.median(reaches, axis=0)
+    known = (usual > 0) & np.isfinite(usual)
+    unrest = (reaches[:, known] / usual[known]).max(axis=1) if known.any() else np.zeros(len(reaches))
+    calm = np.argsort(unrest, kind="stable")[: max(FEWEST_WINDOWS, len(unrest) // 2)]
+    kept = all_deviations[calm]
+    measured = np.sum(np.isfinite(kept), axis=0) >= FEWEST_WINDOWS // 2
+    deviation = np.full(len(CHANNELS), np.nan)
+    deviation[measured] = np.nanmedian(kept[:, measured], axis=0)
+    return Noise(deviation, limits, len(deviations), len(calm), length)
+
+
+def _limit(series: Series, channel: Channel) -> float:
+    length = series.subject.sinc_length
+    if channel.group.is_imu:
+        return float("nan") if series.imu_off else noise_limit(channel, 0)
+    if length is None or not series.subject.settings.get("calibration_matrix", False):
+        return float("nan")
+    return noise_limit(channel, length)
+
+
+def _window(time: Floats, values: Floats, usable: Bools) -> tuple[Floats, Floats]:
+    """Standard deviation of each channel about its cubic, and how far the cubic ranges."""
+    middle, half = (time[0] + time[-1]) / 2, max((time[-1] - time[0]) / 2, 1e-12)
+    basis = np.polynomial.legendre.legvander((time - middle) / half, ORDER)
+    good = usable.all(axis=0)
+    deviation = np.full(values.shape[1], np.nan)
+    reach = np.full(values.shape[1], np.nan)
+    fit, *_ = np.linalg.lstsq(basis, values[:, good], rcond=None)
+    trend = basis @ fit
+    rest = values[:, good] - trend
+    deviation[good] = np.sqrt(np.sum(rest**2, axis=0) / (len(time) - ORDER - 1))
+    reach[good] = np.ptp(trend, axis=0)
+    # What stands still has no noise; the fit leaves rounding errors.
+    deviation[good & (values == values[0]).all(axis=0)] = 0.0
+    return deviation, reach
+
+
+def check_force_torque(series: Series, noise: Noise) -> Check:
+    """Is force and torque as quiet as of a healthy sensor?"""
+    settings = series.subject.settings
+    if series.subject.sinc_length is None:
+        return _not_possible(
+            NAME, "The SINC length is not known, so no limit is known.", "Record the settings too."
+        )
+    if not settings.get("calibration_matrix", False):
+        return _not_possible(
+            NAME,
+            "Force and torque are raw counts (the calibration matrix is off), and limits exist in N and "
+            "Nm only.",
+            "Switch calibration_matrix on and record again.",
+        )
+    return _judge(NAME, noise, range(6), "Small forces drown in it, and a controller acts on it.",
+                  "Record again with the sensor at rest and unloaded. If it is the same, check cable, "
+                  "shield and supply, "
+                  "then ask the manufacturer.")  # fmt: skip
+
+
+def check_imu(series: Series, noise: Noise) -> Check:
+    """Is the IMU as quiet as of a healthy sensor?"""
+    if series.imu_off:
+        return Check(IMU_NAME, Level.NOT_APPLICABLE, "The IMU is off.")
+    found = _judge(
+        IMU_NAME, noise, range(6, 12), "What follows from the IMU (gravity compensation) becomes as noisy.",
+        "Record again with the sensor at rest. If it is the same, ask the manufacturer.",
+    )  # fmt: skip
+    if found.level is not Level.OK:
+        return found
+    odd = [text for group in (ACCELERATION, ANGULAR_RATE) for text in _odd_one(group.name, noise)]
+    if odd:
+        return Check(
+            IMU_NAME, Level.ATTENTION, f"{listing(odd)}. That is below the limit.",
+            "Three axes of one chip should be alike, unless the sensor vibrates about one axis.",
+            "Record again with the sensor at rest; if it is the same, ask the manufacturer.",
+        )  # fmt: skip
+    return found
+
+
+def _odd_one(group: str, noise: Noise) -> list[str]:
+    places = [place for place, channel in enumerate(CHANNELS) if channel.group.name == group]
+    for place in places:
+        others = float(np.median([noise.deviation[other] for other in places if other != place]))
+        own = float(noise.deviation[place])
+        if own > _ODD_FLOOR[group] and own > _ODD * others > 0:
+            channel = CHANNELS[place]
+            return [f"{channel.title} has {figure(own / others, 2)} times the noise of the other two axes "
+                    f"({figure(own)} {channel.group.unit})"]  # fmt: skip
+    return []
+
+
+def _not_possible(name: str, why: str, remedy: str) -> Check:
+    return Check(name, Level.NOT_POSSIBLE, why, "", remedy)
+
+
+def _judge(name: str, noise: Noise, places: range, matters: str, remedy: str) -> Check:
+    if noise.calm == 0:
+        return _not_possible(
+            name, f"Only {noise.windows} windows of {figure(noise.window_s, 2)} s could be used; "
+            f"{FEWEST_WINDOWS} are "
+            "needed.", "Record for at least 10 s without interruption.",
+        )  # fmt: skip
+    ratio = noise.deviation / noise.limit
+    unknown = [CHANNELS[place].title for place in places if not np.isfinite(ratio[place])]
+    above = [place for place in places if ratio[place] > 1]
+    if above and noise.shaken:
+        return _not_possible(
+            name, "The sensor was shaken all the time (the accelerometer shows it), so noise cannot be "
+            "told from "
+            "vibration.", "Record again with the sensor at rest.",
+        )  # fmt: skip
+    if above:
+        texts = [
+            f"{CHANNELS[p].title} has a noise of {figure(noise.deviation[p])} {CHANNELS[p].group.unit}, "
+            f"{figure(ratio[p], 2)} times the limit of {figure(noise.limit[p])}"
+            for p in above
+        ]
+        return Check(name, Level.FAULT, f"{listing(texts)}.", matters, remedy)
+    if unknown:
+        return _not_possible(
+            name, f"It could not be measured for {listing(unknown)}: saturated, or not numbers, too often.",
+            "Mend that first, then record again.",
+        )  # fmt: skip
+    worst = max(places, key=lambda place: float(ratio[place]))
+    return Check(
+        name, Level.OK, f"At most {figure(100 * ratio[worst], 2)} % of a healthy sensor's limit "
+        f"({CHANNELS[worst].title}: {figure(noise.deviation[worst])} {CHANNELS[worst].group.unit}).",
+    )  # fmt: skip

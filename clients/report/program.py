@@ -1,0 +1,92 @@
+"""Reads or listens, examines, writes the page. Everything heavy is imported here; `cli.py` prints."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from clients.recording.errors import RecordingError
+from clients.report import live, recorded
+from clients.report.check import Level
+from clients.report.errors import ReportError
+from clients.report.examine import Examination, examine
+from clients.report.options import ReportOptions
+from clients.report.page import as_json, render
+from clients.report.subject import Subject
+from clients.version import VERSION
+from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
+
+EXIT_CODES = {Level.OK: 0, Level.NOT_POSSIBLE: 3, Level.ATTENTION: 4, Level.FAULT: 5}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a report came to."""
+
+    words: str
+    """For the standard output."""
+    exit_code: int
+
+
+def make(options: ReportOptions, progress: Callable[[float], None]) -> Outcome:
+    """Make the report; ReportError says why there is none. `progress` is told how long it has listened, s."""
+    try:
+        examinations = [examine(each) for each in _subjects(options, progress)]
+    except UnreachableError as error:
+        hint = "start ethercat-server, or give its HOST:PORT"
+        raise ReportError(f"no server at {options.server}: {error}; {hint}") from None
+    except ConnectionFailedError as error:
+        raise ReportError(f"the server at {options.server} cannot be used: {error}") from None
+    except (RecordingError, ProtocolError) as error:
+        raise ReportError(str(error)) from None
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    page = render(examinations, made=now, program=f"ethercat-report {VERSION}", note=options.note)
+    _write(options.output, page)
+    words = as_json(examinations) if options.json else _summary(examinations)
+    return Outcome(words, max(EXIT_CODES[each.verdict.level] for each in examinations))
+
+
+def _subjects(options: ReportOptions, progress: Callable[[float], None]) -> list[Subject]:
+    if options.recording is not None:
+        return recorded.subjects(options.recording, options.sensor, options.imu_units)
+    return live.subjects(options.server, options.seconds, options.sensor, options.imu_units, progress)
+
+
+def _write(path: Path, page: str) -> None:
+    """Whole or not at all: a report that was there stays until the new one is complete."""
+    made: str | None = None
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", encoding="utf-8", dir=path.parent, prefix=f".{path.name}.", delete=False
+        ) as file:
+            made = file.name
+            file.write(page)
+        mask = os.umask(0)
+        os.umask(mask)
+        Path(made).chmod(0o666 & ~mask)
+        Path(made).replace(path)
+        made = None
+    except OSError as error:
+        raise ReportError(f"{path} cannot be written: {error.strerror or error}") from None
+    finally:
+        if made is not None:
+            with contextlib.suppress(OSError):
+                Path(made).unlink()
+
+
+def _summary(examinations: Sequence[Examination]) -> str:
+    lines = []
+    for each in examinations:
+        subject = each.subject
+        who = f"Sensor {subject.place} ({subject.name}, serial {subject.serial})"
+        lines.append(f"{who}: {each.verdict.headline}. {each.verdict.sentence}")
+        for check in each.checks:
+            if check.level >= Level.NOT_POSSIBLE:
+                lines.append(f"  {check.level.word}: {check.name}: {check.found}")
+                lines += [f"    {check.remedy}"] if check.remedy else []
+    return "\n".join(lines)

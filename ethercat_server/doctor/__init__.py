@@ -1,0 +1,1 @@
+"""`ethercat-doctor`: what keeps the samples from being fresh, and what mends it."""

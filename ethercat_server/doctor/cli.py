@@ -1,0 +1,200 @@
+"""`ethercat-doctor`: reads the command line, examines, reports, makes the worst finding an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from types import FrameType
+from typing import TYPE_CHECKING, Final
+
+from ethercat_server import __version__
+from ethercat_server.errors import ServerError, UsageError
+from ethercat_server.interface import MAX_NAME_LENGTH
+from ethercat_server.logs import PlainFormatter
+from ethercat_server.options import VIRTUAL_INTERFACE
+from ethercat_server.server_settings import SERVER_SETTINGS
+
+if TYPE_CHECKING:
+    from ethercat_server.doctor.finding import Finding
+    from ethercat_server.doctor.machine import Machine
+
+_FAILED: Final = 1
+_EXIT_CODES: Final = (
+    "exit codes: 0 nothing worse than a note, 1 the doctor itself failed or was stopped, 2 wrong arguments, "
+    "3 the worst is a warning, 4 something is bad"
+)
+_LONGEST_S: Final = 3600.0
+
+
+class _Formatter(PlainFormatter):
+    prefix = "ethercat-doctor: "
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="ethercat-doctor",
+        description="Looks for what keeps the samples of sensors from being fresh: kernel, "
+        "processors, network card, who else is there, the bus; then measures. Changes nothing. As "
+        "root it sees all.",
+        epilog=_EXIT_CODES,
+    )
+    parser.add_argument(
+        "iface",
+        metavar="IFACE",
+        help="interface the sensors are connected to ('virtual' for a virtual sensor)",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=_seconds,
+        default=10.0,
+        metavar="N",
+        help="measure for so long (default 10; 0: not at all)",
+    )
+    for name in ("rt_priority", "cpu"):
+        setting = SERVER_SETTINGS[name]
+        parser.add_argument(
+            setting.flag, dest=name, type=_whole, metavar=setting.metavar, default=setting.default,
+            help=f"measure as a server with this option would run: {setting.meaning}",
+        )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="JSON for programs")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    return parser
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0 <= value <= _LONGEST_S:
+        raise argparse.ArgumentTypeError(f"{text} must be from 0 to {_LONGEST_S:.0f} seconds")
+    return value
+
+
+_seconds.__name__ = "number"
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, 0 or more")
+    return int(text)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Examine; returns the exit code. argparse exits with 2 for what it finds."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, _interrupt)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Formatter())
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    # What was not granted is a finding.
+    logging.getLogger("ethercat_server.realtime").setLevel(logging.ERROR)
+    try:
+        args = build_parser().parse_args(argv)
+        return _run(args)
+    except ServerError as error:
+        return _fail(args, str(error), error.exit_code)
+    except BrokenPipeError:
+        # Whoever read the output has enough; Python would complain again when it closes it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _FAILED
+    except OSError as error:
+        return _fail(args, f"{error.filename or 'the operating system'}: {error.strerror or error}", _FAILED)
+    except KeyboardInterrupt:
+        return _fail(args, "stopped", _FAILED)
+
+
+def _run(args: argparse.Namespace) -> int:
+    # Takes a moment, in which Ctrl-C is to be heard already.
+    from ethercat_server.doctor.report import EXIT_CODES, Report, as_json, worst  # noqa: PLC0415
+
+    _check(args)
+    findings: list[Finding] = []
+    report = None if args.json else Report()
+    header = {"interface": args.iface, "version": __version__, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
+    header |= {"kernel": os.uname().release, "root": os.geteuid() == 0, "seconds": args.seconds}
+    if report is not None:
+        who = "as root" if header["root"] else "not as root"
+        report.heading(f"ethercat-doctor {__version__} on {args.iface}: Linux {header['kernel']}, {who}")
+    for finding in _examined(args, report.wait if report is not None else lambda _: None):
+        findings.append(finding)
+        if report is not None:
+            report.write(finding)
+    if report is None:
+        print(as_json(header, findings))
+    else:
+        report.summary(findings)
+    return EXIT_CODES[worst(findings)]
+
+
+def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iterator[Finding]:
+    from ethercat_server.doctor.bus_examination import Request, examine_bus  # noqa: PLC0415
+    from ethercat_server.doctor.examination import examine_machine  # noqa: PLC0415
+
+    with contextlib.ExitStack() as cleanup:
+        machine = _machine(args, cleanup)
+        yield from examine_machine(machine)
+        yield from examine_bus(machine, Request(args.seconds, args.cpu, announce))
+
+
+def _machine(args: argparse.Namespace, cleanup: contextlib.ExitStack) -> Machine:
+    """This machine, and the interface, which for `virtual` is brought up and taken down by `cleanup`."""
+    from ethercat_server.doctor.bus_examination import check_rights  # noqa: PLC0415
+    from ethercat_server.doctor.facts import InterfaceFacts, collect  # noqa: PLC0415
+    from ethercat_server.doctor.finding import CannotLookError  # noqa: PLC0415
+    from ethercat_server.doctor.machine import Machine  # noqa: PLC0415
+    from ethercat_server.virtual_bus import VirtualBus  # noqa: PLC0415
+
+    resolution = time.clock_getres(time.CLOCK_MONOTONIC)
+    own = {"asked": args.iface, "timer_resolution_s": resolution, "rt_priority": args.rt_priority}
+    if args.iface != VIRTUAL_INTERFACE:
+        return Machine(args.iface, facts=collect(args.iface), **own)
+    machine = Machine(args.iface, **own)
+    try:
+        check_rights(machine)
+        machine.ifname = cleanup.enter_context(VirtualBus("", args.rt_priority)).ifname
+        machine.facts = collect(machine.ifname)
+    except (CannotLookError, ServerError) as error:
+        machine.facts = InterfaceFacts(link=f"there is no virtual bus: {error}")
+    return machine
+
+
+def _check(args: argparse.Namespace) -> None:
+    """UsageError for arguments that cannot be meant."""
+    if not 0 < len(os.fsencode(args.iface)) <= MAX_NAME_LENGTH or "/" in args.iface:
+        raise UsageError(
+            f"{args.iface!r} is no name of a network interface: it must have 1 to {MAX_NAME_LENGTH} "
+            "characters; "
+            "'ethercat-sensor adapters' lists them"
+        )
+    for name in ("rt_priority", "cpu"):
+        value, setting = getattr(args, name), SERVER_SETTINGS[name]
+        if value is not None:
+            try:
+                setting.parse(str(value))
+            except ValueError as error:
+                raise UsageError(f"{setting.flag} {value}: it must be {error}") from None
+    if args.cpu is not None and args.cpu >= (os.cpu_count() or 1):
+        raise UsageError(
+            f"--cpu {args.cpu}: this machine has the processors 0 to {(os.cpu_count() or 1) - 1}"
+        )
+
+
+def _fail(args: argparse.Namespace, text: str, exit_code: int) -> int:
+    if args.json:
+        print(json.dumps({"error": text}))
+    print(f"ethercat-doctor: {text}", file=sys.stderr)
+    return exit_code
+
+
+def _interrupt(_number: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""The table of checks of machine and interface, and how any check is done: none can take the others along."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+from ethercat_server.doctor import company, cpu, interrupts, kernel, nic, rights
+from ethercat_server.doctor.facts import Link
+from ethercat_server.doctor.finding import CannotLookError, Finding, bad, skipped
+from ethercat_server.doctor.machine import Machine
+from ethercat_server.errors import ServerError
+from ethercat_server.options import VIRTUAL_INTERFACE
+
+_ABOUT_THE_INTERFACE: Final = frozenset({"interface", "who else"})
+
+
+class Check(NamedTuple):
+    """One check of the machine or the interface."""
+
+    subject: str
+    name: str
+    look: Callable[[Machine], Iterator[Finding]]
+
+
+CHECKS: Final = (
+    Check("kernel", "preemption", kernel.preemption),
+    Check("kernel", "tick", kernel.tick),
+    Check("kernel", "clock source", kernel.clock_source),
+    Check("kernel", "real-time throttling", kernel.throttling),
+    Check("kernel", "real-time groups", kernel.group_scheduling),
+    Check("rights", "capabilities", rights.capabilities),
+    Check("rights", "limits", rights.limits),
+    Check("processors", "governor", cpu.governor),
+    Check("processors", "idle states", cpu.idle_states),
+    Check("processors", "isolation", cpu.isolated),
+    Check("processors", "virtualisation", cpu.virtualisation),
+    Check("interface", "link", nic.link),
+    Check("interface", "speed", nic.speed),
+    Check("interface", "driver", nic.driver),
+    Check("interface", "coalescing", nic.coalescing),
+    Check("interface", "offloads", nic.offloads),
+    Check("interface", "EEE", nic.energy_efficient_ethernet),
+    Check("interface", "counters", nic.counters),
+    Check("interface", "interrupts", interrupts.affinity),
+    Check("interface", "interrupt threads", interrupts.threads),
+    Check("who else", "managers", company.managers),
+    Check("who else", "addresses", company.addresses),
+    Check("who else", "membership", company.membership),
+    Check("who else", "listeners", company.listeners),
+)
+
+
+def examine(subject: str, name: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    """The findings of one check, with its name; whatever keeps it from looking is a finding too."""
+    try:
+        for finding in look():
+            yield replace(finding, subject=subject, check=name)
+    except CannotLookError as error:
+        yield replace(skipped(str(error)), subject=subject, check=name)
+    except ServerError as error:
+        yield replace(bad(str(error), ""), subject=subject, check=name)
+    except OSError as error:
+        yield replace(skipped(error.strerror or str(error)), subject=subject, check=name)
+    except Exception as error:  # noqa: BLE001 - one check that fails must not take the others along
+        text = f"{type(error).__name__}: {error}; a fault of the doctor's, please report it"
+        yield replace(skipped(text), subject=subject, check=name)
+
+
+def examine_machine(machine: Machine) -> Iterator[Finding]:
+    """Everything that needs no bus."""
+    there = isinstance(machine.facts.link, Link)
+    for check in CHECKS:
+        if there or check.subject not in _ABOUT_THE_INTERFACE or check.look is nic.link:
+            for finding in examine(check.subject, check.name, functools.partial(check.look, machine)):
+                # Nobody mends what is gone when the doctor ends.
+                gone = check.subject in _ABOUT_THE_INTERFACE and machine.asked == VIRTUAL_INTERFACE
+                yield replace(finding, commands=()) if gone else finding
+        if check.look is nic.link and not there:
+            yield replace(
+                skipped("without it there is nothing to see"), subject=check.subject, check="the rest"
+            )

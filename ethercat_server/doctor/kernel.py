@@ -1,0 +1,154 @@
+"""The kernel: may it be interrupted, how finely does it wake programs, may real-time programs run?"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any, Final
+
+from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, warning
+from ethercat_server.doctor.machine import Machine
+
+_SWITCH: Final = "/sys/kernel/debug/sched/preempt"
+_MOUNT: Final = "sudo mount -t debugfs none /sys/kernel/debug"
+_MODELS: Final = {"none": "NONE", "voluntary": "VOLUNTARY", "full": "", "lazy": "LAZY"}
+"""Preemption models and the kernel option that makes each the default: PREEMPT_ and this."""
+_GOOD_CLOCKS: Final = frozenset(
+    {"tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "xen"}
+)
+_USUAL_RUNTIME: Final = 950_000
+_USUAL_PERIOD: Final = 1_000_000
+_FINE_S: Final = 1e-6
+
+
+def preemption(machine: Machine) -> Iterator[Finding]:
+    """Whether a program of high priority has to wait for the kernel."""
+    version = machine.text_or("/proc/version")
+    config = machine.config
+    if machine.text_or("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
+        yield ok("fully preemptible (PREEMPT_RT)", model="rt")
+        return
+    dynamic = "PREEMPT_DYNAMIC" in version or "PREEMPT_DYNAMIC" in config
+    model, sure = _model(machine, version, dynamic)
+    text = f"{model} (dynamic)" if dynamic else model
+    values: dict[str, Any] = {"model": model, "dynamic": dynamic, "certain": sure}
+    if not sure:
+        text += f", unless it was changed since boot: {_SWITCH} cannot be read"
+    if model in {"full", "lazy"}:
+        yield note(
+            f"{text}: no real-time kernel",
+            "good for most uses; drivers and interrupts may still hold the server up for some 100 µs "
+            "under load",
+            _real_time_kernel(machine), **values,
+        )  # fmt: skip
+        return
+    why = "the kernel gives its processor up only now and then: under load the server wakes milliseconds late"
+    if dynamic:
+        mount = () if machine.names("/sys/kernel/debug") or sure else (_MOUNT,)
+        yield warning(
+            text, f"{why}; the option preempt=full on the kernel's command line keeps the change",
+            *mount, f"echo full | sudo tee {_SWITCH}", **values,
+        )  # fmt: skip
+    else:
+        yield warning(text, why, _real_time_kernel(machine), **values)
+
+
+def _model(machine: Machine, version: str, dynamic: bool) -> tuple[str, bool]:
+    chosen = re.search(r"\((\w+)\)", machine.text_or(_SWITCH))
+    if chosen:
+        return chosen[1], True
+    asked = machine.command_line.get("preempt", "")
+    if dynamic and asked in _MODELS:
+        return asked, True
+    config = machine.config
+    for model, option in _MODELS.items():
+        if f"PREEMPT_{option}".rstrip("_") in config:
+            return model, not dynamic
+    if "PREEMPT" in version.split():
+        return "full", True
+    if dynamic:
+        return "full", False
+    if not version:
+        cannot_look("neither /proc/version nor the kernel's configuration can be read")
+    return "voluntary", False
+
+
+def _real_time_kernel(machine: Machine) -> str:
+    system = machine.text_or("/etc/os-release")
+    if re.search(r"^ID=\"?ubuntu", system, re.MULTILINE):
+        return "sudo pro attach && sudo pro enable realtime-kernel"
+    return "sudo apt install linux-image-rt-amd64"
+
+
+def tick(machine: Machine) -> Iterator[Finding]:
+    """Whether a program that sleeps wakes when it asked to, or at the kernel's next tick."""
+    rate = machine.config.get("HZ")
+    text = f"tick {rate} Hz" if rate else "tick rate unknown"
+    values: dict[str, Any] = {
+        "hz": int(rate) if rate and rate.isdecimal() else None,
+        "resolution_s": machine.timer_resolution_s,
+    }
+    if machine.timer_resolution_s <= _FINE_S:
+        yield ok(f"{text}, timers of high resolution", "waking does not depend on the tick then", **values)
+        return
+    yield bad(
+        f"{text}, timers resolve {machine.timer_resolution_s * 1e3:.3g} ms",
+        "every wake-up is late by up to that: take highres=off and nohz=off off the kernel's command "
+        "line, or use "
+        "a kernel with CONFIG_HIGH_RES_TIMERS",
+        **values,
+    )
+
+
+def clock_source(machine: Machine) -> Iterator[Finding]:
+    """What the kernel reads the time from."""
+    folder = "/sys/devices/system/clocksource/clocksource0"
+    source = machine.text(f"{folder}/current_clocksource")
+    if source in _GOOD_CLOCKS:
+        yield ok(source, source=source)
+        return
+    others = machine.text_or(f"{folder}/available_clocksource").split()
+    better = [name for name in others if name in _GOOD_CLOCKS]
+    why = "to read the time takes microseconds, and the server does so several times an exchange"
+    if better:
+        yield warning(source, why, f"echo {better[0]} | sudo tee {folder}/current_clocksource", source=source)
+    else:
+        log = "'dmesg | grep -i tsc' says why the kernel trusts no better one"
+        yield note(source, f"{why}; {log}", source=source)
+
+
+def throttling(machine: Machine) -> Iterator[Finding]:
+    """How much of the time real-time programs may use."""
+    runtime = machine.number("/proc/sys/kernel/sched_rt_runtime_us")
+    period = machine.number("/proc/sys/kernel/sched_rt_period_us")
+    values: dict[str, Any] = {"runtime_us": runtime, "period_us": period}
+    mend = f"sudo sysctl kernel.sched_rt_runtime_us={_USUAL_RUNTIME * period // _USUAL_PERIOD}"
+    if period <= 0:
+        cannot_look("/proc/sys/kernel/sched_rt_period_us is not positive")
+    if runtime < 0:
+        yield note("off", "a real-time program that hangs takes the machine along", mend, **values)
+    elif runtime < period // 2:
+        yield bad(
+            f"real-time programs get {100 * runtime / period:.0f} % of the time",
+            "the server is stopped for the rest of it", mend, **values,
+        )  # fmt: skip
+    else:
+        why = "the server never uses that much"
+        yield ok(f"real-time programs get {100 * runtime / period:.0f} % of the time", why, **values)
+
+
+def group_scheduling(machine: Machine) -> Iterator[Finding]:
+    """CONFIG_RT_GROUP_SCHED: real-time priorities only for groups that were given time."""
+    if not machine.config:
+        cannot_look(f"neither /proc/config.gz nor /boot/config-{machine.release} can be read")
+    asked = machine.command_line.get("rt_group_sched")
+    off = asked == "0" or ("RT_GROUP_SCHED_DEFAULT_DISABLED" in machine.config and asked != "1")
+    if "RT_GROUP_SCHED" not in machine.config or off:
+        yield ok("no groups with real-time budgets", enabled=False)
+        return
+    yield note(
+        "real-time budgets by group (CONFIG_RT_GROUP_SCHED)",
+        "a service may get no real-time priority at all, and the server then says 'not granted'; the option "
+        "rt_group_sched=0 on the kernel's command line switches it off",
+        enabled=True,
+    )

@@ -1,0 +1,118 @@
+"""How the doctor writes: a line a finding for people, one JSON object for programs."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final, TextIO
+
+from ethercat_server.doctor.finding import Finding, Level
+
+_COLOURS: Final = {
+    Level.OK: "\x1b[32m", Level.SKIPPED: "\x1b[2m", Level.NOTE: "\x1b[36m", Level.WARNING: "\x1b[33m",
+    Level.BAD: "\x1b[1;31m",
+}  # fmt: skip
+_END: Final = "\x1b[0m"
+_CLEAR_LINE: Final = "\x1b[K"
+_BOLD: Final = "\x1b[1m"
+_LEVEL_WIDTH: Final = max(len(level.name) for level in Level)
+_NAME_WIDTH: Final = 20
+_INDENT: Final = " " * (2 + _LEVEL_WIDTH + 2 + _NAME_WIDTH + 2)
+_USUAL_WIDTH: Final = 120
+_LEAST_TEXT: Final = 30
+EXIT_CODES: Final = {Level.OK: 0, Level.SKIPPED: 0, Level.NOTE: 0, Level.WARNING: 3, Level.BAD: 4}
+
+
+def worst(findings: Iterable[Finding]) -> Level:
+    """The worst of the findings; what was skipped says nothing."""
+    return max((f.level for f in findings if f.level is not Level.SKIPPED), default=Level.OK)
+
+
+def wants_colour(stream: TextIO, environment: Mapping[str, str]) -> bool:
+    """Only a terminal, and not if the user set NO_COLOR (no-color.org)."""
+    return stream.isatty() and not environment.get("NO_COLOR") and environment.get("TERM") != "dumb"
+
+
+class Report:
+    """Writes findings for people as they come."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stdout
+        self._colour = wants_colour(self._stream, os.environ)
+        width = (
+            shutil.get_terminal_size((_USUAL_WIDTH, 24)).columns if self._stream.isatty() else _USUAL_WIDTH
+        )
+        self._width = max(_LEAST_TEXT, width - len(_INDENT))
+        self._subject = ""
+        self._waiting = False
+
+    def heading(self, text: str) -> None:
+        """The first line."""
+        self._say(text + "\n")
+
+    def wait(self, text: str) -> None:
+        """Say on a terminal what takes a while, until the next line."""
+        if self._stream.isatty():
+            self._stream.write(f"{text}\r")
+            self._stream.flush()
+            self._waiting = True
+
+    def write(self, finding: Finding) -> None:
+        """One finding, below its subject."""
+        if finding.subject != self._subject:
+            self._say(("\n" if self._subject else "") + self._painted(finding.subject, _BOLD))
+            self._subject = finding.subject
+        level = finding.level.name.lower().ljust(_LEVEL_WIDTH)
+        first, *rest = self._lines(finding.found)
+        head = self._painted(level, _COLOURS[finding.level])
+        self._say(f"  {head}  {finding.check.ljust(_NAME_WIDTH)}  {first}")
+        for line in (*rest, *self._lines(finding.why)) if finding.why else rest:
+            self._say(_INDENT + line)
+        for command in finding.commands:
+            self._say(f"{_INDENT}$ {command}")
+
+    def summary(self, findings: Sequence[Finding]) -> None:
+        """How many of each, and what that means."""
+        counts = {level: sum(f.level is level for f in findings) for level in reversed(Level)}
+        text = ", ".join(f"{count} {_counted(level, count)}" for level, count in counts.items() if count)
+        self._say(f"\n{text}")
+
+    def _lines(self, text: str) -> list[str]:
+        return textwrap.wrap(text, self._width, break_on_hyphens=False, break_long_words=False) or [""]
+
+    def _painted(self, text: str, colour: str) -> str:
+        return f"{colour}{text}{_END}" if self._colour else text
+
+    def _say(self, text: str) -> None:
+        if self._waiting:
+            self._stream.write(_CLEAR_LINE)
+            self._waiting = False
+        self._stream.write(printable(text) + "\n")
+        self._stream.flush()
+
+
+def _counted(level: Level, count: int) -> str:
+    name = level.name.lower()
+    return f"{name}s" if level in {Level.NOTE, Level.WARNING} and count != 1 else name
+
+
+def printable(text: str) -> str:
+    """Without what a device or a file could do to the terminal; our own colours stay."""
+    own = {*_COLOURS.values(), _END, _BOLD}
+    parts = text.split("\x1b")
+    found = "".join(c if c.isprintable() or c == "\n" else "?" for c in parts[0])
+    for part in parts[1:]:
+        colour = next((c for c in own if ("\x1b" + part).startswith(c)), None)
+        kept = part[len(colour) - 1 :] if colour else "?" + part
+        found += (colour or "") + "".join(c if c.isprintable() or c == "\n" else "?" for c in kept)
+    return found
+
+
+def as_json(header: Mapping[str, Any], findings: Sequence[Finding]) -> str:
+    """All of it in one object."""
+    found = {**header, "worst": worst(findings).name.lower(), "findings": [f.as_json() for f in findings]}
+    return json.dumps(found, indent=2, ensure_ascii=False, default=str)

@@ -1,0 +1,91 @@
+"""Reads a slave's SII, its EEPROM, through the controller's registers: one or two datagrams a step.
+
+It is never written. Source: ETG.1000.4, registers 0x0500 to 0x050F. pysoem's own reading takes an EEPROM that
+cannot be read for one full of zeros, after minutes.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import Final
+
+from ethercat_server.bus import Bus
+from ethercat_server.errors import BusError
+from ethercat_server.sdo import Steps
+
+SII_OWNER: Final = 0x0500
+"""Who reads the SII: 0 the master, 1 the slave's own firmware; 2 takes it from the firmware."""
+PROTOCOLS: Final = 0x1C
+"""Word of the SII that says which mailbox protocols there are."""
+PROTOCOL_COE: Final = 0x04
+
+_CONTROL: Final = 0x0502
+_REGISTERS: Final = struct.Struct("<HI8s")
+"""Control and status, the word's address, the data."""
+_COMMAND: Final = struct.Struct("<HI")
+_READ: Final = 0x0100
+_NONE: Final = 0x0000
+_BUSY: Final = 0x8000
+_ERRORS: Final = 0x7800
+_EIGHT_BYTES: Final = 0x0040
+_WORD_TIMEOUT_S: Final = 1.5
+"""So long reading is tried again: a bus that is deaf for a moment is no refusal."""
+
+
+def read_sii(bus: Bus, slave: int, word: int, count: int) -> Steps[bytes]:
+    """`count` words of the SII from `word` on, two bytes each; BusError if it cannot be read."""
+    data = bytearray()
+    try:
+        yield from _write(bus, slave, SII_OWNER, b"\x02", word)
+        yield from _write(bus, slave, SII_OWNER, b"\x00", word)
+        while len(data) < 2 * count:
+            data += yield from _read_word(bus, slave, word + len(data) // 2)
+    finally:
+        bus.write_register(slave, SII_OWNER, b"\x01")
+    return bytes(data[: 2 * count])
+
+
+def has_coe(bus: Bus, slave: int) -> Steps[bool]:
+    """Whether the slave has a mailbox with CoE, and so objects."""
+    words = yield from read_sii(bus, slave, PROTOCOLS, 1)
+    return bool(words[0] & PROTOCOL_COE)
+
+
+def _read_word(bus: Bus, slave: int, word: int) -> Steps[bytes]:
+    """What one read command gives: two words, or four."""
+    deadline = time.monotonic() + _WORD_TIMEOUT_S
+    answer, asked = "no answer", False
+    while time.monotonic() < deadline:
+        if not asked:
+            asked = bus.write_register(slave, _CONTROL, _COMMAND.pack(_READ, word))
+            yield
+            continue
+        found = bus.read_register(slave, _CONTROL, _REGISTERS.size)
+        if found is not None:
+            status, address, data = _REGISTERS.unpack(found)
+            if status & _BUSY:
+                answer = f"it stays busy (status 0x{status:04X})"
+            elif status & _ERRORS or address != word:
+                answer = f"it refuses (status 0x{status:04X})"
+                bus.write_register(slave, _CONTROL, _COMMAND.pack(_NONE, word))
+                asked = False
+            else:
+                return bytes(data if status & _EIGHT_BYTES else data[:4])
+        yield
+    raise _unreadable(slave, word, answer)
+
+
+def _write(bus: Bus, slave: int, address: int, data: bytes, word: int) -> Steps[None]:
+    deadline = time.monotonic() + _WORD_TIMEOUT_S
+    while not bus.write_register(slave, address, data):
+        if time.monotonic() > deadline:
+            raise _unreadable(slave, word, "no answer")
+        yield
+
+
+def _unreadable(slave: int, word: int, why: str) -> BusError:
+    return BusError(
+        f"the SII of slave {slave} cannot be read at word 0x{word:04X}: {why}; power it off and on, "
+        "then try again"
+    )

@@ -1,0 +1,39 @@
+"""The captures of the monitor in docs/: `python -m tests.clients.captures` makes them anew."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+from rich.console import Console
+
+from clients.monitor.screen import Look, render
+from clients.monitor.state import State
+from tests.clients import monitor_states as states
+
+DOCS = Path(__file__).parent.parent.parent / "docs"
+
+
+def svg(state: State, look: Look, width: int, height: int) -> str:
+    console = Console(
+        width=width, height=height, record=True, file=io.StringIO(), force_terminal=True,
+        color_system="truecolor", legacy_windows=False, _environ={},
+    )  # fmt: skip
+    for row in render(state, look, width, height):
+        console.print(row, soft_wrap=True)
+    return console.export_svg(title="ethercat-monitor", unique_id="monitor")
+
+
+def captures() -> Mapping[str, str]:
+    """File name in docs/ to what it holds."""
+    return {
+        "monitor.svg": svg(states.healthy(), Look(recording="REC 42 s"), 80, 24),
+        "monitor-warnings.svg": svg(states.troubled(), Look(), 80, 24),
+        "monitor-gone.svg": svg(states.gone(), Look(), 60, 15),
+    }
+
+
+if __name__ == "__main__":
+    for name, text in captures().items():
+        (DOCS / name).write_text(text)

@@ -1,0 +1,242 @@
+// Does with the C++ client what it is told, for tests: `driver [OPTION=VALUE ...]`, then a command a line on standard
+// input, and for each a line of JSON on standard output.
+//
+//   connect MS | close | latest [PLACE] | peek [PLACE] | next MS | collect COUNT MS | follow COUNT HZ [PLACE]
+//   info [PLACE] | ask REQUEST | describe | status | tare SAMPLES FX FY FZ MX MY MZ
+//
+// Built with COUNT_ALLOCATIONS it counts what `latest` and `next` allocate (not under ASan, which has its own malloc).
+#include <bota_ethercat.hpp>
+
+#include <cinttypes>
+#include <cstdlib>
+#include <iostream>
+#include <sstream>
+
+static std::size_t allocations = 0;
+
+#ifdef COUNT_ALLOCATIONS
+extern "C" {
+void* __libc_malloc(std::size_t size);
+void* __libc_calloc(std::size_t count, std::size_t size);
+void* __libc_realloc(void* old, std::size_t size);
+void* malloc(std::size_t size) { return ++allocations, __libc_malloc(size); }
+void* calloc(std::size_t count, std::size_t size) { return ++allocations, __libc_calloc(count, size); }
+void* realloc(void* old, std::size_t size) { return ++allocations, __libc_realloc(old, size); }
+}
+#endif
+
+namespace {
+
+using namespace bota_ethercat;
+
+std::size_t allocated = 0;  // in calls that promise not to
+
+template <typename Call>
+Reading watched(Call&& call) {
+    const std::size_t before = allocations;
+    const Reading reading = call();
+    allocated += allocations - before;
+    return reading;
+}
+
+const char* yes(bool value) { return value ? "true" : "false"; }
+
+std::string quoted(std::string_view text) {
+    std::string result = "\"";
+    for (const char c : text) {
+        if (c == '"' || c == '\\') result += '\\';
+        result += c;
+    }
+    return result + "\"";
+}
+
+const char* name(Condition condition) {
+    constexpr const char* kNames[] = {"fresh", "late", "repeated", "invalid", "sensor_lost", "silent", "disconnected", "bad_clock"};
+    return kNames[static_cast<int>(condition)];
+}
+
+template <std::size_t Size>
+void print(const char* key, const std::array<double, Size>& numbers) {
+    std::printf(",\"%s\":", key);
+    for (std::size_t i = 0; i < Size; ++i) std::printf("%c%.17g", i == 0 ? '[' : ',', numbers[i]);
+    std::printf("]");
+}
+
+void print(const Reading& r) {
+    std::printf("{\"has_sample\":%s,\"is_new\":%s,\"fresh\":%s,\"condition\":\"%s\",\"sensor\":%u,\"flags\":%u,\"wkc\":%u",
+                yes(r.has_sample), yes(r.is_new), yes(r.fresh()), name(r.condition), unsigned{r.sensor}, unsigned{r.flags},
+                unsigned{r.wkc});
+    std::printf(",\"sequence\":%" PRIu64 ",\"stamp_ns\":%" PRIu64 ",\"monotonic_ns\":%" PRIu64 ",\"received_ns\":%" PRId64
+                ",\"age_ns\":%" PRId64 ",\"age_is_lower_bound\":%s",
+                r.sequence, r.stamp_ns, r.monotonic_ns, r.received_ns, r.age_ns, yes(r.age_is_lower_bound));
+    std::printf(",\"gap\":%s,\"missed\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"warnings_seen\":%" PRIu32
+                ",\"connection\":%" PRIu32 ",\"more_waits\":%s",
+                yes(r.gap), r.missed, r.passed_over, r.warnings_seen, r.connection, yes(r.more_waits));
+    print("array", r.sample.array());
+    std::printf(",\"temperature\":%.17g}", r.sample.temperature);
+}
+
+Options options_from(int argc, char** argv) {
+    Options options;
+    for (int i = 1; i < argc; ++i) {
+        const std::string word = argv[i], key = word.substr(0, word.find('=')), value = word.substr(word.find('=') + 1);
+        const auto number = [&] { return std::stoll(value); };
+        if (key == "host") options.host = value;
+        else if (key == "port") options.port = static_cast<std::uint16_t>(number());
+        else if (key == "sensor") options.sensors.push_back(static_cast<std::uint8_t>(number()));
+        else if (key == "every") options.every = static_cast<std::uint32_t>(number());
+        else if (key == "fresh_only") options.fresh_only = number() != 0;
+        else if (key == "max_age_ms") options.max_age = std::chrono::milliseconds(number());
+        else if (key == "reconnect") options.reconnect = number() != 0;
+        else if (key == "reconnect_every_ms") options.reconnect_every = std::chrono::milliseconds(number());
+        else if (key == "age_from") options.age_from = value == "arrival" ? AgeFrom::arrival : value == "instant" ? AgeFrom::instant : AgeFrom::automatic;
+        else if (key == "max_bytes_per_call") options.max_bytes_per_call = static_cast<std::size_t>(number());
+        else if (key == "receive_buffer") options.receive_buffer = static_cast<int>(number());
+        else std::exit(2);
+    }
+    return options;
+}
+
+/// The next samples, as a list.
+void collect(Client& client, long count, long ms) {
+    std::vector<Reading> readings;
+    readings.reserve(static_cast<std::size_t>(count));
+    const std::int64_t end = monotonic_now_ns() + ms * 1'000'000;
+    while (static_cast<long>(readings.size()) < count && monotonic_now_ns() < end) {
+        const Reading reading = watched([&] { return client.next(std::chrono::milliseconds(50)); });
+        if (reading.is_new) readings.push_back(reading);
+    }
+    std::printf("[");
+    for (std::size_t i = 0; i < readings.size(); ++i) {
+        if (i) std::printf(",");
+        print(readings[i]);
+    }
+    std::printf("]");
+}
+
+/// `latest` at a steady pace; what a controller would have seen.
+void follow(Client& client, long count, double hz, std::uint8_t place) {
+    std::uint64_t fresh = 0, too_young = 0, is_new = 0, not_rising = 0, passed_over = 0, missed = 0, gaps = 0, last = 0;
+    std::int64_t due = monotonic_now_ns();
+    for (long i = 0; i < count; ++i) {
+        due += static_cast<std::int64_t>(1e9 / hz);
+        const timespec at{static_cast<time_t>(due / 1'000'000'000), static_cast<long>(due % 1'000'000'000)};
+        clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &at, nullptr);
+        const std::int64_t before = monotonic_now_ns();
+        const Reading r = watched([&] { return client.latest(place); });
+        fresh += r.fresh();
+        too_young += r.has_sample && r.age_ns < before - static_cast<std::int64_t>(r.monotonic_ns);
+        is_new += r.is_new;
+        not_rising += r.is_new && r.monotonic_ns <= last;
+        if (r.is_new) last = r.monotonic_ns;
+        passed_over += r.passed_over;
+        missed += r.missed;
+        gaps += r.gap;
+    }
+    std::printf("{\"calls\":%ld,\"fresh\":%" PRIu64 ",\"too_young\":%" PRIu64 ",\"new\":%" PRIu64 ",\"not_rising\":%" PRIu64
+                ",\"passed_over\":%" PRIu64 ",\"missed\":%" PRIu64 ",\"gaps\":%" PRIu64 "}",
+                count, fresh, too_young, is_new, not_rising, passed_over, missed, gaps);
+}
+
+void info(const Client& client, std::uint8_t place) {
+    const Counters c = client.counters(place);
+    constexpr const char* kLinks[] = {"down", "connecting", "subscribing", "up"};
+    std::printf("{\"link\":\"%s\",\"error\":%s,\"connections\":%u,\"reconfigurations\":%u,\"bad_messages\":%" PRIu64
+                ",\"allocated\":%zu,\"fd\":%d",
+                kLinks[static_cast<int>(client.link())], quoted(client.error()).c_str(), client.connections(),
+                client.reconfigurations(), client.bad_messages(), allocated, client.fd());
+    std::printf(",\"frames\":%" PRIu64 ",\"samples\":%" PRIu64 ",\"repeated\":%" PRIu64 ",\"invalid\":%" PRIu64 ",\"gaps\":%" PRIu64
+                ",\"missed\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"names\":[",
+                c.frames, c.samples, c.repeated, c.invalid, c.gaps, c.missed, c.passed_over);
+    for (std::size_t i = 0; i < client.description().sensor_count; ++i)
+        std::printf("%s%s", i ? "," : "", quoted(client.description().sensors[i].name.view()).c_str());
+    std::printf("]}");
+}
+
+void print(const Control& control, bool ok) {
+    std::printf("\"ok\":%s,\"error\":%s,\"code\":%s,\"abort_code\":%u}", yes(ok), quoted(control.error()).c_str(),
+                quoted(control.error_code()).c_str(), control.abort_code());
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    const Options options = options_from(argc, argv);
+    Client client(options);
+    Control control(options.host, options.port);
+    for (std::string line, command; std::getline(std::cin, line);) {
+        std::istringstream words(line);
+        words >> command;
+        long number = 0;
+        if (command != "ask") words >> number;
+        const auto place = static_cast<std::uint8_t>(number);
+        if (command == "connect") {
+            const bool ok = client.connect(std::chrono::milliseconds(number));
+            std::printf("{\"ok\":%s,\"error\":%s}", yes(ok), quoted(client.error()).c_str());
+        } else if (command == "close") {
+            client.close();
+            std::printf("{}");
+        } else if (command == "latest") {
+            print(watched([&] { return client.latest(place); }));
+        } else if (command == "peek") {
+            print(watched([&] { return client.peek(place); }));
+        } else if (command == "next") {
+            print(watched([&] { return client.next(std::chrono::milliseconds(number)); }));
+        } else if (command == "collect") {
+            long ms = 0;
+            words >> ms;
+            collect(client, number, ms);
+        } else if (command == "follow") {
+            double hz = 0;
+            int of = 0;
+            words >> hz >> of;
+            follow(client, number, hz, static_cast<std::uint8_t>(of));
+        } else if (command == "info") {
+            info(client, place);
+        } else if (command == "ask") {
+            const bool ok = control.ask(line.substr(4), std::chrono::seconds(5));
+            const std::string_view reply = control.reply().text();
+            std::printf("{\"reply\":%s,", reply.empty() ? "null" : std::string(reply).c_str());
+            print(control, ok);
+        } else if (command == "describe") {
+            Description d;
+            const bool ok = control.describe(d);
+            std::printf("{\"sensors\":[");
+            for (std::size_t i = 0; i < d.sensor_count; ++i) {
+                const SensorInfo& s = d.sensors[i];
+                std::printf("%s{\"sensor\":%u,\"serial\":%" PRIu64 ",\"pdo_size\":%u,\"rate_hz\":%g,\"name\":%s,\"hardware\":%s,"
+                            "\"firmware\":%s,\"state\":%s}",
+                            i ? "," : "", unsigned{s.sensor}, s.serial, s.pdo_size, s.rate_hz, quoted(s.name.view()).c_str(),
+                            quoted(s.hardware.view()).c_str(), quoted(s.firmware.view()).c_str(), quoted(s.state.view()).c_str());
+            }
+            std::printf("],\"version\":%s,", quoted(d.version.view()).c_str());
+            print(control, ok);
+        } else if (command == "status") {
+            Status s;
+            const bool ok = control.status(s);
+            std::printf("{\"cycles\":%" PRIu64 ",\"uptime_s\":%g,\"sensors\":[", s.cycles, s.uptime_s);
+            for (std::size_t i = 0; i < s.sensor_count; ++i)
+                std::printf("%s{\"fresh\":%" PRIu64 ",\"locked\":%s,\"period_us\":%g}", i ? "," : "", s.sensors[i].fresh,
+                            yes(s.sensors[i].locked), s.sensors[i].period_us);
+            std::printf("],");
+            print(control, ok);
+        } else if (command == "tare") {
+            std::array<double, 6> target{};
+            for (double& value : target) words >> value;
+            TareResult t;
+            const bool ok = control.tare(t, 0, static_cast<unsigned>(number), target);
+            std::printf("{\"done\":%s", yes(ok));
+            print("old_offset", t.old_offset);
+            print("new_offset", t.new_offset);
+            print("residual", t.residual);
+            print("deviation", t.deviation);
+            std::printf(",");
+            print(control, ok);
+        } else {
+            return 2;
+        }
+        std::printf("\n");
+        std::fflush(stdout);
+    }
+    return 0;
+}

@@ -1,0 +1,268 @@
+"""The C++ client decodes what the Python code does: the golden vectors, and the fuzzer's hostile messages.
+
+Built with ASan and UBSan, which end the program at the first fault.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import subprocess
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import pytest
+
+from protocol.errors import BadMessageError, RemoteProtocolError
+from protocol.framing import DataMessage, FrameDecoder
+from protocol.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder, layout_for
+from protocol.warnings_register import WarningFlag
+from tests.clients.cpp_programs import CLIENT, SANITIZED, SOURCES, build, needs_gxx, patient
+from tests.golden_vectors import BROKEN, DATA, JSON, STREAMS, Outcome, Vector, expected, same_sample
+from tests.hostile_bytes import FRAMED, HOSTILE_TEXTS, framed, in_chunks, mutate
+from tests.protocol.test_fuzz import LIMIT, SEED
+
+pytestmark = [needs_gxx, patient]
+
+Decoded = tuple[Outcome, Sample | None]
+Stream = Sequence[bytes]
+BATCH = 2000
+INSERTED = (
+    b"\\ud83d\\ude00", b"\\ud83d", b"1e308", b"1e309", b"-", b"0", b".5", b'"', b"[", b"{}", b"null", b",",
+    b"\xf0\x9f\x98\x80", b"\xed\xa0\x80", b"\xe2\x82", b"9" * 30, b"-0.0", b"1E+2", b'"a":', b" ", b"\\",
+)  # fmt: skip
+
+
+def in_cpp(streams: Sequence[Stream], limit: int = 65536, units: str = "g_dps") -> list[list[Decoded]]:
+    """What the C++ decoder makes of each stream."""
+    program = build(SOURCES / "decode.cpp", SANITIZED)
+    lines = (f"{limit} {units} {' '.join(chunk.hex() for chunk in stream)}\n" for stream in streams)
+    done = subprocess.run(
+        [program], input="".join(lines), capture_output=True, text=True, check=False, timeout=100
+    )
+    assert done.returncode == 0, done.stderr
+    return list(by_stream(done.stdout))[: len(streams)]
+
+
+def by_stream(output: str) -> Iterator[list[Decoded]]:
+    found: list[Decoded] = []
+    for line in output.splitlines():
+        if not line:
+            yield found
+            found = []
+        else:
+            found.append(outcome(line))
+
+
+def outcome(line: str) -> Decoded:
+    kind, _, rest = line.partition(" ")
+    if kind == "J":
+        return json.loads(rest), None
+    if kind != "D":
+        return {"B": "refused", "X": "broken"}[kind], None
+    words = rest.split()
+    sequence, stamp, monotonic, sensor, flags, wkc, size, status, warnings, ft, a, r = map(int, words[:12])
+    values = [float.fromhex(word) for word in words[12:-1] if word != "-"]
+    force, torque, acceleration, rate = ((values[k], values[k + 1], values[k + 2]) for k in (0, 3, 6, 9))
+    x, y, z, w = values[13:] or (0.0, 0.0, 0.0, 0.0)
+    orientation = (x, y, z, w) if len(values) > 13 else None
+    sample = Sample(
+        force, torque, acceleration, rate, values[12], orientation, status, warnings, ft, a, r
+    )  # fmt: skip
+    assert sample.is_finite == (words[-1] == "finite")
+    return DataMessage(sequence, stamp, monotonic, sensor, flags, wkc, bytes(size)), sample
+
+
+def in_python(stream: Stream, limit: int = 65536, units: ImuUnits = ImuUnits.G_DPS) -> list[Decoded]:
+    decoder, found = FrameDecoder(max_json_length=limit), list[Decoded]()
+    decoders = {size: SampleDecoder(size, units) for size in (61, 77)}
+    for chunk in stream:
+        decoder.feed(chunk)
+        while True:
+            try:
+                message = decoder.next_message()
+            except BadMessageError:
+                found.append(("refused", None))
+                continue
+            except RemoteProtocolError:
+                return [*found, ("broken", None)]
+            if message is None:
+                break
+            sample = None
+            if isinstance(message, DataMessage):
+                size = len(message.process_data)
+                sample = decoders[size].decode(message.process_data)
+                message = message._replace(process_data=bytes(size))
+            found.append((message, sample))
+    return found
+
+
+def assert_same(cpp: Sequence[Decoded], python: Sequence[Decoded], stream: Stream) -> None:
+    """The bytes of the process data are compared as what they decode to."""
+    told = [b"".join(stream).hex()[:400], cpp[-3:], python[-3:]]
+    assert [message for message, _ in cpp] == [message for message, _ in python], told
+    for (_, one), (_, other) in zip(cpp, python, strict=True):
+        assert (one is None) == (other is None), told
+        if one is not None and other is not None:
+            assert same_sample(one, other), told
+
+
+# -- golden vectors
+
+
+def test_golden_vectors_one_by_one() -> None:
+    vectors = [*DATA, *JSON, *BROKEN]
+    found = in_cpp([[vector.wire] for vector in vectors])
+    for vector, decoded in zip(vectors, found, strict=True):
+        assert_golden(decoded, [vector])
+
+
+@pytest.mark.parametrize("units", ["g_dps", "si"])
+def test_golden_samples(units: str) -> None:
+    found = in_cpp([[vector.wire] for vector in DATA], units=units)
+    for vector, ((_, sample),) in zip(DATA, found, strict=True):
+        wanted = vector.sample if units == "g_dps" else vector.sample_si
+        assert sample is not None
+        assert wanted is not None
+        assert same_sample(sample, wanted), vector.name
+
+
+@pytest.mark.parametrize("vectors", STREAMS.values(), ids=STREAMS)
+def test_golden_streams_cut_at_every_byte(vectors: list[Vector]) -> None:
+    wire = b"".join(vector.wire for vector in vectors)
+    streams = [[wire[:cut], wire[cut:]] for cut in range(1, len(wire))]
+    streams.append([bytes((byte,)) for byte in wire])
+    for decoded in in_cpp(streams):
+        assert_golden(decoded, vectors)
+
+
+def assert_golden(decoded: Sequence[Decoded], vectors: Sequence[Vector]) -> None:
+    outcomes = expected(vectors)
+    messages = [
+        wanted._replace(process_data=bytes(len(wanted.process_data)))
+        if isinstance(wanted, DataMessage)
+        else wanted
+        for wanted in outcomes
+    ]
+    assert [message for message, _ in decoded] == messages
+    for (_, sample), vector in zip(decoded, vectors, strict=False):
+        if sample is not None:
+            assert vector.sample is not None
+            assert same_sample(sample, vector.sample)
+
+
+def without_process_data(outcome: Outcome) -> Outcome:
+    if isinstance(outcome, DataMessage):
+        return outcome._replace(process_data=bytes(len(outcome.process_data)))
+    return outcome
+
+
+# -- the same as Python, whatever comes
+
+
+def hostile_streams(rng: random.Random, count: int) -> list[Stream]:
+    """`count` messages and more, in streams as the fuzzer of the Python code makes them."""
+    streams, done = list[Stream](), 0
+    while done < count:
+        pieces = rng.choices(FRAMED, k=rng.randint(0, 3))
+        for _ in range(rng.randint(1, 6)):
+            piece = rng.choice(FRAMED)
+            if rng.random() < 0.05:
+                piece = framed(rng.choice(HOSTILE_TEXTS))
+            elif rng.random() < 0.4:
+                piece = framed(broken_text(rng))
+            pieces.append(mutate(rng, piece, FRAMED) if rng.random() < 0.5 else piece)
+        done += len(pieces)
+        streams.append(in_chunks(rng, b"".join(pieces)))
+    return streams
+
+
+def broken_text(rng: random.Random) -> bytes:
+    """A JSON text with a fault inside, whose framing is sound: what the JSON reader alone must catch."""
+    text = bytearray(rng.choice(FRAMED[:-2])[5:])
+    for _ in range(rng.randint(0, 3)):
+        at = rng.randrange(len(text) + 1)
+        if rng.random() < 0.5 and at < len(text):
+            text[at] = rng.choice(b'{}[]",:\\u0123456789.eE+-tfn \n\x00\x1f\x7f\x80\xc3\xed\xf4')
+        else:
+            text[at:at] = rng.choice(INSERTED)
+    return bytes(text[: rng.randrange(len(text))]) if text and rng.random() < 0.2 else bytes(text)
+
+
+def compare(seed: int, count: int) -> None:
+    rng, done = random.Random(seed), 0
+    kinds: dict[str, int] = {}
+    while done < count:
+        streams = hostile_streams(rng, min(BATCH, count - done))
+        units = rng.choice(list(ImuUnits))
+        for stream, cpp in zip(streams, in_cpp(streams, LIMIT, units.value), strict=True):
+            python = in_python(stream, LIMIT, units)
+            assert_same(cpp, python, stream)
+            for message, _ in python:
+                kind = message if isinstance(message, str) else type(message).__name__
+                kinds[kind] = kinds.get(kind, 0) + 1
+        done += BATCH
+    assert min(kinds[kind] for kind in ("refused", "broken", "dict", "DataMessage")) > count // 50, kinds
+
+
+def test_hostile_messages_come_out_as_in_python() -> None:
+    compare(SEED, 20_000)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_half_a_million_hostile_messages_come_out_as_in_python() -> None:
+    print(f"FUZZ_SEED={SEED}")
+    compare(SEED, 500_000)
+
+
+@pytest.mark.parametrize("text", HOSTILE_TEXTS, ids=range(len(HOSTILE_TEXTS)))
+def test_each_hostile_text(text: bytes) -> None:
+    streams = [[framed(text)], [framed(text)[:9], framed(text)[9:]], [framed(text), *FRAMED[:2]]]
+    for stream, cpp in zip(streams, in_cpp(streams), strict=True):
+        assert_same(cpp, in_python(stream), stream)
+
+
+def test_a_text_that_ends_anywhere() -> None:
+    text = '{"a\\u00e9\\ud83d\\ude00":[true,false,null,-1.5e-3,{"é€😀":"\\n\\\\"}],"b":0}'.encode()
+    streams = [[framed(text[:cut])] for cut in range(len(text) + 1)]
+    found = in_cpp(streams)
+    for stream, cpp in zip(streams, found, strict=True):
+        assert_same(cpp, in_python(stream), stream)
+    assert [decoded[0][0] for decoded in found[:-1]] == ["refused"] * len(text)
+
+
+@pytest.mark.parametrize(
+    "number",
+    ["1e308", "1.7976931348623157e308", "1.7976931348623158e308", "1.7976931348623159e308", "1e309", "-1e309",
+     "1e-400", "0e999999999999", "0.0e99999", "0." + "0" * 400 + "1e700", "0." + "0" * 400 + "1e800",
+     "1" + "0" * 400 + "e-100", "1" + "0" * 400 + "e-92", "1" + "0" * 400 + ".0", "9" * 4300, "9" * 4301,
+     "-" + "9" * 4300, "-" + "9" * 4301, "1e99999999999999999999", "1e-99999999999999999999", "4.9e-324"],
+)  # fmt: skip
+def test_numbers_at_the_edge(number: str) -> None:
+    stream = [framed(b'{"a":' + number.encode() + b"}")]
+    (cpp,) = in_cpp([stream])
+    assert_same(cpp, in_python(stream), stream)
+
+
+# -- the header's own tables
+
+
+def test_offsets_and_names_are_those_of_the_python_tables() -> None:
+    header = (CLIENT / "include" / "bota_ethercat.hpp").read_text()
+    offsets = layout_for(77).offsets
+    for field in PDO_FIELDS:
+        name, _, part = field.name.partition(".")
+        if part in {"", "x"}:
+            constant = "k" + name.title().replace("_", "") + "At"
+            assert f"{constant} = {offsets[field.name]}," in header, constant
+    for flag in WarningFlag:
+        constant = "k" + str(flag.name).title().replace("_", "")
+        assert f"{constant} = 1u << {flag.value.bit_length() - 1};" in header, constant
+
+
+def test_golden_vectors_have_every_size_and_kind() -> None:
+    assert {len(vector.wire) for vector in DATA} == {94, 110}
+    assert {vector.outcome for vector in BROKEN} == {"refused", "broken"}
+    names = [vector.name for vector in (*DATA, *JSON, *BROKEN)]
+    assert all(one != other for one, other in pairwise(sorted(names)))

@@ -1,0 +1,624 @@
+"""What a controller in C++ is told, against a server that this test plays: ages, gaps, bounds, reconnecting.
+
+The test is the server, in the same thread: it sends, then asks the client what it makes of that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import shutil
+import socket
+import struct
+import subprocess
+import time
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from protocol.control import request
+from protocol.framing import DataFlag, FrameDecoder, JsonObject, encode_data, encode_json
+from protocol.pdo import encode
+from tests.clients.cpp_programs import (
+    CLIENT,
+    COUNTING,
+    ROOT,
+    SANITIZED,
+    Driver,
+    build,
+    check,
+    driver,
+    needs_gxx,
+    patient,
+)
+from tests.server.running import PATIENCE_S, free_port, wait_until
+
+pytestmark = [needs_gxx, patient]
+
+REPEATED, INVALID, GAP = DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP
+PATIENT = {"max_age_ms": 60_000}
+"""For what must not depend on how fast this machine is."""
+SENSOR = {"sensor": 0, "name": "BFT-SENS-ECAT-M8", "serial": 7, "pdo_size": 61, "rate_hz": 800, "state": "OP"}
+GRANTED = {"reply": "subscribe", "ok": True, "protocol": 1, "version": "1.2.3", "sensors": [SENSOR]}
+
+
+def frame(sequence: int, flags: int = 0, *, sensor: int = 0, age_s: float = 0.0, **values: float) -> bytes:
+    """A DATA message; its force along x is its number."""
+    instant = time.monotonic_ns() - int(age_s * 1e9)
+    data = encode(61, {"force.x": sequence, **{k.replace("_", "."): v for k, v in values.items()}})
+    return encode_data(sequence, 5, instant, sensor, flags, 3, data)
+
+
+class PlayedServer:
+    """A listening socket; connections are accepted when the test says so."""
+
+    def __init__(self, port: int = 0) -> None:
+        self.listener = socket.create_server(("127.0.0.1", port))
+        self.listener.settimeout(PATIENCE_S)
+        self.port: int = self.listener.getsockname()[1]
+        self.connection: socket.socket | None = None
+        self.asked: JsonObject = {}
+
+    def accept(self, answer: JsonObject | bytes | None = None) -> None:
+        """Take a connection, and what it asks, and answer."""
+        self.hang_up()
+        self.connection, _ = self.listener.accept()
+        self.connection.settimeout(PATIENCE_S)
+        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        decoder, message = FrameDecoder(), None
+        while message is None:
+            data = self.connection.recv(4096)
+            assert data, "the client closed the connection"
+            decoder.feed(data)
+            message = decoder.next_message()
+        assert isinstance(message, dict)
+        self.asked = message
+        self.send(GRANTED if answer is None else answer)
+
+    def send(self, *messages: bytes | JsonObject) -> None:
+        """Send messages, and wait until the client's kernel has them."""
+        assert self.connection is not None
+        for message in messages:
+            self.connection.sendall(message if isinstance(message, bytes) else encode_json(message))
+        wait_until(lambda: unsent(self.connection) == 0, "the client's kernel")
+
+    def hang_up(self) -> None:
+        if self.connection is not None:
+            self.connection.close()
+            self.connection = None
+
+    def close(self) -> None:
+        self.hang_up()
+        self.listener.close()
+
+
+def unsent(connection: socket.socket | None) -> int:
+    """Bytes that the other side has not acknowledged (SIOCOUTQ)."""
+    import fcntl
+    import termios
+
+    assert connection is not None
+    raw = fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, b"\0\0\0\0")
+    return int(struct.unpack("i", raw)[0])
+
+
+@pytest.fixture
+def server() -> Iterator[PlayedServer]:
+    played = PlayedServer()
+    yield played
+    played.close()
+
+
+def connected(server: PlayedServer, running: Driver) -> Driver:
+    running.begin("connect", int(PATIENCE_S * 1000))
+    server.accept()
+    told = running.answer()
+    assert told == {"ok": True, "error": ""}
+    return running
+
+
+@contextlib.contextmanager
+def stream(server: PlayedServer, flags: Sequence[str] = SANITIZED, **options: object) -> Iterator[Driver]:
+    """A connected client that has time."""
+    with driver(server.port, flags, **{**PATIENT, **options}) as running:
+        yield connected(server, running)
+
+
+def picked(reading: JsonObject, *names: str) -> tuple[Any, ...]:
+    check(reading)
+    return tuple(reading[name] for name in names)
+
+
+# -- what is asked for
+
+
+def test_it_subscribes_as_it_was_told(server: PlayedServer) -> None:
+    with stream(server) as running:
+        assert server.asked == request("subscribe", every=1, fresh_only=True)
+        assert running.info()["names"] == ["BFT-SENS-ECAT-M8"]
+    with driver(server.port, sensor=3, every=7, fresh_only=0) as running:
+        connected(server, running)
+        assert server.asked == request("subscribe", every=7, fresh_only=False, sensors=[3])
+
+
+# -- latest
+
+
+def test_nothing_came_yet(server: PlayedServer) -> None:
+    with stream(server) as running:
+        reading = running.latest()
+        assert picked(reading, "has_sample", "is_new", "condition", "age_ns") == (
+            False,
+            False,
+            "silent",
+            2**63 - 1,
+        )
+
+
+def test_the_newest_is_new_once(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(*(frame(n) for n in range(10, 15)))
+        first = running.latest()
+        assert picked(first, "is_new", "sequence", "passed_over", "missed", "gap") == (True, 14, 4, 0, False)
+        assert first["array"][0] == 14
+        again = running.latest()
+        assert picked(again, "is_new", "sequence", "passed_over", "fresh") == (False, 14, 0, True)
+        assert again["age_ns"] > first["age_ns"]
+        server.send(frame(15))
+        assert picked(running.latest(), "is_new", "sequence", "passed_over") == (True, 15, 0)
+
+
+def test_the_age_counts_from_the_instant_of_the_sample(server: PlayedServer) -> None:
+    with stream(server, max_age_ms=20_000) as running:
+        before = time.monotonic_ns()
+        server.send(frame(1, age_s=8))
+        reading = running.latest()
+        after = time.monotonic_ns()
+        assert 8e9 <= reading["age_ns"] <= 8e9 + after - before
+        assert picked(reading, "fresh", "is_new", "age_is_lower_bound") == (True, True, False)
+        server.send(frame(2, age_s=21))
+        assert picked(running.latest(), "condition", "is_new", "sequence") == ("late", True, 2)
+
+
+def test_the_age_counts_from_the_arrival_where_the_clock_is_another(server: PlayedServer) -> None:
+    with stream(server, age_from="arrival") as running:
+        server.send(frame(1, age_s=1000))
+        reading = running.latest()
+        assert picked(reading, "fresh", "age_is_lower_bound") == (True, True)
+        assert reading["age_ns"] < 999e9
+
+
+def test_a_stamp_ahead_of_this_clock_is_never_fresh(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(1, age_s=-1000))
+        reading = running.latest()
+        assert picked(reading, "condition", "age_ns", "is_new") == ("bad_clock", 2**63 - 1, True)
+
+
+@pytest.mark.parametrize(("flag", "condition"), [(REPEATED, "repeated"), (INVALID, "invalid")])
+def test_an_old_sample_does_not_become_new(server: PlayedServer, flag: int, condition: str) -> None:
+    with stream(server, max_age_ms=5_000) as running:
+        server.send(frame(1, age_s=6))
+        running.latest()
+        # The server stamps these with the time of the exchange: the data in them is older.
+        server.send(frame(2, flag), frame(3, flag))
+        reading = running.latest()
+        assert picked(reading, "is_new", "sequence", "condition", "flags") == (False, 1, condition, flag)
+        assert reading["age_ns"] > 6e9
+        assert reading["array"][0] == 1
+        server.send(frame(4))
+        assert picked(running.latest(), "is_new", "sequence", "condition", "flags") == (True, 4, "fresh", 0)
+        told = running.info()
+        assert (told["frames"], told["samples"], told["repeated"] + told["invalid"]) == (4, 2, 2)
+
+
+def test_only_marked_frames_are_no_sample_at_all(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(1, INVALID), frame(2, REPEATED))
+        assert picked(running.latest(), "has_sample", "is_new", "condition") == (False, False, "repeated")
+        assert picked(running.do("next", 0), "has_sample", "is_new") == (False, False)
+
+
+def test_a_silent_server_shows(server: PlayedServer) -> None:
+    with stream(server, max_age_ms=1) as running:
+        server.send(frame(1))
+        assert picked(running.latest(), "is_new") == (True,)
+        assert picked(running.until(lambda r: r["condition"] == "silent", "silence"), "is_new") == (False,)
+        assert running.info()["link"] == "up"
+
+
+def test_a_lost_sensor_shows_until_it_is_back(server: PlayedServer) -> None:
+    with stream(server, max_age_ms=1_000) as running:
+        server.send(
+            frame(1, age_s=2), {"event": "sensor_lost", "sensor": 0, "message": "sensor 0 is lost: cable"}
+        )
+        server.send(frame(2, INVALID))
+        assert picked(running.latest(), "condition", "is_new", "flags") == ("sensor_lost", True, INVALID)
+        assert running.info()["error"] == "sensor 0 is lost: cable"
+        server.send({"event": "sensor_back", "sensor": 0}, frame(3, GAP))
+        assert picked(running.latest(), "condition", "is_new", "gap") == ("fresh", True, True)
+
+
+def test_warnings_of_samples_that_were_passed_over_are_not_lost(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(1, warnings=1), frame(2, warnings=64), frame(3))
+        assert picked(running.latest(), "warnings_seen") == (65,)
+        assert picked(running.latest(), "warnings_seen") == (0,)
+
+
+def test_sensors_are_kept_apart(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(1, sensor=0), frame(900, sensor=255, flags=GAP), frame(2, sensor=0))
+        assert picked(running.latest(0), "sequence", "passed_over", "gap") == (2, 1, False)
+        assert picked(running.do("peek", 255), "sequence", "passed_over", "gap", "is_new") == (
+            900,
+            0,
+            True,
+            True,
+        )
+        assert picked(running.do("peek", 1), "has_sample", "condition") == (False, "silent")
+
+
+def test_peek_does_not_read_the_socket(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(1))
+        assert picked(running.do("peek", 0), "has_sample") == (False,)
+        assert picked(running.latest(), "has_sample") == (True,)
+
+
+# -- gaps
+
+
+def test_what_was_missed_is_counted_at_gaps_only(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(10), frame(11), frame(20, GAP))
+        assert picked(running.latest(), "gap", "missed", "passed_over") == (True, 8, 2)
+        server.send(frame(21, GAP))  # the server itself never saw some
+        assert picked(running.latest(), "gap", "missed") == (True, 0)
+        server.send(frame(30))  # the sensor was silent, and nothing was withheld
+        assert picked(running.latest(), "gap", "missed") == (False, 0)
+        told = running.info()
+        assert (told["gaps"], told["missed"], told["passed_over"]) == (2, 8, 2)
+
+
+def test_one_frame_in_seven_is_no_gap(server: PlayedServer) -> None:
+    with stream(server, every=7) as running:
+        server.send(frame(7), frame(14), frame(28, GAP))
+        assert picked(running.latest(), "gap", "missed") == (True, 7)
+
+
+def test_a_gap_that_came_with_a_marked_frame_is_told_with_the_next_sample(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(1))
+        running.latest()
+        server.send(frame(9, GAP | INVALID), frame(10))
+        assert picked(running.latest(), "gap", "missed", "sequence") == (True, 7, 10)
+
+
+def test_a_sequence_that_goes_back_is_a_gap(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(50), frame(3))
+        assert picked(running.latest(), "gap", "missed", "sequence") == (True, 0, 3)
+
+
+# -- next
+
+
+def test_next_gives_every_sample_in_order(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(1), frame(2, REPEATED), frame(3, INVALID), frame(4, GAP), frame(5))
+        got = [picked(running.do("next", 1000), "sequence", "gap", "is_new", "passed_over") for _ in range(3)]
+        assert got == [(1, False, True, 0), (4, True, True, 0), (5, False, True, 0)]
+        assert picked(running.do("next", 1), "sequence", "is_new") == (5, False)
+
+
+def test_the_samples_that_came_with_the_reply_are_not_passed_over(server: PlayedServer) -> None:
+    with driver(server.port, **PATIENT) as running:
+        running.begin("connect", int(PATIENCE_S * 1000))
+        server.accept(encode_json(GRANTED) + frame(1) + frame(2))
+        assert running.answer()["ok"]
+        assert picked(running.do("next", 1000), "sequence", "passed_over") == (1, 0)
+        assert picked(running.do("next", 1000), "sequence", "passed_over") == (2, 0)
+
+
+def test_latest_passes_over_what_next_has_not_taken(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(*(frame(n) for n in range(1, 6)))
+        assert picked(running.do("next", 1000), "sequence") == (1,)
+        assert picked(running.latest(), "sequence", "passed_over", "missed") == (5, 3, 0)
+        assert picked(running.do("next", 0), "is_new") == (False,)
+
+
+def test_next_waits_for_the_sample(server: PlayedServer) -> None:
+    with stream(server) as running:
+        running.begin("next", int(PATIENCE_S * 1000))
+        server.send(frame(1, REPEATED))
+        server.send(frame(2)[:50])
+        assert running.process.stdout is not None
+        assert not select.select([running.process.stdout], [], [], 0.05)[0], "it did not wait"
+        server.send(frame(2)[50:])
+        assert picked(running.answer(), "sequence", "is_new") == (2, True)
+
+
+def test_next_says_at_once_that_the_connection_is_lost(server: PlayedServer) -> None:
+    with stream(server, max_age_ms=0, reconnect=0) as running:
+        running.begin("next", int(PATIENCE_S * 1000))
+        began = time.monotonic()
+        server.hang_up()
+        assert picked(running.answer(), "condition", "is_new") == ("disconnected", False)
+        assert time.monotonic() - began < PATIENCE_S / 2
+
+
+# -- bounds
+
+
+def test_a_call_reads_a_bounded_amount_and_says_so(server: PlayedServer) -> None:
+    with stream(server, max_bytes_per_call=940) as running:
+        server.send(*(frame(n) for n in range(1, 26)))
+        assert picked(running.latest(), "sequence", "more_waits", "passed_over") == (10, True, 9)
+        assert picked(running.latest(), "sequence", "more_waits", "passed_over") == (20, True, 9)
+        assert picked(running.latest(), "sequence", "more_waits", "passed_over") == (25, False, 4)
+
+
+def test_messages_cut_anywhere_and_more_than_fits_the_buffer(server: PlayedServer) -> None:
+    with stream(server, receive_buffer=4_000_000) as running:
+        long = {"event": "something new", "text": "x" * 60_000}
+        wire = b"".join(
+            encode_json(long) + frame(n) if n % 50 == 0 else frame(n) for n in range(1, 1001)
+        )  # fmt: skip
+        assert server.connection is not None
+        server.connection.setblocking(False)
+        sent, last = 0, 0
+        while last < 1000:
+            with contextlib.suppress(BlockingIOError):
+                sent += server.connection.send(wire[sent : sent + 7919])
+            reading = running.latest()
+            assert reading["sequence"] >= last
+            assert not reading["gap"]
+            last = reading["sequence"]
+        told = running.info()
+        assert (told["samples"], told["bad_messages"], told["gaps"]) == (1000, 0, 0)
+
+
+def test_what_cannot_be_understood_costs_only_itself(server: PlayedServer) -> None:
+    with stream(server) as running:
+        bad = (
+            b"[]",
+            b'{"event":"sensor_lost"}',
+            b'{"a":1e999}',
+            b"\xff",
+            b"{}",
+            b'{"reply":"status","ok":1}',
+        )
+        server.send(*(struct.pack(">IB", 1 + len(text), 2) + text for text in bad), frame(1))
+        assert picked(running.latest(), "fresh", "sequence") == (True, 1)
+        assert running.info()["bad_messages"] == 5
+
+
+def test_odd_values_where_others_are_expected(server: PlayedServer) -> None:
+    with stream(server) as running:
+        for odd in (None, True, -1, 256, 1.5, 10**30, "0", "", [], {}, [0], {"sensor": 0}, "\\ud800\\u0000"):
+            for name in ("sensor_lost", "sensor_back", "reconfigured", "unknown", odd):
+                server.send({"event": name, "sensor": odd, "message": odd})
+            server.send({"event": "sensor_lost", "sensor": 1, "message": odd})
+            server.send(
+                {"reply": odd, "ok": odd, "error": odd},
+                {"reply": odd, "ok": False, "error": {"message": odd}},
+            )
+        server.send(frame(1))
+        assert picked(running.latest(), "fresh", "is_new") == (True, True)
+        assert running.info()["link"] == "up"
+
+
+def test_what_comes_from_the_network_cannot_command_a_terminal(server: PlayedServer) -> None:
+    with stream(server) as running:
+        text = "\x1b[2J\n!" + "é" * 400
+        server.send({"event": "sensor_lost", "sensor": 0, "message": text})
+        running.latest()
+        error = running.info()["error"]
+        assert error.startswith("?[2J?!éé")
+        assert error.endswith("é"), "it is cut between two characters"
+
+
+@pytest.mark.parametrize(
+    ("wire", "said"),
+    [
+        (b"HTTP/1.1 400 Bad Request\r\n", "a length that no message has"),
+        (struct.pack(">IB", 3, 9) + b"{}", "an unknown type"),
+        (struct.pack(">IB", 50, 1) + bytes(49), "a length that no sensor has"),
+    ],
+)
+def test_a_server_that_breaks_the_framing_is_left(server: PlayedServer, wire: bytes, said: str) -> None:
+    with stream(server, max_age_ms=0) as running:
+        server.send(frame(1), wire, frame(2))
+        assert picked(running.latest(), "sequence", "condition") == (1, "disconnected")
+        told = running.info()
+        assert said in told["error"]
+        assert told["fd"] == -1
+
+
+# -- connecting
+
+
+def test_nobody_listens() -> None:
+    with driver(free_port(), reconnect=0) as running:
+        told = running.do("connect", 5000)
+        assert not told["ok"]
+        assert "nobody listens there: start ethercat-server" in told["error"]
+        assert picked(running.latest(), "condition", "has_sample") == ("disconnected", False)
+        assert picked(running.do("next", 1), "condition") == ("disconnected",)
+
+
+def test_before_and_after_a_connection(server: PlayedServer) -> None:
+    with driver(server.port, **PATIENT) as running:
+        assert picked(running.latest(), "condition", "has_sample") == ("disconnected", False)
+        assert running.info()["error"] == "not connected yet: call connect()"
+        connected(server, running)
+        server.send(frame(1))
+        assert picked(running.latest(), "fresh") == (True,)
+        running.do("close")
+        assert running.info()["error"].endswith("closed by this program")
+        for _ in range(20):
+            running.latest()
+        assert not select.select([server.listener], [], [], 0.2)[0], "it connected again after close"
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        ({"reply": "subscribe", "ok": False, "error": {"code": "busy", "message": "no 9"}}, "refused: no 9"),
+        ({**GRANTED, "protocol": 2}, "another version"),
+        ({"reply": "subscribe", "ok": True}, "another version"),
+        (b"SSH-2.0-OpenSSH_9.2\r\n", "is that ethercat-server?"),
+        (struct.pack(">IB", 2**31, 2), "is that ethercat-server?"),
+    ],
+)  # fmt: skip
+def test_a_connection_that_is_refused(server: PlayedServer, answer: Any, said: str) -> None:
+    with driver(server.port, reconnect=0) as running:
+        running.begin("connect", int(PATIENCE_S * 1000))
+        server.accept(answer)
+        told = running.answer()
+        assert not told["ok"]
+        assert said in told["error"]
+
+
+def test_a_server_that_does_not_answer(server: PlayedServer) -> None:
+    with driver(server.port, reconnect=0) as running:
+        told = running.do("connect", 100)
+        assert not told["ok"]
+        assert "did not answer in time" in told["error"]
+
+
+def test_it_starts_without_the_server() -> None:
+    port = free_port()
+    with driver(port, reconnect_every_ms=1, **PATIENT) as running:
+        assert not running.do("connect", 1000)["ok"]
+        late = PlayedServer(port)
+        assert picked(running.latest(), "condition") == ("disconnected",)
+        accept_while(late, running)
+        late.send(frame(1))
+        running.until(lambda r: r["fresh"], "the first sample")
+        late.close()
+
+
+def accept_while(server: PlayedServer, running: Driver) -> None:
+    """Take the connection that the client makes step by step, a step in each call."""
+    wait_until(
+        lambda: bool(running.latest() and select.select([server.listener], [], [], 0)[0]), "a connection"
+    )
+    running.latest()
+    running.begin("next", 20)
+    server.accept()
+    running.answer()
+    wait_until(lambda: bool(running.latest() and running.info()["link"] == "up"), "the subscription")
+
+
+def test_a_connection_that_was_lost_is_made_anew(server: PlayedServer) -> None:
+    with stream(server, max_age_ms=1000, reconnect_every_ms=1) as running:
+        server.send(frame(70, age_s=2))
+        assert picked(running.latest(), "sequence", "connection") == (70, 1)
+        server.send({"event": "shutting_down"})
+        server.hang_up()
+        down = running.until(lambda r: r["condition"] == "disconnected", "the end")
+        assert picked(down, "is_new", "has_sample", "sequence") == (False, True, 70)
+        accept_while(server, running)
+        assert picked(running.latest(), "is_new", "connection", "condition", "sequence") == (
+            False,
+            2,
+            "silent",
+            70,
+        )
+        server.send(frame(3))
+        anew = running.latest()
+        assert picked(anew, "is_new", "fresh", "gap", "missed", "sequence") == (True, True, True, 0, 3)
+        server.send(frame(4))
+        assert picked(running.latest(), "is_new", "gap") == (True, False)
+
+
+def test_it_says_why_the_connection_ended(server: PlayedServer) -> None:
+    with stream(server, reconnect=0) as running:
+        server.send({"event": "shutting_down"})
+        server.hang_up()
+        wait_until(lambda: bool(running.latest()) and running.info()["link"] == "down", "the end")
+        assert running.info()["error"] == f"127.0.0.1 port {server.port}: the server was shut down"
+
+
+def test_it_tries_again_no_more_often_than_it_may() -> None:
+    port = free_port()
+    with driver(port, reconnect_every_ms=3_600_000) as running:
+        running.do("connect", 1000)
+        late = PlayedServer(port)
+        for _ in range(200):
+            running.latest()
+        assert not select.select([late.listener], [], [], 0.1)[0]
+        late.close()
+
+
+def test_reconfigured_is_counted(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send({"event": "reconfigured", "sensor": 0, "settings": {}})
+        running.latest()
+        assert running.info()["reconfigurations"] == 1
+
+
+# -- real time
+
+
+def test_nothing_is_allocated_in_any_state(server: PlayedServer) -> None:
+    with stream(server, COUNTING, reconnect_every_ms=1) as running:
+        for n in range(1, 200):
+            server.send(frame(n))
+            running.latest() if n % 2 else running.do("next", 1000)
+        server.send(
+            {"event": "sensor_lost", "sensor": 0, "message": "gone"}, b"\0\0\0\3\2[]", frame(300, GAP)
+        )
+        running.latest()
+        server.hang_up()
+        running.do("next", 20)
+        accept_while(server, running)
+        server.close()
+        for _ in range(20):
+            running.latest()
+        told = running.info()
+        assert (told["connections"], told["bad_messages"], told["link"]) == (2, 1, "down")
+        assert told["allocated"] == 0
+
+
+@pytest.mark.parametrize("example", ["control_loop", "print_samples"])
+def test_the_examples_need_no_exceptions_and_give_no_warning(example: str) -> None:
+    flags = ("-O0", "-fno-exceptions", "-fno-rtti", "-Wsign-conversion", "-Wold-style-cast")
+    assert build(CLIENT / "examples" / f"{example}.cpp", flags).exists()
+
+
+def test_the_documentation_shows_the_examples_as_they_are() -> None:
+    page = (ROOT / "docs" / "cpp.md").read_text()
+    code = (CLIENT / "examples" / "print_samples.cpp").read_text()
+    assert code[code.index("int main") :].strip() in page
+
+
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake here: sudo apt install cmake")
+def test_cmake_installs_the_header_without_a_compiler(tmp_path: Path) -> None:
+    prefix = tmp_path / "prefix"
+    commands = (
+        ("cmake", "-Werror=dev", "-S", CLIENT, "-B", tmp_path / "b", f"-DCMAKE_INSTALL_PREFIX={prefix}"),
+        ("cmake", "--install", tmp_path / "b"),
+    )
+    for command in commands:
+        done = subprocess.run(
+            command, check=False, capture_output=True, text=True, env={**os.environ, "CXX": "false"}
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert (prefix / "include/bota_ethercat.hpp").read_bytes() == (
+        CLIENT / "include/bota_ethercat.hpp"
+    ).read_bytes()
+    config = (prefix / "share/bota_ethercat/cmake/bota_ethercat-config.cmake").read_text()
+    assert "bota_ethercat::client" in config
+
+
+def test_the_version_is_the_projects() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert f"project(bota_ethercat VERSION {project['version']} " in (CLIENT / "CMakeLists.txt").read_text()

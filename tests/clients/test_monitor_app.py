@@ -1,0 +1,186 @@
+"""The live view's keys, without a terminal or a server: Textual drives it."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clients.address import Address
+from clients.monitor.app import Monitor
+from clients.monitor.glyphs import UNICODE
+from clients.monitor.model import Model
+from clients.monitor.recorder import Recorder
+from tests.clients import monitor_states as made
+from tests.server.running import free_port, wait_until
+
+RECORDER = """
+import signal, sys, time
+signal.signal(signal.SIGINT, lambda *_: sys.exit(print("ethercat-record: %s of %s: nothing was lost"
+    % (sys.argv[1], sys.argv[2]), file=sys.stderr) or 0))
+open(sys.argv[1], "w").close()
+time.sleep(60)
+"""
+
+
+class Stage:
+    """The app with two sensors on it and a clock that the test moves."""
+
+    def __init__(self) -> None:
+        self.model = Model(made.ADDRESS)
+        names = ("BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8")
+        self.model.connected(made.description(names), made.OWN_PEER, made.START_S)
+        self.now_s = made.fed(self.model, 2)
+        # Nothing listens there.
+        self.address = Address("localhost", free_port())
+        self.app = Monitor(self.model, self.address, UNICODE, clock=lambda: self.now_s)
+        self.pilot: Any = None
+
+    def shown(self) -> str:
+        self.app.draw()
+        view = self.app.query_one("View")
+        return "\n".join(
+            "".join(segment.text for segment in view.render_line(y)) for y in range(view.size.height)
+        )
+
+    async def press(self, *keys: str) -> str:
+        await self.pilot.press(*keys)
+        return self.shown()
+
+
+def play(scene: Callable[[Stage], Awaitable[None]], stage: Stage | None = None) -> Stage:
+    stage = stage or Stage()
+
+    async def run() -> None:
+        async with stage.app.run_test(size=(80, 24)) as stage.pilot:
+            await stage.pilot.pause()
+            await scene(stage)
+
+    asyncio.run(run())
+    return stage
+
+
+def test_tare_asks_first_and_only_y_does_it() -> None:
+    async def scene(stage: Stage) -> None:
+        assert "Tare sensor 0? Its reading becomes zero" in await stage.press("t")
+        assert "Not tared" in await stage.press("enter")
+        await stage.press("n", "t")
+        assert "Tare sensor 1?" in stage.shown()
+        await stage.press("y")
+        wait_until(lambda: "Sensor 1 is not tared: no connection to the server" in stage.shown(), "a word")
+
+    play(scene)
+
+
+def test_next_goes_round() -> None:
+    async def scene(stage: Stage) -> None:
+        assert "Sensor 0  BFT-SENS" in stage.shown()
+        assert "Sensor 1  BFT-ROKS" in await stage.press("n")
+        assert "Sensor 0  BFT-SENS" in await stage.press("n")
+
+    play(scene)
+
+
+def test_pause_holds_the_picture_and_counts_on() -> None:
+    async def scene(stage: Stage) -> None:
+        assert "PAUSED" in await stage.press("p")
+        stage.model.take([made.frame(6400, {"force.x": 77.0})], stage.now_s)
+        assert "+77.00" not in stage.shown()
+        text = await stage.press("p")
+        assert "PAUSED" not in text
+        assert "+77.00" in text
+
+    play(scene)
+
+
+def test_reset_forgets_the_peaks() -> None:
+    async def scene(stage: Stage) -> None:
+        assert "-26.40" in stage.shown()
+        text = await stage.press("0")
+        assert "-26.40" not in text
+        assert "Peaks and past warnings are reset" in text
+
+    play(scene)
+
+
+def test_help_comes_and_goes_and_swallows_the_key() -> None:
+    async def scene(stage: Stage) -> None:
+        assert "Any key goes back" in await stage.press("question_mark")
+        text = await stage.press("t")
+        assert "Any key goes back" not in text
+        assert "Tare sensor" not in text
+
+    play(scene)
+
+
+def test_record_starts_and_stops_a_recorder(tmp_path: Path) -> None:
+    async def scene(stage: Stage) -> None:
+        stage.app.recorder = Recorder(stage.address, tmp_path, [sys.executable, "-c", RECORDER])
+        assert "REC 0 s" in await stage.press("r")
+        assert "Recording to recording-" in stage.shown()
+        wait_until(lambda: bool(list(tmp_path.iterdir())), "the recording's file")
+        await stage.press("r")
+        wait_until(lambda: "REC" not in stage.shown(), "the end of the recording")
+        (made_file,) = tmp_path.iterdir()
+        said = f"Recorded {made_file.name} of {stage.address}: nothing was lost"
+        assert said in " ".join(stage.shown().split())
+
+    play(scene)
+
+
+def test_a_recorder_that_fails_says_why(tmp_path: Path) -> None:
+    async def scene(stage: Stage) -> None:
+        complaint = "import sys; sys.exit('ethercat-record: the disk is full')"
+        stage.app.recorder = Recorder(stage.address, tmp_path, [sys.executable, "-c", complaint])
+        await stage.press("r")
+        wait_until(lambda: "The recording failed: the disk is full" in stage.shown(), "the reason")
+
+    play(scene)
+
+
+def test_a_recorder_that_is_not_there_says_so(tmp_path: Path) -> None:
+    async def scene(stage: Stage) -> None:
+        stage.app.recorder = Recorder(stage.address, tmp_path, [str(tmp_path / "none")])
+        assert "ethercat-record cannot be started: No such file" in await stage.press("r")
+
+    play(scene)
+
+
+@pytest.mark.parametrize("key", ["q", "ctrl+c", "ctrl+q"])
+def test_keys_that_end_it(key: str) -> None:
+    async def scene(stage: Stage) -> None:
+        await stage.pilot.press(key)
+        await stage.pilot.pause()
+        assert not stage.app.is_running or stage.app._exit
+
+    assert play(scene).app.return_code == 0
+
+
+def test_another_size_is_drawn_anew() -> None:
+    async def scene(stage: Stage) -> None:
+        await stage.pilot.resize_terminal(60, 15)
+        await stage.pilot.pause()
+        rows = stage.shown().splitlines()
+        assert len(rows) == 15
+        assert {len(row) for row in rows} == {60}
+
+    play(scene)
+
+
+def test_only_rows_that_changed_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scene(stage: Stage) -> None:
+        view = stage.app.query_one("View")
+        stage.app.draw()
+        drawn: list[Any] = []
+        monkeypatch.setattr(view, "refresh", lambda *regions, **_: drawn.extend(regions))
+        stage.app.draw()
+        assert not drawn
+        stage.model.say("something new")
+        stage.app.draw()
+        assert [region.y for region in drawn] == [22]
+
+    play(scene)

@@ -1,0 +1,276 @@
+"""What the monitor makes of frames, replies and events, without a server."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from clients.monitor.model import Model
+from clients.monitor.state import SensorState
+from protocol.control import Event
+from protocol.framing import DataFlag, DataMessage
+from tests.clients import monitor_states as made
+from tests.clients.monitor_states import START_S, description, frame, now, status
+
+REST = {"force.z": -8.0, "acceleration.z": 1.0, "temperature": 30.0}
+
+
+@pytest.fixture
+def model() -> Model:
+    """Connected to a server with one sensor."""
+    fresh = Model(made.ADDRESS)
+    fresh.connected(description(), made.OWN_PEER, START_S)
+    return fresh
+
+
+def take(model: Model, *frames: DataMessage) -> SensorState:
+    """Its state when these have come together."""
+    at_s = now(frames[-1].sequence)
+    model.take(frames, at_s)
+    return only(model, at_s)
+
+
+def only(model: Model, at_s: float) -> SensorState:
+    (sensor,) = model.state(at_s).sensors
+    return sensor
+
+
+def run(first: int, count: int, **values: float) -> list[DataMessage]:
+    return [frame(k, {**REST, **values}) for k in range(first, first + count)]
+
+
+def texts(sensor: SensorState) -> list[str]:
+    return [alert.text for alert in sensor.alerts]
+
+
+def test_a_peak_of_one_sample_is_held_and_in_the_trace(model: Model) -> None:
+    spike = frame(20, {**REST, "force.x": 55.0, "torque.z": -3.0})
+    sensor = take(model, *run(0, 20), spike, *run(21, 20))
+    assert sensor.sample is not None
+    assert sensor.sample.force == (0.0, 0.0, -8.0)
+    assert sensor.peaks is not None
+    assert [tuple(r) for r in sensor.peaks] == [(0, 55), (0, 0), (-8, -8), (0, 0), (0, 0), (-3, 0)]
+    assert sensor.traces[0][-1] == (0.0, 55.0)
+
+
+def test_a_reset_forgets_peaks_and_past_warnings(model: Model) -> None:
+    take(model, frame(0, {**REST, "force.x": 55.0, "warnings": 8}))
+    model.reset()
+    sensor = take(model, *run(1, 5))
+    assert sensor.peaks is not None
+    assert tuple(sensor.peaks[0]) == (0, 0)
+    assert not sensor.alerts
+
+
+def test_repeated_and_invalid_frames_are_counted_and_bring_no_values(model: Model) -> None:
+    high = {**REST, "force.x": 99.0, "warnings": 0x7F}
+    sensor = take(
+        model,
+        frame(0, REST),
+        frame(1, high, flags=DataFlag.REPEATED),
+        frame(2, high, flags=DataFlag.INVALID),
+        frame(3, high, flags=DataFlag.INVALID | DataFlag.REPEATED),
+    )
+    stream = sensor.stream
+    assert (stream.samples, stream.repeated, stream.invalid) == (1, 1, 2)
+    assert sensor.peaks is not None
+    assert sensor.peaks[0].high == 0
+    assert not sensor.alerts
+
+
+def test_frames_that_did_not_come_are_counted_and_make_no_jitter(model: Model) -> None:
+    steady = [
+        frame(k, flags=DataFlag.GAP if k == 60 else 0)._replace(monotonic_ns=10**12 + k * made.PERIOD_NS)
+        for k in (*range(50), *range(60, 100))
+    ]  # fmt: skip
+    sensor = take(model, *steady)
+    assert (sensor.stream.missed, sensor.stream.gaps) == (10, 1)
+    assert sensor.stream.jitter_us == 0
+    assert sensor.stream.jitter_worst_us == 0
+
+
+def test_the_time_that_a_sensor_was_silent_is_no_jitter(model: Model) -> None:
+    flags = dict.fromkeys(range(50, 60), DataFlag.REPEATED)
+    steady = [
+        frame(k, flags=flags.get(k, 0))._replace(monotonic_ns=10**12 + k * made.PERIOD_NS) for k in range(100)
+    ]
+    assert take(model, *steady).stream.jitter_worst_us == 0
+
+
+def test_jitter_is_the_spread_of_the_intervals(model: Model) -> None:
+    shifted = [
+        frame(k)._replace(monotonic_ns=10**12 + k * made.PERIOD_NS + (50_000 if k % 2 else 0))
+        for k in range(401)
+    ]
+    stream = take(model, *shifted).stream
+    assert stream.jitter_us == pytest.approx(50)
+    assert stream.jitter_worst_us == pytest.approx(50)
+
+
+def test_the_rate_is_that_of_the_samples_and_falls_when_they_stop(model: Model) -> None:
+    for first in range(0, 1600, 40):
+        take(model, *run(first, 40))
+    assert only(model, now(1600)).stream.rate_hz == pytest.approx(800, abs=0.5)
+    falling = only(model, now(1600) + 2).stream.rate_hz
+    assert falling is not None
+    assert 300 < falling < 500
+    assert only(model, now(1600) + 60).stream.rate_hz == 0
+
+
+def test_a_new_connection_is_no_loss_and_keeps_the_peaks(model: Model) -> None:
+    take(model, *run(1000, 10, **{"force.x": 7.0}))
+    model.gone("no server answers", now(1010))
+    model.connected(description(), made.OWN_PEER, now(2000))
+    sensor = take(model, *run(0, 10))
+    assert sensor.stream.missed == 0
+    assert sensor.stream.samples == 10
+    assert sensor.peaks is not None
+    assert tuple(sensor.peaks[0]) == (0, 7)
+
+
+def test_another_sensor_in_its_place_has_its_own_peaks(model: Model) -> None:
+    take(model, *run(0, 10, **{"force.x": 7.0}))
+    other = description()
+    other["sensors"][0]["serial"] = 99
+    model.described(other, now(10))
+    assert only(model, now(10)).peaks is None
+
+
+def test_a_warning_of_one_sample_is_present_for_a_while_then_past(model: Model) -> None:
+    take(model, frame(0, {**REST, "warnings": 0b1000}), *run(1, 40))
+    (present,) = only(model, now(40)).alerts
+    assert (present.severity, present.text, present.ago_s) == ("error", "ADC out of sync", None)
+    assert present.remedy == "Contact support (repair required)"
+    (past,) = take(model, *run(3200, 1)).alerts
+    assert past.ago_s == pytest.approx(4, abs=0.1)
+
+
+def test_the_worst_present_warning_comes_first(model: Model) -> None:
+    take(model, frame(0, {**REST, "warnings": 0b1000}))
+    sensor = take(model, frame(4000, {**REST, "warnings": 0b1100000}))
+    assert texts(sensor) == ["Wrong supply voltage", "Overtemperature", "ADC out of sync"]
+
+
+@pytest.mark.parametrize("bits", [0, 1], ids=["without its warning", "with its warning"])
+def test_saturated_axes_are_named_with_their_remedy(model: Model, bits: int) -> None:
+    sensor = take(model, frame(0, {**REST, "force_torque_saturated": 0b100001, "warnings": bits}))
+    assert sensor.saturated == {"Fx", "Mz"}
+    (alert,) = sensor.alerts
+    assert alert.text == "Force/torque (ADC) saturated: Fx, Mz"
+    assert alert.remedy == "Reduce sensor loading"
+    assert not take(model, *run(4000, 1)).saturated
+
+
+def test_values_that_are_no_numbers_are_told_and_spoil_no_peak(model: Model) -> None:
+    bad = frame(3, {**REST, "force.z": math.nan}), frame(4, {**REST, "torque.x": math.inf})
+    sensor = take(model, *run(0, 3), *bad)
+    assert texts(sensor) == ["Force/torque is not a finite number"]
+    assert sensor.peaks is not None
+    assert all(math.isfinite(value) for peak in sensor.peaks for value in peak)
+    assert tuple(sensor.peaks[2]) == (-8, -8)
+
+
+def test_a_lost_sensor_is_told_until_it_is_back(model: Model) -> None:
+    take(model, *run(0, 10))
+    gone = {"event": Event.SENSOR_LOST, "sensor": 0, "message": "sensor 0 is lost: no carrier"}
+    model.take_event(gone, now(10))
+    lost = only(model, now(10))
+    assert lost.al_state == "LOST"
+    assert texts(lost) == ["sensor 0 is lost: no carrier"]
+    model.take_event({"event": Event.SENSOR_BACK, "sensor": 0}, now(20))
+    assert only(model, now(20)).al_state == "OP"
+    assert not only(model, now(20)).alerts
+
+
+def test_silence_is_the_sensors_only_if_the_server_speaks(model: Model) -> None:
+    take(model, *run(0, 10))
+    later_s = now(10) + 3
+    assert model.state(later_s).server.silent
+    assert not only(model, later_s).alerts
+    model.take([frame(11, REST, flags=DataFlag.INVALID)], later_s)
+    assert not model.state(later_s).server.silent
+    assert texts(only(model, later_s)) == ["No new sample for 3 s"]
+    assert only(model, later_s).old_s == pytest.approx(3, abs=0.1)
+
+
+def test_the_age_is_that_of_a_new_sample_on_arrival(model: Model) -> None:
+    for k, age_us in enumerate((300, 200, 900)):
+        model.note_age(frame(k), frame(k).monotonic_ns + age_us * 1000)
+    model.note_age(frame(3, flags=DataFlag.REPEATED), frame(3).monotonic_ns + 10**9)
+    age = only(model, now(4)).stream.age_us
+    assert age is not None
+    assert tuple(age) == pytest.approx((300, 900), abs=0.01)
+
+
+def test_the_servers_clients_have_rates_and_one_of_them_is_this(model: Model) -> None:
+    model.take_status(status(sent=1000), START_S + 1)
+    assert [client.rate_hz for client in model.state(START_S + 1).clients] == [None, None]
+    model.take_status(status(sent=2600), START_S + 3)
+    state = model.state(START_S + 4)
+    this, other = state.clients
+    assert (this.is_this, this.rate_hz, this.withheld) == (True, 800, 0)
+    assert (other.is_this, other.rate_hz, other.withheld) == (False, 3200, 12)
+    assert state.server.uptime_s == 4568
+
+
+def test_the_clock_is_told_as_the_server_says_it(model: Model) -> None:
+    model.take_status(status(mode="oversampling"), START_S)
+    clock = only(model, START_S).clock
+    assert clock is not None
+    assert clock.mode == "oversampling"
+
+
+def test_without_the_calibration_matrix_the_units_are_counts() -> None:
+    model = Model(made.ADDRESS)
+    model.connected(description(calibration_matrix=False, imu_active=0), made.OWN_PEER, START_S)
+    sensor = only(model, START_S)
+    assert sensor.units == ("counts", "counts")
+    assert sensor.imu_off
+
+
+ODD: list[Any] = [
+    None,
+    7,
+    -1,
+    10**400,
+    1.5,
+    True,
+    "x",
+    "\x1b[2J",
+    [],
+    [[]],
+    [None],
+    {},
+    {"sensor": {}},
+    [{"sensor": []}],
+]
+
+
+@pytest.mark.parametrize("odd", ODD, ids=lambda odd: repr(odd)[:20])
+def test_odd_replies_are_borne(odd: Any) -> None:
+    """Whatever stands for a value of a reply, the monitor goes on and shows no control characters."""
+    model = Model(made.ADDRESS)
+    for key in description():
+        model.connected({**description(), key: odd}, made.OWN_PEER, START_S)
+    for key in description()["sensors"][0]:
+        model.connected(
+            {**description(), "sensors": [{**description()["sensors"][0], key: odd}]}, "", START_S
+        )
+        model.state(START_S)
+    model.connected(description(), made.OWN_PEER, START_S)
+    for key in status():
+        model.take_status({**status(), key: odd}, START_S)
+        model.state(START_S)
+    for key in status()["sensors"][0]:
+        model.take_status({**status(), "sensors": [{**status()["sensors"][0], key: odd}]}, START_S)
+        model.state(START_S)
+    for key in status()["clients"][0]:
+        clients = [{**status()["clients"][0], key: odd}]
+        for seconds in (0, 1):
+            model.take_status({**status(), "clients": clients}, START_S + seconds)
+            model.state(START_S)
+    model.take_event({"event": odd, "sensor": odd, "message": odd}, START_S)
+    model.take_event({"event": Event.SENSOR_LOST, "sensor": 0, "message": odd}, START_S)
+    assert "\\x1b" not in repr(model.state(START_S))  # as repr would write it

@@ -1,0 +1,214 @@
+"""What stands on the screen, at every size."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+from dataclasses import replace
+
+import pytest
+from rich.text import Text
+
+from clients.monitor.bars import bar, scale_for, trace
+from clients.monitor.glyphs import ASCII, UNICODE
+from clients.monitor.json_line import json_line
+from clients.monitor.model import Model
+from clients.monitor.screen import KEYS, Look, render
+from clients.monitor.state import Client, Range, State
+from clients.monitor.table import table
+from clients.monitor.words import duration, quantity
+from protocol.framing import DataMessage
+from tests.clients import monitor_states as made
+from tests.clients.captures import DOCS, captures
+
+STATES = {"healthy": made.healthy(), "troubled": made.troubled(), "gone": made.gone()}
+
+
+def plain(state: State, look: Look | None = None, width: int = 80, height: int = 24) -> str:
+    return "\n".join(row.plain for row in render(state, look or Look(), width, height))
+
+
+@pytest.mark.parametrize("name", STATES)
+@pytest.mark.parametrize("look", [Look(), Look(help=True), Look(glyphs=ASCII), Look(question="x" * 300)])
+def test_every_size_is_filled_and_never_exceeded(name: str, look: Look) -> None:
+    for width in (1, 10, 24, 40, 55, 56, 60, 75, 76, 80, 109, 110, 200):
+        for height in (1, 5, 8, 12, 15, 23, 24, 36, 44, 90):
+            rows = render(STATES[name], look, width, height)
+            assert len(rows) == height
+            assert max(row.cell_len for row in rows) <= width
+
+
+def test_80x24_has_all_there_is_to_know_of_a_healthy_sensor() -> None:
+    text = plain(made.healthy())
+    for fact in (
+        "localhost:12001", "connected", "BFT-SENS-ECAT-M8", "serial 1234", "firmware 1.3.8", "OP",
+        "Fx      -3.64", "Mz     -0.019", "-26.40", "Temperature 34.6 °C", "+9.51 m/s²", "rad/s",
+        "800.0 of 800 Hz", "age 0.2", "jitter 3 µs", "2 on the bus", "repeated 0", "locked, -4.2 ppm",
+        "Warnings none", "missed deadlines 3", "2: this one 800/s · 127.0.0.1:51234 3200/s, 12 withheld",
+    ):  # fmt: skip
+        assert fact in text, fact
+
+
+def test_80x24_has_all_warnings_with_their_remedies() -> None:
+    text = plain(made.troubled())
+    for fact in (
+        "Fz!", "Force/torque (ADC) saturated: Fz -> Reduce sensor loading",
+        "warning  now: Overtemperature -> Power off the sensor and let it cool down",
+        "error 4 s ago: ADC out of sync -> Contact support (repair required)",
+        "oversampling", "5 on the way here", "not tared: it is not at rest", "1 ok",
+    ):  # fmt: skip
+        assert fact in text, fact
+
+
+def test_60x15_keeps_force_torque_the_stream_and_the_worst_warning() -> None:
+    text = plain(made.troubled(), width=60, height=15)
+    for fact in ("Fx", "Fy", "Fz!", "Mx", "My", "Mz", "Stream", "saturated: Fz", "Reduce sensor loading"):
+        assert fact in text, fact
+
+
+def test_what_does_not_fit_of_the_warnings_is_counted() -> None:
+    assert re.search(r"and \d more", plain(made.troubled(), width=60, height=15))
+
+
+def test_two_sensors_stand_one_below_the_other_where_there_is_room() -> None:
+    assert "ROKS" not in plain(made.troubled())
+    tall = plain(made.troubled(), height=48)
+    assert tall.index("BFT-SENS-ECAT-M8") < tall.index("BFT-ROKS-ECAT-M8")
+    other_first = plain(made.troubled(), Look(selected=1))
+    assert "BFT-ROKS-ECAT-M8" in other_first
+    assert "0 error" in other_first
+
+
+def test_a_server_that_is_gone_is_said_with_why_and_since_when() -> None:
+    text = plain(made.gone())
+    assert "SERVER GONE 1m05s" in text
+    assert "gone at 12:00:00: no server answers (Connection refused)" in text
+    assert "values 1m05s old" in text
+
+
+def test_before_anything_is_known() -> None:
+    text = plain(State(replace(made.healthy().server, connected=False, since_s=None)))
+    assert "connecting" in text
+    assert "no sensor known yet" in text
+
+
+def test_ascii_shows_the_same_in_ascii() -> None:
+    text = plain(made.troubled(), Look(glyphs=ASCII))
+    assert text.isascii()
+    assert "34.6 degC" in text
+    assert "#####" in text
+
+
+def test_help_names_every_key() -> None:
+    text = plain(made.healthy(), Look(help=True))
+    assert "…" not in text
+    for key, name, what in KEYS:
+        assert f"  {key}  {name.ljust(8)}{what}" in text
+
+
+def test_no_fact_is_told_by_colour_alone() -> None:
+    """Where colour marks something bad, a word or a sign does too."""
+    rows = render(made.troubled(), Look(), 80, 24)
+    spans = [(row.plain[s.start : s.end].strip(), str(s.style)) for row in rows for s in row.spans]
+    assert {text for text, style in spans if "#d55e00" in style} == {"Fz!", "error", "warning"}
+
+
+@pytest.mark.parametrize("name", ["monitor.svg", "monitor-warnings.svg", "monitor-gone.svg"])
+def test_captures_are_in_step(name: str) -> None:
+    """If this fails, look at the new ones: `python -m tests.clients.captures`."""
+    assert _texts((DOCS / name).read_text()) == _texts(captures()[name])
+
+
+def _texts(svg: str) -> list[str]:
+    """The texts and the style of each, whatever else this version of Rich draws around them."""
+    styles = dict(re.findall(r"\.monitor-(r\d+) \{ ([^}]*) \}", svg))
+    found = re.findall(r'<text class="monitor-(r\d+)"[^>]*>([^<]*)</text>', svg)
+    assert len(found) > 50
+    return [f"{text} {styles[name]}" for name, text in found]
+
+
+@pytest.mark.parametrize(
+    ("value", "drawn"),
+    [
+        (0.0, "-----|-----"),
+        (6.0, "-----|###--"),
+        (10.0, "-----|#####"),
+        (99.0, "-----|#####"),
+        (-10.0, "#####|-----"),
+        (float("nan"), "-----|-----"),
+    ],
+)
+def test_a_bar_grows_from_zero_and_stays_in_its_width(value: float, drawn: str) -> None:
+    assert bar(value, None, 10.0, 11, ASCII).plain == drawn
+
+
+def test_a_bar_marks_its_peaks() -> None:
+    assert bar(2.0, Range(-6.0, 10.0), 10.0, 11, ASCII).plain == "--[--|#---]"
+
+
+def test_a_bar_has_half_cells() -> None:
+    assert bar(5.0, None, 10.0, 11, UNICODE).plain == "─────┼██▌──"
+    assert bar(-5.0, None, 10.0, 11, UNICODE).plain == "──▐██┼─────"
+
+
+@pytest.mark.parametrize(
+    ("reach", "scale"), [(0.0, 5.0), (5.0, 5.0), (5.1, 10.0), (10.1, 20.0), (25.0, 30.0), (412.0, 500.0)]
+)
+def test_the_scale_is_a_round_number_that_shows_everything(reach: float, scale: float) -> None:
+    assert scale_for([Range(-reach, 0.0)], 5.0) == scale
+
+
+def test_a_trace_shows_a_touch_shorter_than_its_columns() -> None:
+    calm, touch = Range(-8.1, -7.9), Range(-26.0, -8.0)
+    assert trace([calm, calm, touch, calm], 30.0, 4, ASCII) == "##_#"
+
+
+def test_a_trace_shows_where_nothing_came_and_does_not_magnify_noise() -> None:
+    assert trace([Range(1, 2), None, Range(3, 4)], 10.0, 5, ASCII) == "  _ #"
+    quiet = trace([Range(0.0, 0.001), Range(0.001, 0.002)], 10.0, 2, UNICODE)
+    assert len(set(quiet)) == 1
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.9, "0 s"), (59.9, "59 s"), (65, "1m05s"), (3725, "1h02m"), (90061, "1d01h")]
+)
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize("value", [0.0, -0.0, 1.5, -12345678.9, 3.4e38, -3.4e38, float("nan"), float("inf")])
+def test_no_number_leaves_its_column(value: float) -> None:
+    assert len(quantity(value, 2, 9)) == 9
+
+
+def test_text_from_the_server_is_shown_as_it_is() -> None:
+    """Nothing in it is taken for Rich's markup."""
+    state = made.healthy()
+    odd = replace(state, sensors=(replace(state.sensors[0], name="[bold]x[/]"),))
+    assert "[bold]x[/]" in plain(odd)
+    assert isinstance(render(odd, Look(), 80, 24)[1], Text)
+
+
+def test_whatever_a_sensor_sends_is_shown() -> None:
+    noise = random.Random(1)
+    model = Model(made.ADDRESS)
+    model.connected(made.description(), made.OWN_PEER, made.START_S)
+    for k in range(300):
+        data = noise.randbytes(77)
+        sequence, stamp_ns, monotonic_ns = (noise.getrandbits(64) for _ in range(3))
+        odd = DataMessage(sequence, stamp_ns, monotonic_ns, 0, noise.getrandbits(3), 0xFFFF, data)
+        model.take([odd], made.now(k))
+        state = model.state(made.now(k))
+        render(state, Look(glyphs=ASCII if k % 2 else UNICODE), 80, 24)
+        assert table(state)[-1].startswith(("Not fine: ", "Fine."))
+        json.loads(json_line(state, 0.0))
+
+
+def test_clients_that_do_not_fit_are_counted() -> None:
+    crowd = tuple(Client(f"127.0.0.1:{40000 + n}", n == 0, 800.0, 10, 0) for n in range(30))
+    text = plain(replace(made.healthy(), clients=crowd))
+    (row,) = (line for line in text.splitlines() if line.startswith("Clients"))
+    shown = row.count("800/s")
+    assert shown >= 2
+    assert row.endswith(f"and {30 - shown} more")

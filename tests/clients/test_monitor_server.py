@@ -1,0 +1,309 @@
+"""The monitor against a real server with two virtual sensors: as a program, in a terminal and in pipes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from clients.address import Address
+from clients.monitor.model import Model
+from clients.monitor.options import parse
+from clients.monitor.reader import Reader
+from clients.monitor.state import State
+from clients.monitor.tare import tare
+from tests.server.running import PATIENCE_S, Server, free_port, needs_bus, wait_until
+
+pytestmark = [pytest.mark.bus, needs_bus]
+
+VIRTUAL = ("--virtual", "--sensors 2 --model BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8 --pdo 77")
+COMMAND = (sys.executable, "-m", "clients.monitor.cli")
+LEAVE_ALTERNATE_SCREEN = b"\x1b[?1049l"
+SHOW_CURSOR = b"\x1b[?25h"
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Server]:
+    running = Server("virtual", *VIRTUAL)
+    try:
+        yield running.wait_streaming()
+    finally:
+        running.close()
+
+
+def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, *arguments],
+        check=False, capture_output=True, text=True, timeout=PATIENCE_S, stdin=subprocess.DEVNULL,
+        env={**os.environ, **environment},
+    )  # fmt: skip
+
+
+class Terminal:
+    """The monitor in a terminal of 80 by 24."""
+
+    def __init__(self, *arguments: str, **environment: str) -> None:
+        self.near, far = pty.openpty()
+        termios.tcsetwinsize(far, (24, 80))
+        self.before = termios.tcgetattr(far)
+        self.far = far
+        self.seen = b""
+        self.process = subprocess.Popen(
+            [*COMMAND, *arguments], stdin=far, stdout=far, stderr=far, start_new_session=True,
+            env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "", "LINES": "", **environment},
+        )  # fmt: skip
+
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        os.close(self.near)
+        os.close(self.far)
+
+    def read(self) -> bytes:
+        """Everything so far."""
+        while select.select((self.near,), (), (), 0.02)[0]:
+            self.seen += os.read(self.near, 65536)
+        return self.seen
+
+    def wait_for(self, text: str) -> None:
+        wait_until(lambda: text.encode() in self.read(), f"{text!r} in {self.seen[-2000:]!r}")
+
+    def type(self, keys: str) -> None:
+        os.write(self.near, keys.encode())
+
+    def end(self) -> int:
+        """Its exit code, once it has ended."""
+        wait_until(lambda: self.read() is not None and self.process.poll() is not None, "its end")
+        return self.process.wait()
+
+    def is_as_it_was(self) -> bool:
+        back = LEAVE_ALTERNATE_SCREEN in self.read() and SHOW_CURSOR in self.seen
+        return back and termios.tcgetattr(self.far) == self.before
+
+
+def test_once_prints_both_sensors_and_says_fine(shared: Server) -> None:
+    done = run("--once", str(shared.port))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "BFT-SENS-ECAT-M8" in done.stdout
+    assert "BFT-ROKS-ECAT-M8" in done.stdout
+    assert done.stdout.count("  force, N  ") == 2
+    assert done.stdout.count("    max  ") == 4
+    assert "client this one" in done.stdout
+    assert done.stdout.endswith("\nFine.\n")
+
+
+def test_once_without_a_server_is_exit_1_and_one_sentence() -> None:
+    port = free_port()
+    done = run("--once", f"localhost:{port}")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == (
+        f"ethercat-monitor: localhost:{port}: no server answers (Connection refused): "
+        "start ethercat-server, or give its HOST:PORT\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["nonsense:port"],
+        ["localhost:0"],
+        ["::1"],
+        ["a", "b"],
+        ["--seconds", "0"],
+        ["--once", "--seconds", "3"],
+    ],
+)
+def test_wrong_usage_is_exit_2(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        parse(arguments)
+    assert ended.value.code == 2
+
+
+def test_json_has_a_line_a_second_with_the_documented_keys(shared: Server) -> None:
+    done = run("--json", "--seconds", "2", str(shared.port))
+    assert done.returncode == 0
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(lines) == 2
+    line = lines[-1]
+    assert line["connected"] is True
+    assert line["server"]["missed_deadlines"] >= 0
+    sensor = line["sensors"][1]
+    for value, (low, high) in zip(sensor["force"], sensor["force_min_max"], strict=True):
+        assert low <= value <= high
+        assert low < high
+    assert sensor["units"] == ["N", "Nm"]
+    assert sensor["clock"]["mode"] in {"locked", "oversampling"}
+    assert sensor["alerts"] == []
+    assert any(client["this"] for client in line["clients"])
+    assert documented_keys() == keys(line)
+
+
+def keys(value: Any) -> set[str]:
+    if isinstance(value, list):
+        return set().union(*map(keys, value))
+    return set(value).union(*map(keys, value.values())) if isinstance(value, dict) else set()
+
+
+def documented_keys() -> set[str]:
+    from tests.clients.captures import DOCS
+
+    table = (DOCS / "monitor.md").read_text().split("## JSON")[1]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    listed = {key for row in rows for key in row.replace("`", "").replace(",", " ").split()}
+    return listed - {"severity", "text", "remedy"}  # of alerts: there are none here
+
+
+def test_a_reader_that_goes_is_no_traceback(shared: Server) -> None:
+    command = f"set -o pipefail; {' '.join(COMMAND)} --json {shared.port} | head -n 1"
+    done = subprocess.run(
+        ["bash", "-c", command], check=False, capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert json.loads(done.stdout)["connected"] is True
+    assert done.stderr == ""
+    assert done.returncode == 0
+
+
+def test_a_dumb_terminal_gets_lines_and_no_escape_sequences(shared: Server) -> None:
+    with Terminal(str(shared.port), "--seconds", "1", TERM="dumb", PYTHONIOENCODING="ascii") as terminal:
+        assert terminal.end() == 0
+        seen = terminal.read().decode("ascii")
+    first, second = seen.splitlines()
+    assert re.search(r"  sensor 0  F ([+-][0-9.]+ ){3}N  M ([+-][0-9.]+ ){3}Nm  [0-9.]+ degC", first)
+    assert "  sensor 1  " in second
+    assert "\x1b" not in seen
+
+
+@pytest.mark.parametrize("way", ["Ctrl-C", "SIGTERM"])
+def test_the_terminal_is_as_it_was(shared: Server, way: str) -> None:
+    with Terminal(str(shared.port)) as terminal:
+        terminal.wait_for("BFT-SENS-ECAT-M8")
+        if way == "SIGTERM":
+            terminal.process.send_signal(signal.SIGTERM)
+        else:
+            terminal.type("\x03")
+        assert terminal.end() == 0
+        assert terminal.is_as_it_was()
+        assert b"Traceback" not in terminal.read()
+
+
+def test_no_color_has_none_and_q_ends_it(shared: Server) -> None:
+    with Terminal(str(shared.port), NO_COLOR="1") as terminal:
+        terminal.wait_for("BFT-SENS-ECAT-M8")
+        terminal.type("q")
+        assert terminal.end() == 0
+        assert terminal.is_as_it_was()
+        seen = terminal.read().decode()
+    codes = {code for style in re.findall(r"\x1b\[([0-9;]*)m", seen) for code in style.split(";")}
+    assert "1" in codes  # bold
+    colours = {"38", "48", *map(str, (*range(30, 38), *range(40, 48), *range(90, 98), *range(100, 108)))}
+    assert not codes & colours
+
+
+@contextlib.contextmanager
+def reading(port: int) -> Iterator[Model]:
+    model = Model("server")
+    reader = Reader(Address("localhost", port), model)
+    reader.start()
+    try:
+        yield model
+    finally:
+        reader.close()
+
+
+def state(model: Model) -> State:
+    return model.state(time.monotonic())
+
+
+def samples(model: Model) -> int:
+    return min((sensor.stream.samples for sensor in state(model).sensors), default=0)
+
+
+def test_rate_jitter_age_and_the_own_row_among_the_clients_are_known(shared: Server) -> None:
+    with reading(shared.port) as model:
+        wait_until(lambda: samples(model) > 400 and bool(state(model).clients), "samples and a status")
+        found = state(model)
+    assert sum(client.is_this for client in found.clients) == 1
+    for sensor in found.sensors:
+        stream = sensor.stream
+        assert stream.rate_hz
+        assert stream.jitter_us is not None
+        assert stream.age_us is not None
+        assert 0 < stream.age_us.p50 <= stream.age_us.worst
+        assert sensor.clock is not None
+        assert sensor.peaks is not None
+
+
+def test_tare_says_what_is_left(shared: Server) -> None:
+    for _ in range(5):  # the virtual tool touches something every seven seconds
+        text, bad = tare(Address("localhost", shared.port), 1)
+        if not bad:
+            break
+        assert "not at rest" in text
+    assert not bad
+    assert re.fullmatch(r"Sensor 1 is tared; what is left is at most [0-9.]+ N and [0-9.]+ Nm", text)
+
+
+def test_tare_of_another_user_says_the_servers_sentence(shared: Server) -> None:
+    if os.geteuid():
+        pytest.skip("only root can be another user")
+    code = (
+        "from clients.address import Address; from clients.monitor.tare import tare;"
+        "from tests.server.as_another_user import become_nobody; become_nobody();"
+        f"print(*tare(Address('localhost', {shared.port}), 0))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert done.stdout.startswith("Sensor 0 is not tared: tare is not for uid 65534"), done.stderr
+    assert done.stdout.endswith("True\n")
+
+
+def test_a_stopped_server_is_said_to_be_silent(shared: Server) -> None:
+    with reading(shared.port) as model:
+        wait_until(lambda: samples(model) > 100, "samples")
+        shared.signal(signal.SIGSTOP)
+        try:
+            wait_until(lambda: state(model).server.silent, "silence")
+            assert all(not sensor.alerts for sensor in state(model).sensors)
+        finally:
+            shared.signal(signal.SIGCONT)
+        wait_until(lambda: not state(model).server.silent, "the server's voice")
+        assert state(model).server.connected
+
+
+def test_a_restart_of_the_server_is_seen_and_survived() -> None:
+    first = Server("virtual", *VIRTUAL)
+    try:
+        first.wait_streaming()
+        with reading(first.port) as model:
+            wait_until(lambda: samples(model) > 100, "samples")
+            first.close()
+            wait_until(lambda: not state(model).server.connected, "the end of the connection")
+            gone = state(model).server
+            assert gone.since_clock
+            assert gone.reason
+            second = Server("virtual", *VIRTUAL, port=first.port)
+            try:
+                wait_until(lambda: state(model).server.connected, "a new connection")
+                wait_until(lambda: samples(model) > 100, "samples again")
+                assert not any(sensor.old_s for sensor in state(model).sensors)
+            finally:
+                second.close()
+    finally:
+        first.close()

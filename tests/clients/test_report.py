@@ -1,0 +1,353 @@
+"""What the report finds in a sensor that has a fault, and that it finds nothing in one that has none.
+
+The samples are the virtual sensor's own, taken through the server's own stream in simulated time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clients.recording.columns import Columns
+from clients.report.channels import CHANNELS, FORCE, limit_origin, noise_limit
+from clients.report.check import Level
+from clients.report.examine import Examination, examine
+from clients.report.stuck import longest_runs
+from clients.report.subject import Subject, no_frames, subject
+from ethercat_server.virtual_sensor import scene
+from protocol.framing import DataFlag
+from protocol.pdo import STANDARD_GRAVITY, ImuUnits
+from tests.clients.simulated import Script, described, sensor, simulate, subject_of
+
+QUIET = {Level.OK, Level.NOT_APPLICABLE}
+
+
+def wrong(examination: Examination) -> dict[str, Level]:
+    """The checks that found something or could not be made."""
+    return {check.name: check.level for check in examination.checks if check.level not in QUIET}
+
+
+def found(examination: Examination, name: str) -> str:
+    [check] = [check for check in examination.checks if check.name == name]
+    assert check.level is Level.OK or check.remedy, "says what to do"
+    return check.found
+
+
+def changed(given: Subject, **columns: Any) -> Subject:
+    return replace(given, columns=replace(given.columns, **columns))
+
+
+@pytest.fixture(scope="module")
+def healthy() -> Subject:
+    """Ten seconds with a contact, a moving wrist, noise."""
+    return sensor(10, seed=3)
+
+
+# A healthy sensor: it turns, shakes a little and touches things, and that is no fault.
+
+
+@pytest.mark.parametrize(
+    ("sinc_length", "seconds", "options"),
+    [
+        (51, 10, {"seed": 1}), (51, 7, {"seed": 2, "ppm": 150.0}), (64, 10, {"seed": 3}),
+        (64, 14, {"seed": 4, "ppm": -80.0, "pdo_size": 77}), (256, 20, {"seed": 5}), (256, 12, {"seed": 6}),
+        (256, 40, {"seed": 7, "ppm": 200.0}), (1024, 40, {"seed": 8}),
+    ],
+)  # fmt: skip
+def test_nothing_is_found_on_a_healthy_sensor(sinc_length: int, seconds: float, options: Any) -> None:
+    examination = examine(sensor(seconds, sinc_length=sinc_length, **options))
+    assert not wrong(examination)
+    assert examination.verdict.headline == "Healthy"
+    assert examination.verdict.sentence == "Every check was made and nothing was found."
+
+
+def test_the_noise_is_that_of_the_sensor_whatever_it_does(healthy: Subject) -> None:
+    examination = examine(healthy)
+    source = scene.Scene(0, noise=True)
+    source.set_sinc_length(64)
+    readings = np.array([source.reading(n, 0, 0.0).force_torque for n in range(4000)])
+    assert examination.noise.deviation[:6] == pytest.approx(readings.std(axis=0), rel=0.06)
+    assert np.ptp(healthy.columns.force[:, 2]) > 20 * examination.noise.deviation[2], "there was a contact"
+
+
+def test_frames_that_the_bus_loses_are_no_lost_samples() -> None:
+    assert not wrong(examine(sensor(10, script=Script(lost_frames=0.05))))
+
+
+# Faults that the virtual sensor can have.
+
+
+@pytest.mark.parametrize(
+    ("command", "check", "words"),
+    [
+        ("noise force.y 0.6", "Noise of force and torque", "Force y has a noise of 0.6"),
+        ("noise torque.z 0.02", "Noise of force and torque", "Torque z has a noise of 0.020"),
+        ("noise acceleration.x 0.02", "Noise of the IMU", "Acceleration x has a noise of 0.19"),
+        ("noise angular_rate.z 10", "Noise of the IMU", "Angular rate z has a noise of 0.17"),
+        ("limit force.z 9", "Saturation", "Force z was saturated in"),
+        ("limit torque.y 0.3", "Saturation", "Torque y was saturated in"),
+        ("limit angular_rate.x 5", "Saturation", "Angular rate x was saturated in"),
+        ("freeze torque.x", "Stuck values", "Torque x stood at"),
+        ("freeze angular_rate.y", "Stuck values", "Angular rate y stood at"),
+        ("skip 2", "Lost samples", "are missing, in"),
+    ],
+)
+def test_an_injected_fault_is_found_and_nothing_else(command: str, check: str, words: str) -> None:
+    examination = examine(sensor(6.5, command, seed=5))
+    assert wrong(examination) == {check: Level.FAULT}
+    assert words in found(examination, check)
+    assert examination.verdict.headline == "Fault"
+    assert check.lower().replace("imu", "IMU") in examination.verdict.sentence
+
+
+def test_noise_below_the_limit_is_measured_and_not_called_a_fault() -> None:
+    examination = examine(sensor(10, "noise force.x 0.3", seed=5))
+    assert not wrong(examination)
+    noise = examination.noise.deviation
+    assert noise[0] == pytest.approx(np.hypot(noise[1], 0.3), rel=0.05)
+
+
+def test_the_share_of_lost_samples_is_told() -> None:
+    examination = examine(sensor(12, "skip 2", seed=9))
+    lost = examination.timing.lost
+    assert lost / (lost + examination.series.count) == pytest.approx(0.02, abs=0.006)
+    assert lost + examination.series.count == pytest.approx(12 * 800, abs=10), "none is counted twice"
+    assert "All of them the server never saw" in found(examination, "Lost samples")
+    assert examination.spectrum is not None
+    assert examination.spectrum.filled == pytest.approx(lost, abs=5)
+
+
+def test_one_imu_axis_that_is_louder_than_the_others_is_pointed_out() -> None:
+    examination = examine(sensor(10, "noise angular_rate.x 1", seed=5))
+    assert wrong(examination) == {"Noise of the IMU": Level.ATTENTION}
+    assert "Angular rate x has 2" in found(examination, "Noise of the IMU")
+
+
+def test_a_channel_that_sticks_for_half_a_second_is_found() -> None:
+    script = Script([(4.0, "freeze force.x"), (4.5, "thaw force.x")])
+    examination = examine(sensor(8, script=script))
+    assert wrong(examination) == {"Stuck values": Level.FAULT}
+    [run] = [run for run in longest_runs(examination.series) if run.is_stuck(8)]
+    assert run.channel is CHANNELS[0]
+    assert (run.begin_s, run.length_s) == pytest.approx((4.0, 0.5), abs=0.005)
+    assert "Force x stood at" in found(examination, "Stuck values")
+
+
+def test_a_sensor_that_gives_the_same_data_for_ever_is_found() -> None:
+    examination = examine(sensor(8, script=Script([(5.0, "stick")])))
+    assert wrong(examination) == {"Silent or stuck sensor": Level.FAULT}
+    assert "the longest 3.00 s" in found(examination, "Silent or stuck sensor")
+
+
+def test_a_sensor_that_never_gave_anything_new_is_no_healthy_one() -> None:
+    examination = examine(sensor(5, signal="constant"))
+    assert examination.verdict.level is Level.FAULT
+    assert "Nothing new came at all" in found(examination, "Silent or stuck sensor")
+    assert wrong(examination)["Noise of force and torque"] is Level.NOT_POSSIBLE
+
+
+def test_warnings_are_told_with_their_remedy() -> None:
+    script = Script([(2.0, "warn 0x20 80"), (4.0, "warn 0x40 8")])
+    examination = examine(sensor(8, script=script))
+    assert wrong(examination) == {"Warnings": Level.FAULT}
+    words = found(examination, "Warnings")
+    assert "Overtemperature (warning) in 80 samples, first 2.00 s after the start" in words
+    assert "Wrong supply voltage (fatal) in 8 samples" in words
+    [check] = [check for check in examination.checks if check.name == "Warnings"]
+    assert "let it cool down" in check.remedy
+    assert "Remove sensor from power supply" in check.remedy
+
+
+def test_a_shaken_sensor_is_not_called_noisy() -> None:
+    sizes = {"acceleration.x": 0.05, "acceleration.y": 0.05, "force.x": 1.0, "torque.y": 0.05}
+    examination = examine(sensor(6, *(f"noise {channel} {size}" for channel, size in sizes.items())))
+    assert set(wrong(examination).values()) == {Level.NOT_POSSIBLE}
+    assert "shaken" in found(examination, "Noise of force and torque")
+    assert examination.verdict.headline == "Not conclusive"
+
+
+# What the frames say, changed by hand.
+
+
+def test_frames_that_the_client_did_not_take_are_told_apart_from_those_the_server_missed() -> None:
+    frames = simulate(8)
+    kept = [frame for number, frame in enumerate(frames) if not 1000 <= number < 1080]
+    kept[1000] = kept[1000]._replace(flags=DataFlag.GAP)
+    examination = examine(subject_of(kept))
+    assert wrong(examination) == {"Lost samples": Level.FAULT}
+    assert (examination.timing.lost, examination.timing.withheld) == (80, 80)
+    assert "did not take them in time" in found(examination, "Lost samples")
+
+
+def test_one_frame_in_some_is_no_loss() -> None:
+    examination = examine(subject_of(simulate(20)[::4]))
+    assert not wrong(examination)
+    assert examination.series.step == 4
+
+
+def test_invalid_frames_are_a_silence() -> None:
+    frames = [
+        frame._replace(flags=DataFlag.INVALID) if 2000 <= number < 2050 else frame
+        for number, frame in enumerate(simulate(8))
+    ]
+    examination = examine(subject_of(frames))
+    assert wrong(examination) == {"Silent or stuck sensor": Level.ATTENTION}
+    assert "50 invalid ones" in found(examination, "Silent or stuck sensor")
+    assert examination.timing.lost == 0
+
+
+def test_a_wall_clock_that_was_set_and_stamps_that_go_back_are_found(healthy: Subject) -> None:
+    stamps = healthy.columns.stamp_ns.copy()
+    stamps[4000:] += 2_500_000_000
+    examination = examine(changed(healthy, stamp_ns=stamps))
+    assert wrong(examination) == {"Stamps": Level.ATTENTION}
+    assert "set 1 time, at most by 2.50 s" in found(examination, "Stamps")
+    moments = healthy.columns.monotonic_ns.copy()
+    moments[4000:] -= 2_500_000_000
+    examination = examine(changed(healthy, monotonic_ns=moments, stamp_ns=healthy.columns.stamp_ns))
+    assert "1 stamp not after the one before" in found(examination, "Stamps")
+
+
+def test_late_stamps_are_uneven_and_no_losses(healthy: Subject) -> None:
+    jitter = np.random.default_rng(1).choice([0, 0, 0, 1, 2], len(healthy.columns)) * 300_000
+    c = healthy.columns
+    examination = examine(
+        changed(healthy, monotonic_ns=c.monotonic_ns + jitter, stamp_ns=c.stamp_ns + jitter)
+    )
+    assert wrong(examination) == {"Stamps": Level.ATTENTION}
+    assert examination.timing.lost == 0
+
+
+def test_settings_that_are_not_those_in_force_are_found(healthy: Subject) -> None:
+    examination = examine(replace(healthy, settings={**healthy.settings, "sinc_length": 128}))
+    assert wrong(examination)["Sampling rate"] is Level.ATTENTION
+    assert "the settings say 400.000 Hz" in found(examination, "Sampling rate")
+
+
+def test_without_settings_nothing_is_called_healthy(healthy: Subject) -> None:
+    examination = examine(replace(healthy, settings={}, rate_hz=0.0))
+    assert set(wrong(examination)) == {"Noise of force and torque", "Sampling rate"}
+    assert examination.verdict.headline == "Not conclusive"
+    raw = examine(replace(healthy, settings={**healthy.settings, "calibration_matrix": False}))
+    assert "raw counts" in found(raw, "Noise of force and torque")
+
+
+def test_an_imu_that_is_off_is_no_reason_not_to_be_healthy(healthy: Subject) -> None:
+    nothing = np.zeros((len(healthy.columns), 3))
+    settings = {**healthy.settings, "imu_active": 0}
+    off = replace(changed(healthy, acceleration=nothing, angular_rate=nothing), settings=settings)
+    examination = examine(off)
+    assert not wrong(examination)
+    assert "Not applicable: noise of the IMU, gravity" in examination.verdict.sentence
+    assert wrong(examine(replace(off, settings=healthy.settings)))["Stuck values"] is Level.FAULT
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [(STANDARD_GRAVITY, "--imu-units si"), (1 / STANDARD_GRAVITY, "leave --imu-units si away")],
+)
+def test_an_accelerometer_in_the_wrong_unit_is_told(healthy: Subject, scale: float, words: str) -> None:
+    examination = examine(changed(healthy, acceleration=healthy.columns.acceleration * scale))
+    [check] = [check for check in examination.checks if check.name == "Gravity"]
+    assert check.level is Level.ATTENTION
+    assert words in check.remedy
+
+
+def test_imu_units_are_taken_as_told() -> None:
+    si = subject_of(simulate(5), imu_units=ImuUnits.SI)
+    assert np.linalg.norm(si.columns.acceleration, axis=1).mean() == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_values_that_are_no_numbers_are_found_and_spoil_nothing_else(healthy: Subject, value: float) -> None:
+    force = healthy.columns.force.copy()
+    force[100:110, 1] = value
+    examination = examine(changed(healthy, force=force))
+    assert wrong(examination) == {"Numbers": Level.FAULT}
+    assert "Force y" in found(examination, "Numbers")
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 50, 400])
+def test_too_little_is_not_conclusive(healthy: Subject, count: int) -> None:
+    short = replace(healthy, columns=healthy.columns.where(np.arange(len(healthy.columns)) < count))
+    examination = examine(short)
+    assert examination.verdict.headline == "Not conclusive"
+    assert Level.FAULT not in wrong(examination).values()
+
+
+def test_no_frames_at_all() -> None:
+    examination = examine(subject({}, None, no_frames(), "nothing", 0))
+    assert examination.verdict.headline == "Not conclusive"
+    assert examination.subject.name == "not known"
+
+
+LAST = 2**63 - 1
+HOSTILE: list[Callable[[Columns], dict[str, Any]]] = [
+    lambda c: {"force": c.force * 1e38, "torque": -c.torque * 1e38},
+    lambda c: {"monotonic_ns": c.monotonic_ns[::-1].copy()},
+    lambda c: {"monotonic_ns": c.monotonic_ns * 0, "stamp_ns": c.stamp_ns * 0 + LAST},
+    lambda c: {"monotonic_ns": np.where(np.arange(len(c)) == 7, LAST, c.monotonic_ns)},
+    lambda c: {"sequence": c.sequence[::-1].copy(), "flags": c.flags + DataFlag.GAP},
+    lambda c: {"flags": np.random.default_rng(1).integers(0, 256, len(c))},
+    lambda c: {"warnings": c.warnings + 0xFFFFFFFF, "force_torque_saturated": c.warnings + 0xFFFF},
+    lambda c: {
+        "force": c.force * np.nan,
+        "acceleration": c.force * np.inf,
+        "temperature": c.temperature * np.nan,
+    },
+    lambda c: {"temperature": c.temperature * 1e30, "angular_rate": c.force * 0},
+]
+
+
+@pytest.mark.parametrize("spoil", HOSTILE)
+def test_nonsense_is_examined_without_an_error(spoil: Callable[[Columns], dict[str, Any]]) -> None:
+    given = sensor(3)
+    examination = examine(changed(given, **spoil(given.columns)))
+    assert examination.verdict.headline != "Healthy"
+    assert all(check.found.endswith(".") for check in examination.checks)
+
+
+def test_descriptions_are_taken_for_what_they_are() -> None:
+    row = {
+        "name": ["a"],
+        "serial": -1,
+        "rate_hz": "fast",
+        "firmware": "x" * 5000,
+        "hardware": "\x1b[31m\u202e",
+    }
+    settings: dict[Any, Any] = {"sinc_length": "64", "fir": 1, "no such": 1, 7: 7, "fast": True}
+    settings |= {f"s{number}": number for number in range(99)}
+    made = subject(row, settings, no_frames(), "s", 0)
+    assert made.settings == {"fast": True}
+    assert (made.rate_hz, made.nominal_period_s) == (0.0, None)
+    assert len(made.firmware) <= 80
+    assert made.hardware.isprintable()
+    assert len(made.remarks) <= 21
+
+
+# Limits.
+
+
+def test_limits_are_botas_at_the_published_lengths_and_between_them_in_between() -> None:
+    for channel in CHANNELS[:6]:
+        assert noise_limit(channel, 51) == channel.limit_short
+        assert noise_limit(channel, 1024) == pytest.approx(channel.limit_long)
+        lengths = (32, 51, 64, 128, 256, 341, 1024, 2048)
+        limits = [noise_limit(channel, length) for length in lengths]
+        assert limits == sorted(limits, reverse=True)
+    assert noise_limit(CHANNELS[0], 229) == pytest.approx(np.sqrt(0.6 * 0.1), rel=0.01), (
+        "half-way in the logarithm"
+    )
+    assert CHANNELS[2].group is FORCE
+    assert (CHANNELS[2].limit_short, CHANNELS[2].limit_long) == (0.6, 0.08)
+    assert "own test limits for SINC 51" in limit_origin(51)
+    assert "interpolated between" in limit_origin(64)
+    assert "extrapolated from" in limit_origin(32)
+
+
+def test_a_description_of_the_simulation_is_that_of_a_server() -> None:
+    assert described(128)["rate_hz"] == 400

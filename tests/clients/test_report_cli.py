@@ -1,0 +1,229 @@
+"""`ethercat-report` as people call it: from a file, from a server, and with what cannot be."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from clients.report import cli, program
+from clients.report.live import Received
+from protocol.framing import DataMessage
+from tests.clients.recordings import writer
+from tests.clients.simulated import STARTED_AT_NS, described, simulate
+from tests.server.running import free_port, needs_bus, server
+
+
+def record(path: Path, frames: list[DataMessage], *rows: object, end: bool = True) -> Path:
+    made = writer(path)
+    made.describe(STARTED_AT_NS, {"reply": "describe", "ok": True, "protocol": 1, "sensors": list(rows)})
+    for number, frame in enumerate(frames):
+        made.frame(frame)
+        if number % 1000 == 999:
+            made.flush()
+    if end:
+        made.finish({})
+    return path
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[DataMessage]:
+    return simulate(6, seed=21)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, frames: list[DataMessage]) -> Path:
+    return record(tmp_path_factory.mktemp("recorded") / "cell.mcap", frames, described())
+
+
+def ended(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Exit code, output and errors."""
+    try:
+        code = cli.main([str(argument) for argument in arguments])
+    except SystemExit as exit_:
+        code = int(str(exit_.code))
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err
+    return code, said.out, said.err
+
+
+def test_a_recording_becomes_a_page_beside_it(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = ended(capsys, recording, "--note", "cell 3 <b>")
+    assert (code, err) == (0, f"ethercat-report: the report is in {recording.with_suffix('.html')}\n")
+    assert out == (
+        "Sensor 0 (BFT-SENS-ECAT-M8, serial 4711): Healthy. Every check was made and nothing was found.\n"
+    )
+    page = recording.with_suffix(".html").read_text()
+    for words in ("cell.mcap", "4711", "1.3.8", "2026-01-01 00:00:00 UTC", "cell 3 &lt;b&gt;", "✓ Healthy"):
+        assert words in page
+    assert not list(recording.parent.glob(".*")), "nothing is left behind"
+
+
+@pytest.mark.parametrize(
+    ("command", "code", "word"),
+    [("warn 0x20", 4, "attention"), ("warn 0x40", 5, "fault")],
+)
+def test_the_exit_code_is_the_verdict(
+    command: str, code: int, word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = record(tmp_path / "bad.mcap", simulate(6, command, seed=3), described())
+    out = tmp_path / "r.html"
+    found, said, _ = ended(capsys, made, "-o", out, "--json")
+    assert found == code
+    [sensor] = json.loads(said)
+    assert sensor["verdict"] == word
+    assert [check["check"] for check in sensor["checks"] if check["outcome"] != "ok"] == ["Warnings"]
+    assert out.exists()
+
+
+def test_too_short_a_recording_is_not_conclusive(
+    frames: list[DataMessage], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = record(tmp_path / "short.mcap", frames[:500], described())
+    code, out, _ = ended(capsys, made)
+    assert code == 3
+    assert "Not conclusive" in out
+    assert "Record for at least 10 s" in out
+
+
+def test_the_longest_stretch_of_the_same_settings_counts(
+    frames: list[DataMessage], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = writer(tmp_path / "changed.mcap")
+    other = described(128, fir=True)
+    made.describe(STARTED_AT_NS, {"reply": "describe", "ok": True, "protocol": 1, "sensors": [other]})
+    event = {"event": "reconfigured", "sensor": 0, "settings": described()["settings"]}
+    made.event(frames[1000].stamp_ns, event)
+    for frame in frames:
+        made.frame(frame)
+    made.finish({})
+    code, _, _ = ended(capsys, tmp_path / "changed.mcap", "-o", tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert code == 0, "the settings are those that were in force"
+    assert "The settings were changed 1 times" in page
+    assert "reconfigured (1)" in page
+    assert f"{len(frames) - 1000:,} samples".replace(",", " ") in page
+
+
+def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(
+    frames: list[DataMessage], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = record(tmp_path / "cut.mcap", frames, described(), end=False)
+    code, _, _ = ended(capsys, made)
+    assert code in {0, 3}
+    assert "The recording was cut off" in made.with_suffix(".html").read_text()
+
+
+def test_sensors_are_chosen_by_place_serial_or_name(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "r.html"
+    code, _, err = ended(capsys, recording, "-o", out, "--sensor", "serial:9")
+    assert (code, out.exists()) == (1, False)
+    assert "has no sensor serial:9: it has 0 (BFT-SENS-ECAT-M8, serial 4711)" in err
+    assert ended(capsys, recording, "-o", out, "--sensor", "serial:4711")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "give a recording, or --server"),
+        (["a.mcap", "--server", "localhost:1"], "give a recording, or --server"),
+        (["a.mcap", "--seconds", "5"], "--seconds goes with --server"),
+        (["--server", "localhost:x"], "HOST:PORT"),
+        (["--server", "localhost", "--seconds", "0"], "from 1 to"),
+        (["--server", "localhost", "--seconds", "nan"], "from 1 to"),
+        (["a.mcap", "-o", "a.mcap"], "would replace the recording"),
+        (["a.mcap", "--sensor", ""], "must be"),
+    ],
+)
+def test_wrong_usage(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = ended(capsys, *arguments)
+    assert code == 2
+    assert words in err
+
+
+def test_what_cannot_be_read_or_written_is_said_in_a_sentence(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = tmp_path / "text.mcap"
+    text.write_text("no recording")
+    for arguments in (
+        [tmp_path / "no.mcap"],
+        [text],
+        [tmp_path],
+        [recording, "-o", tmp_path / "no" / "r.html"],
+    ):
+        code, out, err = ended(capsys, *arguments)
+        assert (code, out) == (1, "")
+        assert re.fullmatch(r"ethercat-report: [^\n]+\n", err)
+    kept = tmp_path / "kept.html"
+    kept.mkdir()
+    assert ended(capsys, recording, "-o", kept)[0] == 1
+    assert not list(tmp_path.glob(".kept*")), "nothing half-written is left"
+
+
+def test_no_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = ended(capsys, "--server", f"localhost:{free_port()}", "-o", tmp_path / "r.html")
+    assert code == 1
+    assert "start ethercat-server" in err
+
+
+def test_ctrl_c_leaves_nothing(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(program, "render", interrupted)
+    code, _, err = ended(capsys, recording, "-o", tmp_path / "r.html")
+    assert (code, err) == (1, "ethercat-report: stopped: no report was written\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_not_installed_is_said(recording: Path) -> None:
+    script = (
+        "import sys; sys.modules['scipy'] = sys.modules['scipy.signal'] = None; "
+        "from clients.report.cli import main; "
+        f"sys.exit(main([{str(recording)!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "is not installed: pip install 'bota-ethercat-bridge[tools]'" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_received_frames_are_told_apart_by_sensor(frames: list[DataMessage]) -> None:
+    received = Received()
+    received.all.extend([frames[0], frames[1]._replace(sensor=1), frames[2]])
+    assert [frame.sequence for frame in received.frames(0)] == [frames[0].sequence, frames[2].sequence]
+    assert len(list(received.frames())) == 3
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    with server("virtual") as running:
+        yield running.port
+
+
+@needs_bus
+@pytest.mark.bus
+def test_a_live_sensor_is_reported_on(port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "live.html"
+    code, said, err = ended(capsys, "--server", f"localhost:{port}", "--seconds", "6", "-o", out, "--json")
+    # A busy machine may lose samples or shake the stamps, which is then rightly said; the sensor is healthy.
+    assert code in {0, 4, 5}, err
+    [sensor] = json.loads(said)
+    assert sensor["source"] == f"localhost:{port}"
+    outcomes = {check["check"]: check["outcome"] for check in sensor["checks"]}
+    of_the_machine = {"Lost samples", "Stamps", "Silent or stuck sensor", "Sampling rate"}
+    assert {outcome for name, outcome in outcomes.items() if name not in of_the_machine} == {"ok"}
+    assert "BFT-SENS-ECAT-M8" in out.read_text()
+    code, _, err = ended(capsys, "--server", f"localhost:{port}", "--sensor", "7", "-o", tmp_path / "no.html")
+    assert code == 1
+    assert "has no sensor 7: it has 0 (BFT-SENS-ECAT-M8" in err

@@ -1,0 +1,307 @@
+"""The page: whole by itself, safe whatever a device says, readable by eye and by ear, drawn by a browser."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+
+from clients.recording.columns import Columns
+from clients.report.envelope import envelope, stretches
+from clients.report.examine import examine
+from clients.report.page import as_json, render
+from clients.report.series import Floats
+from clients.report.subject import no_frames, subject
+from clients.report.text import Markup, element, text
+from clients.report.words import figure, seconds
+from tests.clients import report_capture
+from tests.clients.chromium import DARK, needs_chromium, run, screenshot
+from tests.clients.simulated import described, sensor, simulate, subject_of
+
+MADE = "2026-01-01 00:01 UTC"
+VOID = {"meta", "br"}
+
+
+class Reader(HTMLParser):
+    """Reads a page, and fails where its tags are not in order."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self._open: list[str] = []
+        self.feed(page)
+        self.close()
+        assert not self._open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        assert len(dict(attrs)) == len(attrs), f"{tag} has an attribute twice"
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag, self.getpos()
+
+    def handle_data(self, data: str) -> None:
+        if self._open and self._open[-1] not in {"style", "script"}:
+            self.words.append(data)
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    """A report on a sensor with a noisy axis."""
+    return report_capture.fixed_page()
+
+
+def test_it_is_one_file_with_nothing_outside_it(page: str) -> None:
+    reader = Reader(page)
+    assert page.startswith("<!DOCTYPE html>")
+    assert not {"script", "link", "img", "iframe", "object", "form"} & {tag for tag, _ in reader.tags}
+    for _, attributes in reader.tags:
+        for name, value in attributes.items():
+            assert not name.startswith("on")
+            if name in {"href", "src", "xlink:href", "clip-path", "style"}:
+                assert "//" not in str(value), "loads from elsewhere"
+    [policy] = [tag for tag in reader.of("meta") if "http-equiv" in tag]
+    assert "default-src 'none'" in str(policy["content"])
+    assert "@import" not in page
+    assert "url(http" not in page
+    assert len(page.encode()) < 1_500_000
+
+
+def test_it_can_be_read_without_seeing_it(page: str) -> None:
+    reader = Reader(page)
+    identifiers = [attributes["id"] for _, attributes in reader.tags if "id" in attributes]
+    assert len(identifiers) == len(set(identifiers))
+    plots = reader.of("svg")
+    assert len(plots) == 9
+    for plot in plots:
+        assert plot["role"] == "img"
+        assert set(str(plot["aria-labelledby"]).split()) <= set(identifiers)
+    descriptions = re.findall(r"<desc [^>]*>([^<]+)</desc>", page)
+    assert len(descriptions) == 9
+    assert all(re.search(r"\d", words) for words in descriptions), "they say what is in the plot"
+    assert len(reader.of("th")) == len([tag for tag in reader.of("th") if tag.get("scope")])
+    assert reader.of("html") == [{"lang": "en"}]
+    headings = [tag for tag, _ in reader.tags if re.fullmatch("h[1-6]", tag)]
+    assert headings[0] == "h1"
+    assert headings.count("h1") == 1
+
+
+def test_every_colour_of_a_plot_is_the_pages(page: str) -> None:
+    for plot in re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL):
+        assert not re.findall(r"(?:fill|stroke|color): *#", plot)
+        used = set(re.findall(r"var\((--[a-z]+)\)", plot)) - {"--font"}
+        assert used
+        assert all(page.count(f"{name}:") >= 2 for name in used), "light and dark"
+
+
+def test_outcomes_are_words_and_not_colours_alone(page: str) -> None:
+    words = " ".join(Reader(page).words)
+    assert "✗ Fault" in words
+    assert "2 of 12 checks found something: noise of force and torque, lost samples." in words or (
+        "2 of 12 checks found something: lost samples, noise of force and torque." in words
+    )
+    assert "Force y has a noise of 0.6" in words
+    assert "above the limit" in words
+    assert "interpolated between Bota's own test limits" in words
+    assert re.search(r"It matters because: .*Do: ", words)
+    for meaning in ("800 Hz; cut-off 209.5 Hz with FIR off", "internal IMU", "±250 °/s"):
+        assert meaning in words
+    assert "cut-off 209.5 Hz" in page
+
+
+EVIL = "</title><script>alert(1)</script>\"'&$x^2$<img src=x onerror=y>"
+
+
+def test_what_a_device_says_is_text_and_nothing_else() -> None:
+    row = {
+        **described(), "name": EVIL, "serial": EVIL, "hardware": EVIL, "firmware": "\u202eevil\x07",
+        "settings": {**described()["settings"], EVIL: 1, "sinc_length": EVIL},
+    }  # fmt: skip
+    given = subject_of(simulate(1), row, source=EVIL)
+    page = render([examine(given)], made=MADE, program="p", note=EVIL)
+    reader = Reader(page)
+    assert not reader.of("script")
+    assert not reader.of("img")
+    assert "<script" not in page
+    assert "alert(1)" in "".join(reader.words), "shown as it is"
+    assert not {"\u202e", "\x07"} & set(page)
+    assert json.loads(as_json([examine(given)]))[0]["name"].startswith("</title>")
+
+
+def test_markup_takes_no_plain_text() -> None:
+    plain: Any = "<b>"
+    with pytest.raises(TypeError, match=r"text\(\)"):
+        text("a") + plain
+    with pytest.raises(TypeError, match=r"text\(\)"):
+        Markup("").join([plain])
+    with pytest.raises(TypeError, match=r"text\(\)"):
+        element("p", plain)
+    assert element("p", text("<&>\x00")) == "<p>&lt;&amp;&gt;?</p>"
+
+
+SPOILS: list[Callable[[Columns], dict[str, Any]]] = [
+    lambda c: {"force": c.force * 1e38, "torque": c.torque * np.nan, "temperature": c.temperature * np.inf},
+    lambda c: {
+        "monotonic_ns": np.where(np.arange(len(c)) == 7, 2**63 - 1, c.monotonic_ns),
+        "warnings": c.warnings + 0xFFFFFFFF,
+        "force_torque_saturated": c.warnings + 0xFFFF,
+        "flags": np.random.default_rng(1).integers(0, 256, len(c)),
+    },
+]
+
+
+@pytest.mark.parametrize("spoil", SPOILS)
+def test_nonsense_is_drawn_without_an_error(spoil: Callable[[Columns], dict[str, Any]]) -> None:
+    given = subject_of(simulate(2))
+    page = render(
+        [examine(replace(given, columns=replace(given.columns, **spoil(given.columns))))],
+        made=MADE,
+        program="p",
+    )
+    Reader(page)
+    assert "Healthy" not in page
+
+
+def test_no_frames_make_a_page_too() -> None:
+    page = render([examine(subject(described(), None, no_frames(), "s", 0))], made=MADE, program="p")
+    assert "nothing was received" in " ".join(Reader(page).words)
+    assert "Not conclusive" in page
+
+
+def test_two_sensors_stand_on_one_page() -> None:
+    first = sensor(2, seed=1)
+    second = replace(first, place=1, serial="9", columns=no_frames())
+    reader = Reader(render([examine(first), examine(second)], made=MADE, program="p"))
+    assert [a["href"] for a in reader.of("a")] == ["#sensor-0", "#sensor-1"]
+    identifiers = [attributes["id"] for _, attributes in reader.tags if "id" in attributes]
+    assert len(identifiers) == len(set(identifiers))
+
+
+def test_ten_minutes_make_no_larger_a_page() -> None:
+    tile, times = sensor(10).columns, 60
+    many = {name: np.concatenate([getattr(tile, name)] * times) for name in Columns.__slots__}
+    shift = np.repeat(np.arange(times) * (int(np.ptp(tile.monotonic_ns)) + 1_250_000), len(tile))
+    many["monotonic_ns"], many["stamp_ns"] = many["monotonic_ns"] + shift, many["stamp_ns"] + shift
+    many["sequence"] = np.arange(len(shift))
+    many["force"][12345, 2] = 77.0
+    given = replace(sensor(0.1), columns=Columns(**many))
+    examination = examine(given)
+    assert examination.series.count > 470_000
+    page = render([examination], made=MADE, program="p")
+    assert len(page.encode()) < 2_000_000
+    assert f"z from {figure(float(tile.force[:, 2].min()))} to 77.0" in page, "the spike is in the plot"
+
+
+def test_a_spike_is_never_averaged_away() -> None:
+    time: Floats = np.linspace(0.0, 99.999, 100_000)
+    values = np.zeros(100_000)
+    values[31_415], values[27_182] = 5.0, np.nan
+    band = envelope(time, values, 0.0, 100.0)
+    assert np.nanmax(band.high) == 5.0
+    assert band.high[int(31.415 / 100 * len(band.time))] == 5.0
+    assert np.nanmin(band.low) == 0.0
+    assert 0 < np.nanmax(band.mean) < 0.1
+
+
+def test_stretches_join_neighbours() -> None:
+    assert stretches(np.array([]), 10.0, 10).shape == (0, 2)
+    assert stretches(np.array([0.5, 1.5, 1.6, 5.5, 99.0]), 10.0, 10).tolist() == [[0, 2], [5, 6], [9, 10]]
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(0, "0"), (1234567, "1234567"), (0.000123456, "0.000123"), (1e-9, "1.00e-09"), (-3.14159, "-3.14"),
+     (float("nan"), "not a number"), (float("inf"), "infinite"), (3e38, "3.00e+38")],
+)  # fmt: skip
+def test_figures(value: float, words: str) -> None:
+    assert figure(value) == words
+
+
+def test_spans_of_time() -> None:
+    assert [seconds(s) for s in (0, 2e-6, 0.25, 12, 1200)] == [
+        "0 s",
+        "2.00 µs",
+        "250 ms",
+        "12.0 s",
+        "20.0 min",
+    ]
+
+
+# In a browser.
+
+
+Floats32 = npt.NDArray[np.float32]
+
+
+def pixels_of(picture: Path) -> Floats32:
+    """(n, 3)"""
+    with Image.open(picture) as image:
+        return np.asarray(image.convert("RGB"), dtype=np.float32).reshape(-1, 3)
+
+
+def rgb(colour: str) -> Floats32:
+    return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)], dtype=np.float32)
+
+
+def drawn(pixels: Floats32, colour: str, paper: str) -> int:
+    """How many pixels are of this colour, or of it mixed with the paper: bands, and edges of thin lines."""
+    towards = rgb(colour) - rgb(paper)
+    off = pixels - rgb(paper)
+    part = off @ towards / float(towards @ towards)
+    aside = np.abs(off - part[:, None] * towards).max(axis=1)
+    return int(np.sum((part > 0.3) & (part < 1.1) & (aside < 16)))
+
+
+LIGHT = {"paper": "#ffffff", "x": "#c44601", "y": "#00795c", "z": "#1763c6", "bad": "#b3201b"}
+DARKNESS = {"paper": "#14181d", "x": "#ff9a57", "y": "#3fd0a4", "z": "#79b4ff", "bad": "#ff8078"}
+
+
+@needs_chromium
+@pytest.mark.parametrize(("theme", "other", "options"), [(LIGHT, DARKNESS, ()), (DARKNESS, LIGHT, (DARK,))])
+def test_chromium_draws_it_in_the_light_and_in_the_dark(
+    page: str, tmp_path: Path, theme: dict[str, str], other: dict[str, str], options: tuple[str, ...]
+) -> None:
+    source, picture = tmp_path / "report.html", tmp_path / "drawn.png"
+    source.write_text(page, encoding="utf-8")
+    assert screenshot(source, picture, 700, 4200, *options) == "", "the console is silent"
+    pixels, paper = pixels_of(picture), theme["paper"]
+    assert np.sum(np.abs(pixels - rgb(paper)).max(axis=1) < 2) > len(pixels) // 2
+    assert np.sum(np.abs(pixels - rgb(other["paper"])).max(axis=1) < 2) < len(pixels) // 100
+    for name in ("x", "y", "z", "bad"):
+        assert theme[name] in page
+        assert drawn(pixels, theme[name], paper) > 2000, name
+
+
+@needs_chromium
+def test_chromium_prints_it(page: str, tmp_path: Path) -> None:
+    source, paper = tmp_path / "report.html", tmp_path / "report.pdf"
+    source.write_text(page, encoding="utf-8")
+    run(source, tmp_path, f"--print-to-pdf={paper}", "--no-pdf-header-footer", DARK)
+    printed = paper.read_bytes()
+    assert printed.startswith(b"%PDF")
+    assert 4 <= len(re.findall(rb"/Type\s*/Page\b", printed)) <= 12
+
+
+def test_the_picture_in_the_docs_is_of_this_page(page: str) -> None:
+    assert report_capture.digest_in(report_capture.PICTURE) == report_capture.digest(page), (
+        report_capture.AGAIN
+    )
+    assert report_capture.PICTURE.stat().st_size < 300_000

@@ -1,0 +1,106 @@
+"""The command line: what is refused and said, and the machine's own checks for real. No bus is needed."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from ethercat_server.doctor.examination import CHECKS
+from tests.doctor.running import MODULE, doctor
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([], "usage: ethercat-doctor"),
+        (["a", "b"], "usage: ethercat-doctor"),
+        (["ens5", "--colour"], "usage: ethercat-doctor"),
+        (["ens5", "--seconds", "soon"], "invalid number value"),
+        (["ens5", "--seconds", "-1"], "from 0 to 3600"),
+        (["ens5", "--seconds", "nan"], "from 0 to 3600"),
+        (["ens5", "--cpu", "x"], "whole number"),
+        (["ens5", "--cpu", "4000"], "--cpu 4000: this machine has the processors 0 to"),
+        (["ens5", "--rt-priority", "100"], "--rt-priority 100: it must be a whole number from 0 to 99"),
+        (["a-name-that-is-too-long"], "is no name of a network interface"),
+        (["../lo"], "is no name of a network interface"),
+        ([""], "is no name of a network interface"),
+    ],
+)
+def test_wrong_arguments_are_exit_code_2(arguments: list[str], named: str) -> None:
+    ended = doctor(*arguments)
+    assert (ended.code, ended.out) == (2, "")
+    assert named in ended.err
+    assert ended.err.splitlines()[-1].startswith("ethercat-doctor: ")
+
+
+def test_what_failed_is_json_too() -> None:
+    ended = doctor("a/b", "--json")
+    assert ended.code == 2
+    assert "no name of a network interface" in ended.json["error"]
+
+
+def test_help_names_the_exit_codes() -> None:
+    assert "3 the worst is a warning" in " ".join(doctor("--help").out.split())
+
+
+def test_no_such_interface_is_a_finding_and_the_machine_is_looked_at() -> None:
+    ended = doctor("nosuch0", "--json", "--seconds", 0.05)
+    assert ended.code == 4
+    assert ended.json["worst"] == "bad"
+    assert ended.findings("interface")["link"]["found"] == "no network interface 'nosuch0'"
+    there = {(row["subject"], row["check"]) for row in ended.json["findings"]}
+    assert {(c.subject, c.name) for c in CHECKS if c.subject in {"kernel", "rights", "processors"}} <= there
+    assert "there is no such interface" in ended.findings("bus")["slaves"]["found"]
+    assert ended.findings("measurement")["wake-ups"]["values"]["wake_ups"] > 0
+    assert ended.findings("measurement")["exchanges"]["level"] == "skipped"
+
+
+def test_the_loopback_interface_is_no_place_for_a_sensor() -> None:
+    ended = doctor("lo", "--seconds", 0)
+    assert ended.code == 4
+    assert "the loopback interface" in ended.out
+    assert "could not look: --seconds 0 asks for no measurement" in ended.out
+    assert ended.out.splitlines()[-1].startswith("1 bad, ")
+    assert "\x1b" not in ended.out
+
+
+def test_reader_that_has_enough() -> None:
+    piped = subprocess.Popen(
+        [sys.executable, "-m", MODULE, "lo", "--seconds", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert piped.stdout is not None
+    assert piped.stderr is not None
+    piped.stdout.readline()
+    piped.stdout.close()
+    assert piped.wait(timeout=20) == 1
+    assert piped.stderr.read() == ""
+    piped.stderr.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_while_it_measures(number: signal.Signals) -> None:
+    running = subprocess.Popen(
+        [sys.executable, "-m", MODULE, "nosuch0", "--seconds", "60"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert running.stdout is not None
+    while "no such interface" not in running.stdout.readline():
+        pass
+    running.send_signal(number)
+    _, err = running.communicate(timeout=20)
+    assert (running.returncode, err) == (1, "ethercat-doctor: stopped\n")
+
+
+def test_json_says_on_what_and_how_long() -> None:
+    found = json.loads(doctor("nosuch0", "--json", "--seconds", 0).out)
+    assert (found["interface"], found["seconds"]) == ("nosuch0", 0)
+    assert isinstance(found["root"], bool)

@@ -1,0 +1,95 @@
+"""0x2000, the factory calibration, cannot be written by any path; the virtual sensor counts every attempt."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from ethercat_server.bus import Bus
+from ethercat_server.errors import ForbiddenWriteError
+from ethercat_server.objects import BY_SETTING, FACTORY_CALIBRATION
+from ethercat_server.sdo import BlockingSdo, CyclicSdo, finish
+from protocol.sdo_types import SDO_TYPE_NAMES
+from tests.server.running import Client, needs_bus
+from tests.server.steady import SteadyBench, steady_bench, steady_sensor
+from tests.tool.running import tool
+
+WAYS_TO_SAY_IT: tuple[Any, ...] = (0x2000, "0x2000", "8192", "0X2000", "0x02000", "08192", " 8192 ", "8_192")
+VALUES = {"string": "x", "bool": True}
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[SteadyBench]:
+    with steady_sensor() as sensor, steady_bench(sensor) as found:
+        yield found
+        assert sensor.stats()["calibration_writes"] == 0
+
+
+def refused(asking: Client, **keys: object) -> str:
+    reply = asking.ask("sdo_write", **keys)
+    assert reply["ok"] is False, reply
+    code: str = reply["error"]["code"]
+    return code
+
+
+@pytest.mark.bus
+@needs_bus
+def test_the_control_channel_writes_none_of_it(bench: SteadyBench) -> None:
+    asking = bench.asking
+    before = [asking.ask("sdo_read", index=0x2000, subindex=sub)["hex"] for sub in range(58)]
+    for subindex in range(256):
+        assert refused(asking, index=FACTORY_CALIBRATION, subindex=subindex, hex="00000000") == "denied"
+    for kind in SDO_TYPE_NAMES:
+        value = VALUES.get(kind, 1)
+        assert refused(asking, index=FACTORY_CALIBRATION, subindex=1, type=kind, value=value) == "denied"
+    for index in WAYS_TO_SAY_IT:
+        assert refused(asking, index=index, subindex=1, hex="00" * 4) in {"denied", "bad_request"}
+    for keys in (
+        {"index": FACTORY_CALIBRATION, "subindex": 0, "hex": "00" * 112},  # all of it at once
+        {"index": FACTORY_CALIBRATION, "subindex": 0, "hex": "00", "complete_access": True},
+        {"index": FACTORY_CALIBRATION + 0x10000, "subindex": 1, "hex": "00" * 4},
+        {"index": 8192.0, "subindex": 1, "hex": "00" * 4},
+        {"name": "Calibration 1", "hex": "00" * 4},
+        {"index": 0x8000, "name": "Calibration 1", "hex": "00" * 4},
+    ):
+        assert refused(asking, **keys) in {"denied", "bad_request"}
+    for name in ("Calibration 1", "0x2000:1", "0x2000"):
+        reply = asking.ask("configure", settings={name: 1})
+        assert reply["error"]["code"] == "bad_request"
+    assert before == [asking.ask("sdo_read", index=0x2000, subindex=sub)["hex"] for sub in range(58)]
+
+
+@pytest.mark.bus
+@needs_bus
+def test_no_command_of_the_tool_writes_it(bench: SteadyBench, tmp_path: Path) -> None:
+    address, path = ("--server", f"localhost:{bench.running.port}"), tmp_path / "a.json"
+    tool("snapshot", *address, path)
+    content = json.loads(path.read_text())
+    for row in content["objects"]:
+        if row["index"] == "0x2000":
+            row["hex"] = "00000000"
+    path.write_text(json.dumps(content))
+    assert "nothing to restore" in tool("restore", *address, path).out
+    assert "no setting" in tool("apply", *address, "--set", "0x2000:1=1", code=2).err
+    tool("read", *address, "Calibration")
+    tool("tare", *address, "--samples", 20)
+    tool("save", *address)
+
+
+def test_nothing_below_the_tool_and_the_server_writes_it() -> None:
+    class NoBus:
+        """Whoever comes as far as this has failed."""
+
+    sdos = (
+        BlockingSdo(cast(Bus, NoBus()), 0),
+        CyclicSdo(cast(Bus, NoBus()), 0, ((0x1000, 128), (0x1080, 128))),
+    )
+    for sdo in sdos:
+        for subindex in range(256):
+            with pytest.raises(ForbiddenWriteError, match="never written"):
+                finish(sdo.write(FACTORY_CALIBRATION, subindex, b"\0" * 4))
+    assert FACTORY_CALIBRATION not in {row.index for row in BY_SETTING.values()}
