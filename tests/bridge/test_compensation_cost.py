@@ -42,13 +42,13 @@ def output(_ros: None) -> Iterator[CompensatedOutput]:
 def test_nothing_is_done_while_nobody_wants_it(output: CompensatedOutput) -> None:
     outputs = Outputs([output])
     outputs.refresh()
-    assert outputs.wanted == ()  # the reader does not even call it
+    assert list(outputs.wanted) == []  # the reader does not even call it
     output.window = RestWindow(1.0, StillLimits(), _SOURCE)
     outputs.refresh()
-    assert outputs.wanted == (output,)
+    assert list(outputs.wanted) == [output]
     output.window = None
     outputs.refresh()
-    assert outputs.wanted == ()
+    assert list(outputs.wanted) == []
 
 
 @pytest.mark.long
