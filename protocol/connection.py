@@ -32,9 +32,11 @@ class FramedConnection:
     def __init__(self, host: str, port: int, timeout_s: float = CONNECT_TIMEOUT_S) -> None:
         """Connect; UnreachableError if there is nothing to connect to."""
         self._decoder = FrameDecoder()
+        if not 0 < port < 65536:  # create_connection would leave a socket behind
+            raise UnreachableError(f"{port} is no port: it must be from 1 to 65535")
         try:
             self.sock = socket.create_connection((host, port), timeout=timeout_s)
-        except (OSError, UnicodeError, OverflowError) as error:  # a host or a port that cannot be one
+        except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot be one
             reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
             raise UnreachableError(reason) from None
         try:

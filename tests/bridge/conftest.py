@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
-import random
 import signal
 import subprocess
 import sys
@@ -159,7 +158,6 @@ def _ros() -> Iterator[None]:
     )
     from rclpy.signals import SignalHandlerOptions
 
-    os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("ROS_LOG_DIR", tempfile.gettempdir())
     os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
@@ -255,11 +256,14 @@ def test_saved_settings_are_in_the_flash(bench: tuple[Bench, Client]) -> None:
 
 
 def tare_at_rest(asking: Client, **keys: object) -> dict[str, Any]:
-    """Tare until nothing touched the virtual tool meanwhile: now and then something does."""
+    """Tare until nothing touched the virtual tool meanwhile: now and then something does.
+
+    On a busy machine the sensor's watchdog may be quicker than the server.
+    """
     for _ in range(20):
         tared = asking.ask("tare", samples=200, **keys)
         if not tared["ok"]:
-            assert "not at rest" in error(tared)["message"]
+            assert re.search("not at rest|is lost", error(tared)["message"])
         elif all(abs(r) < limit for r, limit in zip(tared["residual"], [1.5] * 3 + [0.15] * 3, strict=True)):
             return tared
     raise AssertionError(f"never at rest: {tared}")
