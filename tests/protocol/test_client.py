@@ -153,7 +153,7 @@ def test_another_thread_may_close_it(scripted: ScriptedServer) -> None:
 def test_another_thread_may_close_it_in_the_very_moment_of_waiting(scripted: ScriptedServer) -> None:
     client = connect(scripted.port)
     os.close(client.fileno())
-    with pytest.raises(ConnectionFailedError, match="closed|Bad file descriptor"):
+    with pytest.raises(ConnectionFailedError, match=r"closed|Bad file descriptor"):
         client.receive(1.0)
     client.connection.sock.detach()
 
