@@ -29,6 +29,7 @@ from clients.recording.file_format import (
     unpack_json,
 )
 from protocol.framing import DataMessage, JsonObject
+from protocol.text import visible
 
 __all__ = ["DamagedError", "Description", "Event", "NotARecordingError", "RecordedSensor", "Recording",
            "RecordingError", "Settings", "open_recording"]  # fmt: skip
@@ -232,7 +233,7 @@ def _number(value: object) -> float:
 
 def _text(value: object) -> str:
     """Text from a file as it may appear in a line: no control characters, not endless."""
-    return "".join(c if c.isprintable() else "?" for c in str(value)[:80]) if value is not None else "?"
+    return visible(str(value)[:80]) if value is not None else "?"
 
 
 def _sensor(place: int, row: JsonObject, history: list[Settings], frames: int) -> RecordedSensor:
