@@ -14,26 +14,26 @@ PPM_LIMIT: Final = 100_000.0
 def _warn(call: Call) -> None:
     bits = whole(call.arguments[0], 0, 0xFFFFFFFF)
     samples = whole(call.arguments[1], 1, 2**31) if len(call.arguments) > 1 else None
-    call.life.set_warnings(bits, samples)
+    call.life.sampler.set_warnings(bits, samples, call.life.now)
 
 
 def _stick(call: Call) -> None:
-    call.life.stick(True)
+    call.life.sampler.stick(call.life.now)
 
 
 def _unstick(call: Call) -> None:
-    call.life.stick(False)
+    call.life.sampler.unstick()
 
 
 def _channel(call: Call) -> tuple[str, Disturbances]:
     name = call.arguments[0].lower()
     if name not in CHANNELS:
         raise CommandError(f"no channel {name[:40]!r}: the channels are {', '.join(CHANNELS)}")
-    life = call.life
-    if life.exact:
+    sampler = call.life.sampler
+    if sampler.exact:
         raise CommandError("the signal `clock` is always exact: use another one")
-    life.disturbed()
-    return name, life.disturbances
+    sampler.disturbed()
+    return name, sampler.disturbances
 
 
 def _noise(call: Call) -> None:
@@ -58,7 +58,7 @@ def _thaw(call: Call) -> None:
 
 
 def _skip(call: Call) -> None:
-    call.life.set_skip(real(call.arguments[0], 0, MOST_SKIPPED))
+    call.life.sampler.set_skip(real(call.arguments[0], 0, MOST_SKIPPED), call.life.now)
 
 
 def _ppm(call: Call) -> None:
