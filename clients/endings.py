@@ -7,10 +7,14 @@ import os
 import sys
 
 
+def missing(name: object) -> str:
+    """That a package or program is not installed, and how to get it."""
+    return f"{name} is not installed: pip install 'bota-ethercat-bridge[tools]'"
+
+
 def not_installed(program: str, error: ImportError) -> int:
-    """Say what is missing and how to get it; returns the exit code."""
-    missing = f"{error.name} is not installed: pip install 'bota-ethercat-bridge[tools]'"
-    sys.stderr.write(f"{program}: {missing}\n")
+    """Say what is missing; returns the exit code."""
+    sys.stderr.write(f"{program}: {missing(error.name)}\n")
     return 1
 
 
