@@ -30,6 +30,7 @@ from clients.recording.file_format import (
 )
 from protocol.framing import DataMessage, JsonObject
 from protocol.text import visible
+from protocol.untrusted import rows
 
 __all__ = ["DamagedError", "Description", "Event", "NotARecordingError", "RecordedSensor", "Recording",
            "RecordingError", "Settings", "open_recording"]  # fmt: skip
@@ -200,8 +201,8 @@ class Recording:
             [*self.descriptions, *self.events], key=lambda note: note.stamp_ns
         )
         for note in notes:
-            rows = _rows(note.reply) if isinstance(note, Description) else [note.event]
-            for row in rows:
+            told = rows(note.reply.get("sensors")) if isinstance(note, Description) else [note.event]
+            for row in told:
                 place, values = row.get("sensor"), row.get("settings")
                 if not isinstance(place, int) or isinstance(place, bool) or not isinstance(values, dict):
                     continue
@@ -220,11 +221,6 @@ class Recording:
 def open_recording(path: Path) -> Recording:
     """Open the recording at `path`; RecordingError says in one sentence why it cannot be read."""
     return Recording(path)
-
-
-def _rows(description: JsonObject) -> list[JsonObject]:
-    rows = description.get("sensors")
-    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
 
 def _number(value: object) -> float:
