@@ -90,7 +90,7 @@ class Actions:
                 ErrorCode.BAD_REQUEST,
                 f"{request.action} works on framed connections only: a bare JSON connection carries no DATA",
             )
-        if action.controls and not self._hub.may_control(connection):
+        if action.controls and not self._hub.door.may_control(connection):
             kind = f"{connection.uid} {request.action}"
             log.warning("%s: %s denied", connection, request.action, extra={"kind": kind})
             raise RequestError(ErrorCode.DENIED, _denial(request.action, connection.uid))

@@ -1,4 +1,4 @@
-"""The TCP side: listens, accepts, serves the connections in the time between two exchanges.
+"""The TCP side: serves the connections in the time between two exchanges.
 
 It runs in the acquisition's own thread and only until the deadline it is given, so that no client can delay
 the bus.
@@ -14,22 +14,15 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from ethercat_server.connection import Connection, Limits, Unreadable
-from ethercat_server.listeners import listen
-from ethercat_server.socket_owner import open_diagnostics, peer_uid
+from ethercat_server.door import Door
 from protocol.control import ErrorCode, error_reply
 from protocol.errors import RequestError
 from protocol.framing import JsonObject
 
-MAX_CLIENTS: Final = 64
-RESERVED: Final = 16
-"""So many of them are for users who may control: strangers cannot take all."""
-MOST_OF_A_STRANGER: Final = 16
-"""So many one user who may not control can have."""
 _LAST_WORDS_S: Final = 1.0
 """How long a closing connection may take to accept its last reply."""
 
 _SWEEP_NS: Final = 50_000_000
-_ACCEPTS_AT_ONCE: Final = 2
 _LEAST_TURN_NS: Final = 200_000
 """So long a turn takes at least, even if the deadline has passed: nobody is shut out for ever."""
 _FORCE_EVERY_NS: Final = 20_000_000
@@ -50,7 +43,7 @@ class Hub:
         self._subscribers: list[Connection] = []
         self._closing_since: dict[int, float] = {}
         self._handler: Handler | None = None
-        self._listeners = listen(hosts, port)
+        self.door = Door(hosts, port)
         self._readers: list[int] = []
         self._readers_changed = True
         self._first = 0
@@ -59,9 +52,6 @@ class Hub:
         self._force_at_ns = 0
         self._hasty: list[Connection] = []
         """They have asked too much lately and wait for their turn."""
-        self._diagnostics = open_diagnostics()
-        self.control_uids: frozenset[int] = frozenset({0})
-        """Users who may change something."""
         self.limits = Limits()
         self._sweep_at_ns = 0
 
@@ -90,12 +80,6 @@ class Hub:
         if connection.unread:
             self._unread.append(connection)
         self._readers_changed = True
-
-    def may_control(self, connection: Connection) -> bool:
-        """Whether the user at the other end may change something. What is not known is refused."""
-        if connection.uid is None:
-            connection.uid = peer_uid(self._diagnostics, connection.sock)
-        return connection.uid in self.control_uids
 
     def subscriptions_changed(self) -> None:
         """A connection's subscription was made or ended."""
@@ -156,9 +140,7 @@ class Hub:
 
     def close(self) -> None:
         """Send what waits, for a bounded time, then close everything."""
-        for listener in self._listeners:
-            listener.close()
-        self._listeners = []
+        self.door.shut()
         self._readers_changed = True
         deadline = time.monotonic() + _LAST_WORDS_S
         for connection in self.connections.values():
@@ -170,36 +152,13 @@ class Hub:
         for connection in self.connections.values():
             connection.close()
         self.connections.clear()
-        self._diagnostics.close()
-
-    def _accept(self, fd: int) -> None:
-        listener = next((item for item in self._listeners if item.fileno() == fd), None)
-        if listener is None:
-            return
-        for _ in range(_ACCEPTS_AT_ONCE):
-            try:
-                sock, _ = listener.accept()
-            except OSError:
-                break
-            uid = peer_uid(self._diagnostics, sock)
-            connection = Connection(sock, uid)
-            if not self._has_room_for(uid):
-                log.warning("%s refused: there are %d clients already", connection, len(self.connections))
-                connection.close()
-                continue
-            self.connections[connection.fd] = connection
-        self._readers_changed = True
-
-    def _has_room_for(self, uid: int | None) -> bool:
-        if uid in self.control_uids:
-            return len(self.connections) < MAX_CLIENTS
-        of_this_user = sum(connection.uid == uid for connection in self.connections.values())
-        return of_this_user < MOST_OF_A_STRANGER and len(self.connections) < MAX_CLIENTS - RESERVED
+        self.door.close()
 
     def _read(self, fd: int) -> None:
         connection = self.connections.get(fd)
         if connection is None:
-            self._accept(fd)
+            self.connections |= {new.fd: new for new in self.door.accept(fd, self.connections.values())}
+            self._readers_changed = True
             return
         connection.receive()
         if connection.unread:
@@ -266,7 +225,7 @@ class Hub:
 
     def _update_readers(self) -> None:
         self._readers_changed = False
-        self._readers = [listener.fileno() for listener in self._listeners]
+        self._readers = self.door.fds()
         self._readers += [
             fd for fd, c in self.connections.items() if not (c.end_of_input or c.unread or c.busy or c.dead)
         ]

@@ -19,6 +19,7 @@ from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError
 from ethercat_server.sdo import Sdo, Steps
 from protocol.meaning import value_meaning
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue
+from protocol.text import visible
 
 _MODEL_NAME: Final = re.compile(r"BFT-[A-Z]{4}-ECAT-M8")
 _SETTLE_S: Final = 0.5
@@ -250,4 +251,4 @@ def _read_text(sdo: Sdo, address: tuple[int, int]) -> Steps[str]:
     data = yield from _read(sdo, address)
     # Up to the first NUL: strings come padded, and from the wire, so only what can be printed is kept.
     text = (data or b"").split(b"\0")[0].decode("ascii", errors="replace").strip()
-    return "".join(c if c.isprintable() else "?" for c in text)
+    return visible(text)

@@ -38,7 +38,7 @@ class Policy:
 
     def apply(self, hub: Hub) -> None:
         """Put it in force."""
-        hub.control_uids = self.control_uids
+        hub.door.control_uids = self.control_uids
         hub.limits = self.limits
 
 

@@ -6,6 +6,8 @@ import signal
 import sys
 from collections.abc import Sequence
 
+from clients.endings import not_installed
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Identify; returns the exit code."""
@@ -14,9 +16,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         from clients.identify.program import run  # noqa: PLC0415 - NumPy takes a while to load
     except ImportError as error:
-        missing = f"{error.name} is not installed: pip install 'bota-ethercat-bridge[tools]'"
-        print(f"ethercat-identify: {missing}", file=sys.stderr)
-        return 1
+        return not_installed("ethercat-identify", error)
     return run(argv)
 
 

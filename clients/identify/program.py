@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Sequence
 
@@ -14,6 +13,7 @@ from bridge.compensation.payload import Identified, identify
 from bridge.compensation.poses import MOST_POSES, Pose, pose_of
 from bridge.compensation.quantities import CompensationError
 from bridge.compensation.session import summary
+from clients.endings import hush
 from clients.identify.options import IdentifyOptions, parse_options
 from clients.identify.report import as_json, show_poses, show_result
 from clients.identify.stills import Still, Stills, find_stills
@@ -34,8 +34,7 @@ def run(argv: Sequence[str] | None = None) -> int:
         _say(str(error))
         return 1
     except BrokenPipeError:
-        # Whoever read has had enough; Python would complain once more when it flushes at the end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        hush()
         return 1
 
 

@@ -6,6 +6,8 @@ import signal
 import sys
 from collections.abc import Sequence
 
+from clients.endings import hush, not_installed
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the monitor; returns its exit code."""
@@ -13,7 +15,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # SIGTERM ends what prints lines as Ctrl-C does; the live view takes it over.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         from clients.monitor.options import parse  # noqa: PLC0415 - Ctrl-C is heard while this loads
-        from clients.monitor.program import hush, run  # noqa: PLC0415
+        from clients.monitor.program import run  # noqa: PLC0415
 
         options = parse(argv)
         try:
@@ -26,10 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 0
     except ImportError as error:
-        sys.stderr.write(
-            f"ethercat-monitor: {error.name} is not installed: pip install 'bota-ethercat-bridge[tools]'\n"
-        )
-        return 1
+        return not_installed("ethercat-monitor", error)
 
 
 if __name__ == "__main__":

@@ -17,10 +17,10 @@ from typing import Any, Final
 from clients.monitor.sensor_model import SensorModel, spread
 from clients.monitor.state import Client, Message, ServerState, State
 from clients.monitor.stream_meter import OLD
-from clients.monitor.untrusted import number, rows, text, whole
 from protocol.control import Event
 from protocol.framing import DataMessage, JsonObject
 from protocol.pdo import ImuUnits
+from protocol.untrusted import number, rows, text, whole
 
 _PLACE: Final = attrgetter("sensor")
 

@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from clients.address import DEFAULT_HOST, DEFAULT_PORT, Address
+from clients.address import Address
+from clients.arguments import add_address, add_imu_units, seconds
 from clients.version import VERSION
 from protocol.pdo import ImuUnits
 
@@ -30,17 +31,11 @@ def parse(argv: Sequence[str] | None) -> Options:
         description="Shows what ethercat-server streams, live in the terminal. Keys: ? lists them.",
         epilog="With --once: exit 0 if all is fine, 1 if there is no server or a sensor has an error.",
     )
-    parser.add_argument(
-        "address", nargs="?", type=_address, metavar="HOST:PORT", default=Address(DEFAULT_HOST, DEFAULT_PORT),
-        help=f"the server (default {DEFAULT_HOST}:{DEFAULT_PORT})",
-    )  # fmt: skip
+    add_address(parser)
     parser.add_argument("--once", action="store_true", help="print a table of one second and end")
     parser.add_argument("--json", action="store_true", help="print a JSON object a second; with --once, one")
-    parser.add_argument("--seconds", type=_positive, metavar="S", help="end by itself after S seconds")
-    parser.add_argument(
-        "--imu-units", choices=[unit.value for unit in ImuUnits], default=ImuUnits.G_DPS.value,
-        help="what the sensor sends acceleration and angular rate in (default g_dps)",
-    )  # fmt: skip
+    parser.add_argument("--seconds", type=seconds, metavar="S", help="end by itself after S seconds")
+    add_imu_units(parser)
     parser.add_argument("--ascii", action="store_true", help="use ASCII characters only")
     parser.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
     given = parser.parse_args(argv)
@@ -49,20 +44,3 @@ def parse(argv: Sequence[str] | None) -> Options:
     return Options(
         given.address, given.once, given.json, given.seconds, ImuUnits(given.imu_units), given.ascii
     )
-
-
-def _address(text: str) -> Address:
-    try:
-        return Address.parse(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < 1e9:
-        raise ValueError(text)
-    return value
-
-
-_positive.__name__ = "positive number"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import time
@@ -128,9 +127,3 @@ def _say(*lines: str, spelled: bool = False) -> None:
     text = "".join(f"{line}\n" for line in lines)
     sys.stdout.write(to_ascii(text) if spelled else text)
     sys.stdout.flush()
-
-
-def hush() -> None:
-    """Nobody reads our output any more: let nothing complain of it at the end."""
-    with contextlib.suppress(OSError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

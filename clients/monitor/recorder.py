@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO, Final
 
 from clients.address import Address
+from clients.endings import missing
 from protocol.text import printable
 
 PROGRAM: Final = "ethercat-record"
@@ -55,7 +56,7 @@ class Recorder:
         """Begin one; what to say of it, and whether it is bad news."""
         command = self._command or program()
         if command is None:
-            return f"{PROGRAM} is not installed: pip install 'bota-ethercat-bridge[tools]'", True
+            return missing(PROGRAM), True
         name = time.strftime("recording-%Y%m%d-%H%M%S.mcap")
         said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         try:

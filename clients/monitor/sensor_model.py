@@ -14,9 +14,9 @@ from typing import Any, Final
 
 from clients.monitor.state import AXES, SILENT_S, WRENCH_FIELDS, Alert, Clock, Range, SensorState, Spread
 from clients.monitor.stream_meter import StreamMeter
-from clients.monitor.untrusted import number, text, whole
 from protocol.framing import DataMessage, JsonObject
 from protocol.pdo import LAYOUTS, ImuUnits, SampleDecoder
+from protocol.untrusted import number, text, whole
 from protocol.warnings_register import WarningFlag, explain
 
 TRACE_STEP_S: Final = 0.25

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from clients.address import Address
-from clients.monitor.untrusted import number
 from protocol.client import Client
 from protocol.errors import NoReplyError, ProtocolError, RefusedError
+from protocol.untrusted import number
 
 _TIMEOUT_S: Final = 60.0
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from clients.address import Address
+from clients.arguments import add_address, add_imu_units, seconds
 from clients.recording.file_format import MAX_SENSOR
 from clients.version import VERSION
 from protocol.pdo import ImuUnits
@@ -47,20 +48,16 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     )
     add = parser.add_argument
     add("path", type=Path, metavar="OUT.mcap", help="file to make")
-    add(
-        "address", type=_address, nargs="?", default=Address("localhost", 12001), metavar="HOST:PORT",
-        help="the server (default localhost:12001)",
-    )  # fmt: skip
+    add_address(parser)
     add("--sensor", type=_place, action="append", dest="sensors", metavar="N",
         help="only the sensor at this place on the bus; may be given more than once")  # fmt: skip
-    add("--seconds", type=_seconds, metavar="S", help="end by itself after so long")
+    add("--seconds", type=seconds, metavar="S", help="end by itself after so long")
     add("--ros", action="store_true",
         help="also write what the ROS 2 node would publish: WrenchStamped, Imu, Temperature")  # fmt: skip
     add("--ros-namespace", type=_namespace, action="append", dest="namespaces", metavar="NAME",
         help="namespace of their topics, one for each sensor in turn (default none for one sensor, sensor_0, "
         "sensor_1, ... for several)")  # fmt: skip
-    add("--imu-units", choices=[units.value for units in ImuUnits], default=ImuUnits.G_DPS.value,
-        help="what the sensor sends acceleration and angular rate in, for --ros (default g_dps)")  # fmt: skip
+    add_imu_units(parser, "--ros")
     add("--rotate-size", type=_size, metavar="SIZE", help="begin a new file whenever one has this size")
     add("--rotate-seconds", type=_rotate_seconds, metavar="S", help="begin a new file every S seconds")
     add("--force", action="store_true", help="replace files that exist")
@@ -79,33 +76,16 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     )  # fmt: skip
 
 
-def _address(text: str) -> Address:
-    try:
-        return Address.parse(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
 def _place(text: str) -> int:
     if text.isascii() and text.isdecimal() and int(text) <= MAX_SENSOR:
         return int(text)
     raise argparse.ArgumentTypeError(f"{text!r}: it must be a place on the bus, from 0")
 
 
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = 0.0
-    if 0 < seconds <= 1e9:
-        return seconds
-    raise argparse.ArgumentTypeError(f"{text!r}: it must be seconds, such as 60")
-
-
 def _rotate_seconds(text: str) -> float:
-    seconds = _seconds(text)
-    if seconds >= _LEAST_SECONDS:
-        return seconds
+    value = seconds(text)
+    if value >= _LEAST_SECONDS:
+        return value
     raise argparse.ArgumentTypeError(f"{text!r}: it must be at least {_LEAST_SECONDS:g} s")
 
 

@@ -21,6 +21,7 @@ from clients.signals import Signals
 from clients.version import VERSION
 from protocol.errors import ConnectionFailedError, ProtocolError
 from protocol.text import printable
+from protocol.untrusted import rows
 
 _WAIT_S = 0.2
 
@@ -137,8 +138,7 @@ def _ros(options: RecordOptions, source: Source) -> dict[int, RosTopics]:
     if not options.ros:
         return {}
     assert source.description is not None
-    rows = source.description.get("sensors")
-    described = [row.get("sensor") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    described = [row.get("sensor") for row in rows(source.description.get("sensors"))]
     places = options.sensors or sorted({place for place in described if isinstance(place, int)})
     names = options.namespaces or ([""] if len(places) == 1 else [f"sensor_{place}" for place in places])
     if len(names) != len(places):

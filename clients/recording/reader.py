@@ -29,6 +29,8 @@ from clients.recording.file_format import (
     unpack_json,
 )
 from protocol.framing import DataMessage, JsonObject
+from protocol.text import visible
+from protocol.untrusted import rows
 
 __all__ = ["DamagedError", "Description", "Event", "NotARecordingError", "RecordedSensor", "Recording",
            "RecordingError", "Settings", "open_recording"]  # fmt: skip
@@ -199,8 +201,8 @@ class Recording:
             [*self.descriptions, *self.events], key=lambda note: note.stamp_ns
         )
         for note in notes:
-            rows = _rows(note.reply) if isinstance(note, Description) else [note.event]
-            for row in rows:
+            told = rows(note.reply.get("sensors")) if isinstance(note, Description) else [note.event]
+            for row in told:
                 place, values = row.get("sensor"), row.get("settings")
                 if not isinstance(place, int) or isinstance(place, bool) or not isinstance(values, dict):
                     continue
@@ -221,18 +223,13 @@ def open_recording(path: Path) -> Recording:
     return Recording(path)
 
 
-def _rows(description: JsonObject) -> list[JsonObject]:
-    rows = description.get("sensors")
-    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
-
-
 def _number(value: object) -> float:
     return float(value) if isinstance(value, int | float) and 0 < value < 2**32 else 0.0
 
 
 def _text(value: object) -> str:
     """Text from a file as it may appear in a line: no control characters, not endless."""
-    return "".join(c if c.isprintable() else "?" for c in str(value)[:80]) if value is not None else "?"
+    return visible(str(value)[:80]) if value is not None else "?"
 
 
 def _sensor(place: int, row: JsonObject, history: list[Settings], frames: int) -> RecordedSensor:

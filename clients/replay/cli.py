@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from clients.endings import not_installed
 from clients.signals import Signals
 
 
@@ -15,9 +16,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Takes a moment, in which Ctrl-C is to be heard already.
         from clients.replay.program import run  # noqa: PLC0415
     except ImportError as error:
-        missing = f"{error.name} is not installed: pip install 'bota-ethercat-bridge[tools]'"
-        print(f"ethercat-replay: {missing}", file=sys.stderr)
-        return 1
+        return not_installed("ethercat-replay", error)
     return run(argv, signals)
 
 

@@ -52,7 +52,7 @@ def _play(
         raise RecordingError(f"{recordings[0].path} has no frames and describes no sensor: nothing to play")
     hub = Hub(options.hosts, options.port)
     cleanup.callback(hub.close)
-    hub.control_uids = controlling_uids(options.control_users, options.control_groups)
+    hub.door.control_uids = controlling_uids(options.control_users, options.control_groups)
     timeline = Timeline(
         options.speed,
         original=options.original,

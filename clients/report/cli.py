@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 
+from clients.endings import hush, not_installed
 from clients.report.errors import ReportError
 from clients.report.options import parse_options
 
@@ -21,10 +22,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _fail("stopped: no report was written")
     except ImportError as error:
-        return _fail(f"{error.name} is not installed: pip install 'bota-ethercat-bridge[tools]'")
+        return not_installed("ethercat-report", error)
     except ReportError as error:
         return _fail(str(error))
-    print(outcome.words)
+    try:
+        print(outcome.words, flush=True)
+    except BrokenPipeError:
+        hush()  # the report is written all the same
     print(f"ethercat-report: the report is in {options.output}", file=sys.stderr)
     return outcome.exit_code
 

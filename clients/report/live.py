@@ -12,6 +12,7 @@ from clients.recording.columns import columns
 from clients.report.errors import ReportError
 from clients.report.recorded import event_remarks, no_sensor
 from clients.report.subject import Subject, subject
+from protocol import untrusted
 from protocol.client import Client, connect
 from protocol.errors import ConnectionFailedError
 from protocol.framing import DataMessage, JsonObject
@@ -61,11 +62,9 @@ def subjects(
 
 
 def _rows(description: JsonObject) -> dict[int, dict[str, Any]]:
-    sensors = description.get("sensors")
-    rows = [row for row in sensors if isinstance(row, dict)] if isinstance(sensors, list) else []
     return {
         row["sensor"]: row
-        for row in rows
+        for row in untrusted.rows(description.get("sensors"))
         if type(row.get("sensor")) is int and 0 <= row["sensor"] < MOST_PLACES
     }
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from clients.address import Address
+from clients.arguments import add_imu_units, address
 from clients.version import VERSION
 from protocol.pdo import ImuUnits
 from protocol.sensor_choice import MEANING, SensorChoice
@@ -47,13 +48,12 @@ def parse_options(argv: Sequence[str] | None) -> ReportOptions:
     )
     add = parser.add_argument
     add("recording", type=Path, nargs="?", metavar="FILE.mcap", help="what ethercat-record wrote")
-    add("--server", type=_address, metavar="HOST:PORT", help="instead of a recording: listen to this server")
+    add("--server", type=address, metavar="HOST:PORT", help="instead of a recording: listen to this server")
     add("--seconds", type=_seconds, metavar="S", help="how long to listen (default 10)")
     add("-o", "--output", type=Path, metavar="REPORT.html",
         help="where to write the page (default: beside the recording, or report.html)")  # fmt: skip
     add("--sensor", type=_choice, metavar="S", help=f"only this sensor: {MEANING}")
-    add("--imu-units", choices=[units.value for units in ImuUnits], default=ImuUnits.G_DPS.value,
-        help="what the sensor sends acceleration and angular rate in (default g_dps)")  # fmt: skip
+    add_imu_units(parser)
     add("--note", default="", metavar="TEXT", help="a remark of yours for the head of the page")
     add("--json", action="store_true", help="print the checks as JSON too")
     add("--version", action="version", version=f"%(prog)s {VERSION}")
@@ -71,13 +71,6 @@ def parse_options(argv: Sequence[str] | None) -> ReportOptions:
         given.recording, given.server or Address.parse(""), given.seconds or 10.0, output, given.sensor,
         ImuUnits(given.imu_units), given.note, given.json,
     )  # fmt: skip
-
-
-def _address(text: str) -> Address:
-    try:
-        return Address.parse(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _choice(text: str) -> SensorChoice:

@@ -6,6 +6,8 @@ import html
 from collections.abc import Iterable
 from typing import SupportsIndex
 
+from protocol.text import visible
+
 
 class Markup(str):
     """HTML that is ours or has been escaped."""
@@ -30,7 +32,7 @@ class Markup(str):
 
 def text(words: str) -> Markup:
     """Plain text, escaped; what a terminal or a bidirectional override could play with is shown as `?`."""
-    return Markup(html.escape("".join(c if c.isprintable() else "?" for c in words)))
+    return Markup(html.escape(visible(words)))
 
 
 def element(name: str, inside: Markup, *, cls: str = "", id: str = "", aria_label: str = "") -> Markup:  # noqa: A002

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import logging
 import os
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from types import FrameType
 from typing import TYPE_CHECKING, Final
 
-from ethercat_server import __version__
+from ethercat_server import __version__, command_line
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.interface import MAX_NAME_LENGTH
-from ethercat_server.logs import PlainFormatter
 from ethercat_server.options import VIRTUAL_INTERFACE
 from ethercat_server.server_settings import SERVER_SETTINGS
 
@@ -25,7 +21,7 @@ if TYPE_CHECKING:
     from ethercat_server.doctor.finding import Finding
     from ethercat_server.doctor.machine import Machine
 
-_FAILED: Final = 1
+_PROGRAM: Final = "ethercat-doctor"
 _EXIT_CODES: Final = (
     "exit codes: 0 nothing worse than a note, 1 the doctor itself failed or was stopped, 2 wrong arguments, "
     "3 the worst is a warning, 4 something is bad"
@@ -33,14 +29,10 @@ _EXIT_CODES: Final = (
 _LONGEST_S: Final = 3600.0
 
 
-class _Formatter(PlainFormatter):
-    prefix = "ethercat-doctor: "
-
-
 def build_parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(
-        prog="ethercat-doctor",
+        prog=_PROGRAM,
         description="Looks for what keeps the samples of sensors from being fresh: kernel, "
         "processors, network card, who else is there, the bus; then measures. Changes nothing. As "
         "root it sees all.",
@@ -87,26 +79,11 @@ def _whole(text: str) -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Examine; returns the exit code. argparse exits with 2 for what it finds."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, _interrupt)
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_Formatter())
-    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    command_line.begin(_PROGRAM)
     # What was not granted is a finding.
     logging.getLogger("ethercat_server.realtime").setLevel(logging.ERROR)
-    try:
-        args = build_parser().parse_args(argv)
-        return _run(args)
-    except ServerError as error:
-        return _fail(args, str(error), error.exit_code)
-    except BrokenPipeError:
-        # Whoever read the output has enough; Python would complain again when it closes it.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _FAILED
-    except OSError as error:
-        return _fail(args, f"{error.filename or 'the operating system'}: {error.strerror or error}", _FAILED)
-    except KeyboardInterrupt:
-        return _fail(args, "stopped", _FAILED)
+    args = build_parser().parse_args(argv)
+    return command_line.run(_PROGRAM, lambda: _run(args), as_json=args.json)
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -120,7 +97,7 @@ def _run(args: argparse.Namespace) -> int:
     header |= {"kernel": os.uname().release, "root": os.geteuid() == 0, "seconds": args.seconds}
     if report is not None:
         who = "as root" if header["root"] else "not as root"
-        report.heading(f"ethercat-doctor {__version__} on {args.iface}: Linux {header['kernel']}, {who}")
+        report.heading(f"{_PROGRAM} {__version__} on {args.iface}: Linux {header['kernel']}, {who}")
     for finding in _examined(args, report.wait if report is not None else lambda _: None):
         findings.append(finding)
         if report is not None:
@@ -183,17 +160,6 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(
             f"--cpu {args.cpu}: this machine has the processors 0 to {(os.cpu_count() or 1) - 1}"
         )
-
-
-def _fail(args: argparse.Namespace, text: str, exit_code: int) -> int:
-    if args.json:
-        print(json.dumps({"error": text}))
-    print(f"ethercat-doctor: {text}", file=sys.stderr)
-    return exit_code
-
-
-def _interrupt(_number: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, TextIO
 
 from ethercat_server.doctor.finding import Finding, Level
+from protocol.text import visible
 
 _COLOURS: Final = {
     Level.OK: "\x1b[32m", Level.SKIPPED: "\x1b[2m", Level.NOTE: "\x1b[36m", Level.WARNING: "\x1b[33m",
@@ -104,12 +105,16 @@ def printable(text: str) -> str:
     """Without what a device or a file could do to the terminal; our own colours stay."""
     own = {*_COLOURS.values(), _END, _BOLD}
     parts = text.split("\x1b")
-    found = "".join(c if c.isprintable() or c == "\n" else "?" for c in parts[0])
+    found = _lines(parts[0])
     for part in parts[1:]:
         colour = next((c for c in own if ("\x1b" + part).startswith(c)), None)
         kept = part[len(colour) - 1 :] if colour else "?" + part
-        found += (colour or "") + "".join(c if c.isprintable() or c == "\n" else "?" for c in kept)
+        found += (colour or "") + _lines(kept)
     return found
+
+
+def _lines(text: str) -> str:
+    return "\n".join(map(visible, text.split("\n")))
 
 
 def as_json(header: Mapping[str, Any], findings: Sequence[Finding]) -> str:

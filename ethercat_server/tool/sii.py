@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from ethercat_server.virtual_sensor.sii import checksum
 from protocol.control import MAX_SII_WORDS
+from protocol.text import visible
 
 _HEADER_WORDS: Final = 0x40
 """The categories begin here."""
@@ -105,7 +106,7 @@ def _strings(body: bytes) -> list[str]:
     at = 1
     while at < len(body) and len(found) < body[0]:
         text = body[at + 1 : at + 1 + body[at]].decode("ascii", errors="replace")
-        found.append("".join(c if c.isprintable() else "?" for c in text))
+        found.append(visible(text))
         at += 1 + body[at]
     return found
 

@@ -159,7 +159,7 @@ class Bus:
         self._last_frame = self.now
         for life in self._alive:
             life.check_watchdog(self.now)
-            life.prepare(expected)
+            life.sampler.prepare(expected)
 
     def idle(self, now: int) -> None:
         """No frame is waiting: let time pass for watchdogs and power."""

@@ -12,7 +12,9 @@ from ethercat_server import __version__
 from ethercat_server.objects import MODELS
 from ethercat_server.virtual_sensor import link
 from ethercat_server.virtual_sensor.control import ControlError
-from ethercat_server.virtual_sensor.faults import COMMANDS, PPM_LIMIT, CommandError, real, whole
+from ethercat_server.virtual_sensor.fault_command import CommandError, real, whole
+from ethercat_server.virtual_sensor.faults import COMMANDS
+from ethercat_server.virtual_sensor.measurement_faults import PPM_LIMIT
 from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
 from ethercat_server.virtual_sensor.signals import SIGNALS
 from protocol.pdo import LAYOUTS

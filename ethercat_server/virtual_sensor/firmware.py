@@ -1,6 +1,6 @@
 """The firmware of one sensor: one life of it, from power-on to power-off.
 
-It sits behind the EtherCAT controller and ties together AL states, mailbox, objects, clock and measurement.
+It sits behind the EtherCAT controller and ties together AL states, mailbox, objects and what is measured.
 """
 
 from __future__ import annotations
@@ -12,34 +12,20 @@ from typing import Final
 from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor.abort_faults import AbortFaults
 from ethercat_server.virtual_sensor.al import AlCode, AlState, AlStateMachine
-from ethercat_server.virtual_sensor.clock import SampleClock
 from ethercat_server.virtual_sensor.coe import CoeServer
 from ethercat_server.virtual_sensor.dictionary import Dictionary
-from ethercat_server.virtual_sensor.disturbance import NO_SATURATION, Disturbances
 from ethercat_server.virtual_sensor.esc import Esc
 from ethercat_server.virtual_sensor.flash import Flash
 from ethercat_server.virtual_sensor.layout import SYNC_MANAGERS, sync_manager_lengths
 from ethercat_server.virtual_sensor.mailbox import Mailbox
-from ethercat_server.virtual_sensor.measurement import Measurement
-from ethercat_server.virtual_sensor.motion import MOTIONS
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.scene import Scene
+from ethercat_server.virtual_sensor.sampler import Sampler
 from ethercat_server.virtual_sensor.sdo_abort import SdoAbortError
 from ethercat_server.virtual_sensor.sdo_information import SdoInformation
-from ethercat_server.virtual_sensor.signals import FORMULAS, Signal
 from ethercat_server.virtual_sensor.sii import build_image
-from protocol.pdo import layout_for
 
 _SM_CONTROL_MASK: Final = 0x0F  # operation mode and direction
 _WATCHDOG_UNIT_NS: Final = 40
-
-
-def make_signal(options: SensorOptions) -> Signal:
-    """The signal that `options` name."""
-    if options.signal in MOTIONS:
-        return Scene(options.seed, options.noise, MOTIONS[options.signal]())
-    return FORMULAS[options.signal]()
-
 
 OnWrite = Callable[[int, int, bytes, AlState, int], None]
 
@@ -51,87 +37,35 @@ class Firmware:
 
     Attributes:
         now: CLOCK_MONOTONIC in ns; whoever hands over a frame sets it first.
-        disturbances: what is wrong with its channels; call `disturbed` after changing them.
+        sampler: what it measures.
     """
 
     def __init__(self, options: SensorOptions, flash: Flash, now: int, on_write: OnWrite) -> None:
         self.now = now
         self._on_write = on_write
         self._options = options
-        self._layout = layout_for(options.pdo_size)
-        self._signal = make_signal(options)
         self.dictionary = Dictionary(
             options.model, options.serial, options.pdo_size,
             flash, self.inputs, self._settings_changed, lambda: self.now,
         )  # fmt: skip
-        sinc_length = int(self.dictionary.settings()["sinc_length"])
-        self._signal_start = self.now
-        self.clock = SampleClock(self.now, sinc_length, options.ppm)
+        self.sampler = Sampler(options, self.dictionary, now)
         self.esc = Esc(self, build_image(options.model, options.serial, options.pdo_size))
         self.al = AlStateMachine(self._mailbox_fault, self._process_data_fault)
         self._coe = CoeServer(self, SdoInformation(self.dictionary))
         managers = self.esc.sync_managers
         self.mailbox = Mailbox(managers[0], managers[1], self._coe.answer)
-        self.made = 0
-        self._warnings, self._warnings_until = 0, -1
-        self._stuck = b""
-        self.disturbances = Disturbances(options.seed)
         self.aborts = AbortFaults()
         self._fed = 0  # when the process data watchdog was last triggered; 0 = not running
-        self._number, self._data = -1, b""
-        self._prepared_number, self._prepared = -1, b""
-        self._settings_changed()
         self._show_state()
 
     # Process data.
 
     def inputs(self) -> bytes:
         """The newest process data at `now`."""
-        if self._stuck:
-            return self._stuck
-        number = self.disturbances.newest_given(self.clock.number_at(self.now))
-        if number != self._number:
-            if number == self._prepared_number:
-                self._data = self._prepared
-            else:
-                self._data = self._make(number)
-            self._number = number
-        return self._data
-
-    def prepare(self, expected: int) -> None:
-        """Make the sample that a frame at the time `expected` will ask for, while there is time."""
-        number = self.disturbances.newest_given(self.clock.number_at(expected))
-        if number not in (self._number, self._prepared_number) and not self._stuck:
-            self._prepared = self._make(number)
-            self._prepared_number = number
-
-    def _make(self, number: int) -> bytes:
-        self.made += 1
-        instant = self.clock.instant(number)
-        reading = self._signal.reading(number, instant, (instant - self._signal_start) * 1e-9)
-        saturated = NO_SATURATION
-        if not self._signal.exact:
-            reading, saturated = self.disturbances.apply(reading)
-        warnings = self._warnings if number < self._warnings_until else 0
-        return self._measurement.pack(reading, warnings, saturated)
+        return self.sampler.newest(self.now)
 
     def _settings_changed(self) -> None:
-        settings = self.dictionary.settings()
-        sinc_length = int(settings["sinc_length"])
-        if sinc_length != self.clock.sinc_length:
-            self.clock.change(self.now, sinc_length=sinc_length)
-        if isinstance(self._signal, Scene):
-            self._signal.set_sinc_length(sinc_length)
-        self._measurement = Measurement(
-            self._layout,
-            settings,
-            self.dictionary.offsets(0x8000),
-            self.dictionary.offsets(0x8001)[:3],
-            self.dictionary.offsets(0x8002)[:3],
-            self._signal.exact,
-        )
-        # The newest sample stays what it is: the change shows from the next one on.
-        self._prepared_number = -1
+        self.sampler.settings_changed(self.now)
 
     def outputs(self, data: bytes) -> None:
         """The master wrote the outputs; they count in OP only."""
@@ -247,42 +181,3 @@ class Firmware:
             raise
         finally:
             self._on_write(index, subindex, data, self.al.state, abort)
-
-    # Faults.
-
-    def set_warnings(self, bits: int, samples: int | None) -> None:
-        """OR `bits` into the warnings of the next `samples` samples, or of all."""
-        newest = self.clock.number_at(self.now)
-        self._warnings = bits
-        # The newest sample stays as it is: it may have been given away already.
-        self._warnings_until = 2**63 if samples is None else newest + 1 + samples
-        self._prepared_number = -1
-
-    def stick(self, on: bool) -> None:
-        """Give the same process data for ever, or stop doing so."""
-        self._stuck = self.inputs() if on else b""
-
-    def set_signal(self, options: SensorOptions) -> None:
-        """Measure the signal that `options` name, which begins with the next sample."""
-        self._signal = make_signal(options)
-        self._signal_start = self.clock.instant(self.clock.number_at(self.now) + 1)
-        self._settings_changed()
-
-    @property
-    def exact(self) -> bool:
-        """Whether it measures a signal that nothing may change."""
-        return self._signal.exact
-
-    def disturbed(self) -> None:
-        """The disturbances were changed: they show from the next sample on."""
-        self._prepared_number = -1
-
-    def set_skip(self, percent: float) -> None:
-        """Withhold this share of the samples after the newest one."""
-        self.disturbances.set_skip(percent, self.clock.number_at(self.now))
-        self.disturbed()
-
-    def set_ppm(self, ppm: float) -> None:
-        """Another error of the clock, from the newest sample on."""
-        self.clock.change(self.now, ppm=ppm)
-        self._prepared_number = -1

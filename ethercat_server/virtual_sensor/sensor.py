@@ -99,13 +99,13 @@ class VirtualSensor:
         """Another error of its clock, now and after a power cycle."""
         self._options = replace(self._options, ppm=ppm)
         if self.life is not None:
-            self.life.set_ppm(ppm)
+            self.life.sampler.set_ppm(ppm, self.now)
 
     def set_signal(self, signal: str) -> None:
         """Measure something else, now and after a power cycle."""
         self._options = replace(self._options, signal=signal)
         if self.life is not None:
-            self.life.set_signal(self._options)
+            self.life.sampler.set_signal(self._options, self.now)
 
     def statistics(self) -> dict[str, Any]:
         """What `stats` says of it."""
@@ -117,9 +117,9 @@ class VirtualSensor:
             "al_state": life.al.state.name if life else None,
             "al_error": life is not None and life.al.error,
             "al_status_code": life.al.code if life else 0,
-            "sample": life.clock.number_at(self.now) if life else None,
-            "samples_made": life.made if life else 0,
-            "sinc_length": life.clock.sinc_length if life else None,
+            "sample": life.sampler.clock.number_at(self.now) if life else None,
+            "samples_made": life.sampler.made if life else 0,
+            "sinc_length": life.sampler.clock.sinc_length if life else None,
             "ppm": self._options.ppm,
             "calibration_writes": self.calibration_writes,
             "sdo_write_count": self.sdo_write_count,

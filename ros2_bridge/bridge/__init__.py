@@ -7,6 +7,6 @@ that does it all, `messages` the ROS messages. How things are: `link` and `watch
 that publishes it. From ROS to the sensor: `requests`, `services` (`triggers`), `settings_parameters`.
 Compensation: `compensation` the mathematics, `compensated_output` what is done with a sample by
 `gravity_sources` (`orientation_listener`, `orientation_messages`); `compensation_control` what to do, from
-`compensation_parameters` (`live_parameters`) and `kept_bias`; `bias_services`, `identify_services`, `rest`;
-`compensation_state` how it is.
+`compensation_parameters` (`live_parameters`) and `bias_keeper` (`kept_bias`); `bias_services`,
+`identify_services`, `rest`; `compensation_state` how it is.
 """

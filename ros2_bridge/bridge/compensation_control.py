@@ -12,24 +12,20 @@ from typing import Final
 
 from rclpy.node import Node
 
-from bridge import kept_bias
+from bridge.bias_keeper import FROM_PARAMETER, BiasKeeper
 from bridge.compensated_output import CompensatedOutput, Plan
 from bridge.compensation.bias import BiasHistory
 from bridge.compensation.compensator import Compensator
 from bridge.compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
-from bridge.compensation.store import Stored, StoreError
-from bridge.compensation_parameters import TOPIC_SOURCES, CompensationParameters
-from bridge.compensation_state import CompensationState
+from bridge.compensation_parameters import CompensationParameters
+from bridge.compensation_state import CompensationState, conflict
 from bridge.gravity_sources import AccelerometerSource, ListenerSource, NoSource, SensorSource, Source
 from bridge.link import Link
 from bridge.live_parameters import LiveParameters
-from bridge.orientation_listener import OrientationListener
-from bridge.orientation_messages import check_tf
-from bridge.parameter_row import ParameterError
+from bridge.orientation_listener import OrientationListener, check_can_listen
 from bridge.parameters import Parameters
 from protocol.pdo import Vector3
 
-FROM_PARAMETER: Final = "parameter"
 _LOOKING_UP: Final = "the bias of this sensor is being looked up"
 
 
@@ -49,17 +45,12 @@ class CompensationControl:
         self.output, self.link = output, link
         self.origin = FROM_PARAMETER
         """Where the bias in force comes from."""
-        self.keeping = ""
-        """Why the bias could not be kept or read, a sentence; empty if it could, or was not to be."""
         self.ending = False
         self._node, self._log = node, node.get_logger()
         self._frame, self._on_failure = parameters.frame_id, on_failure
         self._listener: OrientationListener | None = None
         self._angular_rate_offset = ZERO
-        self._serial: str | None = None
-        """Of the sensor that the bias is for; None until there was one."""
-        self._kept: Wrench | None = None
-        """What the file has."""
+        self._keeper = BiasKeeper(self._log)
         self._next_origin = FROM_PARAMETER
         self._check(self.parameters)
         self._history = BiasHistory(self.parameters.bias, self.parameters.bias_ramp_time)
@@ -88,6 +79,11 @@ class CompensationControl:
             self._guard.trigger()
 
     @property
+    def keeping(self) -> str:
+        """Why the bias could not be kept or read, a sentence; empty if it could, or was not to be."""
+        return self._keeper.problem
+
+    @property
     def bias(self) -> Wrench:
         """The one in force, or being ramped in."""
         return self._history.bias
@@ -100,18 +96,7 @@ class CompensationControl:
 
     def conflict(self) -> str | None:
         """What the sensor is set to that does not go with compensation, a sentence."""
-        settings = self.link.settings
-        if settings.get("calibration_matrix") is False:
-            return (
-                "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
-                "switch it on"
-            )
-        if settings.get("inertia_compensation") is True and self.parameters.payload.mass:
-            return (
-                "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
-                "or set tool_mass to 0"
-            )
-        return None
+        return conflict(self.link.settings, self.parameters.payload)
 
     def state(self) -> CompensationState:
         """How things are, for the diagnostics' thread."""
@@ -176,15 +161,7 @@ class CompensationControl:
 
     def _check(self, wanted: CompensationParameters) -> None:
         """ParameterError if that cannot be had on this machine."""
-        if wanted.orientation.source == "tf":
-            check_tf()
-        if wanted.orientation.source in TOPIC_SOURCES:
-            topic = wanted.orientation.topic
-            try:
-                self._node.resolve_topic_name(topic)
-            except RuntimeError as error:  # rclpy has no public name for it
-                reason = str(error).removeprefix("failed to resolve name: ").partition(", at /")[0]
-                raise ParameterError(f"parameter orientation.topic is {topic!r}: {reason}") from None
+        check_can_listen(self._node, wanted.orientation)
 
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted
@@ -196,8 +173,8 @@ class CompensationControl:
             self.origin = self._next_origin
         self._make_plan()
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
-            self._kept = None
-        self._keep()
+            self._keeper.forget()
+        self._keeper.keep(self.bias, wanted)
 
     def _make_plan(self) -> None:
         wanted = self.parameters
@@ -220,29 +197,9 @@ class CompensationControl:
         self._listener = OrientationListener(self._node, wanted.orientation, self._frame, self._on_failure)
         return ListenerSource(wanted, self._listener)
 
-    def _keep(self) -> None:
-        if not self.parameters.bias_keep:
-            self.keeping = ""
-            return
-        if self._serial is None or self.bias == self._kept:
-            return
-        try:
-            path = kept_bias.save(
-                self.parameters.bias_directory, self._serial, self.bias, self.parameters.payload
-            )
-        except StoreError as error:
-            self._say_not_kept(str(error))
-            return
-        self._kept, self.keeping = self.bias, ""
-        self._log.info(f"the bias is kept in {path}")
-
-    def _say_not_kept(self, problem: str) -> None:
-        self.keeping = problem
-        self._log.warning(problem)
-
     def _is_same_sensor(self) -> bool:
         info = self.link.info
-        return self.link.connection is None or info is None or info.serial == self._serial
+        return self.link.connection is None or info is None or info.serial == self._keeper.serial
 
     def _follow_sensor(self) -> None:
         """Find the bias of the sensor that is there now."""
@@ -250,61 +207,24 @@ class CompensationControl:
             info = self.link.info
             if info is None:
                 break
-            is_first, self._serial = self._serial is None, info.serial
-            self._take_sensor(info.serial, is_first=is_first)
+            begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters)
+            if begin is not None:
+                self._begin_with(*begin)
+            if not self.keeping and self.bias != NO_WRENCH:
+                self._keeper.keep(self.bias, self.parameters)
         self.output.hold = None
         if not self._is_same_sensor():
             self.link_changed()
 
-    def _take_sensor(self, serial: str, *, is_first: bool) -> None:
-        self._kept = None
-        stored = self._look_up(serial)
-        if stored is not None and is_first and self.bias not in (NO_WRENCH, stored.bias):
-            self._log.warning(
-                f"the bias kept of sensor {serial} is not used, because the parameter bias is given; "
-                "it is replaced by it"
-            )
-        elif stored is not None:
-            self._kept = stored.bias
-            self._begin_with(stored.bias, f"kept since {stored.saved}")
-            self._log.info(f"sensor {serial} has the bias that was kept at {stored.saved}")
-            if stored.payload is not None and stored.payload != self.parameters.payload:
-                self._log.warning(
-                    f"the kept bias was taken with {_payload_text(stored.payload)}, and now there is "
-                    f"{_payload_text(self.parameters.payload)}: tare again"
-                )
-        elif not is_first and self.origin != FROM_PARAMETER:
-            self._begin_with(NO_WRENCH, FROM_PARAMETER)
-            self._log.warning(
-                f"another sensor is there now, serial number {serial}: the bias was the other's and is "
-                "zero now; tare"
-            )
-        if not self.keeping and (stored is not None or self.bias != NO_WRENCH):
-            self._keep()
-
-    def _look_up(self, serial: str) -> Stored | None:
-        self.keeping = ""
-        if not self.parameters.bias_keep:
-            return None
-        try:
-            return kept_bias.load(self.parameters.bias_directory, serial)
-        except StoreError as error:
-            self._say_not_kept(str(error))
-            return None
-
     def _begin_with(self, bias: Wrench, origin: str) -> None:
         """Put a bias in force at once, with nothing before it."""
-        keeping = self.keeping
+        problem = self.keeping
         with self._origin(origin):
             self._history = BiasHistory(bias, self.parameters.bias_ramp_time)
             self._live.put(bias=[*bias.values])
-        self.origin, self.keeping = origin, keeping
+        self.origin, self._keeper.problem = origin, problem
         self._make_plan()
 
 
 def _source_part(parameters: CompensationParameters) -> tuple[object, ...]:
     return parameters.orientation, parameters.accelerometer, parameters.gravity
-
-
-def _payload_text(payload: Payload) -> str:
-    return f"a tool of {payload.mass:.3g} kg" if payload.mass else "no tool_mass"

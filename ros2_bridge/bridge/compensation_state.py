@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from bridge.compensation.quantities import NO_WRENCH, Payload, Wrench
@@ -63,6 +64,21 @@ class CompensationState(NamedTuple):
             "compensated": self.published,
             "withheld": self.withheld,
         }
+
+
+def conflict(settings: Mapping[str, object], payload: Payload) -> str | None:
+    """What the sensor is set to that does not go with compensation, a sentence."""
+    if settings.get("calibration_matrix") is False:
+        return (
+            "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
+            "switch it on"
+        )
+    if settings.get("inertia_compensation") is True and payload.mass:
+        return (
+            "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
+            "or set tool_mass to 0"
+        )
+    return None
 
 
 def _numbers(values: tuple[float, ...]) -> str:

@@ -19,6 +19,7 @@ from protocol.errors import ConnectionFailedError, SettingError
 from protocol.framing import DataMessage, JsonObject
 from protocol.settings import SETTINGS, SettingValue
 from protocol.text import printable
+from protocol.untrusted import rows
 
 _REPLY_TIMEOUT_S: Final = 3.0
 _MOST_HZ: Final = 1e6
@@ -141,8 +142,7 @@ def known_settings(settings: object) -> dict[str, SettingValue]:
 
 def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
     """The row of `sensor` in a `describe` reply; ConnectionFailedError if there is none."""
-    rows = description.get("sensors")
-    found = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    found = rows(description.get("sensors"))
     for row in found:
         if row.get("sensor") == sensor and not isinstance(row.get("sensor"), bool):
             name, serial, rate, state, hardware, firmware = (

@@ -15,21 +15,35 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from bridge.compensation_parameters import OrientationParameters
+from bridge.compensation_parameters import TOPIC_SOURCES, OrientationParameters
 from bridge.orientation_messages import (
     TOPIC_KINDS,
     Oriented,
     Tf,
     UnusableError,
+    check_tf,
     look_up,
     multiply,
     open_tf,
     read_message,
 )
+from bridge.parameter_row import ParameterError
 
 TF_PERIOD_S: Final = 0.005
 """How often TF is asked."""
 TF_TOPICS: Final = ("/tf", "/tf_static")
+
+
+def check_can_listen(node: Node, chosen: OrientationParameters) -> None:
+    """ParameterError if that source cannot be had on this machine, or its topic has no possible name."""
+    if chosen.source == "tf":
+        check_tf()
+    if chosen.source in TOPIC_SOURCES:
+        try:
+            node.resolve_topic_name(chosen.topic)
+        except RuntimeError as error:  # rclpy has no public name for it
+            reason = str(error).removeprefix("failed to resolve name: ").partition(", at /")[0]
+            raise ParameterError(f"parameter orientation.topic is {chosen.topic!r}: {reason}") from None
 
 
 class OrientationListener:

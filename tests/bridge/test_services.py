@@ -49,9 +49,8 @@ def test_settings_given_at_start_are_not_taken_in_silence(node: NodeProcess, ser
     assert not [r for r in server.requests if r["action"] == "configure"]
 
 
-def test_settings_given_at_start_or_set_since_are_applied_together(
-    node: NodeProcess, server: ScriptedServer, listener: Listener
-) -> None:
+def configures(server: ScriptedServer) -> list[Any]:
+    """From now on every setting is taken and told; what is asked for comes into the list."""
     held = dict(SETTINGS)
     asked: list[Any] = []
 
@@ -62,6 +61,13 @@ def test_settings_given_at_start_or_set_since_are_applied_together(
         return {"ok": True, "settings": held}
 
     server.answers["configure"] = answer
+    return asked
+
+
+def test_settings_given_at_start_or_set_since_are_applied_together(
+    node: NodeProcess, server: ScriptedServer, listener: Listener
+) -> None:
+    asked = configures(server)
     done, text = listener.trigger("apply_settings")
     assert done, text
     assert '"sinc_length": 64' in text
@@ -116,16 +122,7 @@ def test_settings_are_shown_and_saved(server: ScriptedServer, listener: Listener
 
 
 def test_a_setting_is_set(server: ScriptedServer, listener: Listener) -> None:
-    held = dict(SETTINGS)
-    asked: list[Any] = []
-
-    def answer(message: JsonObject) -> JsonObject:
-        asked.append(message["settings"])
-        held.update(message["settings"])
-        server.send_json(event(Event.RECONFIGURED, sensor=0, settings=held))
-        return {"ok": True, "settings": held}
-
-    server.answers["configure"] = answer
+    asked = configures(server)
     for value in (64, SETTINGS["sinc_length"]):
         assert listener.set_parameter("settings.sinc_length", value) == (True, "")
         assert listener.parameters("settings.sinc_length") == [value]

@@ -56,7 +56,7 @@ def simulate(
     decoder = FrameDecoder()
     end = START_NS + round(seconds * 1e9)
     with mock.patch("ethercat_server.stream.time", clock):
-        stream = SensorStream(0, life.clock.sinc_length * 1e9 / 51200)
+        stream = SensorStream(0, life.sampler.clock.sinc_length * 1e9 / 51200)
         while now < end:
             while todo and now >= START_NS + todo[0][0] * 1e9:
                 answer = obey(bus, todo.pop(0)[1])

@@ -12,9 +12,9 @@ import pytest
 from protocol.framing import DataFlag
 from protocol.pdo import SampleDecoder
 from tests.clients.cpp_programs import COUNTING, Driver, Reading, driver, needs_gxx, patient
+from tests.server.commands import command
 from tests.server.running import (
     Client,
-    Program,
     Server,
     Veth,
     free_port,
@@ -196,12 +196,6 @@ def count(reading: Reading, total: dict[str, int | bool]) -> None:
     total["passed_over"] += reading["passed_over"]
     total["new"] += reading["is_new"]
     total["gap"] = total["gap"] or reading["gap"]
-
-
-def command(sensor: Program, text: str) -> None:
-    assert sensor.process.stdin is not None
-    sensor.process.stdin.write(text + "\n")
-    sensor.process.stdin.flush()
 
 
 def test_a_stuck_sensor_and_a_cut_cable() -> None:

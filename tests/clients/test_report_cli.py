@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from clients.report.live import Received
 from protocol.framing import DataMessage
 from tests.clients.recordings import writer
 from tests.clients.simulated import STARTED_AT_NS, described, simulate
-from tests.server.running import free_port, needs_bus, server
+from tests.server.running import PATIENCE_S, free_port, needs_bus, server
 
 
 def record(path: Path, frames: list[DataMessage], *rows: object, end: bool = True) -> Path:
@@ -62,6 +63,19 @@ def test_a_recording_becomes_a_page_beside_it(recording: Path, capsys: pytest.Ca
     for words in ("cell.mcap", "4711", "1.3.8", "2026-01-01 00:00:00 UTC", "cell 3 &lt;b&gt;", "✓ Healthy"):
         assert words in page
     assert not list(recording.parent.glob(".*")), "nothing is left behind"
+
+
+def test_a_reader_that_has_enough_gets_its_page(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "r.html"
+    reads, writes = os.pipe()
+    os.close(reads)
+    done = subprocess.run(
+        [sys.executable, "-m", "clients.report.cli", recording, "-o", out],
+        stdout=writes, stderr=subprocess.PIPE, text=True, check=False, timeout=PATIENCE_S,
+    )  # fmt: skip
+    os.close(writes)
+    assert (done.returncode, done.stderr) == (0, f"ethercat-report: the report is in {out}\n")
+    assert out.exists()
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ def process_data(
     for number, offset in enumerate(OFFSET, 1):
         firmware.write(0x8000, number, struct.pack("<f", offset))
     for number in range(int(seconds * 51200 / sinc)):
-        firmware.now = firmware.clock.instant(number)
+        firmware.now = firmware.sampler.clock.instant(number)
         yield firmware.now * 1e-9, number, firmware.inputs()
 
 

@@ -2,45 +2,26 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from typing import Any, NamedTuple
+from typing import Any
 
-from tests.server.running import PATIENCE_S
+from tests.ended import Result, run
 
 MODULE = "ethercat_server.doctor.cli"
 
 
-class Result(NamedTuple):
-    """How it ended."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.out)
-        return found
+class Examined(Result):
+    """How it ended, and what it found."""
 
     def findings(self, subject: str) -> dict[str, dict[str, Any]]:
         """The findings of a subject by check; the last one where there are two."""
         return {row["check"]: row for row in self.json["findings"] if row["subject"] == subject}
 
 
-def doctor(*arguments: object, module: str = MODULE, under: tuple[str, ...] = ()) -> Result:
+def doctor(*arguments: object, module: str = MODULE, under: tuple[str, ...] = ()) -> Examined:
     """Run `ethercat-doctor arguments...`."""
-    ended = subprocess.run(
-        [*under, sys.executable, "-m", module, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    assert "Traceback" not in ended.stderr, ended.stderr
-    assert "fault of the doctor" not in ended.stdout, ended.stdout
-    return Result(ended.returncode, ended.stdout, ended.stderr)
+    ended = Examined(*run(module, *arguments, under=under))
+    assert "fault of the doctor" not in ended.out, ended.out
+    return ended
 
 
 def levels(rows: dict[str, dict[str, Any]]) -> dict[str, str]:

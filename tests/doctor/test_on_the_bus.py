@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.doctor.running import MODULE, doctor, levels
+from tests.server.commands import command, stats
 from tests.server.running import Program, Veth, needs_bus, server, virtual_sensor, wait_until
-from tests.tool.running import command, stats
 
 pytestmark = [pytest.mark.bus, needs_bus]
 Bench = tuple[Veth, Program]

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from tests.doctor.running import doctor, levels
+from tests.server.commands import command, stats
 from tests.server.running import Program, Server, Veth, needs_bus, server, virtual_sensor, wait_until
-from tests.tool.running import command, stats
 
 pytestmark = [pytest.mark.bus, needs_bus]
 Bench = tuple[Veth, Program, Server]

@@ -229,6 +229,14 @@ class Client:
                 assert message["id"] == self._id
                 return message
 
+    def wait_event(self, name: str) -> JsonObject:
+        """The first event of this name that has not been asked for yet."""
+        while not any(event["event"] == name for event in self.events):
+            self.receive()
+        found = next(event for event in self.events if event["event"] == name)
+        self.events.remove(found)
+        return found
+
     def collect(self, count: int) -> list[DataMessage]:
         """The next `count` frames."""
         self.frames.clear()

@@ -66,11 +66,7 @@ class SteadyBench:
         return self.sensor.command(text)
 
     def wait_event(self, name: str) -> dict[str, Any]:
-        while not any(event["event"] == name for event in self.client.events):
-            self.client.receive()
-        event = next(event for event in self.client.events if event["event"] == name)
-        self.client.events.remove(event)
-        return event
+        return self.client.wait_event(name)
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from ethercat_server.connection import MAX_REQUEST_LENGTH
-from ethercat_server.hub import MOST_OF_A_STRANGER
+from ethercat_server.door import MOST_OF_A_STRANGER
 from protocol.control import request
 from protocol.framing import DataFlag, encode_json
 from tests.hostile_bytes import framed

@@ -13,7 +13,7 @@ from itertools import pairwise
 import pytest
 
 from ethercat_server import connection as connection_module
-from ethercat_server import hub as hub_module
+from ethercat_server import door
 from ethercat_server.connection import (
     MAX_REQUEST_LENGTH,
     Connection,
@@ -302,7 +302,7 @@ def test_a_client_that_asks_and_never_reads_is_closed(served: Served) -> None:
 
 
 def test_too_many_clients_are_turned_away(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hub_module, "MAX_CLIENTS", 2)
+    monkeypatch.setattr(door, "MAX_CLIENTS", 2)
     with served.connect() as first, served.connect() as second, served.connect() as third:
         assert served.is_closed(third)
         for sock in (first, second):
@@ -446,31 +446,31 @@ def test_a_client_that_asks_without_pause_waits_and_gets_all_answers_in_order(se
 
 
 def test_strangers_cannot_take_all_places(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    served.hub.control_uids = frozenset()
+    served.hub.door.control_uids = frozenset()
     uids = iter(range(100, 10_000))
-    monkeypatch.setattr(hub_module, "peer_uid", lambda *_: next(uids))
-    for _ in range(hub_module.MAX_CLIENTS):
+    monkeypatch.setattr(door, "peer_uid", lambda *_: next(uids))
+    for _ in range(door.MAX_CLIENTS):
         served.connect()
-    assert len(served.hub.connections) == hub_module.MAX_CLIENTS - hub_module.RESERVED
-    monkeypatch.setattr(hub_module, "peer_uid", lambda *_: 7)
-    served.hub.control_uids = frozenset({7})
-    for _ in range(hub_module.RESERVED + 3):
+    assert len(served.hub.connections) == door.MAX_CLIENTS - door.RESERVED
+    monkeypatch.setattr(door, "peer_uid", lambda *_: 7)
+    served.hub.door.control_uids = frozenset({7})
+    for _ in range(door.RESERVED + 3):
         served.connect()
-    assert len(served.hub.connections) == hub_module.MAX_CLIENTS
+    assert len(served.hub.connections) == door.MAX_CLIENTS
 
 
 @pytest.mark.parametrize("uid", [4711, None])
 def test_one_stranger_cannot_take_the_places_of_others(
     served: Served, monkeypatch: pytest.MonkeyPatch, uid: int | None
 ) -> None:
-    served.hub.control_uids = frozenset()
-    monkeypatch.setattr(hub_module, "peer_uid", lambda *_: uid)
-    for _ in range(hub_module.MOST_OF_A_STRANGER + 5):
+    served.hub.door.control_uids = frozenset()
+    monkeypatch.setattr(door, "peer_uid", lambda *_: uid)
+    for _ in range(door.MOST_OF_A_STRANGER + 5):
         served.connect()
-    assert len(served.hub.connections) == hub_module.MOST_OF_A_STRANGER
-    monkeypatch.setattr(hub_module, "peer_uid", lambda *_: 4712)
+    assert len(served.hub.connections) == door.MOST_OF_A_STRANGER
+    monkeypatch.setattr(door, "peer_uid", lambda *_: 4712)
     served.connect()
-    assert len(served.hub.connections) == hub_module.MOST_OF_A_STRANGER + 1
+    assert len(served.hub.connections) == door.MOST_OF_A_STRANGER + 1
 
 
 def test_an_answer_may_come_later_and_what_follows_waits_for_it(served: Served) -> None:

@@ -12,8 +12,8 @@ import time
 
 import pytest
 
+from tests.server.commands import command
 from tests.server.running import Server, Veth, free_port, needs_bus, virtual_sensor
-from tests.tool.running import command
 
 pytestmark = [pytest.mark.bus, needs_bus]
 

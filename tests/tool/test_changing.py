@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from protocol.filters import FORCE_TORQUE_FILTERS
+from tests.server.commands import command, stats, written
 from tests.server.running import Program, Veth, needs_bus, virtual_sensor, wait_until
-from tests.tool.running import command, complaints, one_sentence, stats, tool, written
+from tests.tool.running import MODULE, complaints, one_sentence, tool
 
 pytestmark = [pytest.mark.bus, needs_bus]
 Bench = tuple[Veth, Program]
@@ -170,7 +171,7 @@ def test_a_sensor_that_moves_is_not_tared() -> None:
 def test_a_tare_that_is_stopped_changes_nothing() -> None:
     with virtual_sensor("--signal", "sine") as (veth, sensor):
         taring = subprocess.Popen(
-            [sys.executable, "-m", "ethercat_server.tool.cli", "tare", veth.near, "--samples", "20000"],
+            [sys.executable, "-m", MODULE, "tare", veth.near, "--samples", "20000"],
             stderr=subprocess.PIPE,
             text=True,
         )

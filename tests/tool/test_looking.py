@@ -13,9 +13,10 @@ import pytest
 
 from ethercat_server.known_objects import KNOWN_OBJECTS
 from ethercat_server.object_names import NOTE_NAMES
+from tests.server.commands import command, stats, written
 from tests.server.odd_sensor import FOREIGN_LACKS
 from tests.server.running import Program, Veth, needs_bus, virtual_sensor
-from tests.tool.running import command, complaints, one_sentence, stats, tool, written
+from tests.tool.running import MODULE, complaints, one_sentence, tool
 
 pytestmark = [pytest.mark.bus, needs_bus]
 Bench = tuple[Veth, Program]
@@ -185,7 +186,7 @@ def test_watch_gives_si_units_rate_and_warnings() -> None:
 def test_watch_ends_with_ctrl_c_and_leaves_the_bus(chain: Bench) -> None:
     veth, sensor = chain
     watching = subprocess.Popen(
-        [sys.executable, "-m", "ethercat_server.tool.cli", "watch", veth.near, "--interval", "0.1"],
+        [sys.executable, "-m", MODULE, "watch", veth.near, "--interval", "0.1"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.server.commands import command, stats, written
 from tests.server.running import Program, Server, Veth, needs_bus, server, virtual_sensor
-from tests.tool.running import command, one_sentence, stats, tool, written
+from tests.tool.running import one_sentence, tool
 
 pytestmark = [pytest.mark.bus, needs_bus]
 Bench = tuple[Veth, Program, Server]

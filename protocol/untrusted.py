@@ -1,10 +1,11 @@
-"""Values from a server's JSON: taken if they are of the right kind, else not there.
+"""Values from the other side's JSON: taken if they are of the right kind, else not there.
 
 Texts lose what a terminal would obey.
 """
 
 from __future__ import annotations
 
+from protocol.framing import JsonObject
 from protocol.text import printable
 
 
@@ -30,6 +31,6 @@ def whole(value: object) -> int | None:
     return value
 
 
-def rows(value: object) -> list[dict[str, object]]:
+def rows(value: object) -> list[JsonObject]:
     """The objects in a list."""
     return [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []

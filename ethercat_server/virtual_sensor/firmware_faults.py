@@ -1,0 +1,80 @@
+"""Faults of a sensor's firmware and memory: AL states, SDOs, the mailbox, saving, the EEPROM."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Final
+
+from ethercat_server.virtual_sensor.al import AlState
+from ethercat_server.virtual_sensor.fault_command import Call, CommandError, FaultCommand, real, whole
+from ethercat_server.virtual_sensor.sii import SiiInterface
+
+
+def _safeop(call: Call) -> None:
+    code = whole(call.arguments[0], 0, 0xFFFF)
+    call.life.fail(AlState.SAFEOP, code)
+
+
+def _error(call: Call) -> None:
+    code = whole(call.arguments[0], 0, 0xFFFF)
+    call.life.fail(call.life.al.state, code)
+
+
+def _abort(call: Call) -> None:
+    index, subindex = whole(call.arguments[0], 0, 0xFFFF), whole(call.arguments[1], 0, 0xFF)
+    call.life.aborts.arm((index, subindex), whole(call.arguments[2], 0, 0xFFFFFFFF))
+
+
+def _on_write(call: Call) -> None:
+    address = whole(call.arguments[0], 0, 0xFFFF), whole(call.arguments[1], 0, 0xFF)
+    later = call.parse(" ".join(call.arguments[2:]))
+
+    def do() -> None:
+        with contextlib.suppress(CommandError):  # it has no power then
+            later()
+
+    call.sensor.on_write(address, do)
+
+
+def _saving(call: Call) -> None:
+    flash = call.sensor.flash
+    flash.seconds = real(call.arguments[0], 0, 1e6)
+    flash.result = whole(call.arguments[1], 0, 0xFE) if len(call.arguments) > 1 else 0
+
+
+def _cut_save(call: Call) -> None:
+    sensor, count = call.sensor, whole(call.arguments[0], 0, 1000)
+    sensor.flash.cut = count, lambda: sensor.due.append(lambda: call.bus.power(sensor, False))
+
+
+def _mute(call: Call) -> None:
+    call.life.mailbox.mute = whole(call.arguments[0], 0, 2**31)
+
+
+def _sii(call: Call) -> None:
+    faults = SiiInterface.FAULTS.get(call.arguments[0])
+    if faults is None:
+        raise CommandError(f"sii takes {', '.join(SiiInterface.FAULTS)}")
+    call.life.esc.sii.fail(faults)
+
+
+COMMANDS: Final[tuple[FaultCommand, ...]] = (
+    FaultCommand("safeop", "safeop CODE [@N]", (1,), "fall to SAFEOP with this AL status code", _safeop),
+    FaultCommand("error", "error CODE [@N]", (1,), "set the error bit and this AL status code", _error),
+    FaultCommand(
+        "abort", "abort INDEX SUBINDEX CODE [@N]", (3,), "abort the next SDO on that entry", _abort
+    ),
+    FaultCommand(
+        "on-write", "on-write INDEX SUBINDEX COMMAND ...", range(3, 7),
+        "do a command right after the next SDO write to that entry", _on_write,
+    ),
+    FaultCommand(
+        "saving", "saving SECONDS [STATUS] [@N]", (1, 2),
+        "from now on the save command takes so long, and ends with this status", _saving,
+    ),
+    FaultCommand(
+        "cut-save", "cut-save N [@N]", (1,), "lose power in the next save, after N entries of it", _cut_save
+    ),
+    FaultCommand("mute-mailbox", "mute-mailbox N [@N]", (1,), "swallow the next N mailbox requests", _mute),
+    FaultCommand("sii", "sii error|busy|ok [@N]", (1,), "how reading its EEPROM ends", _sii),
+)  # fmt: skip

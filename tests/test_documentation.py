@@ -1,0 +1,47 @@
+"""The README and docs/ as a whole: what they point to is there, and every page can be found."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("*.md"))]
+FOLDERS = {path.name for path in ROOT.iterdir() if path.is_dir()}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+        assert "://" in target or (page.parent / target).exists(), target
+
+
+def test_the_readme_leads_to_every_page() -> None:
+    linked = set(re.findall(r"\]\(docs/([^)#]+\.md)", (ROOT / "README.md").read_text()))
+    assert linked == {page.name for page in DOCS.glob("*.md")}
+
+
+def test_the_readme_names_every_program() -> None:
+    text = (ROOT / "README.md").read_text()
+    programs = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    for name in programs.keys() - {"bridge-client"}:  # which is `ros2 run bridge client`
+        assert name in text, name
+
+
+def test_the_files_of_the_architecture_page_exist() -> None:
+    """A path from the root, or beside the one that was named before it in the same row."""
+    rows = re.findall(
+        r"^\| (?!Question)[^|]+ \| (.+) \|$", (DOCS / "architecture.md").read_text(), re.MULTILINE
+    )
+    assert len(rows) > 30
+    for row in rows:
+        folder = ROOT
+        for name in re.findall(r"`([\w./]+(?:\.py|/))`", row):
+            path = (ROOT if name.split("/")[0] in FOLDERS else folder) / name
+            assert path.exists(), f"{name}: {row}"
+            if name.split("/")[0] in FOLDERS:
+                folder = path if path.is_dir() else path.parent
