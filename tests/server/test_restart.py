@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from protocol.errors import ConnectionFailedError
 from tests.server.running import Client, Server, needs_bus, virtual_sensor, wait_until
 
 pytestmark = [pytest.mark.bus, needs_bus]
@@ -28,7 +29,7 @@ class Persistent:
 
     def _run(self) -> None:
         while not self._ending.is_set():
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(ConnectionFailedError):
                 self._listen()
             self._ending.wait(0.02)
 
