@@ -149,7 +149,7 @@ def measure_waits(setup: Setup) -> dict[str, list[float]]:
                 (WAITS[2], lambda: _stop(run, run.node, 2.0), 2_000_000_000),
             )
             for name, act, pause_ns in stops:
-                wrench = run.listen("wrench", 10 * number + WAITS.index(name))
+                wrench = run.listen("newest", 10 * number + WAITS.index(name))
                 run.pass_time(_SETTLE_S)
                 act()
                 run.pass_time(_SETTLE_S)

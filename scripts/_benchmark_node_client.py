@@ -2,7 +2,8 @@
 
 Four whole numbers an arrival: the sample's `stamp_ns`, its `monotonic_ns` (0: ROS messages have none), a
 check sum of force and torque, CLOCK_MONOTONIC of the arrival.
-`all` subscribes to every topic of the node's, to give it work.
+`newest` is `wrench` with a queue of one, so that nothing waits here; `all` subscribes to every topic
+of the node's, to give it work.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def tcp(port: int, note: Any) -> None:
             return
 
 
-def ros(note: Any, *, every_topic: bool) -> None:
+def ros(note: Any, depth: int = 50, *, every_topic: bool = False) -> None:
     """Every message of the node's, until the process is ended."""
     import rclpy  # noqa: PLC0415 - the arguments come first
     from diagnostic_msgs.msg import DiagnosticArray  # noqa: PLC0415
@@ -58,7 +59,7 @@ def ros(note: Any, *, every_topic: bool) -> None:
 
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
-    node.create_subscription(WrenchStamped, "wrench", on_wrench, 50)
+    node.create_subscription(WrenchStamped, "wrench", on_wrench, depth)
     if every_topic:
         others = (Float64MultiArray, "/sensone_sensor_data"), (Imu, "imu/data_raw")
         for kind, topic in (*others, (Temperature, "temperature"), (DiagnosticArray, "/diagnostics")):
@@ -69,7 +70,7 @@ def ros(note: Any, *, every_topic: bool) -> None:
 def main() -> None:
     """Record until SIGTERM, then write."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=("tcp", "wrench", "all"))
+    parser.add_argument("what", choices=("tcp", "wrench", "newest", "all"))
     parser.add_argument("path", type=Path)
     parser.add_argument("--port", type=int, required=True)
     arguments = parser.parse_args()
@@ -90,7 +91,8 @@ def main() -> None:
         if arguments.what == "tcp":
             tcp(arguments.port, note)
         else:
-            ros(note, every_topic=arguments.what == "all")
+            depth = 1 if arguments.what == "newest" else 50
+            ros(note, depth, every_topic=arguments.what == "all")
     except KeyboardInterrupt:
         pass
     finally:

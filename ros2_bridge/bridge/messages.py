@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, Protocol
 
 from geometry_msgs.msg import WrenchStamped
@@ -89,6 +89,7 @@ class Topic:
 
     def __init__(self, node: Node, message_type: Any, topic: str) -> None:
         self.publisher = create_publisher(node, message_type, topic)
+        self._publish: Callable[[bytes], None] = self.publisher.publish
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed."""
@@ -114,7 +115,7 @@ class ArrayOutput(Topic):
     def publish(self, sample: Sample, stamp_ns: int) -> None:  # noqa: ARG002 - the message has no header
         """Publish the twelve values."""
         self._serialized.fill(0, sample.array)
-        self.publisher.publish(self._serialized.message())
+        self._publish(self._serialized.message())
 
 
 class WrenchTopic(Topic):
@@ -125,16 +126,15 @@ class WrenchTopic(Topic):
         message = WrenchStamped()
         message.header.frame_id = frame_id
         wrench = message.wrench
-        places = [axes(wrench.force), axes(wrench.torque)]
+        places = [[*axes(wrench.force), *axes(wrench.torque)]]
         self._serialized = SerializedMessage(message, places, message.header.stamp)
 
     def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
         """Publish a force and a torque."""
         serialized = self._serialized
         serialized.stamp(stamp_ns)
-        serialized.fill(0, force)
-        serialized.fill(1, torque)
-        self.publisher.publish(serialized.message())
+        serialized.fill(0, force + torque)
+        self._publish(serialized.message())
 
 
 class WrenchOutput(WrenchTopic):
@@ -184,7 +184,7 @@ class ImuOutput(Topic):
         serialized.fill(0, sample.acceleration)
         serialized.fill(1, sample.angular_rate)
         serialized.fill(2, sample.orientation or _NO_ROTATION)
-        self.publisher.publish(serialized.message())
+        self._publish(serialized.message())
 
 
 class TemperatureOutput(Topic):
@@ -203,7 +203,7 @@ class TemperatureOutput(Topic):
         serialized = self._serialized
         serialized.stamp(stamp_ns)
         serialized.fill(0, (sample.temperature,))
-        self.publisher.publish(serialized.message())
+        self._publish(serialized.message())
 
 
 def _covariance(values: Numbers) -> list[float]:
