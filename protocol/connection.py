@@ -94,6 +94,13 @@ class FramedConnection:
         except ProtocolError as error:
             raise ConnectionFailedError(f"what came is not this protocol: {printable(error)}") from None
 
+    def take_data(self, into: list[DataMessage]) -> DataMessage | JsonObject | None:
+        """Append the DATA messages that are next to `into`; the message after them, if it is whole."""
+        try:
+            return self._decoder.take_data(into)
+        except ProtocolError as error:
+            raise ConnectionFailedError(f"what came is not this protocol: {printable(error)}") from None
+
     def send(self, message: JsonObject) -> None:
         """Send a message; ConnectionFailedError if it cannot be sent."""
         try:

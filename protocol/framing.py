@@ -246,6 +246,26 @@ class FrameDecoder:
         while (message := self.next_message()) is not None:
             yield message
 
+    def take_data(self, into: list[DataMessage]) -> DataMessage | JsonObject | None:
+        """Append the DATA messages that are next and whole to `into`, then `next_message`.
+
+        The same as calling that until it gives something else, in less time: for a stream's receiver.
+        """
+        buffer, start, end = self._buffer, self._start, self._end
+        if self._accept_data and self._broken is None:
+            while end - start >= _BODY_OFFSET:
+                length, kind = _PREFIX.unpack_from(buffer, start)
+                after = start + _LENGTH.size + length
+                if kind != _DATA or length not in _DATA_LENGTHS or after > end:
+                    break
+                body = start + _BODY_OFFSET
+                header = _DATA_HEADER.unpack_from(buffer, body)
+                into.append(DataMessage._make((*header, bytes(buffer[body + _DATA_HEADER.size : after]))))
+                self._start = start = after
+            if start == end:
+                return None
+        return self.next_message()
+
     def _types_text(self) -> str:
         return "1 (DATA) and 2 (JSON)" if self._accept_data else "2 (JSON)"
 

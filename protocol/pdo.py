@@ -165,10 +165,12 @@ class Sample(NamedTuple):
     def is_finite(self) -> bool:
         """Whether every measured value is a finite number."""
         # An infinity or a NaN survives every sum, and a sum of float32 values cannot overflow a double.
-        total = sum(self.force) + sum(self.torque) + sum(self.acceleration) + sum(self.angular_rate)
+        (fx, fy, fz), (mx, my, mz) = self.force, self.torque
+        (ax, ay, az), (rx, ry, rz) = self.acceleration, self.angular_rate
+        total = self.temperature
         if self.orientation is not None:
             total += sum(self.orientation)
-        return math.isfinite(total + self.temperature)
+        return math.isfinite(total + fx + fy + fz + mx + my + mz + ax + ay + az + rx + ry + rz)
 
 
 class SampleDecoder:

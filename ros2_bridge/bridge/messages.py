@@ -131,10 +131,7 @@ class WrenchTopic(Topic):
 
     def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
         """Publish a force and a torque."""
-        serialized = self._serialized
-        serialized.stamp(stamp_ns)
-        serialized.fill(0, force + torque)
-        self._publish(serialized.message())
+        self._publish(self._serialized.filled(stamp_ns, force + torque))
 
 
 class WrenchOutput(WrenchTopic):
@@ -144,7 +141,7 @@ class WrenchOutput(WrenchTopic):
 
     def publish(self, sample: Sample, stamp_ns: int) -> None:
         """Publish force and torque."""
-        self.send(sample.force, sample.torque, stamp_ns)
+        self._publish(self._serialized.filled(stamp_ns, sample.force + sample.torque))
 
 
 class ImuOutput(Topic):

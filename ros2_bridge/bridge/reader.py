@@ -174,13 +174,15 @@ class Reader:
 
     def _take(self, connection: Connection, frames: list[DataMessage]) -> None:
         """Move every whole message that has been received to `frames`; answer the others."""
-        while (message := connection.next_message()) is not None:
+        known = len(frames)
+        while (message := connection.take_data(frames)) is not None:
             if isinstance(message, DataMessage):
-                if message.stamp_ns > _LAST_STAMP_NS:
-                    raise ConnectionFailedError(f"a frame has the impossible time {message.stamp_ns} ns")
                 frames.append(message)
             elif not connection.take_reply(message):
                 self._say_event(message)
+        for frame in frames[known:] if known else frames:
+            if frame.stamp_ns > _LAST_STAMP_NS:
+                raise ConnectionFailedError(f"a frame has the impossible time {frame.stamp_ns} ns")
 
     def _publish_finite(self, sample: Sample, stamp_ns: int) -> None:
         self._outputs.publish_finite(sample, stamp_ns)

@@ -62,6 +62,13 @@ class SerializedMessage:
         """Put `values` into the numbers of this run."""
         self._packers[run](self._buffer, self._offsets[run], *values)
 
+    def filled(self, stamp_ns: int, values: Sequence[float]) -> bytes:
+        """`stamp`, `fill` the first run, and `message` in one."""
+        buffer = self._buffer
+        _STAMP.pack_into(buffer, self._stamp_offset, *divmod(stamp_ns, _NS_PER_S))
+        self._packers[0](buffer, self._offsets[0], *values)
+        return bytes(buffer)
+
     def message(self) -> bytes:
         """What a publisher takes in a message's place."""
         return bytes(self._buffer)

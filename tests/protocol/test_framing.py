@@ -222,3 +222,43 @@ def test_a_flipped_byte_never_escapes_as_another_exception(at: int, flip: int) -
             return
         except BadMessageError:
             continue
+
+
+def outcomes(decoder: FrameDecoder, *, with_take_data: bool) -> list[Any]:
+    """What a decoder gives for the bytes it has: messages, and errors by their text."""
+    got: list[Any] = []
+    while True:
+        try:
+            message = decoder.take_data(got) if with_take_data else decoder.next_message()
+        except BadMessageError as error:
+            got.append(str(error))
+            continue
+        except RemoteProtocolError as error:
+            return [*got, str(error)]
+        if message is None:
+            return got
+        got.append(message)
+
+
+@given(
+    st.lists(data_messages | json_objects, max_size=6),
+    st.lists(st.integers(1, 200), min_size=1),
+    st.lists(st.tuples(st.integers(0, 2000), st.integers(1, 255)), max_size=2),
+    st.booleans(),
+)
+def test_taking_data_in_bulk_is_the_same_as_one_by_one(
+    messages: list[Any], sizes: list[int], flips: list[tuple[int, int]], accept_data: bool
+) -> None:
+    stream = bytearray(b"".join(encode(message) for message in messages))
+    for at, flip in flips:
+        if at < len(stream):
+            stream[at] ^= flip
+    one, bulk = FrameDecoder(accept_data=accept_data), FrameDecoder(accept_data=accept_data)
+    at, turn = 0, 0
+    while at < len(stream):
+        size = sizes[turn % len(sizes)]
+        for decoder in (one, bulk):
+            decoder.feed(stream[at : at + size])
+        assert outcomes(bulk, with_take_data=True) == outcomes(one, with_take_data=False)
+        assert bulk.pending == one.pending
+        at, turn = at + size, turn + 1
