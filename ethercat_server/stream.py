@@ -35,6 +35,8 @@ class SensorStream:
         self.clock = SampleClock(period_ns, time.monotonic_ns())
         self.process_data = b""
         """The newest valid process data."""
+        self._handed_out = b""
+        """What the last frame carried: a REPEATED or INVALID one carries it again."""
         self.alive = True
         """False while the sensor is lost: what the bus gives for it is not its own."""
         self.sequence = 0
@@ -91,7 +93,7 @@ class SensorStream:
         if valid:
             self._valid_ns = back_ns
         if fresh and wkc == self._head_wkc and self._head_from_ns <= back_ns < self._head_until_ns:
-            self.process_data = data
+            self.process_data = self._handed_out = data
             self.sequence += 1
             return self._head + data, 0
         self._head_until_ns = 0.0
@@ -101,12 +103,14 @@ class SensorStream:
                 self._discard -= 1
                 self._idle_at_ns = back_ns + _IDLE_PERIODS * clock.period_ns
                 return None
+            self._handed_out = data
             clock.predict(sent_ns, back_ns)
             flags = self._new_sample(back_ns)
             if clock.locked:
                 moment_ns = int(clock.instant_ns)
         elif back_ns >= self._idle_at_ns and self.process_data:
             self._discard = 0  # a sensor that is stuck from the start is to be seen too
+            self._handed_out = self._handed_out or self.process_data
             # One lost frame is no news: INVALID is what nothing valid came for in two periods.
             flags = self._nothing_new(back_ns - self._valid_ns < 2 * clock.period_ns, back_ns)
         else:
@@ -115,7 +119,7 @@ class SensorStream:
         sequence = self.sequence
         self.sequence += 1
         return encode_data(
-            sequence, stamp_ns, moment_ns, self.place, flags, max(wkc, 0), self.process_data
+            sequence, stamp_ns, moment_ns, self.place, flags, max(wkc, 0), self._handed_out
         ), flags  # fmt: skip
 
     def learn(self) -> None:

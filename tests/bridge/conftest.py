@@ -19,7 +19,7 @@ import pytest
 
 from tests.bridge.scripted_server import ScriptedServer
 
-PATIENCE_S = 20.0
+PATIENCE_S = 45.0
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:

@@ -107,6 +107,20 @@ def test_invalid_exchanges_show_the_last_good_data() -> None:
     assert {m.wkc for m in invalid} == {0}
 
 
+def test_samples_that_are_discarded_after_a_recovery_are_not_shown_as_the_last_good_ones() -> None:
+    feeder = Feeder().start()
+    shown = feeder.exchange(new=True)
+    assert shown is not None
+    feeder.stream.recover(PERIOD_NS)
+    assert feeder.exchange(new=True, after_ns=PERIOD_NS) is None
+    silent = [feeder.exchange(new=False, valid=False, after_ns=PERIOD_NS) for _ in range(10)]
+    frames = [frame for frame in silent if frame is not None]
+    assert frames
+    for frame in frames:
+        assert frame.flags & INVALID
+        assert frame.process_data == shown.process_data
+
+
 def test_a_gap_is_flagged_and_counted() -> None:
     feeder = Feeder().start()
     for _ in range(100):
