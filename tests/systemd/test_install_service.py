@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import configparser
 import os
+import re
 import shutil
 import subprocess
 import tempfile
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -212,6 +214,15 @@ def test_without_a_staging_root_it_makes_users_and_cleans_up(tmp_path: Path) -> 
     assert all(line.endswith("nologin") for line in users)
     assert files == ["installed 5", "left 0"]
     assert "next: systemctl enable --now 'ethercat-server@virtual'" in done.stderr
+
+
+def test_every_package_is_in_the_copy_that_is_built() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    tops = {name.split(".")[0] for name in project["packages"]}
+    folders = {project["package-dir"].get(top, top).split("/")[0] for top in tops}
+    copied = re.search(r'"\$root"/\{(.*?)\}', (ROOT / "scripts" / "install-service").read_text())
+    assert copied is not None
+    assert folders <= set(copied[1].split(","))
 
 
 @pytest.mark.long
