@@ -48,10 +48,13 @@ def test_twelve_labelled_values_in_si_units(server: ScriptedServer, listener: Li
 
 
 def test_every_fresh_sample_once_and_in_order(server: ScriptedServer, listener: Listener) -> None:
+    heard = []
     for number in range(400):
         server.send_sample(number)
         time.sleep(0.001)
-    assert [listener.next_number() for _ in range(400)] == list(range(400))
+        if number % 5 == 4:  # a topic keeps ten: a subscriber that is starved of its CPU would miss some
+            heard += [listener.next_number() for _ in range(5)]
+    assert heard == list(range(400))
 
 
 def test_samples_that_come_together_are_all_published(server: ScriptedServer, listener: Listener) -> None:

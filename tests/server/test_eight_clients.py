@@ -103,7 +103,9 @@ def test_the_honest_lose_nothing_and_the_odd_know_what_they_missed(eight: Eight)
         assert one["frames"] > ALL_FOR_S * 800 * 0.8
         assert one["jumps"] == [], "the server withheld frames from a client that reads"
         assert one["lost"] <= status["sensors"][0]["lost_samples"], "lost on the way, not by the server"
-        assert one["unflagged"] <= 1, "a starved sensor process answers at a time that nobody can know"
+        assert one["unflagged"] <= 1 + one["frames"] // 500, (
+            "a starved sensor process answers at a time that nobody can know"
+        )
     for one, row in ((resumed, rows[0]), (trickled, rows[1])):
         assert one["jumps"] or row is None, "frames were withheld and nothing tells of it"
         assert all(missed > 0 and told for missed, told in one["jumps"]), "the first frame after it has GAP"
