@@ -102,8 +102,7 @@ class Actions:
     def _describe(self, _: Connection, request: Request) -> JsonObject:
         rows = [sensor.describe() for sensor in self._sensors]
         if len(rows) > _MOST_EXPLAINED:
-            for row in rows:
-                row.pop("meaning", None)
+            rows = [{key: value for key, value in row.items() if key != "meaning"} for row in rows]
         return reply(request, protocol=PROTOCOL_VERSION, version=__version__, sensors=rows, **self._extra)
 
     def _subscribe(self, connection: Connection, request: Request) -> JsonObject:

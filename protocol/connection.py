@@ -94,8 +94,8 @@ class FramedConnection:
         except ProtocolError as error:
             raise ConnectionFailedError(f"what came is not this protocol: {printable(error)}") from None
 
-    def take_data(self, into: list[DataMessage]) -> DataMessage | JsonObject | None:
-        """Append the DATA messages that are next to `into`; the message after them, if it is whole."""
+    def take_data(self, into: list[DataMessage]) -> JsonObject | None:
+        """As `FrameDecoder.take_data`; ConnectionFailedError if the bytes are not this protocol."""
         try:
             return self._decoder.take_data(into)
         except ProtocolError as error:

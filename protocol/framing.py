@@ -246,10 +246,11 @@ class FrameDecoder:
         while (message := self.next_message()) is not None:
             yield message
 
-    def take_data(self, into: list[DataMessage]) -> DataMessage | JsonObject | None:
-        """Append the DATA messages that are next and whole to `into`, then `next_message`.
+    def take_data(self, into: list[DataMessage]) -> JsonObject | None:
+        """Append the DATA messages that are next and whole to `into`; returns the JSON message after them.
 
-        The same as calling that until it gives something else, in less time: for a stream's receiver.
+        The same as calling `next_message` until it gives something else, in less time: for a stream's
+        receiver. None and errors as there.
         """
         buffer, start, end = self._buffer, self._start, self._end
         if self._accept_data and self._broken is None:
@@ -264,7 +265,9 @@ class FrameDecoder:
                 self._start = start = after
             if start == end:
                 return None
-        return self.next_message()
+        message = self.next_message()
+        assert not isinstance(message, DataMessage)  # a whole one was taken above
+        return message
 
     def _types_text(self) -> str:
         return "1 (DATA) and 2 (JSON)" if self._accept_data else "2 (JSON)"

@@ -141,7 +141,7 @@ class WrenchOutput(WrenchTopic):
 
     def publish(self, sample: Sample, stamp_ns: int) -> None:
         """Publish force and torque."""
-        self._publish(self._serialized.filled(stamp_ns, sample.force + sample.torque))
+        self.send(sample.force, sample.torque, stamp_ns)
 
 
 class ImuOutput(Topic):
@@ -197,10 +197,7 @@ class TemperatureOutput(Topic):
 
     def publish(self, sample: Sample, stamp_ns: int) -> None:
         """Publish the temperature."""
-        serialized = self._serialized
-        serialized.stamp(stamp_ns)
-        serialized.fill(0, (sample.temperature,))
-        self._publish(serialized.message())
+        self._publish(self._serialized.filled(stamp_ns, (sample.temperature,)))
 
 
 def _covariance(values: Numbers) -> list[float]:

@@ -176,11 +176,9 @@ class Reader:
         """Move every whole message that has been received to `frames`; answer the others."""
         known = len(frames)
         while (message := connection.take_data(frames)) is not None:
-            if isinstance(message, DataMessage):
-                frames.append(message)
-            elif not connection.take_reply(message):
+            if not connection.take_reply(message):
                 self._say_event(message)
-        for frame in frames[known:] if known else frames:
+        for frame in frames[known:]:
             if frame.stamp_ns > _LAST_STAMP_NS:
                 raise ConnectionFailedError(f"a frame has the impossible time {frame.stamp_ns} ns")
 

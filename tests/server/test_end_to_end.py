@@ -59,7 +59,7 @@ def test_every_sample_arrives_once_and_in_order(shared: Server) -> None:
             gap = bool(after.flags & DataFlag.GAP)
             unflagged += sample_number(after) > sample_number(before) + 1 and not gap
             gaps += gap
-        assert unflagged <= 1 + len(frames) // 500, "a starved sensor answers when nobody can know"
+        assert unflagged <= 1 + len(frames) // 1000, "a starved sensor answers when nobody can know"
         assert gaps < 0.05 * len(frames)
         assert {frame.wkc for frame in frames} == {3}
         assert {frame.sensor for frame in frames} == {0}

@@ -88,8 +88,7 @@ def inertial_force(
     angular_acceleration: ArrayLike = (0.0, 0.0, 0.0),
     imu_position: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Array:
-    """What the tool's mass adds to the force on the sensor because the sensor is accelerated: N, (3,) or (n,
-    3).
+    """What the tool's mass adds to the force on an accelerated sensor: N, (3,) or (n, 3).
 
     -m (a + alpha x d + omega x (omega x d)), where a = acceleration + gravity is how the IMU really moves
     and d leads from it to the centre of gravity. Its torque is `torque_of(centre, force)`: the payload is a
