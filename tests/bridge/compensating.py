@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import queue
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
@@ -110,16 +110,6 @@ def comes_to_rest(messages: queue.Queue[Any], seconds: float = 0.4) -> None:
         if messages.empty():
             return
     raise AssertionError("messages go on coming")
-
-
-def until_said(next_status: Callable[[], Any], words: str) -> Any:
-    """The first status whose message has these words."""
-    deadline = time.monotonic() + PATIENCE_S
-    while True:
-        status = next_status()
-        if words in status.message:
-            return status
-        assert time.monotonic() < deadline, f"waited in vain for {words!r}; last: {status.message}"
 
 
 def weight(up: Sequence[float], payload: Payload = TOOL) -> list[float]:

@@ -106,16 +106,20 @@ class Diagnostics:
         while not self._arrays.empty():
             self._arrays.get()
 
-    def until(self, **levels: int) -> dict[str, Any]:
-        """The first array in which these statuses have these levels."""
+    def until(self, *words: str, **levels: int) -> dict[str, Any]:
+        """The first array in which these statuses have these levels and their messages hold these words.
+
+        A busy machine loses samples of its own accord: the same levels can have another cause.
+        """
         deadline = time.monotonic() + PATIENCE_S
         while True:
             array = self.next()
             found = {name: array[name].level[0] for name in levels}
-            if found == levels:
+            said = " ".join(array[name].message for name in levels)
+            if found == levels and all(word in said for word in words):
                 return array
             texts = {name: status.message for name, status in array.items()}
-            assert time.monotonic() < deadline, f"waited in vain for {levels}; last: {texts}"
+            assert time.monotonic() < deadline, f"waited in vain for {levels} {words}; last: {texts}"
 
 
 def values(status: Any) -> dict[str, str]:

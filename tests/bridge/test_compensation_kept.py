@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 from bridge.compensation.quantities import Payload, Wrench
 from bridge.compensation.store import CompensationStore
-from tests.bridge.compensating import QUICK, UP, ZERO6, Stages, hold, six, stamp_ns, until_said
+from tests.bridge.compensating import QUICK, UP, ZERO6, Stages, hold, six, stamp_ns
 from tests.bridge.conftest import Listener, NodeProcess, Start, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.streaming import Diagnostics, Stream, streaming, streaming_description
@@ -146,7 +146,7 @@ def test_a_damaged_file_is_said_and_not_used(bench: Bench) -> None:
     node = bench.start()
     assert bench.first() == pytest.approx(BIAS.values, abs=1e-5)
     diagnostics = Diagnostics(bench.listener)
-    until_said(lambda: diagnostics.until(compensation=WARN)["compensation"], "is not used: it is not whole")
+    diagnostics.until("is not used: it is not whole", compensation=WARN)
     node.says("take the bias again or remove the file")
     done, text = bench.listener.trigger("tare")
     assert done
@@ -173,7 +173,7 @@ def test_a_folder_that_cannot_be_written(bench: Bench, tmp_path: Path) -> None:
     assert "not kept: " in text
     bench.stages.settle(ZERO6)
     diagnostics = Diagnostics(bench.listener)
-    assert "cannot be" in diagnostics.until(compensation=WARN)["compensation"].message
+    diagnostics.until("cannot be", compensation=WARN)
     assert bench.listener.set_parameter("bias_directory", str(tmp_path / "other")) == (True, "")
     diagnostics.until(compensation=OK)
     assert CompensationStore(tmp_path / "other").load(1) is not None

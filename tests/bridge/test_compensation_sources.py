@@ -35,7 +35,6 @@ from tests.bridge.compensating import (
     comes_to_rest,
     hold,
     settle,
-    until_said,
     weight,
 )
 from tests.bridge.conftest import Listener, NodeProcess, starter, wait_until
@@ -152,8 +151,8 @@ def robot(
 
 
 def test_before_anything_has_come(robot: Robot, diagnostics: Diagnostics, listener: Listener) -> None:
-    status = diagnostics.until(compensation=ERROR)["compensation"]
-    assert f"no orientation from topic /{listener.tag}/arm/pose: nothing has come" in status.message
+    words = f"no orientation from topic /{listener.tag}/arm/pose: nothing has come"
+    diagnostics.until(words, compensation=ERROR)
     done, text = listener.trigger("tare")
     assert not done
     assert "nothing has come" in text
@@ -182,8 +181,7 @@ def test_a_source_that_falls_silent_and_comes_back(
     stages.settle(ZERO6)
     diagnostics.until(compensation=OK)
     robot.sending = False
-    status = diagnostics.until(compensation=ERROR)["compensation"]
-    assert "older than the sample (limit 0.5 s): it has stopped" in status.message
+    diagnostics.until("older than the sample (limit 0.5 s): it has stopped", compensation=ERROR)
     comes_to_rest(stages.final)
     for others in (stages.bias, stages.gravity, stages.inertia):
         comes_to_rest(others, 0.1)
@@ -215,7 +213,7 @@ def test_what_cannot_be_used(
     stages.settle(ZERO6)
     for name, value in spoil.items():
         setattr(robot, name, value)
-    until_said(lambda: diagnostics.until(compensation=ERROR)["compensation"], words)
+    diagnostics.until(words, compensation=ERROR)
     comes_to_rest(stages.final)
     robot.restore()
     stages.settle(ZERO6)
@@ -234,7 +232,7 @@ def test_an_imu_without_orientation(
     robot.change = unknown
     robot.use(Imu, f"/{listener.tag}/arm/imu")
     words = f"no orientation from topic /{listener.tag}/arm/imu: its messages say that they have none"
-    until_said(lambda: diagnostics.until(compensation=ERROR)["compensation"], words)
+    diagnostics.until(words, compensation=ERROR)
     robot.restore()
     stages.settle(ZERO6)
 

@@ -24,6 +24,8 @@ from tests.server.running import Program, Server, needs_bus, virtual_sensor
 __all__ = ["listener"]
 pytestmark = [pytest.mark.ros, pytest.mark.bus, needs_bus]
 OK, WARN, ERROR, STALE = range(4)
+SLOW = ("--set", "sinc_length=512")
+"""100 samples a second: what is tested here is no question of speed."""
 HEALTHY = {"link": OK, "stream": OK, "sensor": OK, "clock": OK, "compensation": OK}
 
 
@@ -32,17 +34,14 @@ class Bench:
 
     def __init__(self, ifname: str, sensor: Program, listener: Listener) -> None:
         self.ifname, self.sensor, self.listener = ifname, sensor, listener
-        self.server = Server(ifname).wait_streaming()
+        self.server = Server(ifname, *SLOW).wait_streaming()
         self.port = self.server.port
         self.diagnostics = Diagnostics(listener)
         self.wrench: queue.Queue[Any] = listener.subscribe(WrenchStamped, "wrench")
 
     def restart_server(self) -> None:
         self.server.close()
-        self.server = Server.__new__(Server)
-        self.server.port = self.port
-        Program.__init__(self.server, "ethercat_server.cli", [self.ifname, str(self.port)])
-        self.server.wait_streaming()
+        self.server = Server(self.ifname, *SLOW, port=self.port).wait_streaming()
 
     def command(self, text: str) -> None:
         assert self.sensor.process.stdin is not None
@@ -78,7 +77,7 @@ def node(_bench: Bench, listener: Listener) -> Iterator[NodeProcess]:
         tolerant = {
             "diagnostics.age_warn": 1.0,
             "diagnostics.rate_tolerance": 0.2,
-            "diagnostics.lost_warn": 60,
+            "diagnostics.lost_warn": 20,
         }
         yield start(_bench.port, **tolerant)
 
@@ -104,7 +103,7 @@ def test_gravity_and_orientation(bench: Bench, listener: Listener) -> None:
 
 
 def test_settings(bench: Bench, listener: Listener) -> None:
-    assert listener.parameters("settings.sinc_length", "settings.chop") == [64, False]
+    assert listener.parameters("settings.sinc_length", "settings.chop") == [512, False]
     assert listener.set_parameter("settings.sinc_length", 256) == (True, "")
     done, text = listener.trigger("get_settings")
     assert done
@@ -127,8 +126,9 @@ def test_tare(bench: Bench, listener: Listener) -> None:
         done, text = listener.trigger("sensor_tare")
         if done:
             break
-        assert "is not at rest" in text
-    assert done
+        # A busy machine may lose the sensor for a moment.
+        assert any(words in text for words in ("is not at rest", "is lost")), text
+    assert done, text
     assert "old offset Fx 0.0000" in text
     assert "residual Fx" in text
 
@@ -136,23 +136,20 @@ def test_tare(bench: Bench, listener: Listener) -> None:
 def test_a_server_that_stood_still(bench: Bench) -> None:
     bench.server.signal(signal.SIGSTOP)
     try:
-        array = bench.diagnostics.until(stream=ERROR, sensor=STALE, clock=STALE)
-        assert "no new sample for" in array["stream"].message
+        bench.diagnostics.until("no new sample for", stream=ERROR, sensor=STALE, clock=STALE)
         time.sleep(2.0)
         bench.forget()
     finally:
         bench.server.signal(signal.SIGCONT)
     first = bench.next_wrench()
     assert bench.age_s(first) < 0.5
-    array = bench.diagnostics.until(stream=WARN)
-    assert "samples lost" in array["stream"].message
-    assert int(values(array["stream"])["lost"]) > 300
+    array = bench.diagnostics.until("samples lost", stream=WARN)
+    assert int(values(array["stream"])["lost"]) > 100
 
 
 def test_a_sensor_without_power(bench: Bench) -> None:
     bench.command("power off")
-    array = bench.diagnostics.until(sensor=ERROR, stream=ERROR, clock=STALE)
-    assert "is lost" in array["sensor"].message
+    bench.diagnostics.until("is lost", sensor=ERROR, stream=ERROR, clock=STALE)
     bench.forget()
     time.sleep(0.3)
     assert bench.wrench.empty()
@@ -170,6 +167,6 @@ def test_a_server_that_starts_again(bench: Bench, listener: Listener) -> None:
     bench.restart_server()
     array = bench.diagnostics.until(**HEALTHY)
     assert values(array["link"])["reconnects"] == "1"
-    assert listener.parameters("settings.sinc_length") == [64]  # the server's own default again
+    assert listener.parameters("settings.sinc_length") == [512]  # not what the node had asked for
     bench.forget()  # what has come since the restart
     assert bench.age_s(bench.next_wrench()) < 10
