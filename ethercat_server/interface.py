@@ -61,7 +61,7 @@ def check_present(ifname: str, ifindex: int) -> None:
 
 def _check_free(ifname: str) -> None:
     """Raise InterfaceError if another EtherCAT master has the interface open: two would wreck one another."""
-    index = socket.if_nametoindex(ifname)
+    index = {name: number for number, name in socket.if_nameindex()}.get(ifname)
     for line in Path("/proc/self/net/packet").read_text(encoding="ascii").splitlines()[1:]:
         _, _, _, protocol, its_index, *_ = line.split()
         if int(protocol, 16) == _ETHERCAT and int(its_index) == index:

@@ -37,10 +37,7 @@ def open_interface(ifname: str) -> socket.socket:
     """A raw socket for EtherCAT frames on `ifname`; LinkError if there is none to be had."""
     if not ifname or len(ifname.encode()) > LONGEST_NAME:
         raise LinkError(f"interface name {ifname!r}: it must have 1 to {LONGEST_NAME} characters")
-    try:
-        socket.if_nametoindex(ifname)
-    except OSError:
-        raise LinkError(f"no network interface {ifname!r}: `ip link` lists those there are") from None
+    _index(ifname)
     try:
         # No protocol yet: with one, it would take in the frames of all interfaces until it is bound.
         raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
@@ -60,6 +57,13 @@ def open_interface(ifname: str) -> socket.socket:
         raw.close()
         raise
     return raw
+
+
+def _index(ifname: str) -> int:
+    try:
+        return socket.if_nametoindex(ifname)
+    except OSError:
+        raise LinkError(f"no network interface {ifname!r}: `ip link` lists those there are") from None
 
 
 def _is_up(ifname: str) -> bool:
@@ -109,7 +113,7 @@ def _serve(
 ) -> None:
     descriptor = raw.fileno()
     buffer = bytearray(_BUFFER)
-    index = socket.if_nametoindex(ifname)
+    index = _index(ifname)
     up = True
     while not stop():
         if exit_on_eof and channel.ended:
