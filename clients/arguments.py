@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from clients.address import DEFAULT_HOST, DEFAULT_PORT, Address
+from protocol.address import DEFAULT_HOST, DEFAULT_PORT, Address
 from protocol.pdo import ImuUnits
 
 
@@ -21,7 +21,7 @@ def add_imu_units(parser: argparse.ArgumentParser, purpose: str = "") -> None:
     """What the firmware sends acceleration and angular rate in; the help says for which `purpose`."""
     what = f"what the sensor sends acceleration and angular rate in{purpose and f', for {purpose}'}"
     parser.add_argument(
-        "--imu-units", choices=[units.value for units in ImuUnits], default=ImuUnits.G_DPS.value,
+        "--imu-raw-units", choices=[units.value for units in ImuUnits], default=ImuUnits.G_DPS.value,
         help=f"{what} (default {ImuUnits.G_DPS.value})",
     )  # fmt: skip
 

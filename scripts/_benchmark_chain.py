@@ -62,6 +62,22 @@ class Setup:
         return f"--sensors {self.sensors} --signal {self.signal} --sinc {self.sinc} --ppm={errors}"
 
 
+class CpuUse:
+    """What a process uses of one core from now on."""
+
+    def __init__(self, process: psutil.Process) -> None:
+        self._process = process
+        self._began_s, self._had_s = time.monotonic(), self._used_s()
+
+    def percent(self) -> float:
+        """Since this was made."""
+        return round(100 * (self._used_s() - self._had_s) / (time.monotonic() - self._began_s), 1)
+
+    def _used_s(self) -> float:
+        times = self._process.cpu_times()
+        return float(times.user + times.system)
+
+
 @dataclass
 class Chain:
     """A run of some programs: starts them, measures them, ends them."""
@@ -124,7 +140,7 @@ class Chain:
     def record(self, path: Path) -> dict[str, Any]:
         """Wait for a recording, which has been started, to be whole; CPU and memory meanwhile."""
         self.wait(lambda: began(path).exists() or path.exists(), "nothing was received")
-        before = {name: process.cpu_times() for name, process in self.watched.items()}
+        uses = {name: CpuUse(process) for name, process in self.watched.items()}
         others = cpu_of_others()
         started = time.monotonic()
         ending = started + self.setup.seconds - 0.1
@@ -132,9 +148,7 @@ class Chain:
         usage: dict[str, Any] = {"cpu_percent": {}, "rss_mb": {}}
         wall = time.monotonic() - started
         for name, process in self.watched.items():
-            now = process.cpu_times()
-            used = now.user + now.system - before[name].user - before[name].system
-            usage["cpu_percent"][name] = round(100 * used / wall, 1)
+            usage["cpu_percent"][name] = uses[name].percent()
             usage["rss_mb"][name] = round(process.memory_info().rss / _MEGABYTE, 1)
         since = sum(taken - others.get(pid, 0.0) for pid, taken in cpu_of_others().items())
         usage["cpu_percent"]["everything else"] = round(100 * since / wall, 1)

@@ -17,7 +17,7 @@ from typing import Any, Final
 from rich.console import Console
 
 from protocol.client import Client
-from scripts._benchmark_chain import PORT, Chain, Setup, chain, start_server, virtual_bus
+from scripts._benchmark_chain import PORT, Chain, CpuUse, Setup, chain, start_server, virtual_bus
 from scripts._demo import Child
 from scripts._odd_clients import EIGHT
 
@@ -52,18 +52,17 @@ def measure(running: Chain, link: Client, server: Child, manners: Sequence[str])
     """The server's own figures with these clients."""
     with clients(manners):
         _wait(running, _SETTLE_S)
-        before, cpu = link.ask("status"), running.watched["server"].cpu_times()
+        before, use = link.ask("status"), CpuUse(running.watched["server"])
         _wait(running, _WINDOW_S)
-        status, cpu_now = link.ask("status"), running.watched["server"].cpu_times()
+        status, percent = link.ask("status"), use.percent()
     server.check()
-    used = cpu_now.user + cpu_now.system - cpu.user - cpu.system
     counters = ("cycles", "missed_deadlines", "lost_frames")
     lost = [sum(row["lost_samples"] for row in asked["sensors"]) for asked in (before, status)]
     return {
         **{name: status["last_10s"][name] for name in _FIGURES},
         **{name: status[name] - before[name] for name in counters},
         "lost_samples": lost[1] - lost[0],
-        "cpu_percent": round(100 * used / (status["uptime_s"] - before["uptime_s"]), 1),
+        "cpu_percent": percent,
     }
 
 

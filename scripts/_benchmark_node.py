@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from scripts._benchmark_chain import PORT, Chain, Setup, chain, start_server, virtual_bus
+from scripts._benchmark_chain import PORT, Chain, CpuUse, Setup, chain, start_server, virtual_bus
 from scripts._benchmark_node_client import COLUMNS
 from scripts._benchmark_records import began
 from scripts._benchmark_statistics import Ints, read_numbers
@@ -67,14 +67,13 @@ class Run:
     def usage(self, seconds: float) -> dict[str, float]:
         """CPU in percent of one, and memory, of the node over this time."""
         node = self.running.watched["node"]
-        before, start = node.cpu_times(), time.monotonic()
+        use = CpuUse(node)
         rss = node.memory_info().rss
         self.pass_time(seconds)
-        now, wall = node.cpu_times(), time.monotonic() - start
-        used = now.user + now.system - before.user - before.system
+        percent = use.percent()
         after = node.memory_info().rss
         return {
-            "cpu_percent": round(100 * used / wall, 1),
+            "cpu_percent": percent,
             "rss_mb": round(after / 1e6, 1),
             "rss_growth_kb": round((after - rss) / 1e3, 1),
         }

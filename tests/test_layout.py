@@ -131,7 +131,7 @@ def test_the_monitor_knows_the_protocol_only() -> None:
     for path in monitor:
         assert imports(path) <= allowed, path
         others = {module for module in modules(path) if module.startswith("clients.")}
-        shared = {"clients.address", "clients.arguments", "clients.endings", "clients.version"}
+        shared = {"clients.arguments", "clients.endings", "clients.version"}
         assert all(m.startswith("clients.monitor") for m in others - shared), path
     assert [path.name for path in monitor if "textual" in imports(path)] == ["app.py"]
 

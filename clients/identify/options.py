@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from bridge.compensation.still import StillLimits
+from clients.arguments import add_imu_units
 from clients.version import VERSION
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
 
@@ -46,8 +47,7 @@ def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
     add("path", type=Path, metavar="FILE.mcap", help="recording of ethercat-record")
     add("--sensor", type=_between(int, 0, _MAX_SENSOR), metavar="N",
         help="place on the bus (default: the only one in the recording)")  # fmt: skip
-    add("--imu-raw-units", choices=[unit.value for unit in ImuUnits], default=ImuUnits.G_DPS.value,
-        help="what the firmware sends acceleration and angular rate in (default g_dps)")  # fmt: skip
+    add_imu_units(parser)
     add("--gravity", type=_between(float, 9.0, 10.0), default=STANDARD_GRAVITY, metavar="M/S2",
         help=f"acceleration of gravity, m/s² (default {STANDARD_GRAVITY})")  # fmt: skip
     add("--least-seconds", type=_between(float, 0.3, 3600.0), default=1.0, metavar="S",

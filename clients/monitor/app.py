@@ -19,7 +19,6 @@ from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
 
-from clients.address import Address
 from clients.monitor import words
 from clients.monitor.glyphs import Glyphs
 from clients.monitor.model import Model, clock_text
@@ -27,6 +26,7 @@ from clients.monitor.recorder import Recorder
 from clients.monitor.screen import Look, render
 from clients.monitor.state import SensorState, State
 from clients.monitor.tare import start_tare
+from protocol.address import Address
 
 REFRESH_S: Final = 0.1
 

@@ -6,9 +6,9 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from clients.address import Address
 from clients.arguments import add_address, add_imu_units, seconds
 from clients.version import VERSION
+from protocol.address import Address
 from protocol.pdo import ImuUnits
 
 
@@ -42,5 +42,5 @@ def parse(argv: Sequence[str] | None) -> Options:
     if given.once and given.seconds is not None:
         parser.error("--seconds does not go with --once, which ends by itself")
     return Options(
-        given.address, given.once, given.json, given.seconds, ImuUnits(given.imu_units), given.ascii
+        given.address, given.once, given.json, given.seconds, ImuUnits(given.imu_raw_units), given.ascii
     )

@@ -11,8 +11,8 @@ import threading
 import time
 from typing import Final
 
-from clients.address import Address
 from clients.monitor.model import Model
+from protocol.address import Address
 from protocol.client import Client
 from protocol.control import Event
 from protocol.errors import ProtocolError, RefusedError, UnreachableError

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Final
 
-from clients.address import Address
 from clients.endings import missing
+from protocol.address import Address
 from protocol.text import printable
 
 PROGRAM: Final = "ethercat-record"

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Any, Final
 
-from clients.address import Address
+from protocol.address import Address
 from protocol.client import Client
 from protocol.errors import NoReplyError, ProtocolError, RefusedError
 from protocol.untrusted import number

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from clients.address import Address
 from clients.arguments import add_address, add_imu_units, seconds
 from clients.recording.file_format import MAX_SENSOR
 from clients.version import VERSION
+from protocol.address import Address
 from protocol.pdo import ImuUnits
 
 _UNITS: Final = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}
@@ -71,7 +71,7 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     sensors = tuple(sorted(set(given.sensors))) if given.sensors else None
     return RecordOptions(
         given.path, given.address, sensors, given.seconds, given.ros,
-        tuple(given.namespaces) if given.namespaces else None, ImuUnits(given.imu_units),
+        tuple(given.namespaces) if given.namespaces else None, ImuUnits(given.imu_raw_units),
         given.rotate_size, given.rotate_seconds, given.force, given.wait, given.reconnect,
     )  # fmt: skip
 

@@ -10,9 +10,9 @@ import time
 from collections.abc import Sequence
 from typing import Any, Final
 
-from clients.address import Address
 from clients.recording.file_format import RECORDER
 from clients.recording.reader import Description, Event
+from protocol.address import Address
 from protocol.client import Client
 from protocol.control import Event as ServerEvent
 from protocol.control import request

@@ -19,7 +19,7 @@ class SensorTally:
     withheld: int = 0
     """Frames that the server had but did not send, because they were not read in time: `sequence` jumps."""
     gaps: int = 0
-    """Places where the server itself lost samples: GAP without a jump. How many it lost its `status` says."""
+    """GAP without a jump: places where the server itself lost samples, or cannot rule it out."""
     next_sequence: int = -1
 
 
@@ -78,7 +78,9 @@ class Tally:
             if sensor.withheld:
                 found.append(f"{_frames(sensor.withheld)} of sensor {place} not read in time")
             if sensor.gaps:
-                found.append(f"sensor {place}: {sensor.gaps} times samples were lost on the bus")
+                found.append(
+                    f"sensor {place}: {sensor.gaps} times samples were or may have been lost on the bus (GAP)"
+                )
             if sensor.invalid:
                 found.append(f"{_frames(sensor.invalid)} of sensor {place} invalid")
         return found

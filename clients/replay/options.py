@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from clients.address import DEFAULT_PORT
 from clients.version import VERSION
+from protocol.address import DEFAULT_PORT
 
 _HOSTS: Final = ("127.0.0.1", "::1")
 _SLOWEST: Final = 1e-6

@@ -7,12 +7,12 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any, Final
 
-from clients.address import Address
 from clients.recording.columns import columns
 from clients.report.errors import ReportError
 from clients.report.recorded import event_remarks, no_sensor
 from clients.report.subject import Subject, subject
 from protocol import untrusted
+from protocol.address import Address
 from protocol.client import Client, connect
 from protocol.errors import ConnectionFailedError
 from protocol.framing import DataMessage, JsonObject

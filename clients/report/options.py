@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from clients.address import Address
 from clients.arguments import add_imu_units, address
 from clients.version import VERSION
+from protocol.address import Address
 from protocol.pdo import ImuUnits
 from protocol.sensor_choice import MEANING, SensorChoice
 
@@ -69,7 +69,7 @@ def parse_options(argv: Sequence[str] | None) -> ReportOptions:
         parser.error("the report would replace the recording: give another name with -o")
     return ReportOptions(
         given.recording, given.server or Address.parse(""), given.seconds or 10.0, output, given.sensor,
-        ImuUnits(given.imu_units), given.note, given.json,
+        ImuUnits(given.imu_raw_units), given.note, given.json,
     )  # fmt: skip
 
 

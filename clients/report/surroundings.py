@@ -132,9 +132,9 @@ def check_gravity(series: Series) -> Check:
         return Check(name, Level.OK, found)
     remedy = "At rest: check acceleration_range_g and the acceleration offset (0x8001)."
     if abs(usual / STANDARD_GRAVITY - STANDARD_GRAVITY) < _GRAVITY_TOLERANCE:
-        remedy = "This firmware sends SI units already: give --imu-units si (for the ROS node imu_raw_units)."
+        remedy = "This firmware sends SI units: give --imu-raw-units si (the ROS node: imu_raw_units)."
     elif abs(usual * STANDARD_GRAVITY - STANDARD_GRAVITY) < _GRAVITY_TOLERANCE:
-        remedy = "This firmware sends g: leave --imu-units si away."
+        remedy = "This firmware sends g: leave --imu-raw-units si away."
     return Check(name, Level.ATTENTION, found, "Gravity compensation takes off the wrong weight.", remedy)
 
 

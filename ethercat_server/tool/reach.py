@@ -8,7 +8,8 @@ from ethercat_server.errors import InterfaceError, UsageError
 from ethercat_server.tool.direct import DirectLink
 from ethercat_server.tool.holder import find_holder
 from ethercat_server.tool.link import Link
-from ethercat_server.tool.remote import ServerLink, parse_address
+from ethercat_server.tool.remote import ServerLink
+from protocol.address import Address
 
 
 def open_link(ifname: str | None, server: str | None, *, any_slave: bool = False) -> Link:
@@ -29,7 +30,11 @@ def find_server(ifname: str | None, server: str | None) -> ServerLink | None:
     if (ifname is None) == (server is None):
         raise UsageError("name either an interface, such as ens5, or a server with --server HOST:PORT")
     if server is not None:
-        return ServerLink(*parse_address(server))
+        try:
+            address = Address.parse(server)
+        except ValueError as error:
+            raise UsageError(f"--server {error}") from None
+        return ServerLink(address.host, address.port)
     assert ifname is not None
     holder = find_holder(ifname)
     if holder is None:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
+from ethercat_server.errors import BusError, SdoAbortError, ServerError
 from ethercat_server.sdo import Steps
 from ethercat_server.sensor import Identity
 from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, signals_held_back
@@ -30,14 +30,6 @@ _SLOWEST_SAMPLE_S: Final = 0.2
 _IDLE_S: Final = 0.05
 _READ_ATTEMPTS: Final = 3
 _READ_PAUSE_S: Final = 0.1
-
-
-def parse_address(text: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT; UsageError if it is none."""
-    host, colon, port = text.rpartition(":")
-    if not colon or not host or not port.isdecimal() or not 1 <= int(port) <= 65535:
-        raise UsageError(f"--server {text}: it must be HOST:PORT, for example localhost:12001")
-    return host.strip("[]"), int(port)
 
 
 class ServerLink(Link):

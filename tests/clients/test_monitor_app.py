@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from clients.address import Address
 from clients.monitor.app import Monitor
 from clients.monitor.glyphs import UNICODE
 from clients.monitor.model import Model
 from clients.monitor.recorder import Recorder
+from protocol.address import Address
 from tests.clients import monitor_states as made
 from tests.server.running import free_port, wait_until
 

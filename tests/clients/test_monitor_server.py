@@ -18,12 +18,12 @@ from typing import Any
 
 import pytest
 
-from clients.address import Address
 from clients.monitor.model import Model
 from clients.monitor.options import parse
 from clients.monitor.reader import Reader
 from clients.monitor.state import State
 from clients.monitor.tare import tare
+from protocol.address import Address
 from tests.server.running import PATIENCE_S, Server, free_port, needs_bus, wait_until
 
 pytestmark = [pytest.mark.bus, needs_bus]
@@ -263,7 +263,7 @@ def test_tare_of_another_user_says_the_servers_sentence(shared: Server) -> None:
     if os.geteuid():
         pytest.skip("only root can be another user")
     code = (
-        "from clients.address import Address; from clients.monitor.tare import tare;"
+        "from protocol.address import Address; from clients.monitor.tare import tare;"
         "from tests.server.as_another_user import become_nobody; become_nobody();"
         f"print(*tare(Address('localhost', {shared.port}), 0))"
     )

@@ -248,7 +248,7 @@ def test_an_imu_that_is_off_is_no_reason_not_to_be_healthy(healthy: Subject) -> 
 
 @pytest.mark.parametrize(
     ("scale", "words"),
-    [(STANDARD_GRAVITY, "--imu-units si"), (1 / STANDARD_GRAVITY, "leave --imu-units si away")],
+    [(STANDARD_GRAVITY, "--imu-raw-units si"), (1 / STANDARD_GRAVITY, "leave --imu-raw-units si away")],
 )
 def test_an_accelerometer_in_the_wrong_unit_is_told(healthy: Subject, scale: float, words: str) -> None:
     examination = examine(changed(healthy, acceleration=healthy.columns.acceleration * scale))

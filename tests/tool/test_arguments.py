@@ -93,7 +93,7 @@ def test_the_rate_decides_which_sinc_length_is_in_force(
     [
         (["objects"], "either an interface"),
         (["objects", "ens5", "--server", "localhost:12001"], "either an interface"),
-        (["objects", "--server", "localhost"], "HOST:PORT"),
+        (["objects", "--server", "localhost:port"], "HOST:PORT"),
         (["objects", "--server", "localhost:0"], "HOST:PORT"),
         (["plan", "ens5"], "nothing is asked for"),
         (["plan", "ens5", "--set", "sinc_length"], "NAME=VALUE"),
