@@ -15,7 +15,7 @@ from ethercat_server.bus import Bus
 from ethercat_server.errors import BusError
 from ethercat_server.sdo import CyclicSdo, Steps
 from ethercat_server.sensor import Identity, Sensor, identify, put_right, set_up
-from ethercat_server.sii import SII_OWNER
+from ethercat_server.sii import OF_FIRMWARE, SII_OWNER
 
 _STATE_TIMEOUT_S: Final = 2.0
 _ABSENT_PAUSE_S: Final = 0.005
@@ -105,7 +105,7 @@ class Ladder:
     def _set_up_anew(self) -> Steps[None]:
         sensor, rows = self._sensor, self._sync_managers
         yield from self._go(AlState.INIT)
-        self._write(SII_OWNER, b"\x01")  # the sensor reads its SII on the way to PREOP
+        self._write(SII_OWNER, OF_FIRMWARE)  # the sensor reads its SII on the way to PREOP
         self._write(_SM, rows[:_MAILBOXES_END])
         yield from self._go(AlState.PREOP)
         found = yield from identify(self.sdo, sensor.identity.name)

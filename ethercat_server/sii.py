@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import struct
 import time
-from typing import Final
+from typing import Final, Protocol
 
-from ethercat_server.bus import Bus
 from ethercat_server.errors import BusError
 from ethercat_server.sdo import Steps
 
 SII_OWNER: Final = 0x0500
 """Who reads the SII: 0 the master, 1 the slave's own firmware; 2 takes it from the firmware."""
+OF_FIRMWARE: Final = b"\x01"
+_OF_MASTER: Final = b"\x00"
+_TAKE: Final = b"\x02"
 PROTOCOLS: Final = 0x1C
 """Word of the SII that says which mailbox protocols there are."""
 PROTOCOL_COE: Final = 0x04
@@ -29,30 +31,45 @@ _NONE: Final = 0x0000
 _BUSY: Final = 0x8000
 _ERRORS: Final = 0x7800
 _EIGHT_BYTES: Final = 0x0040
+_ATTEMPTS_TO_GIVE_BACK: Final = 3
 _WORD_TIMEOUT_S: Final = 1.5
 """So long reading is tried again: a bus that is deaf for a moment is no refusal."""
 
 
-def read_sii(bus: Bus, slave: int, word: int, count: int) -> Steps[bytes]:
-    """`count` words of the SII from `word` on, two bytes each; BusError if it cannot be read."""
+class Registers(Protocol):
+    """How the registers of a slave's controller are reached, as `Bus` does it."""
+
+    def read_register(self, slave: int, address: int, size: int, /) -> bytes | None:
+        """None if the slave did not do it."""
+
+    def write_register(self, slave: int, address: int, data: bytes, /) -> bool:
+        """False if the slave did not do it."""
+
+
+def read_sii(bus: Registers, slave: int, word: int, count: int, owner: bytes = OF_FIRMWARE) -> Steps[bytes]:
+    """`count` words of the SII from `word` on, two bytes each; BusError if it cannot be read.
+
+    `owner` is who has the right to use it afterwards, as in register 0x0500.
+    """
     data = bytearray()
     try:
-        yield from _write(bus, slave, SII_OWNER, b"\x02", word)
-        yield from _write(bus, slave, SII_OWNER, b"\x00", word)
+        yield from _write(bus, slave, SII_OWNER, _TAKE, word)
+        yield from _write(bus, slave, SII_OWNER, _OF_MASTER, word)
         while len(data) < 2 * count:
             data += yield from _read_word(bus, slave, word + len(data) // 2)
     finally:
-        bus.write_register(slave, SII_OWNER, b"\x01")
+        # No waiting here: the one who reads may have given up.
+        any(bus.write_register(slave, SII_OWNER, owner) for _ in range(_ATTEMPTS_TO_GIVE_BACK))
     return bytes(data[: 2 * count])
 
 
-def has_coe(bus: Bus, slave: int) -> Steps[bool]:
+def has_coe(bus: Registers, slave: int) -> Steps[bool]:
     """Whether the slave has a mailbox with CoE, and so objects."""
     words = yield from read_sii(bus, slave, PROTOCOLS, 1)
     return bool(words[0] & PROTOCOL_COE)
 
 
-def _read_word(bus: Bus, slave: int, word: int) -> Steps[bytes]:
+def _read_word(bus: Registers, slave: int, word: int) -> Steps[bytes]:
     """What one read command gives: two words, or four."""
     deadline = time.monotonic() + _WORD_TIMEOUT_S
     answer, asked = "no answer", False
@@ -76,7 +93,7 @@ def _read_word(bus: Bus, slave: int, word: int) -> Steps[bytes]:
     raise _unreadable(slave, word, answer)
 
 
-def _write(bus: Bus, slave: int, address: int, data: bytes, word: int) -> Steps[None]:
+def _write(bus: Registers, slave: int, address: int, data: bytes, word: int) -> Steps[None]:
     deadline = time.monotonic() + _WORD_TIMEOUT_S
     while not bus.write_register(slave, address, data):
         if time.monotonic() > deadline:

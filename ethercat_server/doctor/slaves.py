@@ -13,6 +13,8 @@ from typing import Any, Final
 from ethercat_server.al import AL_STATUS, AL_STATUS_SIZE, AlStatus
 from ethercat_server.bus import Bus
 from ethercat_server.errors import BusError
+from ethercat_server.sdo import finish
+from ethercat_server.sii import SII_OWNER, read_sii
 from ethercat_server.tool import sii
 
 MOST_PORTS: Final = 4
@@ -20,13 +22,6 @@ _DL_STATUS: Final = 0x0110
 _COUNTERS: Final = 0x0300
 _COUNTERS_SIZE: Final = 0x14
 _WATCHDOG_COUNTER: Final = 0x0442
-_SII_CONFIGURATION: Final = 0x0500
-_SII_CONTROL: Final = 0x0502
-_SII_DATA: Final = 0x0508
-_SII_READ: Final = 0x0100
-_SII_BUSY: Final = 0x8000
-_SII_ERRORS: Final = 0x7800
-_OF_FIRMWARE: Final = 0x01
 _ATTEMPTS: Final = 10
 _FIND_ATTEMPTS: Final = 5
 _FIND_TIMEOUT_S: Final = 0.05
@@ -123,31 +118,18 @@ def _read(bus: Bus, place: int, address: int, size: int) -> bytes:
 
 
 def _read_sii(bus: Bus, place: int) -> bytes:
-    """The SII through the ESC's registers. Who had the right to use it has it again."""
-    before = _read(bus, place, _SII_CONFIGURATION, 1)
-    if before[0] & _OF_FIRMWARE:
-        bus.write_at(place, _SII_CONFIGURATION, b"\0")
-    try:
-        return sii.read_image(lambda word, _words: _sii_words(bus, place, word))
-    finally:
-        if before[0] & _OF_FIRMWARE:
-            bus.write_at(place, _SII_CONFIGURATION, before)
+    """Who had the right to use the SII has it again."""
+    owner = _read(bus, place, SII_OWNER, 1)
+    registers = _ByPlace(bus)
+
+    def read(word: int, words: int) -> bytes:
+        return finish(read_sii(registers, place, word, words, owner), pause_s=0)
+
+    return sii.read_image(read)
 
 
-def _sii_words(bus: Bus, place: int, word: int) -> bytes:
-    for _ in range(_ATTEMPTS):
-        _sii_ready(bus, place, word)
-        if not bus.write_at(place, _SII_CONTROL, struct.pack("<HI", _SII_READ, word)):
-            continue
-        if not _sii_ready(bus, place, word) & _SII_ERRORS:
-            return _read(bus, place, _SII_DATA, 4)
-    raise BusError(f"the SII of slave {place} cannot be read at word 0x{word:04x}: check cable and power")
+class _ByPlace:
+    """Registers of slaves that were not scanned."""
 
-
-def _sii_ready(bus: Bus, place: int, word: int) -> int:
-    """Wait until the interface is not busy; returns its status."""
-    for _ in range(_ATTEMPTS):
-        (status,) = struct.unpack("<H", _read(bus, place, _SII_CONTROL, 2))
-        if not status & _SII_BUSY:
-            return int(status)
-    raise BusError(f"the SII of slave {place} is busy at word 0x{word:04x}: power it off and on")
+    def __init__(self, bus: Bus) -> None:
+        self.read_register, self.write_register = bus.read_at, bus.write_at
