@@ -218,6 +218,7 @@ def test_the_node_ends_while_a_service_waits(
             node = start(mute.port)
             mute.answers["tare"] = lambda _: None
             assert mute.subscribed.wait(20)
+            other.parameters("server_port")  # its services are there
             caller = threading.Thread(target=lambda: other.trigger("sensor_tare"), daemon=True)
             caller.start()
             wait_until(lambda: any(r["action"] == "tare" for r in mute.requests), "the request")
