@@ -22,7 +22,7 @@ setup(
     name="bridge",
     version="0.1.0",
     packages=["bridge", "bridge.compensation", "protocol"],
-    package_data={"": ["py.typed"]},
+    package_data={"": ["py.typed"], "bridge": ["fastdds.xml"]},
     data_files=list(data_files()),
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},

@@ -6,9 +6,11 @@ Everything of ROS is imported only after the signals are in hand, so that Ctrl-C
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 
+from bridge.middleware import use_own_profiles
 from bridge.signals import block_stop_signals
 
 USAGE = """\
@@ -27,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if own and own[0] in {"-h", "--help"}:
         sys.stdout.write(USAGE)
         return 0
+    use_own_profiles(os.environ)
     try:
         from bridge.node import run  # noqa: PLC0415 - rclpy takes a while to load, see above
     except ImportError as error:
