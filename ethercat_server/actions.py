@@ -15,7 +15,7 @@ from ethercat_server.connection import Connection, Subscription
 from ethercat_server.hub import Hub
 from protocol.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
 from protocol.errors import RequestError
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 
 _MOST_EXPLAINED: Final = 32
 """With more sensors `describe` leaves out what their settings mean: a reply has 65536 bytes at most."""

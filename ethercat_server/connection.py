@@ -9,15 +9,9 @@ from typing import Final, NamedTuple
 
 from ethercat_server.outbox import Outbox, with_gap
 from protocol.errors import BadMessageError, RemoteProtocolError
-from protocol.framing import (
-    BARE_JSON_FIRST_BYTE,
-    BareJsonDecoder,
-    DataFlag,
-    FrameDecoder,
-    JsonObject,
-    encode_bare_json,
-    encode_json,
-)
+from protocol.framing import DataFlag, FrameDecoder, encode_json
+from protocol.json_text import JsonObject
+from protocol.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 
 MAX_REQUEST_LENGTH: Final = 4096
 _SEND_BUFFER: Final = 65536

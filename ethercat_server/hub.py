@@ -17,7 +17,7 @@ from ethercat_server.connection import Connection, Limits, Unreadable
 from ethercat_server.door import Door
 from protocol.control import ErrorCode, error_reply
 from protocol.errors import RequestError
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 
 _LAST_WORDS_S: Final = 1.0
 """How long a closing connection may take to accept its last reply."""

@@ -21,7 +21,7 @@ from ethercat_server.sdo import CyclicSdo, Steps
 from ethercat_server.sensor import Identity, Sensor
 from ethercat_server.stream import SensorStream
 from protocol.control import Event, event
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 from protocol.settings import SettingValue
 
 _SHORT_EXCHANGES: Final = 2

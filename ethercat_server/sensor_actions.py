@@ -21,7 +21,7 @@ from ethercat_server.stream import SensorStream
 from ethercat_server.tare import tare
 from protocol.control import ErrorCode, Event, Request, error_reply, event, reply
 from protocol.errors import RequestError, SettingError
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import SettingValue
 

@@ -23,7 +23,8 @@ from typing import Any, Final
 from protocol.connection import CONNECT_TIMEOUT_S, FramedConnection
 from protocol.control import PROTOCOL_VERSION, Event, request
 from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError
-from protocol.framing import DataFlag, DataMessage, JsonObject
+from protocol.framing import DataFlag, DataMessage
+from protocol.json_text import JsonObject
 from protocol.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
 from protocol.text import printable
 

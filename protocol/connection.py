@@ -12,7 +12,8 @@ import struct
 from typing import Final
 
 from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
-from protocol.framing import DataMessage, FrameDecoder, JsonObject, encode_json
+from protocol.framing import DataMessage, FrameDecoder, encode_json
+from protocol.json_text import JsonObject
 from protocol.text import printable
 
 CONNECT_TIMEOUT_S: Final = 2.0

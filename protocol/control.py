@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import Any, Final, NamedTuple
 
 from protocol.errors import RequestError, SettingError
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 from protocol.sdo_types import sdo_type
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import check_settings

@@ -6,34 +6,18 @@ The rules it keeps:
 - Hostile lengths are refused as soon as the length is there: nothing is buffered for them.
 - RemoteProtocolError is final: the decoder raises it again on every later call and keeps nothing more.
 - BadMessageError concerns one message: it has been consumed, and the next call goes on after it.
-- On a bare JSON connection a message ends with its closing brace or with a newline, whichever is first,
-  so a client that sends no newline is understood and a broken line costs only itself.
 """
 
 from __future__ import annotations
 
-import json
-import math
-import re
 import struct
 from collections.abc import Iterator
 from enum import IntEnum, IntFlag
 from typing import Any, Final, NamedTuple, NoReturn
 
 from protocol.errors import BadMessageError, RemoteProtocolError
+from protocol.json_text import MAX_JSON_LENGTH, JsonObject, encode_json_text, parse_json_object
 from protocol.pdo import LAYOUTS
-
-MAX_JSON_LENGTH: Final = 65536
-"""Longest JSON text, bytes, that either side accepts in one message."""
-MAX_JSON_DEPTH: Final = 32
-"""Most objects and arrays in each other."""
-BARE_JSON_FIRST_BYTE: Final = b"{"
-"""A connection that starts with this byte is a bare JSON connection."""
-
-_NEWLINE: Final = ord("\n")
-
-JsonObject = dict[str, Any]
-
 
 class MessageType(IntEnum):
     """The `type` byte."""
@@ -94,68 +78,10 @@ def encode_data_head(
     return _DATA_MESSAGE.pack(length, _DATA, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc)
 
 
-def encode_json_text(message: JsonObject) -> bytes:
-    """Compact JSON text. ValueError for NaN and infinities, which JSON has none of."""
-    return json.dumps(message, separators=(",", ":"), allow_nan=False).encode("ascii")
-
-
 def encode_json(message: JsonObject) -> bytes:
     """A whole JSON message for a framed connection."""
     text = encode_json_text(message)
     return _PREFIX.pack(_TYPE_SIZE + len(text), MessageType.JSON) + text
-
-
-def encode_bare_json(message: JsonObject) -> bytes:
-    """A whole message for a bare JSON connection: one line."""
-    return encode_json_text(message) + b"\n"
-
-
-def parse_json_object(text: bytes) -> JsonObject:
-    """The JSON object in `text`; BadMessageError if it is anything else."""
-    try:
-        decoded = text.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise BadMessageError(f"the message is not UTF-8: {error.reason} at byte {error.start}") from None
-    try:
-        value = json.loads(decoded, parse_constant=_no_constant, parse_float=_finite_float)
-    except RecursionError:
-        raise BadMessageError("the message is nested too deeply") from None
-    except json.JSONDecodeError as error:
-        raise BadMessageError(f"the message is not valid JSON: {error}") from None
-    except ValueError as error:
-        raise BadMessageError(f"the message has a number that cannot be used: {error}") from None
-    if not isinstance(value, dict):
-        raise BadMessageError(f"the message is a JSON {_json_kind(value)}: it must be an object")
-    if decoded.count("[") + decoded.count("{") > MAX_JSON_DEPTH and _depth(value) > MAX_JSON_DEPTH:
-        raise BadMessageError(f"the message is nested more than {MAX_JSON_DEPTH} deep")
-    return value
-
-
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON number")
-
-
-def _finite_float(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text[:20]} is too large")
-    return value
-
-
-def _json_kind(value: object) -> str:
-    if value is None:
-        return "null"
-    kinds = {list: "array", str: "string", bool: "boolean", int: "number", float: "number"}
-    return kinds.get(type(value), "value")
-
-
-def _depth(value: object) -> int:
-    """How many containers are in each other."""
-    level, depth = [value], 0
-    while level := [item for item in level if isinstance(item, dict | list)]:
-        depth += 1
-        level = [inner for item in level for inner in (item.values() if isinstance(item, dict) else item)]
-    return depth
 
 
 class FrameDecoder:
@@ -289,92 +215,3 @@ class FrameDecoder:
             self._buffer.extend(bytes(pending + count - len(self._buffer)))
 
 
-class BareJsonDecoder:
-    """Decodes a bare JSON connection's bytes: one JSON object a line, the newline optional.
-
-    Same use as `FrameDecoder`: `feed`, then `next_message` until None. Call `end_of_input` when the peer
-    has closed its side, so that a half-finished object is reported.
-    """
-
-    _STRUCTURE = re.compile(rb'["\\{}\n]')
-    _STRING_STRUCTURE = re.compile(rb'["\\\n]')
-
-    def __init__(self, *, max_json_length: int = MAX_JSON_LENGTH) -> None:
-        self._max_json_length = max_json_length
-        self._buffer = bytearray()
-        self._broken: str | None = None
-        self._ended = False
-        self._reset_scan()
-
-    @property
-    def pending(self) -> int:
-        """Bytes of an unfinished message that are waiting for the rest."""
-        return len(self._buffer)
-
-    def feed(self, data: bytes | bytearray | memoryview) -> None:
-        """Add received bytes."""
-        if self._broken is None:
-            self._buffer += data
-
-    def end_of_input(self) -> None:
-        """No more bytes will come."""
-        self._ended = True
-
-    def next_message(self) -> JsonObject | None:
-        """The next whole message, or None; raises as `FrameDecoder.next_message`."""
-        if self._broken is not None:
-            raise RemoteProtocolError(self._broken)
-        if not self._scanned:
-            self._buffer = self._buffer.lstrip(b" \t\r\n")
-        end = self._find_end()
-        if end is None and self._ended and self._buffer:
-            end = len(self._buffer)
-        if end is not None and end <= self._max_json_length:
-            text = bytes(self._buffer[:end])
-            del self._buffer[:end]
-            self._reset_scan()
-            return parse_json_object(text)
-        if end is not None or len(self._buffer) > self._max_json_length:
-            self._broken = f"a line of more than {self._max_json_length} bytes"
-            self._buffer.clear()
-            raise RemoteProtocolError(self._broken)
-        return None
-
-    def __iter__(self) -> Iterator[JsonObject]:
-        """The whole messages there are now."""
-        while (message := self.next_message()) is not None:
-            yield message
-
-    def _reset_scan(self) -> None:
-        self._scanned = 0
-        self._depth = 0
-        self._in_string = False
-
-    def _find_end(self) -> int | None:
-        """Where the first message ends, scanning each byte once however it trickles in."""
-        position = self._scanned
-        while True:
-            pattern = self._STRING_STRUCTURE if self._in_string else self._STRUCTURE
-            match = pattern.search(self._buffer, position)
-            if match is None:
-                self._scanned = len(self._buffer)
-                return None
-            position = match.end()
-            byte = match.group()
-            if byte == b"\n":
-                return position
-            if byte == b'"':
-                self._in_string = not self._in_string
-            elif byte == b"\\":
-                # Skip the escaped byte, once it is there: a newline is never escaped.
-                if position == len(self._buffer):
-                    self._scanned = position - 1
-                    return None
-                if self._buffer[position] != _NEWLINE:
-                    position += 1
-            elif byte == b"{":
-                self._depth += 1
-            elif byte == b"}":
-                self._depth -= 1
-                if self._depth <= 0:
-                    return position

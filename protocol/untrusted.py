@@ -5,7 +5,7 @@ Texts lose what a terminal would obey.
 
 from __future__ import annotations
 
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 from protocol.text import printable
 
 

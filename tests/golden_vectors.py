@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from protocol.framing import DataMessage, JsonObject
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject
 from protocol.pdo import Sample
 
 _FOLDER: Final = Path(__file__).parent / "protocol" / "golden"

@@ -18,7 +18,8 @@ from clients.monitor.sensor_model import SensorModel, spread
 from clients.monitor.state import Client, Message, ServerState, State
 from clients.monitor.stream_meter import OLD
 from protocol.control import Event
-from protocol.framing import DataMessage, JsonObject
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject
 from protocol.pdo import ImuUnits
 from protocol.untrusted import number, rows, text, whole
 

@@ -14,7 +14,8 @@ from typing import Any, Final
 
 from clients.monitor.state import AXES, SILENT_S, WRENCH_FIELDS, Alert, Clock, Range, SensorState, Spread
 from clients.monitor.stream_meter import StreamMeter
-from protocol.framing import DataMessage, JsonObject
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject
 from protocol.pdo import LAYOUTS, ImuUnits, SampleDecoder
 from protocol.untrusted import number, text, whole
 from protocol.warnings_register import WarningFlag, explain

@@ -12,7 +12,8 @@ from typing import Final
 
 from clients.recording.errors import DamagedError
 from protocol.errors import BadMessageError
-from protocol.framing import DataMessage, JsonObject, encode_json_text, parse_json_object
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject, encode_json_text, parse_json_object
 from protocol.pdo import LAYOUTS
 
 FORMAT_VERSION: Final = "1"

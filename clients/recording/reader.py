@@ -28,7 +28,8 @@ from clients.recording.file_format import (
     unpack_frame,
     unpack_json,
 )
-from protocol.framing import DataMessage, JsonObject
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject
 from protocol.text import visible
 from protocol.untrusted import rows
 

@@ -17,7 +17,8 @@ from protocol.client import Client
 from protocol.control import Event as ServerEvent
 from protocol.control import request
 from protocol.errors import ConnectionFailedError, RefusedError
-from protocol.framing import DataMessage, JsonObject
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject
 
 Batch = list[DataMessage | Description | Event]
 

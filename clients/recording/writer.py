@@ -28,7 +28,8 @@ from clients.recording.file_format import (
     pack_json,
 )
 from clients.recording.ros_messages import DEFINITIONS, RosTopics
-from protocol.framing import DataMessage, JsonObject
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject
 
 _CHUNK_SIZE: Final = 1024 * 1024
 _U32: Final = 0xFFFFFFFF

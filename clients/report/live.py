@@ -15,7 +15,8 @@ from protocol import untrusted
 from protocol.address import Address
 from protocol.client import Client, connect
 from protocol.errors import ConnectionFailedError
-from protocol.framing import DataMessage, JsonObject
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject
 from protocol.pdo import ImuUnits
 from protocol.sensor_choice import MOST_PLACES, SensorChoice
 

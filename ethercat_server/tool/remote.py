@@ -20,7 +20,7 @@ from protocol.errors import (
     RefusedError,
     UnreachableError,
 )
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 from protocol.settings import SettingValue
 
 _CONNECT_TIMEOUT_S: Final = 5.0

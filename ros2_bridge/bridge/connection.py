@@ -16,7 +16,8 @@ from typing import Any, Final, NamedTuple
 from protocol.connection import CONNECT_TIMEOUT_S, FramedConnection
 from protocol.control import PROTOCOL_VERSION, request
 from protocol.errors import ConnectionFailedError, SettingError
-from protocol.framing import DataMessage, JsonObject
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject
 from protocol.settings import SETTINGS, SettingValue
 from protocol.text import printable
 from protocol.untrusted import rows

@@ -11,7 +11,7 @@ from typing import Final
 
 from bridge.connection import Connection, SensorInfo, known_settings
 from protocol.control import Event
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 from protocol.settings import SettingValue, sampling_rate_hz
 from protocol.text import printable
 

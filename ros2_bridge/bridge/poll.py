@@ -9,7 +9,7 @@ from typing import Any
 
 from bridge.connection import Connection
 from protocol.errors import ConnectionFailedError
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 
 
 class Poll:

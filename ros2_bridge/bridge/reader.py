@@ -19,7 +19,8 @@ from bridge.watch import Watch
 from protocol.connection import SILENCE_S
 from protocol.control import Event
 from protocol.errors import ConnectionFailedError, UnreachableError
-from protocol.framing import DataMessage, JsonObject
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject
 from protocol.pdo import LAYOUTS, Sample, SampleDecoder
 from protocol.text import printable
 

@@ -14,7 +14,7 @@ from bridge.connection import Connection, refusal
 from bridge.link import Link
 from bridge.parameters import Parameters
 from protocol.errors import ConnectionFailedError
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 
 CONFIGURE_TIMEOUT_S: Final = 10.0
 DESCRIBE_TIMEOUT_S: Final = 3.0

@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 from bridge.requests import CONFIGURE_TIMEOUT_S
 from protocol.control import ErrorCode, Event, event
-from protocol.framing import JsonObject
+from protocol.json_text import JsonObject
 from protocol.settings import SETTINGS as TABLE
 from tests.bridge.conftest import Listener, NodeProcess, starter, wait_until
 from tests.bridge.scripted_server import ScriptedServer

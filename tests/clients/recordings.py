@@ -10,7 +10,8 @@ from clients.recording.file_format import FORMAT_VERSION
 from clients.recording.ros_messages import RosTopics
 from clients.recording.writer import RecordingWriter
 from protocol import pdo
-from protocol.framing import DataMessage, JsonObject
+from protocol.framing import DataMessage
+from protocol.json_text import JsonObject
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 1_250_000

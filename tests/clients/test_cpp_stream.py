@@ -21,7 +21,8 @@ from typing import Any
 import pytest
 
 from protocol.control import request
-from protocol.framing import DataFlag, FrameDecoder, JsonObject, encode_data, encode_json
+from protocol.framing import DataFlag, FrameDecoder, encode_data, encode_json
+from protocol.json_text import JsonObject
 from protocol.pdo import encode
 from tests.clients.cpp_programs import (
     CLIENT,

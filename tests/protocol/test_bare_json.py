@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import BadMessageError, ProtocolError, RemoteProtocolError
-from protocol.framing import BareJsonDecoder, encode_bare_json
+from protocol.bare_json import BareJsonDecoder, encode_bare_json
 
 OBJECT: dict[str, Any] = {"action": "shutdown", "id": 'a "quoted" \\ } { text'}
 LINE = encode_bare_json(OBJECT)

@@ -19,7 +19,8 @@ import pytest
 from protocol.connection import FramedConnection
 from protocol.control import request
 from protocol.errors import ConnectionFailedError
-from protocol.framing import DataFlag, DataMessage, JsonObject
+from protocol.framing import DataFlag, DataMessage
+from protocol.json_text import JsonObject
 
 START_TIMEOUT_S = 40.0
 PATIENCE_S = 30.0

@@ -12,7 +12,8 @@ from ethercat_server.cycle import Cycle
 from ethercat_server.hub import Hub
 from ethercat_server.sensor import Identity, Sensor
 from ethercat_server.sensor_actions import SensorActions
-from protocol.framing import MAX_JSON_LENGTH, JsonObject, encode_json
+from protocol.framing import encode_json
+from protocol.json_text import MAX_JSON_LENGTH, JsonObject
 from protocol.meaning import value_meaning
 from protocol.settings import SETTINGS, SettingValue, start_up_defaults
 

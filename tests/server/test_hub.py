@@ -24,7 +24,8 @@ from ethercat_server.errors import ServerError
 from ethercat_server.hub import Hub
 from ethercat_server.outbox import MAX_QUEUED_DATA
 from protocol.control import parse_request, reply
-from protocol.framing import DataFlag, DataMessage, FrameDecoder, JsonObject, encode_data, encode_json
+from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
+from protocol.json_text import JsonObject
 
 
 def free_port() -> int:
