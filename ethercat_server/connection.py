@@ -8,10 +8,10 @@ import time
 from typing import Final, NamedTuple
 
 from ethercat_server.outbox import Outbox, with_gap
+from protocol.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 from protocol.errors import BadMessageError, RemoteProtocolError
 from protocol.framing import DataFlag, FrameDecoder, encode_json
 from protocol.json_text import JsonObject
-from protocol.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 
 MAX_REQUEST_LENGTH: Final = 4096
 _SEND_BUFFER: Final = 65536

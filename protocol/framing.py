@@ -13,11 +13,12 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from enum import IntEnum, IntFlag
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Final, NamedTuple, NoReturn
 
-from protocol.errors import BadMessageError, RemoteProtocolError
+from protocol.errors import RemoteProtocolError
 from protocol.json_text import MAX_JSON_LENGTH, JsonObject, encode_json_text, parse_json_object
 from protocol.pdo import LAYOUTS
+
 
 class MessageType(IntEnum):
     """The `type` byte."""
@@ -213,5 +214,3 @@ class FrameDecoder:
         self._start, self._end = 0, pending
         if len(self._buffer) - pending < count:
             self._buffer.extend(bytes(pending + count - len(self._buffer)))
-
-

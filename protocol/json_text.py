@@ -1,4 +1,4 @@
-"""JSON texts as both kinds of connection carry them: one object, bounded, no NaN, nothing that is not JSON."""
+"""JSON texts as both kinds of connection carry them: one object, bounded, no NaN, nothing that is no JSON."""
 
 from __future__ import annotations
 

@@ -10,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import BadMessageError, ProtocolError, RemoteProtocolError
-from protocol.framing import DATA_FLAGS_OFFSET, MAX_DATA_MESSAGE_SIZE, DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
+from protocol.framing import (
+    DATA_FLAGS_OFFSET,
+    MAX_DATA_MESSAGE_SIZE,
+    DataFlag,
+    DataMessage,
+    FrameDecoder,
+    encode_data,
+    encode_json,
+)
 from protocol.json_text import MAX_JSON_LENGTH
 
 SAMPLE = DataMessage(7, 1_700_000_000_000_000_000, 123_456_789, 3, int(DataFlag.GAP), 3, bytes(range(61)))

@@ -21,9 +21,9 @@ import time
 from collections.abc import Callable
 
 from ethercat_server.connection import MAX_REQUEST_LENGTH
+from protocol.bare_json import encode_bare_json
 from protocol.control import request
 from protocol.framing import encode_json
-from protocol.bare_json import encode_bare_json
 from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, mutate
 from tests.server.as_another_user import become_nobody
 

@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
-from protocol.control import ACTIONS, request
 from protocol.bare_json import encode_bare_json
+from protocol.control import ACTIONS, request
 from tests.server.as_another_user import NOBODY
 from tests.server.running import Server, Veth, free_port, needs_bus, server, wait_until
 
