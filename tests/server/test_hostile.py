@@ -100,7 +100,7 @@ def attack(running: Server, listener: Listener, count: int, seed: int | str) -> 
     assert sum(report["done"].values()) == count
     assert report["answers"]["grants"] > 0
     assert report["answers"]["refusals"] > 0
-    assert report["answers"]["heard after a half close"] > 0
+    assert "half_close" not in report["done"] or report["answers"].get("heard after a half close", 0) > 0
     print(f"seed {seed}: {report}")
     return report
 
