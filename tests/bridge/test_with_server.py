@@ -6,7 +6,7 @@ import json
 import queue
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import Imu
 
-from tests.bridge.conftest import Listener, NodeProcess, starter, wait_until
+from tests.bridge.conftest import PATIENCE_S, Listener, NodeProcess, starter, wait_until
 from tests.bridge.shared import listener
 from tests.bridge.streaming import Diagnostics, values
 from tests.server.running import Program, Server, needs_bus, virtual_sensor
@@ -48,15 +48,20 @@ class Bench:
         self.sensor.process.stdin.write(text + "\n")
         self.sensor.process.stdin.flush()
 
-    def set_parameter(self, name: str, value: object) -> None:
-        """Set it, again while a busy machine has lost the sensor for a moment."""
+    def answer(self, ask: Callable[[], tuple[bool, str]]) -> tuple[bool, str]:
+        """Whether it was done, and what is said; asked again while a busy machine has lost the sensor."""
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            done, text = ask()
+            if done or "(not_ready)" not in text:
+                return done, text
+            assert time.monotonic() < deadline, text
 
-        def is_set() -> bool:
-            done, reason = self.listener.set_parameter(name, value)
-            assert done or "(not_ready)" in reason, reason
-            return done
-
-        wait_until(is_set, name)
+    def granted(self, ask: Callable[[], tuple[bool, str]]) -> str:
+        """What is said once it is done."""
+        done, text = self.answer(ask)
+        assert done, text
+        return text
 
     def forget(self) -> None:
         while not self.wrench.empty():
@@ -106,7 +111,7 @@ def test_gravity_and_orientation(bench: Bench, listener: Listener) -> None:
     a = imu.linear_acceleration
     assert (a.x**2 + a.y**2 + a.z**2) ** 0.5 == pytest.approx(9.8, abs=2.0)
     assert imu.orientation_covariance[0] == -1.0  # mapped, but not estimated
-    bench.set_parameter("settings.orientation_estimation", True)
+    bench.granted(lambda: listener.set_parameter("settings.orientation_estimation", True))
     messages = listener.subscribe(Imu, "imu/data_raw")
     wait_until(lambda: messages.get(timeout=20).orientation_covariance[0] == 0.0, "an orientation")
     assert bench.age_s(bench.next_wrench()) < 10
@@ -114,29 +119,29 @@ def test_gravity_and_orientation(bench: Bench, listener: Listener) -> None:
 
 def test_settings(bench: Bench, listener: Listener) -> None:
     assert listener.parameters("settings.sinc_length", "settings.chop") == [512, False]
-    bench.set_parameter("settings.sinc_length", 256)
-    done, text = listener.trigger("get_settings")
-    assert done
+    bench.granted(lambda: listener.set_parameter("settings.sinc_length", 256))
+    text = bench.granted(lambda: listener.trigger("get_settings"))
     assert (json.loads(text)["sinc_length"], json.loads(text)["rate_hz"]) == (256, 200)
     array = bench.diagnostics.until(**HEALTHY)
     assert values(array["stream"])["expected_hz"] == "200.0"
-    done, reason = listener.set_parameter("settings.fast", True)
+    done, reason = bench.answer(lambda: listener.set_parameter("settings.fast", True))
     assert not done
     assert "FAST filter works only with the FIR filter on (bad_request)" in reason
     with bench.server.connect() as other:
-        assert other.ask("configure", settings={"temperature_compensation": True})["ok"]
+        change = {"temperature_compensation": True}
+        wait_until(lambda: other.ask("configure", settings=change)["ok"], "the other's change")
     wait_until(
-        lambda: listener.parameters("settings.temperature_compensation") == [True], "the other's change"
+        lambda: listener.parameters("settings.temperature_compensation") == [True], "what the other changed"
     )
-    assert listener.trigger("save_settings")[0]
+    bench.granted(lambda: listener.trigger("save_settings"))
 
 
 def test_tare(bench: Bench, listener: Listener) -> None:
     for _ in range(20):  # the wrist turns, and touches something now and then
-        done, text = listener.trigger("sensor_tare")
+        done, text = bench.answer(lambda: listener.trigger("sensor_tare"))
         if done:
             break
-        assert any(words in text for words in ("is not at rest", "(not_ready)")), text
+        assert "is not at rest" in text
     assert done, text
     assert "old offset Fx 0.0000" in text
     assert "residual Fx" in text
