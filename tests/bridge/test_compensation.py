@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -123,7 +124,7 @@ def test_a_tare_takes_the_offset_and_leaves_the_tool(
     done, text = listener.trigger("tare")
     assert done, text
     assert "the weight of tool_mass 0.8 kg is not part of it" in text
-    assert "bias of 3" in text  # some 30 samples
+    assert re.search(r"bias of \d+ samples", text)
     stages.settle(ZERO6)
     assert list(listener.parameters("bias")[0]) == pytest.approx(BIAS.values, abs=1e-4)
     hold(stream, OVER, bias=BIAS)

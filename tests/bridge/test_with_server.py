@@ -122,8 +122,10 @@ def test_settings(bench: Bench, listener: Listener) -> None:
     bench.granted(lambda: listener.set_parameter("settings.sinc_length", 256))
     text = bench.granted(lambda: listener.trigger("get_settings"))
     assert (json.loads(text)["sinc_length"], json.loads(text)["rate_hz"]) == (256, 200)
-    array = bench.diagnostics.until(**HEALTHY)
-    assert values(array["stream"])["expected_hz"] == "200.0"
+    wait_until(
+        lambda: values(bench.diagnostics.next()["stream"])["expected_hz"] == "200.0", "the rate expected"
+    )
+    bench.diagnostics.until(**HEALTHY)
     done, reason = bench.answer(lambda: listener.set_parameter("settings.fast", True))
     assert not done
     assert "FAST filter works only with the FIR filter on (bad_request)" in reason
