@@ -139,9 +139,11 @@ class Ears:
         self._node.create_subscription(Float64MultiArray, TOPIC, self._on_message, 50)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
+        self._closing = rclpy.task.Future()
+        spin = self._executor.spin_until_future_complete
         self._threads = [
             threading.Thread(target=self._hear_server, daemon=True),
-            threading.Thread(target=self._executor.spin, daemon=True),
+            threading.Thread(target=spin, args=(self._closing,), daemon=True),
         ]
         client.subscribe()
         for thread in self._threads:
@@ -162,9 +164,10 @@ class Ears:
     def close(self) -> None:
         """Stop listening."""
         self._client.close()
-        self._executor.shutdown()
+        self._closing.set_result(None)
         for thread in self._threads:
             thread.join(3)
+        self._executor.shutdown()
         self._node.destroy_node()
         self._rclpy.try_shutdown()
 

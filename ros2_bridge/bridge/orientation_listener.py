@@ -14,6 +14,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 
 from bridge.compensation_parameters import TOPIC_SOURCES, OrientationParameters
 from bridge.orientation_messages import (
@@ -92,18 +93,19 @@ class OrientationListener:
             )
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(self._node)
-        self._closing = False
+        self._closing: Future = Future()
         self._thread = threading.Thread(target=self._run, name="orientation", daemon=True)
         self._thread.start()
 
     def close(self, timeout_s: float = 5.0) -> bool:
         """Stop listening; False if the thread does not end in time."""
-        self._closing = True
-        self._executor.shutdown(timeout_s)
+        self._closing.set_result(None)
         self._thread.join(timeout_s)
-        if not self._thread.is_alive():
-            self._node.destroy_node()
-        return not self._thread.is_alive()
+        if self._thread.is_alive():
+            return False  # what it waits for must not be taken from under it
+        self._executor.shutdown()
+        self._node.destroy_node()
+        return True
 
     def _take(self, read: Callable[[], Oriented]) -> None:
         try:
@@ -118,9 +120,9 @@ class OrientationListener:
 
     def _run(self) -> None:
         try:
-            self._executor.spin()
+            self._executor.spin_until_future_complete(self._closing)
         except ExternalShutdownException:
             return
         except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a dead source
-            if not self._closing:
+            if not self._closing.done():
                 self._on_failure(f"the orientation's source failed: {type(error).__name__}: {error}")

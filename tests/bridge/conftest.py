@@ -37,6 +37,7 @@ class Listener:
         import rclpy
         from diagnostic_msgs.msg import KeyValue
         from rclpy.executors import SingleThreadedExecutor
+        from rclpy.task import Future
         from std_msgs.msg import Float64MultiArray
 
         self.tag = f"test_{uuid.uuid4().hex}"
@@ -48,12 +49,17 @@ class Listener:
         self._supervisor = self._node.create_publisher(KeyValue, self.supervisor_topic, 10)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
-        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._closing: Future = Future()
+        spin = self._executor.spin_until_future_complete
+        self._thread = threading.Thread(target=spin, args=(self._closing,), daemon=True)
         self._thread.start()
 
     def close(self) -> None:
+        # The thread first: what it waits for must not be taken from under it.
+        self._closing.set_result(None)
+        self._thread.join(PATIENCE_S)
+        assert not self._thread.is_alive()
         self._executor.shutdown()
-        self._thread.join(5)
         self._node.destroy_node()
 
     def subscribe(self, message_type: Any, topic: str) -> queue.Queue[Any]:

@@ -63,6 +63,10 @@ def wait_until(condition: Callable[[], bool], what: str, seconds: float = PATIEN
         time.sleep(0.02)
 
 
+_AWAY = "taken out of OP to be set up: ask again"
+_AWAY_S = 20.0
+
+
 class Program:
     """A program of ours running as a process, its standard error in a file."""
 
@@ -221,7 +225,16 @@ class Client:
                 self.receive()
 
     def ask(self, action: str, **values: object) -> dict[str, Any]:
-        """The reply to a request."""
+        """The reply to a request; asked again while a starved sensor is away for a moment."""
+        deadline = time.monotonic() + _AWAY_S
+        while True:
+            reply = self.ask_once(action, **values)
+            if _AWAY not in reply.get("error", {}).get("message", "") or time.monotonic() > deadline:
+                return reply
+            time.sleep(0.05)
+
+    def ask_once(self, action: str, **values: object) -> dict[str, Any]:
+        """The reply to a request, also where the sensor is lost on purpose."""
         self._id += 1
         self.connection.send(request(action, self._id, **values))
         while True:

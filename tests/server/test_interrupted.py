@@ -103,7 +103,7 @@ def test_whoever_asked_is_told_at_once_that_the_sensor_is_lost(bench: tuple[Stea
     sensor.command("on-write 0x8006 4 power off")
     assert error(asking.ask("configure", settings=BY_PREOP))["code"] == "not_ready"
     assert row(asking)["state"] == "LOST"
-    assert error(asking.ask("configure", settings=BY_PREOP))["code"] == "not_ready"
+    assert error(asking.ask_once("configure", settings=BY_PREOP))["code"] == "not_ready"
     sensor.command("power on")
     sensor.wait_event("sensor_back")
     check_former(sensor, asking, before)

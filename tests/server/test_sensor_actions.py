@@ -236,7 +236,7 @@ def test_what_was_configured_and_tared_outlives_a_power_cut(bench: tuple[Bench, 
     sensor.client.events.clear()
     sensor.command("power cycle 0.2")
     sensor.wait_event("sensor_lost")
-    assert error(asking.ask("sdo_read", index=RATE))["code"] == "not_ready"
+    assert error(asking.ask_once("sdo_read", index=RATE))["code"] == "not_ready"
     sensor.wait_event("sensor_back")
     assert asking.ask("describe")["sensors"][0]["settings"]["sinc_length"] == 128
     for place, value in enumerate(offset, 1):
