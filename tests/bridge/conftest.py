@@ -30,6 +30,10 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
         time.sleep(0.01)
 
 
+_ENDED: list[Any] = []
+"""Nodes of closed listeners: `destroy_node` crashes the process now and then, so they end with it."""
+
+
 class Listener:
     """A subscriber of the node's array topic, and a publisher of the supervisor's."""
 
@@ -60,7 +64,11 @@ class Listener:
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
         self._executor.shutdown()
-        self._node.destroy_node()
+        for publisher in list(self._node.publishers):
+            self._node.destroy_publisher(publisher)
+        for subscription in list(self._node.subscriptions):
+            self._node.destroy_subscription(subscription)
+        _ENDED.append(self._node)
 
     def subscribe(self, message_type: Any, topic: str) -> queue.Queue[Any]:
         """What comes on a topic of the node's namespace from now on."""
