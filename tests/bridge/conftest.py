@@ -64,6 +64,8 @@ class Listener:
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
         self._executor.shutdown()
+        for client in list(self._node.clients):
+            self._node.destroy_client(client)
         for publisher in list(self._node.publishers):
             self._node.destroy_publisher(publisher)
         for subscription in list(self._node.subscriptions):
@@ -76,14 +78,22 @@ class Listener:
         self._node.create_subscription(message_type, f"/{self.tag}/{topic}", messages.put, 2000)
         return messages
 
+    def _ask(self, client: Any, request: Any) -> queue.Queue[Any]:
+        assert client.wait_for_service(PATIENCE_S), f"no service {client.srv_name}"
+        answer: queue.Queue[Any] = queue.Queue()
+        client.call_async(request).add_done_callback(lambda future: answer.put(future.result()))
+        return answer
+
+    def ask(self, service_type: Any, name: str) -> queue.Queue[Any]:
+        """Ask one of the node's services and do not wait; the response comes into the queue, if ever."""
+        client = self._node.create_client(service_type, f"/{self.tag}/bridge/{name}")
+        return self._ask(client, service_type.Request())
+
     def call(self, service_type: Any, name: str, request: Any = None) -> Any:
         """The response of one of the node's services."""
         client = self._node.create_client(service_type, f"/{self.tag}/bridge/{name}")
         try:
-            assert client.wait_for_service(PATIENCE_S), f"no service {name}"
-            done: queue.Queue[Any] = queue.Queue()
-            client.call_async(request or service_type.Request()).add_done_callback(done.put)
-            return done.get(timeout=PATIENCE_S).result()
+            return self._ask(client, request or service_type.Request()).get(timeout=PATIENCE_S)
         finally:
             self._node.destroy_client(client)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +11,8 @@ from typing import Any
 import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
+
+from std_srvs.srv import Trigger
 
 from bridge.compensation.quantities import Payload, Wrench
 from bridge.compensation.store import CompensationStore
@@ -188,8 +189,7 @@ def test_a_kept_bias_that_was_taken_with_another_tool(bench: Bench) -> None:
 
 def test_the_node_ends_while_a_tare_waits(bench: Bench, stream: Stream) -> None:
     node = bench.start(**{"rest.duration": 30.0})
-    calling = threading.Thread(target=lambda: bench.listener.trigger("tare"), daemon=True)
-    calling.start()
+    bench.listener.ask(Trigger, "tare")
     diagnostics = Diagnostics(bench.listener)
     diagnostics.next()  # the stream and the diagnostics do not wait for it
     bench.stages.forget()

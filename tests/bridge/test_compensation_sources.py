@@ -18,6 +18,7 @@ import rclpy
 from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped, TransformStamped
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
 
 from bridge.compensation.quantities import length
 from bridge.compensation_parameters import CompensationParameters, OrientationParameters
@@ -25,6 +26,7 @@ from bridge.gravity_sources import ListenerSource, SensorSource
 from bridge.orientation_listener import OrientationListener
 from bridge.orientation_messages import Oriented, Tf, UnusableError, check_tf, look_up, multiply, unit
 from bridge.parameters import ParameterError
+from protocol.json_text import JsonObject
 from tests.bridge.compensating import (
     OVER,
     QUICK,
@@ -37,7 +39,7 @@ from tests.bridge.compensating import (
     settle,
     weight,
 )
-from tests.bridge.conftest import Listener, NodeProcess, starter, wait_until
+from tests.bridge.conftest import PATIENCE_S, Listener, NodeProcess, starter, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.shared import listener, server, stream
 from tests.bridge.streaming import Diagnostics, Stream, values
@@ -273,19 +275,20 @@ def test_the_orientation_is_taken_in_while_a_service_waits(
     robot: Robot, stages: Stages, server: ScriptedServer, stream: Stream, listener: Listener
 ) -> None:
     stages.settle(ZERO6)
-    server.answers["describe"] = lambda _: None
-    done: list[tuple[bool, str]] = []
-    caller = threading.Thread(target=lambda: done.append(listener.trigger("get_settings")))
-    caller.start()
+    asked: list[JsonObject] = []
+    server.answers["tare"] = asked.append  # the reply is kept back
+    response = listener.ask(Trigger, "sensor_tare")
+    wait_until(lambda: asked, "the request")
     time.sleep(0.8)  # longer than an orientation holds
     stages.forget()
     robot.quaternion = ROLLED
     hold(stream, OVER)
     stages.settle(ZERO6)
-    assert caller.is_alive()
-    caller.join()
-    del server.answers["describe"]
-    assert not done[0][0]
+    assert response.empty()
+    refused = {"ok": False, "error": {"code": "denied", "message": "no"}}
+    server.send_json({"reply": "tare", "id": asked[0]["id"], **refused})
+    assert response.get(timeout=PATIENCE_S).message == "no (denied)"
+    del server.answers["tare"]
 
 
 @pytest.mark.parametrize(

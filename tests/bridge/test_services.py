@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -13,11 +12,13 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
+from std_srvs.srv import Trigger
+
 from bridge.requests import CONFIGURE_TIMEOUT_S
 from protocol.control import ErrorCode, Event, event
 from protocol.json_text import JsonObject
 from protocol.settings import SETTINGS as TABLE
-from tests.bridge.conftest import Listener, NodeProcess, starter, wait_until
+from tests.bridge.conftest import PATIENCE_S, Listener, NodeProcess, starter, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.shared import listener, server, stream
 from tests.bridge.streaming import SETTINGS, Stream
@@ -166,17 +167,14 @@ def test_an_unanswered_request_holds_up_neither_stream_nor_node(
 ) -> None:
     answer = server.answers.pop("describe", None)
     server.answers["describe"] = lambda _: None
-    got: list[tuple[bool, str]] = []
-    caller = threading.Thread(target=lambda: got.append(listener.trigger("get_settings")))
     began = time.monotonic()
-    caller.start()
+    response = listener.ask(Trigger, "get_settings")
     time.sleep(0.3)
     listener.numbers()
     numbers = [listener.next_number() for _ in range(50)]
     assert numbers == sorted(set(numbers))
-    caller.join()
+    assert "did not answer describe: no reply within 3 s" in response.get(timeout=PATIENCE_S).message
     assert time.monotonic() - began > 2.5
-    assert "did not answer describe: no reply within 3 s" in got[0][1]
     del server.answers["describe"]
     if answer is not None:
         server.answers["describe"] = answer
@@ -219,8 +217,7 @@ def test_the_node_ends_while_a_service_waits(
             mute.answers["tare"] = lambda _: None
             assert mute.subscribed.wait(20)
             other.parameters("server_port")  # its services are there
-            caller = threading.Thread(target=lambda: other.trigger("sensor_tare"), daemon=True)
-            caller.start()
+            other.ask(Trigger, "sensor_tare")
             wait_until(lambda: any(r["action"] == "tare" for r in mute.requests), "the request")
             began = time.monotonic()
             node.send_signal(signal.SIGTERM)
