@@ -21,6 +21,9 @@ _SERVE_MARGIN_NS: Final = 80_000
 """Sockets are left alone this long before a deadline: select may wake late."""
 _SERVE_EVERY_NS: Final = 10_000_000
 """The sockets' turn comes this often even if the deadlines leave no time."""
+_TIMEOUT_PERIODS: Final = 0.75
+"""A frame is lost when it has taken this part of the shortest sample period, so that the next is in time."""
+_LEAST_TIMEOUT_S: Final = 300e-6
 _RECOVERY_STEP_NS: Final = 500_000
 """Time between two exchanges while no sensor is left to be read."""
 _RECOVERY_TIMEOUT_S: Final = 0.02
@@ -82,8 +85,7 @@ class Cycle:
         bus, hub, streams, recovery = self._bus, self._hub, self._streams, self._recovery
         jobs, notifier = self._jobs, self._notifier
         monotonic_ns, sleep = time.monotonic_ns, time.sleep
-        shortest_ns = min(stream.clock.period_ns for stream in streams)
-        timeout_s = max(300e-6, 0.75e-9 * shortest_ns)
+        shortest_ns, timeout_s = self._limits()
         lead_ns = 0.0  # how late this thread usually wakes: deadlines are brought forward by it
         serve_by = roll_at = feed_at = 0
         while not self.stopping:
@@ -124,12 +126,18 @@ class Cycle:
             if back >= roll_at:
                 roll_at = back + SLOT_NS
                 self._roll()
+                shortest_ns, timeout_s = self._limits()
             if back >= feed_at:
                 feed_at = back + notifier.feed_every_ns
                 notifier.feed()
             self._cycles += 1
             self._lost_frames += wkc < 0
             self._exchange.record(back - sent)
+
+    def _limits(self) -> tuple[float, float]:
+        """The shortest sample period in ns and how long a frame may take in s; both change with the rates."""
+        shortest_ns = min(stream.clock.period_ns for stream in self._streams)
+        return shortest_ns, max(_LEAST_TIMEOUT_S, _TIMEOUT_PERIODS * 1e-9 * shortest_ns)
 
     def _roll(self) -> None:
         """Once a second."""

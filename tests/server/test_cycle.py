@@ -28,11 +28,13 @@ class ScriptedBus:
         self.started_ns = time.monotonic_ns()
         self.exchanges: list[int] = []
         self.lose: set[int] = set()
+        self.timeout_s = 0.0
 
     def send(self) -> None:
         self.exchanges.append(time.monotonic_ns())
 
-    def receive(self, _timeout_s: float) -> int:
+    def receive(self, timeout_s: float) -> int:
+        self.timeout_s = timeout_s
         return -1 if len(self.exchanges) in self.lose else 3
 
     def process_data(self, _slave: int) -> bytes:
@@ -70,14 +72,16 @@ class NoTrouble:
         pass
 
 
-def run(turns: int, on_serve: Callable[[int], None], bus: ScriptedBus) -> tuple[dict[str, Any], ScriptedHub]:
+def run(
+    turns: int, on_serve: Callable[[int], None], bus: ScriptedBus, stream: SensorStream | None = None
+) -> tuple[dict[str, Any], ScriptedHub]:
     def stop_at_the_end(turn: int) -> None:
         on_serve(turn)
         if turn == turns:
             cycle.stop()
 
     hub = ScriptedHub(stop_at_the_end)
-    stream = SensorStream(0, PERIOD_NS)
+    stream = stream or SensorStream(0, PERIOD_NS)
     cycle = Cycle(
         cast(Bus, bus),
         [stream],
@@ -125,6 +129,20 @@ def test_lost_frames_cost_no_sample_when_the_next_exchange_comes_in_time() -> No
     assert got == [number for number in sorted(seen) if number >= got[0]], "all that a frame brought, once"
     assert got[0] < 200, "it has followed the sensor since before"
     assert lost & seen, "a lost frame is followed by another, in time for the same sample"
+
+
+def test_a_frame_may_take_as_long_as_the_rate_in_force_allows() -> None:
+    bus, stream = ScriptedBus(), SensorStream(0, PERIOD_NS)
+    seen: list[float] = []
+
+    def change(turn: int) -> None:
+        if turn == 10:
+            seen.append(bus.timeout_s)
+            stream.recover(PERIOD_NS / 4)  # as after a change of settings
+
+    run(6000, change, bus, stream)  # it looks once a second
+    seen.append(bus.timeout_s)
+    assert seen == pytest.approx([0.75e-9 * PERIOD_NS, 0.75e-9 * PERIOD_NS / 4], rel=0.2)
 
 
 def test_the_sockets_have_their_turn_even_if_every_deadline_has_passed(
