@@ -8,6 +8,7 @@ import time
 from typing import Final, NamedTuple
 
 from ethercat_server.outbox import Outbox, with_gap
+from protocol.address import Address
 from protocol.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 from protocol.errors import BadMessageError, RemoteProtocolError
 from protocol.framing import DataFlag, FrameDecoder, encode_json
@@ -238,7 +239,6 @@ class Connection:
 
 def _address_text(sock: socket.socket) -> str:
     try:
-        host, port = sock.getpeername()[:2]
+        return str(Address(*sock.getpeername()[:2]))
     except OSError:
         return "unknown"
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -112,5 +112,4 @@ class Reader:
 
 
 def _own_peer(client: Client) -> str:
-    host, port = client.connection.sock.getsockname()[:2]
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    return str(Address(*client.connection.sock.getsockname()[:2]))

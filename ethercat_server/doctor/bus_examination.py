@@ -18,6 +18,7 @@ from ethercat_server.doctor.measurement import Exchange, Measured, measure
 from ethercat_server.doctor.through_server import ServerView
 from ethercat_server.errors import ServerError
 from ethercat_server.tool.holder import Holder, find_holder
+from protocol.address import Address
 
 if TYPE_CHECKING:
     from ethercat_server.bus import Bus
@@ -88,7 +89,7 @@ def _no_bus(holder: Holder | None, why: str) -> Finding:
 
 
 def _through_server(
-    machine: Machine, holder: Holder, address: tuple[str, int], request: Request
+    machine: Machine, holder: Holder, address: Address, request: Request
 ) -> Iterator[Finding]:
     view: list[ServerView] = []
     if request.seconds:

@@ -10,6 +10,7 @@ from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, 
 from ethercat_server.doctor.verdict import age_finding, exchange_finding, wake_finding
 from ethercat_server.errors import ServerError
 from ethercat_server.tool.remote import ServerLink
+from protocol.address import Address
 
 Examine = Callable[[str, str, Callable[[], Iterator[Finding]]], Iterator[Finding]]
 
@@ -17,10 +18,10 @@ Examine = Callable[[str, str, Callable[[], Iterator[Finding]]], Iterator[Finding
 class ServerView:
     """What a server says of itself, twice: at the beginning and after the time of measurement."""
 
-    def __init__(self, address: tuple[str, int], holder: str, seconds: float) -> None:
+    def __init__(self, address: Address, holder: str, seconds: float) -> None:
         """ServerError if it does not answer."""
         self.holder, self.address = holder, address
-        link = ServerLink(*address)
+        link = ServerLink(address)
         try:
             self.described: list[dict[str, Any]] = link.ask("describe")["sensors"]
             self.before: dict[str, Any] = link.ask("status")
@@ -38,10 +39,11 @@ class ServerView:
 
     def holds(self) -> Iterator[Finding]:
         """Who it is."""
-        host, port = self.address
         why = "the bus is not touched while it streams; these are its own figures"
         hours = float(self.after["uptime_s"]) / 3600
-        yield ok(f"{self.holder} serves it at {host}:{port}, for {hours:.1f} h", why, host=host, port=port)
+        yield ok(
+            f"{self.holder} serves it at {self.address}, for {hours:.1f} h", why, **self.address._asdict()
+        )
 
     def sensors(self) -> Iterator[Finding]:
         """Each sensor: state, clock, losses."""

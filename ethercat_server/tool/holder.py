@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from protocol.address import Address
+
 _ETHERCAT: Final = 0x88A4
 _LISTEN: Final = 0x0A
 
@@ -24,7 +26,7 @@ class Holder(NamedTuple):
     pid: int | None
     """None if it may not be seen."""
     name: str
-    address: tuple[str, int] | None
+    address: Address | None
     """Where on this machine it serves TCP; None if nowhere, or it may not be seen."""
 
     def __str__(self) -> str:
@@ -81,20 +83,20 @@ def _sockets(process: Path) -> Iterator[int]:
                     yield int(target[8:-1])
 
 
-def _listening(process: Path, sockets: set[int]) -> tuple[str, int] | None:
+def _listening(process: Path, sockets: set[int]) -> Address | None:
     found = []
     for table in ("tcp", "tcp6"):
         with contextlib.suppress(OSError):
             for columns in _table(process / "net" / table):
                 if int(columns[3], 16) == _LISTEN and int(columns[9]) in sockets:
                     host, _, port = columns[1].partition(":")
-                    found.append((_address(host), int(port, 16)))
+                    found.append(Address(_host(host), int(port, 16)))
     # Whoever comes by loopback may control the server if its user may.
-    return min(found, key=lambda row: not ipaddress.ip_address(row[0]).is_loopback, default=None)
+    return min(found, key=lambda row: not ipaddress.ip_address(row.host).is_loopback, default=None)
 
 
-def _address(text: str) -> str:
-    """The address in one of the kernel's tables: words in the machine's byte order."""
+def _host(text: str) -> str:
+    """The host of an address in one of the kernel's tables: words in the machine's byte order."""
     raw = bytes.fromhex(text)
     words = struct.unpack(f">{len(raw) // 4}I", raw)
     packed = struct.pack(f"={len(words)}I", *words)

@@ -34,7 +34,7 @@ def find_server(ifname: str | None, server: str | None) -> ServerLink | None:
             address = Address.parse(server)
         except ValueError as error:
             raise UsageError(f"--server {error}") from None
-        return ServerLink(address.host, address.port)
+        return ServerLink(address)
     assert ifname is not None
     holder = find_holder(ifname)
     if holder is None:
@@ -45,7 +45,6 @@ def find_server(ifname: str | None, server: str | None) -> ServerLink | None:
         else:
             hint = "it serves no port that the tool could use, so stop it first"
         raise InterfaceError(f"{ifname} is in use by {holder}: {hint}")
-    host, port = holder.address
-    used = f"the server at {host}:{port}, {holder}, which holds {ifname}"
+    used = f"the server at {holder.address}, {holder}, which holds {ifname}"
     sys.stderr.write(f"ethercat-sensor: going through {used}\n")
-    return ServerLink(host, port, used)
+    return ServerLink(holder.address, used)

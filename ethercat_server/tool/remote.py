@@ -11,6 +11,7 @@ from ethercat_server.sdo import Steps
 from ethercat_server.sensor import Identity
 from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, signals_held_back
 from ethercat_server.tool.show import note
+from protocol.address import Address
 from protocol.client import Client
 from protocol.control import ErrorCode, Event
 from protocol.errors import (
@@ -35,27 +36,23 @@ _READ_PAUSE_S: Final = 0.1
 class ServerLink(Link):
     """One framed connection to the server."""
 
-    def __init__(self, host: str, port: int, used: str | None = None) -> None:
-        self._name = f"the server at {host}:{port}"
+    def __init__(self, address: Address, used: str | None = None) -> None:
+        self._name = f"the server at {address}"
         self.used = used or self._name
         try:
-            self._client = Client(port, host, timeout_s=_CONNECT_TIMEOUT_S)
+            self._client = Client(address.port, address.host, timeout_s=_CONNECT_TIMEOUT_S)
         except UnreachableError as error:
-            raise ServerError(
-                f"no server answers at {host}:{port} ({error}): start ethercat-server"
-            ) from None
+            raise ServerError(f"no server answers at {address} ({error}): start ethercat-server") from None
         except ProtocolError as error:
             raise ServerError(
-                f"what answers at {host}:{port} is no ethercat-server that this tool understands ({error}): "
+                f"what answers at {address} is no ethercat-server that this tool understands ({error}): "
                 "check the port, or install the same version of both"
             ) from None
         try:
             self.sensors = [_found(row) for row in self._client.description["sensors"]]
         except (KeyError, TypeError):
             self._client.close()
-            raise ServerError(
-                f"what answers at {host}:{port} is no ethercat-server: check the port"
-            ) from None
+            raise ServerError(f"what answers at {address} is no ethercat-server: check the port") from None
 
     def close(self) -> None:
         """See `Link`."""

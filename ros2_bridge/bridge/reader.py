@@ -16,6 +16,7 @@ from bridge.messages import Outputs
 from bridge.parameters import Parameters
 from bridge.selection import FrameCounts, FrameSelector
 from bridge.watch import Watch
+from protocol.address import Address
 from protocol.connection import SILENCE_S
 from protocol.control import Event
 from protocol.errors import ConnectionFailedError, UnreachableError
@@ -64,7 +65,7 @@ class Reader:
         self.counts = FrameCounts()
         self.not_finite = 0
         self._decoders = {size: SampleDecoder(size, parameters.imu_units) for size in LAYOUTS}
-        self._address = f"{printable(parameters.server_host)}:{parameters.server_port}"
+        self._address = str(Address(printable(parameters.server_host), parameters.server_port))
         self.link = Link(self._address, parameters.sensor)
         self.watch = Watch(parameters.sensor)
         self._stopping = threading.Event()

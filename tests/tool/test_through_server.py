@@ -151,6 +151,7 @@ def test_snapshot_and_restore(bench: Bench, tmp_path: Path) -> None:
     assert ("0x8000", 2, "0000803f") in written(sensor)
 
 
-def test_a_port_where_no_server_is(bench: Bench) -> None:
-    said = one_sentence(tool("objects", "--server", "localhost:1", "--json", code=1))
-    assert "no server answers at localhost:1" in said
+@pytest.mark.parametrize("where", ["localhost:1", "[::1]:1"])
+def test_a_port_where_no_server_is(bench: Bench, where: str) -> None:
+    said = one_sentence(tool("objects", "--server", where, "--json", code=1))
+    assert f"no server answers at {where} " in said
