@@ -53,8 +53,17 @@ class Mode(NamedTuple):
     """Unless told otherwise."""
 
 
+def _compensation(setup: Setup, console: Console) -> dict[str, Any]:
+    if find_spec("rclpy") is None:
+        raise DemoError("no ROS 2 here (rclpy): install the extra 'ros' or source ROS 2")
+    from scripts._benchmark_compensation import measure_compensation  # noqa: PLC0415 - needs ROS 2
+
+    return measure_compensation(setup, console)
+
+
 MODES: Final[dict[str, Mode]] = {
     "clients": Mode(measure_clients, "only the server, eight clients against one"),
+    "compensation": Mode(_compensation, "only what compensation costs the node for each sample"),
     "cpp": Mode(measure_cpp, "only the C++ client, against a bare read"),
     "sdo": Mode(measure_sdo, "only the server, without and with SDO traffic", SDO_SECONDS),
     "node": Mode(
