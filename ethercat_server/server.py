@@ -41,8 +41,8 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
             ifname = cleanup.enter_context(VirtualBus(options.virtual_arguments, priority)).ifname
         check_interface(ifname)
         bus = Bus(ifname)
-        bus.open()
         cleanup.callback(bus.close)
+        bus.open()
         sensors = bring_up(bus, options, signals.check)
         realtime.prepare(priority, options.server["cpu"])
         streams = [SensorStream(sensor.place, sensor.period_ns) for sensor in sensors]

@@ -79,11 +79,11 @@ class Master:
                 "check 'ip link' and the permissions"
             ) from None
         self._opened = True
+        self._socket = RawSocket((packet_sockets() - before).pop())
         try:
             self.ifindex = socket.if_nametoindex(self.ifname)
         except OSError:
             raise BusError(f"the interface {self.ifname} went away: connect it and start again") from None
-        self._socket = RawSocket((packet_sockets() - before).pop())
         # Until SOEM had bound it to the interface, it took in the EtherCAT frames of all others.
         self._socket.set_blocking(False)
         self._socket.drop(0)
