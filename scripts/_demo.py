@@ -130,6 +130,8 @@ class Ears:
         from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
         from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
 
+        from bridge.spinning import Spinner  # noqa: PLC0415
+
         self._client = client
         self.measurement = measurement
         self.lock = threading.Lock()
@@ -139,11 +141,10 @@ class Ears:
         self._node.create_subscription(Float64MultiArray, TOPIC, self._on_message, 50)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
-        self._closing = rclpy.task.Future()
-        spin = self._executor.spin_until_future_complete
+        self._spinner = Spinner(self._executor)
         self._threads = [
             threading.Thread(target=self._hear_server, daemon=True),
-            threading.Thread(target=spin, args=(self._closing,), daemon=True),
+            threading.Thread(target=self._spinner.run, daemon=True),
         ]
         client.subscribe()
         for thread in self._threads:
@@ -164,7 +165,7 @@ class Ears:
     def close(self) -> None:
         """Stop listening."""
         self._client.close()
-        self._closing.set_result(None)
+        self._spinner.stop()
         for thread in self._threads:
             thread.join(3)
         self._executor.shutdown()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import rclpy
 from diagnostic_msgs.msg import KeyValue
@@ -12,7 +12,6 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
-from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
 from bridge.bias_services import BiasServices
@@ -27,18 +26,20 @@ from bridge.requests import Requests
 from bridge.services import Services
 from bridge.settings_parameters import SettingsParameters
 from bridge.signals import call_on_stop_signal
+from bridge.spinning import Spinner
 
 SUPERVISOR_TOPIC = "/supervisor_status_data"
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
 
 
 class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
-    """The node `bridge`. `finished` becomes the exit code as soon as something ends it."""
+    """The node `bridge`. What ends it sets `exit_code` and calls `on_finish`."""
 
     def __init__(self) -> None:
         """ParameterError or InvalidTopicNameException if a parameter is wrong."""
         super().__init__("bridge")
-        self.finished: Future = Future()
+        self.exit_code: int | None = None
+        self.on_finish: Callable[[], None] = lambda: None
         parameters = declare(self)
         compensated = CompensatedOutput(self, parameters.frame_id)
         outputs = make(self, parameters, compensated)
@@ -71,8 +72,9 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
 
     def finish(self, exit_code: int) -> None:
         """End the node, from any thread; the first call counts."""
-        if not self.finished.done():
-            self.finished.set_result(exit_code)
+        if self.exit_code is None:
+            self.exit_code = exit_code
+        self.on_finish()
         self.requests.cancel()
         self.compensation.cancel()
 
@@ -81,7 +83,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.finish(1)
 
     def _on_supervisor(self, message: KeyValue) -> None:
-        if message.key != SUPERVISOR_KEY or message.value != SUPERVISOR_STOP or self.finished.done():
+        if message.key != SUPERVISOR_KEY or message.value != SUPERVISOR_STOP or self.exit_code is not None:
             return
         self.get_logger().info("the supervisor stops the force/torque sensors")
         self.get_logger().info(self.requests.shut_server_down())
@@ -111,12 +113,16 @@ def _spin(node: BridgeNode) -> int:
     call_on_stop_signal(lambda _signal: node.finish(0))
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    spinner = Spinner(executor)
+    node.on_finish = spinner.stop
     node.compensation.start()
     node.reader.start()
     node.monitor.start()
     try:
-        executor.spin_until_future_complete(node.finished)
-        return int(node.finished.result() if node.finished.done() else 0)
+        if node.exit_code is not None:  # it was told before there was a spinner
+            spinner.stop()
+        spinner.run()
+        return node.exit_code or 0
     finally:
         stopped = node.monitor.stop() & node.reader.stop() & node.compensation.close()
         if not stopped:

@@ -11,10 +11,9 @@ from collections.abc import Callable
 from typing import Final
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.task import Future
 
 from bridge.compensation_parameters import TOPIC_SOURCES, OrientationParameters
 from bridge.orientation_messages import (
@@ -29,6 +28,7 @@ from bridge.orientation_messages import (
     read_message,
 )
 from bridge.parameter_row import ParameterError
+from bridge.spinning import Spinner
 
 TF_PERIOD_S: Final = 0.005
 """How often TF is asked."""
@@ -63,6 +63,7 @@ class OrientationListener:
         self.problem = "nothing has come yet"
         """What was wrong with what came last; empty if nothing was."""
         self._on_failure = on_failure
+        self._closing = False
         self._mounting = None if chosen.source == "tf" else chosen.mounting
         name = f"_{node.get_name()}_orientation"
         self._node = rclpy.create_node(
@@ -93,13 +94,14 @@ class OrientationListener:
             )
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(self._node)
-        self._closing: Future = Future()
+        self._spinner = Spinner(self._executor)
         self._thread = threading.Thread(target=self._run, name="orientation", daemon=True)
         self._thread.start()
 
     def close(self, timeout_s: float = 5.0) -> bool:
         """Stop listening; False if the thread does not end in time."""
-        self._closing.set_result(None)
+        self._closing = True
+        self._spinner.stop()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             return False  # what it waits for must not be taken from under it
@@ -120,9 +122,7 @@ class OrientationListener:
 
     def _run(self) -> None:
         try:
-            self._executor.spin_until_future_complete(self._closing)
-        except ExternalShutdownException:
-            return
+            self._spinner.run()
         except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a dead source
-            if not self._closing.done():
+            if not self._closing:
                 self._on_failure(f"the orientation's source failed: {type(error).__name__}: {error}")

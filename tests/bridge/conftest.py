@@ -41,8 +41,9 @@ class Listener:
         import rclpy
         from diagnostic_msgs.msg import KeyValue
         from rclpy.executors import SingleThreadedExecutor
-        from rclpy.task import Future
         from std_msgs.msg import Float64MultiArray
+
+        from bridge.spinning import Spinner
 
         self.tag = f"test_{uuid.uuid4().hex}"
         self.topic, self.supervisor_topic = f"/{self.tag}/array", f"/{self.tag}/supervisor"
@@ -53,14 +54,13 @@ class Listener:
         self._supervisor = self._node.create_publisher(KeyValue, self.supervisor_topic, 10)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
-        self._closing: Future = Future()
-        spin = self._executor.spin_until_future_complete
-        self._thread = threading.Thread(target=spin, args=(self._closing,), daemon=True)
+        self._spinner = Spinner(self._executor)
+        self._thread = threading.Thread(target=self._spinner.run, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         # The thread first: what it waits for must not be taken from under it.
-        self._closing.set_result(None)
+        self._spinner.stop()
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
         self._executor.shutdown()
