@@ -210,7 +210,17 @@ def test_the_ramp_is_straight_and_ends_exactly() -> None:
 def test_a_late_sample_from_before_the_ramp_has_the_old_bias() -> None:
     ramp = BiasRamp(OLD, seconds=2.0)
     ramp.go(NEW, 10.0)
-    assert ramp.at(9.0) == OLD
+    assert ramp.at(9.95) == OLD
+    assert not ramp.arrived(9.95)
+
+
+@pytest.mark.parametrize("now_s", [9.0, -600.0])
+def test_a_clock_that_is_set_back_does_not_bring_the_old_bias_back(now_s: float) -> None:
+    ramp = BiasRamp(OLD, seconds=2.0)
+    ramp.go(NEW, 10.0)
+    assert ramp.at(13.0) == NEW
+    assert ramp.at(now_s) == NEW
+    assert ramp.arrived(now_s)
 
 
 def test_a_ramp_that_takes_no_time_jumps() -> None:

@@ -68,11 +68,22 @@ def estimate_bias(
     )
 
 
+_EARLY_S: Final = 0.1
+"""A sample may be so much older than the one that a ramp began at."""
+
+
 class _Course(NamedTuple):
     start: Wrench
     target: Wrench
     begin_s: float
     seconds: float
+
+    def is_under_way(self, now_s: float) -> bool:
+        """Whether a sample of this time falls into it.
+
+        One of long before it does not: the clock was set back, and what was to be left behind is left behind.
+        """
+        return self.seconds > 0.0 and -_EARLY_S <= now_s - self.begin_s < self.seconds
 
 
 class BiasRamp:
@@ -97,16 +108,15 @@ class BiasRamp:
 
     def arrived(self, now_s: float) -> bool:
         """Whether the bias of `now_s` is the target."""
-        course = self._course
-        return now_s - course.begin_s >= course.seconds
+        return not self._course.is_under_way(now_s)
 
     def at(self, now_s: float) -> Wrench:
         """The bias of the sample of time `now_s`."""
-        start, target, begin_s, seconds = self._course
-        passed_s = now_s - begin_s
-        if passed_s >= seconds or seconds <= 0.0:
-            return target
-        share = max(0.0, passed_s / seconds)
+        course = self._course
+        if not course.is_under_way(now_s):
+            return course.target
+        start, target, begin_s, seconds = course
+        share = max(0.0, (now_s - begin_s) / seconds)
         (ax, ay, az), (au, av, aw) = start
         (bx, by, bz), (bu, bv, bw) = target
         return Wrench(
