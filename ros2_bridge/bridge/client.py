@@ -18,7 +18,7 @@ usage: ros2 run bridge client [--ros-args -p NAME:=VALUE ... --params-file FILE 
        bridge-client          [--ros-args ...]
 
 Publishes the force/torque sensor that ethercat-server serves. Parameters, topics and their
-defaults: share/bridge/config/bridge.yaml.
+defaults: share/bridge/config/client.yaml.
 """
 
 

@@ -50,7 +50,7 @@ def start_node(context):
 
 
 def generate_launch_description():
-    file = PathJoinSubstitution([FindPackageShare("bridge"), "config", "bridge.yaml"])
+    file = PathJoinSubstitution([FindPackageShare("bridge"), "config", "client.yaml"])
     return LaunchDescription(
         [
             DeclareLaunchArgument("params_file", default_value=file, description="The node's parameters"),

@@ -29,5 +29,5 @@ def test_the_program_says_how_it_is_used() -> None:
 
 def test_the_files_it_shares_are_there() -> None:
     package = Path(__file__).parent.parent
-    for name in ("launch/bridge.launch.py", "config/bridge.yaml", "urdf/bota_sensor.xacro"):
+    for name in ("launch/bridge.launch.py", "config/client.yaml", "urdf/bota_sensor.xacro"):
         assert (package / name).stat().st_size, name

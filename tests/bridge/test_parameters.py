@@ -17,7 +17,7 @@ from bridge.parameters import PARAMETERS, ParameterError
 
 pytestmark = pytest.mark.ros
 ROWS = {row.name: row for row in PARAMETERS}
-CONFIG = Path(__file__).parents[2] / "ros2_bridge" / "config" / "bridge.yaml"
+CONFIG = Path(__file__).parents[2] / "ros2_bridge" / "config" / "client.yaml"
 
 
 def test_defaults_are_the_contracts() -> None:
