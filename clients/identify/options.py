@@ -25,7 +25,8 @@ class IdentifyOptions:
     path: Path
     sensor: int | None
     imu_units: ImuUnits
-    gravity: float
+    gravity: float | None
+    """m/s², if it was given."""
     least_seconds: float
     limits: StillLimits
     confidence: float
@@ -48,8 +49,8 @@ def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
     add("--sensor", type=_between(int, 0, _MAX_SENSOR), metavar="N",
         help="place on the bus (default: the only one in the recording)")  # fmt: skip
     add_imu_units(parser)
-    add("--gravity", type=_between(float, 9.0, 10.0), default=STANDARD_GRAVITY, metavar="M/S2",
-        help=f"acceleration of gravity, m/s² (default {STANDARD_GRAVITY})")  # fmt: skip
+    add("--gravity", type=_between(float, 9.0, 10.0), metavar="M/S2",
+        help=f"acceleration of gravity, m/s² ({STANDARD_GRAVITY}); OUT.yaml has it if given")  # fmt: skip
     add("--least-seconds", type=_between(float, 0.3, 3600.0), default=1.0, metavar="S",
         help="a shorter rest is no pose (default 1)")  # fmt: skip
     add("--limit", type=_limit, action="append", default=[], metavar="NAME=VALUE",

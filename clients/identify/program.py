@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from bridge.compensation.parameter_file import parameters_of, write_yaml
+from bridge.compensation.parameter_file import write_yaml
 from bridge.compensation.payload import Identified, identify
 from bridge.compensation.poses import MOST_POSES, Pose, pose_of
 from bridge.compensation.quantities import CompensationError
@@ -20,6 +20,7 @@ from clients.identify.stills import Still, Stills, find_stills
 from clients.recording.columns import columns
 from clients.recording.errors import RecordingError
 from clients.recording.reader import RecordedSensor, Recording, open_recording
+from protocol.pdo import STANDARD_GRAVITY
 
 
 class SensorChoiceError(CompensationError):
@@ -67,7 +68,8 @@ def _identify(options: IdentifyOptions) -> int:
         return 1
     if options.yaml is not None:
         who = f"{sensor.name}, serial number {sensor.serial}, from {options.path.name}"
-        write_yaml(options.yaml, parameters_of(result), f"{who}\n{summary(result)}")
+        gravity = None if options.gravity is None else (0.0, 0.0, -options.gravity)
+        write_yaml(options.yaml, result, f"{who}\n{summary(result)}", gravity)
         _say(f"written to {options.yaml}")
     return 0
 
@@ -93,7 +95,7 @@ def _solve(
     reason = None
     for still in found.stills:
         try:
-            poses.append(pose_of(still.means, magnitude=options.gravity))
+            poses.append(pose_of(still.means, magnitude=options.gravity or STANDARD_GRAVITY))
             taken.append(still)
         except CompensationError as error:
             reason = str(error)

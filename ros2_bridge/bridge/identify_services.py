@@ -8,7 +8,7 @@ from rclpy.node import Node
 
 from bridge import kept_bias
 from bridge.bias_services import wrench_text
-from bridge.compensation.parameter_file import parameters_of, write_yaml
+from bridge.compensation.parameter_file import write_yaml
 from bridge.compensation.payload import Identified
 from bridge.compensation.quantities import CompensationError, length
 from bridge.compensation.session import IdentificationSession, summary
@@ -21,10 +21,11 @@ from bridge.triggers import create_triggers
 class IdentifyServices:
     """One identification at a time. A pose blocks the executor for `rest.duration`, and never the stream."""
 
-    def __init__(self, node: Node, control: CompensationControl, limit_hz: float) -> None:
-        """`limit_hz` is the parameter `publishing_frequency`."""
-        self._control, self._limit_hz, self._log = control, limit_hz, node.get_logger()
+    def __init__(self, node: Node, control: CompensationControl) -> None:
+        self._control, self._log = control, node.get_logger()
         self._session: IdentificationSession | None = None
+        self._sensors = control.sensors
+        """As of the session's start."""
         self._result: Identified | None = None
         """What was solved last, and fits the poses that there are."""
         acts = {
@@ -45,6 +46,7 @@ class IdentifyServices:
             )
         before = f", the {len(self._session.poses)} poses before are dropped" if self._session else ""
         self._session = IdentificationSession(length(self._control.parameters.gravity))
+        self._sensors = self._control.sensors
         self._result = None
         return self._said(
             f"identification started{before}; gravity is known by {self._control.source.describe}; "
@@ -54,7 +56,7 @@ class IdentifyServices:
 
     def _add_pose(self) -> str:
         session = self._started()
-        window = take_window(self._control, self._limit_hz)
+        window = take_window(self._control)
         means = window.means()
         text = session.add(means, window.gravity())
         self._control.note_rest(means.angular_rate)
@@ -73,6 +75,8 @@ class IdentifyServices:
         return self._said(". ".join(parts))
 
     def _apply(self) -> str:
+        if self._session is not None:
+            self._started()
         result = self._result
         if result is None:
             raise CompensationError("there is no result to apply: call identify/solve first")
@@ -92,6 +96,11 @@ class IdentifyServices:
         )
 
     def _started(self) -> IdentificationSession:
+        if self._session is not None and self._sensors != self._control.sensors:
+            self._session = self._result = None
+            raise CompensationError(
+                "another sensor is there now, so the poses before were dropped: call identify/start again"
+            )
         if self._session is None:
             raise CompensationError("no identification was started: call identify/start first")
         return self._session
@@ -100,7 +109,7 @@ class IdentifyServices:
         try:
             path = self._path()
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_yaml(path, parameters_of(result), "\n".join(comment))
+            write_yaml(path, result, "\n".join(comment), self._control.parameters.gravity)
         except (CompensationError, OSError) as error:
             self._log.warning(f"the result of the identification is not written: {error}")
             return f"Not written: {error}"

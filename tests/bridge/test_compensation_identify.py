@@ -9,13 +9,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
-from bridge.compensation.parameter_file import read_yaml
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, sensed
 from tests.bridge.conftest import Listener, NodeProcess, starter
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.shared import listener, server, stream
 from tests.bridge.streaming import Stream
-from tests.compensation.making import AXES, BIAS, TOOL, load
+from tests.compensation.making import AXES, BIAS, TOOL, load, written_parameters
 
 __all__ = ["listener", "server", "stream"]
 pytestmark = pytest.mark.ros
@@ -91,8 +90,9 @@ def test_from_six_poses_to_a_compensated_wrench(
     assert started.parameters("tool_mass") == [0.0]  # solving changes nothing
     path = folder / "deeper" / "sensor-1-payload.yaml"
     assert f"Written to {path}" in text
-    written = read_yaml(path)
-    assert written.payload.mass == pytest.approx(TOOL.mass, abs=1e-4)
+    written = written_parameters(path)
+    assert written["tool_mass"] == pytest.approx(TOOL.mass, abs=1e-4)
+    assert written["gravity"] == list(started.parameters("gravity")[0])
     assert "# mass 0.8000" in path.read_text()
     done, text = started.trigger("identify/apply")
     assert done

@@ -15,7 +15,6 @@ from typing import Any
 
 import pytest
 
-from bridge.compensation.parameter_file import read_yaml
 from clients.identify.program import run
 from clients.identify.stills import find_stills
 from clients.recording.columns import columns
@@ -24,6 +23,7 @@ from ethercat_server.virtual_sensor import scene
 from ethercat_server.virtual_sensor.motion import MOVE_LENGTH, POSE_LENGTH, POSES
 from protocol.framing import DataFlag, DataMessage
 from tests.clients.recordings import START_NS, record
+from tests.compensation.making import written_parameters
 from tests.compensation.streaming import OFFSET, POSES_TAKE, process_data
 
 CYCLE = POSE_LENGTH + MOVE_LENGTH
@@ -111,9 +111,12 @@ def test_the_yaml_is_what_the_node_takes(
     _, answer, said = asked(capsys, recording, "--yaml", out)
     assert f"written to {out}" in said
     assert "serial number 100, from poses.mcap" in out.read_text().splitlines()[0]
-    parameters = read_yaml(out)
-    assert parameters.payload.mass == pytest.approx(answer["tool_mass"], abs=1e-8)
-    assert parameters.bias.values == pytest.approx(answer["bias"], abs=1e-8)
+    parameters = written_parameters(out)
+    assert parameters["tool_mass"] == pytest.approx(answer["tool_mass"], abs=1e-8)
+    assert parameters["bias"] == pytest.approx(answer["bias"], abs=1e-8)
+    assert "gravity" not in parameters
+    asked(capsys, recording, "--yaml", out, "--gravity", "9.81")
+    assert written_parameters(out)["gravity"] == [0.0, 0.0, -9.81]
     assert "cannot be written" in refused(capsys, recording, "--yaml", tmp_path / "no" / "x.yaml")
 
 

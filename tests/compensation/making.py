@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+
+import yaml
 
 from bridge.compensation.poses import Pose
 from bridge.compensation.quantities import Payload, Wrench
@@ -48,6 +51,12 @@ def pose(
             value + noise.gauss(0.0, deviation if i < 3 else deviation / 50) for i, value in enumerate(values)
         )
     return Pose(Wrench.of(values), gravity_for(up))
+
+
+def written_parameters(path: Path) -> dict[str, Any]:
+    """What a parameter file gives every node, as ROS's own parser would read it."""
+    found: dict[str, Any] = yaml.safe_load(path.read_text())["/**"]["ros__parameters"]
+    return found
 
 
 def sample(**changed: Any) -> Sample:
