@@ -18,15 +18,14 @@ AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 class BiasServices:
     """A tare blocks the executor for `rest.duration`, and never the stream."""
 
-    def __init__(self, node: Node, control: CompensationControl, limit_hz: float) -> None:
-        """`limit_hz` is the parameter `publishing_frequency`."""
-        self._control, self._limit_hz, self._log = control, limit_hz, node.get_logger()
+    def __init__(self, node: Node, control: CompensationControl) -> None:
+        self._control, self._log = control, node.get_logger()
         acts = {"tare": self._tare, "clear_tare": self._clear, "undo_tare": self._undo}
         create_triggers(node, acts, CompensationError)
 
     def _tare(self) -> str:
         control = self._control
-        window = take_window(control, self._limit_hz)
+        window = take_window(control)
         means = window.means()
         payload, gravity = control.parameters.payload, None
         if payload.mass:

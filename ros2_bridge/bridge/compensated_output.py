@@ -128,10 +128,14 @@ class CompensatedOutput:
         """Whether anybody has subscribed, as of the last look."""
         return bool(self._wanted)
 
-    def publish(self, sample: Sample, stamp_ns: int) -> None:
-        """Compensate a sample and publish its stages; nothing if gravity is needed and not known."""
+    def follow(self, sample: Sample, stamp_ns: int) -> None:
+        """Have the source and the open window take in a sample that is not published."""
         self.time_s = time_s = stamp_ns * 1e-9
-        plan, window = self.plan, self.window
+        self._gravity(self.plan, sample, time_s)
+
+    def _gravity(self, plan: Plan, sample: Sample, time_s: float) -> Vector3 | None:
+        """Gravity as far as it is needed, None if it is not known; the open window takes the sample in."""
+        window = self.window
         gravity: Vector3 | None = ZERO
         if plan.needs_gravity or window is not None:
             gravity = plan.source.gravity(sample, time_s)
@@ -139,6 +143,13 @@ class CompensatedOutput:
                 self.window = None
             if not plan.needs_gravity:
                 gravity = ZERO
+        return gravity
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Compensate a sample and publish its stages; nothing if gravity is needed and not known."""
+        self.time_s = time_s = stamp_ns * 1e-9
+        plan = self.plan
+        gravity = self._gravity(plan, sample, time_s)
         if gravity is None or self.hold is not None:
             self.withheld += 1
             self.is_stopped = True

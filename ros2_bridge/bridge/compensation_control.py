@@ -23,6 +23,7 @@ from bridge.gravity_sources import AccelerometerSource, ListenerSource, NoSource
 from bridge.link import Link
 from bridge.live_parameters import LiveParameters
 from bridge.orientation_listener import OrientationListener, check_can_listen
+from bridge.parameter_row import ParameterError
 from bridge.parameters import Parameters
 from protocol.pdo import Vector3
 
@@ -38,6 +39,7 @@ class CompensationControl:
         parameters: Parameters,
         output: CompensatedOutput,
         link: Link,
+        count_bad: Callable[[], int],
         on_failure: Callable[[str], object],
     ) -> None:
         """ParameterError if the parameters cannot be had here."""
@@ -45,12 +47,16 @@ class CompensationControl:
         self.output, self.link = output, link
         self.origin = FROM_PARAMETER
         """Where the bias in force comes from."""
+        self.sensors = 1
+        """How many have been there: what was measured on one is of no use with another."""
         self.ending = False
         self._node, self._log = node, node.get_logger()
         self._frame, self._on_failure = parameters.frame_id, on_failure
         self._listener: OrientationListener | None = None
         self._angular_rate_offset = ZERO
         self._keeper = BiasKeeper(self._log)
+        self.count_bad = count_bad
+        """Frames so far that should have been samples and were not: invalid, or not finite."""
         self._next_origin = FROM_PARAMETER
         self._check(self.parameters)
         self._history = BiasHistory(self.parameters.bias, self.parameters.bias_ramp_time)
@@ -59,7 +65,10 @@ class CompensationControl:
         self._guard = node.create_guard_condition(self._follow_sensor)
 
     def start(self) -> None:
-        """Open the orientation's source, which may take a thread; before any sample comes."""
+        """Open the orientation's source, which may take a thread; before any sample comes.
+
+        ParameterError if it cannot be had.
+        """
         self.source = self._open_source(self.parameters)
         self._make_plan()
 
@@ -166,7 +175,11 @@ class CompensationControl:
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted
         if _source_part(wanted) != _source_part(was):
-            self.source = self._open_source(wanted)
+            try:
+                self.source = self._open_source(wanted)
+            except ParameterError as error:  # too late to refuse the parameter
+                self._log.error(str(error))
+                self.source = NoSource(str(error))
         self._history.ramp.seconds = wanted.bias_ramp_time
         if wanted.bias != self.bias:
             self._history.set(wanted.bias, self.output.time_s)
@@ -207,9 +220,17 @@ class CompensationControl:
             info = self.link.info
             if info is None:
                 break
+            is_another = self._keeper.serial is not None
             begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters)
             if begin is not None:
                 self._begin_with(*begin)
+            elif is_another:
+                # What was before in its history was the other's too.
+                self._history = BiasHistory(self.bias, self.parameters.bias_ramp_time)
+                self._make_plan()
+            if is_another:
+                self.note_rest(ZERO)
+                self.sensors += 1
             if not self.keeping and self.bias != NO_WRENCH:
                 self._keeper.keep(self.bias, self.parameters)
         self.output.hold = None

@@ -34,10 +34,13 @@ class Source(Protocol):
 
 
 class NoSource:
-    """There is none: `orientation_source` is `none`."""
+    """There is none: `orientation_source` is `none`, or what it is set to cannot be had."""
 
     describe = "none"
     is_accelerometer = False
+
+    def __init__(self, why: str = "orientation_source is none") -> None:
+        self._why = why
 
     def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:  # noqa: ARG002
         """None."""
@@ -46,8 +49,8 @@ class NoSource:
     def why_none(self, time_s: float) -> str:  # noqa: ARG002
         """What to do."""
         return (
-            "orientation_source is none, so where gravity points is not known: set it to a source, or set "
-            "tool_mass to 0"
+            f"{self._why}, so where gravity points is not known: set orientation_source to a source, or "
+            "set tool_mass to 0"
         )
 
     def age_s(self, time_s: float) -> float:  # noqa: ARG002

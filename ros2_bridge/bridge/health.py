@@ -71,7 +71,9 @@ def _link(s: Snapshot, _: Thresholds) -> Status:
         verdict.add(
             Level.ERROR,
             f"no server at {s.address}: {s.problem}; start ethercat-server there, or set server_host and "
-            "server_port to where it is (the node goes on trying)",
+            "server_port to where it is (the node goes on trying)"
+            if not s.is_reachable
+            else f"not connected to {s.address}: {s.problem} (the node goes on trying)",
         )
     elif s.answer_s > _SLOW_ANSWER_S:
         verdict.add(
@@ -153,9 +155,14 @@ def _judge_losses(verdict: _Verdict, s: Snapshot, t: Thresholds) -> None:
         verdict.add(Level.WARN, f"{s.new_not_finite} samples held numbers that are not finite")
 
 
+def _lost_text(lost: str) -> str:
+    """The server's words, with what to do if they do not say it."""
+    return lost if "check " in lost else f"{lost}; check its cable and power"
+
+
 def _why_silent(s: Snapshot) -> str:
     if s.lost is not None:
-        return f"{s.lost}; check its cable and power"
+        return _lost_text(s.lost)
     if s.answer_s > 1.0:
         return "the server does not answer: it is stopped or overloaded"
     if s.info is not None and s.info.state not in {"OP", "?"}:
@@ -172,7 +179,7 @@ def _sensor(s: Snapshot, t: Thresholds) -> Status:
     if not s.connected:
         verdict.add(Level.STALE, "unknown: there is no connection to the server, see link")
     elif s.lost is not None:
-        verdict.add(Level.ERROR, f"{s.lost}; check its cable and power")
+        verdict.add(Level.ERROR, _lost_text(s.lost))
     elif s.silent_s > t.stale_after:
         verdict.add(Level.STALE, "unknown: there are no new samples, see stream")
     else:

@@ -35,6 +35,8 @@ class Link:
         """Samples a second that are to be expected; 0 if the server does not say."""
         self.problem = NEVER_CONNECTED
         """Why there is no connection."""
+        self.is_reachable = False
+        """Whether there is a server there for all that; it may be too old, or have no such sensor."""
         self.lost: str | None = None
         """The server's words, while the sensor is lost."""
         self.connects = 0
@@ -53,12 +55,20 @@ class Link:
         self.connection = connection
         self.on_change()
 
-    def disconnected(self, problem: str) -> None:
+    @property
+    def absence(self) -> str:
+        """That there is no connection, and why: the beginning of a sentence."""
+        what = "the node is not connected to the server" if self.is_reachable else "there is no server"
+        return f"{what} at {self.address} ({self.problem})"
+
+    def disconnected(self, problem: str, *, is_reachable: bool = False) -> None:
         """There is no connection (any more)."""
         if self.connection is not None:
             self.since_s = time.monotonic()
         had, self.connection = self.connection, None
         self.settings, self.problem, self.lost = {}, problem, None
+        # One that has just gone away is not there, whatever it said last.
+        self.is_reachable = is_reachable and had is None
         if had is not None:
             self.on_change()
 

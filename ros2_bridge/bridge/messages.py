@@ -44,6 +44,9 @@ class Output(Protocol):
     def publish(self, sample: Sample, stamp_ns: int) -> None:
         """Publish `sample`; `stamp_ns` is its time, ns since the Unix epoch."""
 
+    def follow(self, sample: Sample, stamp_ns: int) -> None:
+        """Take note of a sample that `publishing_frequency` leaves out."""
+
 
 class Outputs:
     """All outputs. `wanted` are those that were so at the last `refresh`."""
@@ -94,6 +97,9 @@ class Topic:
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed."""
         return bool(self.publisher.get_subscription_count())
+
+    def follow(self, sample: Sample, stamp_ns: int) -> None:
+        """Nothing: each message stands by itself."""
 
 
 class ArrayOutput(Topic):

@@ -45,17 +45,19 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         outputs = make(self, parameters, compensated)
         self.reader = Reader(parameters, outputs, self.get_logger(), self._fail)
         link = self.reader.link
-        self.compensation = CompensationControl(self, parameters, compensated, link, self._fail)
+        # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
+        self.requests = Requests(parameters, link)
+        self.sensor_settings = SettingsParameters(self, link, self.requests)
+        self.compensation = CompensationControl(
+            self, parameters, compensated, link, self.reader.count_bad, self._fail
+        )
         self.monitor = Monitor(
             self, parameters.thresholds, self.reader, self.compensation.state, outputs, self._fail
         )
-        self.requests = Requests(parameters, link)
-        self.sensor_settings = SettingsParameters(self, link, self.requests)
-        limit_hz = parameters.publishing_frequency
         self.triggers = (
             Services(self, link, self.requests, self.sensor_settings, self.compensation.after_sensor_tare),
-            BiasServices(self, self.compensation, limit_hz),
-            IdentifyServices(self, self.compensation, limit_hz),
+            BiasServices(self, self.compensation),
+            IdentifyServices(self, self.compensation),
         )
         link.on_change = self._on_link_change
         self.create_subscription(
@@ -102,8 +104,15 @@ def run(arguments: Sequence[str]) -> int:
     try:
         try:
             node = BridgeNode()
+            node.compensation.start()
         except (ParameterError, InvalidTopicNameException, ParameterException) as error:
             return _refuse(" ".join(str(error).split()), 1)
+        except RuntimeError as error:  # rclpy says no more, and not of what
+            return _refuse(
+                f"ROS cannot make the node's topics and services ({' '.join(str(error).split())}): check "
+                "qos_overrides, and that array_topic and the remappings give no two topics one name",
+                1,
+            )
         return _spin(node)
     finally:
         rclpy.try_shutdown()
@@ -115,7 +124,6 @@ def _spin(node: BridgeNode) -> int:
     executor.add_node(node)
     spinner = Spinner(executor)
     node.on_finish = spinner.stop
-    node.compensation.start()
     node.reader.start()
     node.monitor.start()
     try:

@@ -59,6 +59,7 @@ class Observer:
             address=link.address,
             connected=connection is not None,
             problem=link.problem,
+            is_reachable=link.is_reachable,
             connection_s=now_s - link.since_s,
             connects=link.connects,
             new_connects=link.connects - self._then_connects,

@@ -41,10 +41,18 @@ def check_can_listen(node: Node, chosen: OrientationParameters) -> None:
         check_tf()
     if chosen.source in TOPIC_SOURCES:
         try:
-            node.resolve_topic_name(chosen.topic)
+            resolved = node.resolve_topic_name(chosen.topic)
         except RuntimeError as error:  # rclpy has no public name for it
             reason = str(error).removeprefix("failed to resolve name: ").partition(", at /")[0]
             raise ParameterError(f"parameter orientation.topic is {chosen.topic!r}: {reason}") from None
+        wanted = TOPIC_KINDS[chosen.source].type
+        for own in (*node.publishers, *node.subscriptions):
+            # DDS has one type for a topic in a process.
+            if own.topic_name == resolved and own.msg_type is not wanted:
+                raise ParameterError(
+                    f"parameter orientation.topic is {chosen.topic!r}: this node itself has that topic, with "
+                    f"{own.msg_type.__name__} messages and not {wanted.__name__}"
+                )
 
 
 class OrientationListener:
@@ -58,7 +66,10 @@ class OrientationListener:
         on_failure: Callable[[str], object],
         open_buffer: Callable[[Node], Tf] = open_tf,
     ) -> None:
-        """`chosen.source` is a key of TOPIC_KINDS, or `tf`: then `frame` is the sensor's."""
+        """`chosen.source` is a key of TOPIC_KINDS, or `tf`: then `frame` is the sensor's.
+
+        ParameterError if ROS refuses to listen there.
+        """
         self.latest: Oriented | None = None
         self.problem = "nothing has come yet"
         """What was wrong with what came last; empty if nothing was."""
@@ -79,6 +90,27 @@ class OrientationListener:
             start_parameter_services=False,
             enable_rosout=False,
         )
+        try:
+            self._listen(node, chosen, frame, open_buffer)
+        except RuntimeError as error:
+            self._node.destroy_node()
+            raise ParameterError(
+                f"parameter orientation.topic is {chosen.topic!r}: ROS refuses to listen there ({error}); "
+                "choose another topic"
+            ) from None
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(self._node)
+        self._spinner = Spinner(self._executor)
+        self._thread = threading.Thread(target=self._run, name="orientation", daemon=True)
+        self._thread.start()
+
+    def _listen(
+        self,
+        node: Node,
+        chosen: OrientationParameters,
+        frame: str,
+        open_buffer: Callable[[Node], Tf],
+    ) -> None:
         if chosen.source == "tf":
             base, tf = chosen.base_frame, open_buffer(self._node)
             self.describe = f"TF from {base} to {frame}"
@@ -92,11 +124,6 @@ class OrientationListener:
             self._node.create_subscription(
                 kind.type, resolved, lambda message: self._take(lambda: read_message(kind, message)), profile
             )
-        self._executor = SingleThreadedExecutor(context=node.context)
-        self._executor.add_node(self._node)
-        self._spinner = Spinner(self._executor)
-        self._thread = threading.Thread(target=self._run, name="orientation", daemon=True)
-        self._thread.start()
 
     def close(self, timeout_s: float = 5.0) -> bool:
         """Stop listening; False if the thread does not end in time."""

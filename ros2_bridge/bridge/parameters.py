@@ -22,9 +22,10 @@ __all__ = ["PARAMETERS", "ParameterError", "Parameters", "Thresholds", "declare"
 _UNKNOWN: Final = (0.0, 0.0, 0.0)
 _COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"
 
+_SERVER_PORT: Final = Row("server_port", 12001, "TCP port of ethercat-server", 1, 65535)
 PARAMETERS: Final = (
     Row("server_host", "localhost", "Host that ethercat-server runs on"),
-    Row("server_port", 12001, "TCP port of ethercat-server", 1, 65535),
+    _SERVER_PORT,
     Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535),
     Row("sensor", 0, "The sensor's place on the bus, from 0", 0, 255),
     Row("publishing_frequency", 0.0, "Most messages a second, always the newest; 0 = every sample", 0, 1e6),
@@ -87,24 +88,25 @@ class Parameters(NamedTuple):
 def declare(node: Node) -> Parameters:
     """Declare every parameter on `node` and return their values; ParameterError if one is wrong."""
     # Of any type here: `Row.check` has made each what its default is.
-    values: dict[str, Any] = {row.name: _declare(node, row) for row in PARAMETERS}
-    port, alias = values["server_port"], values.pop("SERVER_PORT")
+    values: dict[str, Any] = {row.name: _given(node, row) for row in PARAMETERS}
+    port, alias = values["server_port"], values["SERVER_PORT"]
     if alias:
-        if port not in (12001, alias):
+        if port not in (_SERVER_PORT.default, alias):
             raise ParameterError(
                 f"parameters server_port is {port} and SERVER_PORT is {alias}: they are one thing, give one"
             )
         values["server_port"] = alias
+    for row in PARAMETERS:
+        node.declare_parameter(row.name, values[row.name], row.descriptor(), ignore_override=True)
+    del values["SERVER_PORT"]
     compensation = gather({row.name: values.pop(row.name) for row in COMPENSATION_ROWS})
     thresholds = Thresholds(**{name: values.pop(f"diagnostics.{name}") for name in Thresholds._fields})
     units = ImuUnits(values.pop("imu_raw_units"))
     return Parameters(**values, imu_units=units, thresholds=thresholds, compensation=compensation)
 
 
-def _declare(node: Node, row: Row) -> ParameterValue:
-    # Declared twice: loosely, to see what was given whatever its type, then as what it is.
+def _given(node: Node, row: Row) -> ParameterValue:
+    """What was given, checked; declared loosely for that, whatever its type, and undeclared again."""
     given = node.declare_parameter(row.name, row.default, ParameterDescriptor(dynamic_typing=True)).value
-    value = row.check(given)
     node.undeclare_parameter(row.name)
-    node.declare_parameter(row.name, value, row.descriptor(), ignore_override=True)
-    return value
+    return row.check(given)

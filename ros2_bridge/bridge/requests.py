@@ -46,10 +46,7 @@ class Requests:
         """The reply that grants the request; RequestFailedError otherwise. Blocks for `timeout_s` at most."""
         connection = self._link.connection
         if connection is None:
-            raise RequestFailedError(
-                f"there is no server at {self._link.address} ({self._link.problem}): "
-                "ask again when the node is connected"
-            )
+            raise RequestFailedError(f"{self._link.absence}: ask again when the node is connected")
         try:
             return self._exchange(connection, action, timeout_s, values)
         except ConnectionFailedError as error:

@@ -14,24 +14,21 @@ _PATIENCE_S: Final = 2.0
 _LOOK_S: Final = 0.05
 
 
-def take_window(control: CompensationControl, limit_hz: float) -> RestWindow:
+def take_window(control: CompensationControl) -> RestWindow:
     """The samples of the next `rest.duration`, whole; blocks the caller and never the stream.
 
-    `limit_hz` is the parameter `publishing_frequency`. CompensationError if they do not come or mean nothing.
+    CompensationError if they do not come or mean nothing.
     """
     if (conflict := control.conflict()) is not None:
         raise CompensationError(conflict)
     link = control.link
     if link.connection is None:
-        raise CompensationError(
-            f"there is no server at {link.address} ({link.problem}), so there are no samples"
-        )
+        raise CompensationError(f"{link.absence}, so there are no samples")
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
     window = RestWindow(seconds, limits, control.source)
-    if limit_hz > 0:
-        seconds = max(seconds, limits.least_samples / limit_hz)
     patience_s = 1.5 * seconds + _PATIENCE_S
     deadline_s = time.monotonic() + patience_s
+    sensors, bad = control.sensors, control.count_bad()
     control.output.window = window
     try:
         while not window.done.wait(_LOOK_S):
@@ -43,4 +40,11 @@ def take_window(control: CompensationControl, limit_hz: float) -> RestWindow:
                 )
     finally:
         control.output.window = None
+    if control.sensors != sensors:
+        raise CompensationError("the sensor was replaced by another meanwhile: call again")
+    if bad := control.count_bad() - bad:
+        raise CompensationError(
+            f"the window is spoiled: {bad} of its samples were invalid or not finite; see /diagnostics, "
+            "stream, and call again"
+        )
     return window

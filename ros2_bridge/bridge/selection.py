@@ -67,6 +67,8 @@ class FrameSelector:
         self._offset_ns: int | None = 0 if same_clock else None
         self._now_ns = 0
         self._skipping_since_ns: int | None = None
+        self.passed_over: list[DataMessage] = []
+        """Fresh frames of the last `select` that the limit to the rate left out, all older than its own."""
 
     def select(self, frames: Sequence[DataMessage], now_ns: int) -> list[DataMessage]:
         """The frames of `frames`, all that were queued, that are to be published, oldest first.
@@ -74,6 +76,8 @@ class FrameSelector:
         `now_ns` is CLOCK_MONOTONIC after the last was received.
         """
         fresh = [frame for frame in frames if self._is_fresh(frame)]
+        if self._limit is not None:
+            self.passed_over = []
         if not fresh:
             return fresh
         newest = fresh[-1]
@@ -95,7 +99,9 @@ class FrameSelector:
         if self._limit is not None:
             allowed = self._limit.allows(newest.monotonic_ns)
             self._counts.limited += len(fresh) - allowed
-            return [newest] if allowed else []
+            selected = [newest] if allowed else []
+            self.passed_over = fresh[: len(fresh) - len(selected)]
+            return selected
         return fresh
 
     def _age_ns(self, newest: DataMessage, now_ns: int) -> int:

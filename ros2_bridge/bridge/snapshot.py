@@ -18,6 +18,8 @@ class Snapshot(NamedTuple):
     address: str
     connected: bool
     problem: str
+    is_reachable: bool
+    """Whether there is a server there, connected or not."""
     connection_s: float
     """How long there has been, or has not been, a connection."""
     connects: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 import time
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 from geometry_msgs.msg import WrenchStamped
 
 from protocol.control import Event, event
+from protocol.framing import DataFlag
 from protocol.pdo import encode
 from tests.bridge.compensating import (
     OVER,
@@ -183,6 +185,23 @@ def test_a_saturated_sample_spoils_a_tare(stages: Stages, stream: Stream, listen
     done, text = listener.trigger("tare")
     assert not done
     assert "force or torque was saturated" in text
+
+
+@pytest.mark.parametrize(
+    "bad", [{"flags": int(DataFlag.INVALID)}, {"process_data": sensed(UP, force_x=math.nan)}]
+)
+def test_a_bad_sample_spoils_a_tare(
+    stages: Stages, stream: Stream, listener: Listener, bad: dict[str, Any]
+) -> None:
+    hold(stream, UP, bias=BIAS)
+    good = stream.changes
+    for _ in range(1000):  # until after the window, however late that is
+        stream.once(**{**good, **bad})
+        stream.once(**good)
+    done, text = listener.trigger("tare")
+    assert not done
+    assert "of its samples were invalid or not finite" in text
+    assert list(listener.parameters("bias")[0]) == ZERO6
 
 
 def test_a_tare_without_samples(stages: Stages, stream: Stream, listener: Listener) -> None:

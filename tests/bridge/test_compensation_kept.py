@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -139,6 +140,33 @@ def test_another_sensor_does_not_get_a_tare_that_is_not_kept(bench: Bench, strea
     bench.server.description["sensors"][0]["serial"] = 9
     bench.server.drop()
     bench.stages.settle(list(BIAS.values))
+
+
+def test_nothing_of_one_sensor_is_used_for_another(bench: Bench, stream: Stream) -> None:
+    bench.start(bias_keep=False)
+    listener = bench.listener
+    assert listener.trigger("tare")[0]
+    assert listener.set_parameter("bias", [0.0] * 6) == (True, "")
+    assert listener.trigger("identify/start")[0]
+    assert listener.trigger("identify/add_pose")[0]
+    bench.server.description["sensors"][0]["serial"] = 2
+    bench.server.drop()
+    wait_until(lambda: bench.server.connections > 1 and bench.server.subscribed.is_set(), "a connection")
+    bench.stages.settle(list(BIAS.values))
+    assert listener.trigger("undo_tare") == (False, "there is no change of the bias to undo")
+    done, text = listener.trigger("identify/add_pose")
+    assert not done
+    assert "another sensor is there now, so the poses before were dropped" in text
+    assert "no identification was started" in listener.trigger("identify/add_pose")[1]
+
+
+def test_a_limit_to_the_rate_leaves_out_no_sample_of_a_tare(bench: Bench, stream: Stream) -> None:
+    bench.start(publishing_frequency=10.0, **{"rest.duration": 1.0})
+    done, text = bench.listener.trigger("tare")
+    assert done, text
+    found = re.match(r"bias of (\d+) samples", text)
+    assert found is not None
+    assert int(found[1]) > 30  # of about 100, where 10 are published
 
 
 def test_a_damaged_file_is_said_and_not_used(bench: Bench) -> None:

@@ -299,6 +299,11 @@ def test_the_orientation_is_taken_in_while_a_service_waits(
             "no such name!",
             "'no such name!': topic name must not contain",
         ),
+        (
+            "orientation.topic",
+            "wrench",
+            "'wrench': this node itself has that topic, with WrenchStamped messages and not",
+        ),
         ("orientation_source", "tf", "sudo apt install ros-$ROS_DISTRO-tf2-ros-py"),
     ],
 )

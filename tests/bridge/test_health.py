@@ -23,7 +23,8 @@ from tests.compensation.making import BIAS, TOOL
 pytestmark = pytest.mark.ros
 SAFEOP = SensorInfo(0, "", "", "", "SAFEOP")
 GOOD = Snapshot(
-    sensor=0, address="localhost:1", connected=True, problem="", connection_s=5.0, connects=1, new_connects=0,
+    sensor=0, address="localhost:1", connected=True, problem="", is_reachable=True,
+    connection_s=5.0, connects=1, new_connects=0,
     info=SensorInfo(0, "name", "7", "800", "OP"), lost=None, silent_s=0.0, rate_hz=800.0, expected_hz=800.0,
     age_us=(100.0, 300.0), counts=FrameCounts(), new=FrameCounts(), not_finite=0, new_not_finite=0,
     flags=Flags(), temperature=30.0, server={"sensors": [{"clock": {"mode": "locked"}}]}, new_server_lost=0,
@@ -47,7 +48,18 @@ def test_good_is_good() -> None:
 @pytest.mark.parametrize(
     ("name", "level", "words", "changes"),
     [
-        ("link", Level.ERROR, "no server at localhost:1: gone", {"connected": False, "problem": "gone"}),
+        (
+            "link",
+            Level.ERROR,
+            "no server at localhost:1: gone; start ethercat-server",
+            {"connected": False, "problem": "gone", "is_reachable": False},
+        ),
+        (
+            "link",
+            Level.ERROR,
+            "not connected to localhost:1: it has no sensor 3 (the node goes on trying)",
+            {"connected": False, "problem": "it has no sensor 3"},
+        ),
         ("stream", Level.STALE, "see link", {"connected": False}),
         ("sensor", Level.STALE, "see link", {"connected": False}),
         ("clock", Level.STALE, "see stream", {"connected": False}),

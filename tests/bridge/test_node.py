@@ -111,6 +111,7 @@ def test_a_limit_and_the_notes_parameter_names(listener: Listener, start: Start)
             numbers.append(listener.next_number())
         assert numbers == sorted(numbers)
         assert len(numbers) <= 24
+        assert listener.parameters("server_port", "SERVER_PORT") == [server.port, server.port]
         node.send_signal(signal.SIGTERM)
         assert node.ends() == 0
 
@@ -120,6 +121,29 @@ def test_a_wrong_parameter_is_one_sentence(start: Start) -> None:
     assert node.ends() == 1
     (line,) = node.log.splitlines()
     assert line == "bridge-client: parameter server_port is 70000: it must be a whole number from 1 to 65535"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"array_topic": "wrench"}, "no two topics one name"),
+        ({"array_topic": "/diagnostics"}, "no two topics one name"),
+        ({"qos_overrides.NS/wrench.publisher.reliability": "foo"}, "check qos_overrides"),
+        ({"qos_overrides.NS/wrench.publisher.depth": -1}, "check qos_overrides"),
+        (
+            {"orientation_source": "topic_pose", "orientation.topic": "imu/data_raw"},
+            "this node itself has that topic, with Imu messages and not PoseStamped",
+        ),
+    ],
+)
+def test_topics_that_cannot_be_made_are_one_sentence(
+    start: Start, listener: Listener, wrong: dict[str, object], words: str
+) -> None:
+    node = start(12001, **{name.replace("NS", f"/{listener.tag}"): value for name, value in wrong.items()})
+    assert node.ends() == 1
+    lines = [line for line in node.log.splitlines() if line.startswith("bridge-client: ")]
+    assert words in lines[-1]
+    assert "Traceback" not in node.log
 
 
 def test_a_wrong_setting_at_start_is_one_sentence(start: Start) -> None:

@@ -140,9 +140,16 @@ def test_a_clock_wrongly_taken_for_ours_does_not_silence_the_stream() -> None:
 def test_a_limit_takes_the_newest() -> None:
     select, counts = selector(limit_hz=100)
     got = numbers(select.select(frames(range(8)), 8 * PERIOD_NS))
-    got += numbers(select.select(frames(range(8, 16)), 16 * PERIOD_NS))
+    passed_over = numbers(select.passed_over)
+    assert numbers(select.select(frames(range(8, 10)), 10 * PERIOD_NS)) == []
+    passed_over += numbers(select.passed_over)
+    got += numbers(select.select(frames(range(10, 16)), 16 * PERIOD_NS))
+    passed_over += numbers(select.passed_over)
     assert got == [7, 15]
+    assert passed_over == [*range(7), *range(8, 15)]
     assert counts.limited == 14
+    assert select.select([], 17 * PERIOD_NS) == []
+    assert select.passed_over == []
 
 
 @given(st.sampled_from([1.0, 10.0, 99.9, 100.0, 333.0, 799.0]), st.integers(800, 1700))

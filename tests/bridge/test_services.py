@@ -106,6 +106,24 @@ def test_a_refusal_in_the_servers_own_words(server: ScriptedServer, listener: Li
     assert listener.trigger("save_settings") == (False, "not for uid 7 (denied)")
 
 
+def test_parameters_refused_together_leave_the_sensor_alone(
+    server: ScriptedServer, listener: Listener
+) -> None:
+    from rcl_interfaces.srv import SetParametersAtomically
+    from rclpy.parameter import Parameter
+
+    asked: list[JsonObject] = []
+    server.answers["configure"] = asked.append
+    for wrong in (Parameter("gravity", value=[0.0, 0.0, 0.0]), Parameter("tool_mass", value=-1.0)):
+        both = [Parameter("settings.sinc_length", value=128), wrong]
+        request = SetParametersAtomically.Request(parameters=[one.to_parameter_msg() for one in both])
+        result = listener.call(SetParametersAtomically, "set_parameters_atomically", request).result
+        assert not result.successful
+        assert wrong.name in result.reason
+    assert not asked
+    del server.answers["configure"]
+
+
 def test_settings_are_shown_and_saved(server: ScriptedServer, listener: Listener) -> None:
     done, text = listener.trigger("get_settings")
     assert done
