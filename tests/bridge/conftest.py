@@ -20,6 +20,8 @@ import pytest
 from tests.bridge.scripted_server import ScriptedServer
 
 PATIENCE_S = 45.0
+AHEAD_NS = 60 * 10**9
+"""Longer than any test waits."""
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:
@@ -49,7 +51,7 @@ class Listener:
         self.topic, self.supervisor_topic = f"/{self.tag}/array", f"/{self.tag}/supervisor"
         self.messages: queue.Queue[Any] = queue.Queue()
         self._key_value = KeyValue
-        self.node = self._node = rclpy.create_node(self.tag)
+        self.node = self._node = rclpy.create_node(self.tag, start_parameter_services=False)
         self._node.create_subscription(Float64MultiArray, self.topic, self.messages.put, 2000)
         self._supervisor = self._node.create_publisher(KeyValue, self.supervisor_topic, 10)
         self._executor = SingleThreadedExecutor()
@@ -234,7 +236,11 @@ def server() -> Iterator[ScriptedServer]:
 
 
 def establish(server: ScriptedServer, listener: Listener) -> None:
-    """Send samples until one arrives at the listener, then until none is on the way."""
+    """Send samples until one arrives at the listener, then until none is on the way.
+
+    From then on samples are dated ahead: the node skips those that it comes to read 50 ms after their time.
+    """
+    server.ahead_ns = AHEAD_NS
     assert server.subscribed.wait(PATIENCE_S)
     number = -1.0
     listener.numbers()

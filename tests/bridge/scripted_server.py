@@ -53,6 +53,8 @@ class ScriptedServer:
         self.subscribed = threading.Event()
         self.disconnected = threading.Event()
         self.sequence = 0
+        self.ahead_ns = 0
+        """How far ahead samples are dated: a node that is starved finds none too old to publish."""
         self._peer: socket.socket | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -96,9 +98,8 @@ class ScriptedServer:
     def frame(self, number: float, flags: int = 0, **changes: Any) -> bytes:
         """The next frame of sensor 0, encoded."""
         self.sequence += 1
-        message = DataMessage(
-            self.sequence, time.time_ns(), time.monotonic_ns(), 0, flags, 3, process_data(number)
-        )
+        moment = time.monotonic_ns() + self.ahead_ns
+        message = DataMessage(self.sequence, time.time_ns(), moment, 0, flags, 3, process_data(number))
         return encode_data(*message._replace(**changes))
 
     def _serve(self) -> None:

@@ -165,7 +165,7 @@ def test_a_tare_is_refused(
 
 def test_a_tare_while_the_force_moves_is_refused(stages: Stages, stream: Stream, listener: Listener) -> None:
     still, pushed = sensed(UP), sensed(UP, force_y=9.0)
-    for place in range(200):
+    for place in range(1000):  # for longer than the call may take
         stream.once(process_data=pushed if place // 3 % 2 else still)
     done, text = listener.trigger("tare")
     assert not done
@@ -177,11 +177,9 @@ def test_a_saturated_sample_spoils_a_tare(stages: Stages, stream: Stream, listen
     saturated = bytearray(sensed(UP))
     mask = encode(61, {"force_torque_saturated": 4})
     saturated = bytearray(a | b for a, b in zip(saturated, mask, strict=True))
-    for _ in range(10):
-        stream.once(process_data=sensed(UP))
-    stream.once(process_data=bytes(saturated))
-    for _ in range(10):
-        stream.once(process_data=sensed(UP))
+    # Again and again: on a busy machine the call takes its time, and a window has 30 samples.
+    for place in range(1000):
+        stream.once(process_data=bytes(saturated) if place % 10 == 9 else sensed(UP))
     done, text = listener.trigger("tare")
     assert not done
     assert "force or torque was saturated" in text

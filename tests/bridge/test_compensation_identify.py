@@ -150,7 +150,7 @@ def test_poses_that_do_not_suffice_are_refused_with_what_is_missing(started: Lis
 
 def test_a_pose_that_is_no_good_is_not_taken(started: Listener, take: Take, stream: Stream) -> None:
     take(UP)
-    for place in range(60):
+    for place in range(1000):  # for longer than the call may take
         stream.once(process_data=sensed(UP, force_x=9.0 * (place % 2)))
     done, text = started.trigger("identify/add_pose")
     assert not done

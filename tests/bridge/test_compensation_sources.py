@@ -65,14 +65,15 @@ class Robot:
         """What is added to the stamps; None: they are 0."""
         self.stamped = self.sending = True
         self.change: Callable[[Any], None] = lambda message: None
-        self._publisher: Any = None
+        self._target: tuple[Any, Any] | None = None
+        """Message type and publisher; one attribute, because the thread reads it while a test sets it."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def use(self, message_type: Any, topic: str) -> None:
-        self._publisher, self._type = None, message_type
-        self._publisher = self._node.create_publisher(message_type, topic, 10)
+        self._target = None
+        self._target = message_type, self._node.create_publisher(message_type, topic, 10)
 
     def restore(self) -> None:
         self.quaternion, self.offset_s, self.stamped, self.sending = UPRIGHT, 0.0, True, True
@@ -84,18 +85,19 @@ class Robot:
 
     def _run(self) -> None:
         while not self._stop.wait(0.02):
-            publisher = self._publisher
-            if publisher is None or not self.sending:
+            target = self._target
+            if target is None or not self.sending:
                 continue
-            message = self._type()
+            message_type, publisher = target
+            message = message_type()
             if self.stamped:
                 stamp = message.header.stamp
                 stamp.sec, stamp.nanosec = divmod(time.time_ns() + int(self.offset_s * 1e9), 10**9)
             x, y, z, w = self.quaternion
             quaternion = Quaternion(x=x, y=y, z=z, w=w)
-            if self._type is PoseStamped:
+            if message_type is PoseStamped:
                 message.pose.orientation = quaternion
-            elif self._type is Imu:
+            elif message_type is Imu:
                 message.orientation = quaternion
             else:
                 message.quaternion = quaternion

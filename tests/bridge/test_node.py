@@ -102,7 +102,7 @@ def test_a_limit_and_the_notes_parameter_names(listener: Listener, start: Start)
         node = start(12001, SERVER_PORT=server.port, publishing_frequency=100)
         establish(server, listener)
         time.sleep(0.05)
-        at = time.monotonic_ns()
+        at = time.monotonic_ns() + server.ahead_ns
         for number in range(160):
             server.send_sample(number, monotonic_ns=at + number * 1_250_000)
         server.send_sample(1000.0, monotonic_ns=at + 10**9)

@@ -115,6 +115,7 @@ def test_gravity_and_orientation(bench: Bench, listener: Listener) -> None:
     bench.granted(lambda: listener.set_parameter("settings.orientation_estimation", True))
     messages = listener.subscribe(Imu, "imu/data_raw")
     wait_until(lambda: messages.get(timeout=20).orientation_covariance[0] == 0.0, "an orientation")
+    bench.forget()  # what has come since the test began
     assert bench.age_s(bench.next_wrench()) < 10
 
 
@@ -159,7 +160,7 @@ def test_a_server_that_stood_still(bench: Bench) -> None:
     finally:
         bench.server.signal(signal.SIGCONT)
     first = bench.next_wrench()
-    assert bench.age_s(first) < 0.5
+    assert bench.age_s(first) < 1.5  # those of before are 2 s old
     array = bench.diagnostics.until("samples lost", stream=WARN)
     assert int(values(array["stream"])["lost"]) > 100
 

@@ -9,6 +9,11 @@ from tests.ended import Result, run
 MODULE = "ethercat_server.doctor.cli"
 
 
+_STARVED = "no EtherCAT slave answers"
+"""What it finds too when a busy machine lets the virtual sensor's process wait for too long."""
+_ATTEMPTS = 3
+
+
 class Examined(Result):
     """How it ended, and what it found."""
 
@@ -19,7 +24,10 @@ class Examined(Result):
 
 def doctor(*arguments: object, module: str = MODULE, under: tuple[str, ...] = ()) -> Examined:
     """Run `ethercat-doctor arguments...`."""
-    ended = Examined(*run(module, *arguments, under=under))
+    for _ in range(_ATTEMPTS):
+        ended = Examined(*run(module, *arguments, under=under))
+        if _STARVED not in ended.out:
+            break
     assert "fault of the doctor" not in ended.out, ended.out
     return ended
 

@@ -55,9 +55,11 @@ class Served:
         return reply(request)
 
     def serve(self, seconds: float = 0.02) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
+        """Give the hub this long, but no fewer turns than fit into it: this process may be held up."""
+        end, left = time.monotonic() + seconds, seconds / 0.002
+        while left > 0 or time.monotonic() < end:
             self.hub.serve(time.monotonic_ns() + 2_000_000)
+            left -= 1
 
     def connect(self) -> socket.socket:
         sock = socket.create_connection(("127.0.0.1", self.hub.port), timeout=5)
@@ -65,9 +67,9 @@ class Served:
         self.serve()
         return sock
 
-    def publish(self, place: int = 0, flags: int = 0) -> None:
+    def publish(self, place: int = 0, flags: int = 0, now_ns: int = 0) -> None:
         frame = encode_data(self.sequence, 1, 2, place, flags, 3, bytes(61))
-        self.hub.publish(frame, place, flags, time.monotonic_ns())
+        self.hub.publish(frame, place, flags, now_ns or time.monotonic_ns())
         self.sequence += 1
 
     def read(self, sock: socket.socket) -> list[DataMessage | JsonObject]:
@@ -227,8 +229,9 @@ def test_subscription_filters(served: Served) -> None:
         served.subscribe(fresh_only=False) as everything,
         served.subscribe() as default,
     ):
+        now_ns = time.monotonic_ns()
         for number in range(9):
-            served.publish(place=number % 2, flags=DataFlag.REPEATED if number >= 6 else 0)
+            served.publish(number % 2, DataFlag.REPEATED if number >= 6 else 0, now_ns)
 
         def sequences(sock: socket.socket) -> list[int]:
             return [m.sequence for m in served.read(sock) if isinstance(m, DataMessage)]
@@ -238,8 +241,7 @@ def test_subscription_filters(served: Served) -> None:
         assert sequences(everything) == list(range(9))
         assert sequences(default) == list(range(6))
         # After 10 ms with nothing, a silent sensor becomes visible.
-        served.serve(0.02)
-        served.publish(place=0, flags=DataFlag.REPEATED)
+        served.publish(0, DataFlag.REPEATED, now_ns + 10_000_001)
         assert sequences(default) == [9]
 
 
@@ -397,9 +399,10 @@ def test_a_client_that_takes_nothing_is_closed_after_a_while(served: Served) -> 
 
 
 def test_one_that_takes_a_little_now_and_then_stays(served: Served) -> None:
-    served.hub.limits = Limits(stall_ns=0.3e9)
+    served.hub.limits = Limits(stall_ns=1.5e9)
     sock = served.subscribe()
-    for _ in range(10):
+    ending = time.monotonic() + 2.0
+    while time.monotonic() < ending:
         for _ in range(600):
             served.publish()
         sock.recv(60000)
@@ -411,18 +414,19 @@ def test_idle_and_unfinished_connections_are_closed_with_a_reason(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connection_module, "_UNFINISHED_NS", int(0.2e9))
-    served.hub.limits = Limits(idle_ns=0.6e9)
+    served.hub.limits = Limits(idle_ns=2e9)
     subscriber = served.subscribe()
     unfinished, idle = served.connect(), served.connect()
-    unfinished.sendall(b"\0\0\1\0\2{")
     idle.sendall(b'{"action":"describe"}\n')
+    served.serve()
+    assert b'"reply":"describe"' in idle.recv(4096)
+    unfinished.sendall(b"\0\0\1\0\2{")
     served.serve(0.4)
     message = json.loads(unfinished.recv(4096)[5:])
     assert message["error"]["code"] == "bad_request"
     assert "has not finished its message" in message["error"]["message"]
-    assert b'"reply":"describe"' in idle.recv(4096)
-    served.serve(0.8)
-    assert b"asked nothing for 0.6 s" in idle.recv(4096)
+    served.serve(2.2)
+    assert b"asked nothing for 2 s" in idle.recv(4096)
     for sock in (unfinished, idle):
         assert sock.recv(1) == b""
         sock.close()
@@ -433,16 +437,14 @@ def test_idle_and_unfinished_connections_are_closed_with_a_reason(
 
 def test_a_client_that_asks_without_pause_waits_and_gets_all_answers_in_order(served: Served) -> None:
     hasty, other = served.connect(), served.connect()
+    began = time.monotonic()
     hasty.sendall(b"".join(encode_json({"action": "describe", "id": n}) for n in range(400)))
-    served.serve(0.1)
-    answered_soon = [m["id"] for m in served.read(hasty) if isinstance(m, dict)]
-    assert 100 <= len(answered_soon) < 300
     other.sendall(encode_json({"action": "describe", "id": 1}))
     assert served.read(other), "others need not wait for it"
-    answers = answered_soon
-    deadline = time.monotonic() + 10
-    while len(answers) < 400 and time.monotonic() < deadline:
+    answers: list[object] = []
+    while len(answers) < 400 and time.monotonic() - began < 30:
         answers += [m["id"] for m in served.read(hasty) if isinstance(m, dict)]
+        assert len(answers) <= 101 + 500 * (time.monotonic() - began), "100 at once, then 500 a second"
     assert answers == list(range(400))
 
 

@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 
 import pytest
@@ -15,7 +14,7 @@ from ethercat_server.known_objects import KNOWN_OBJECTS
 from ethercat_server.object_names import NOTE_NAMES
 from tests.server.commands import command, stats, written
 from tests.server.odd_sensor import FOREIGN_LACKS
-from tests.server.running import Program, Veth, needs_bus, virtual_sensor
+from tests.server.running import Program, Veth, needs_bus, virtual_sensor, wait_until
 from tests.tool.running import MODULE, complaints, one_sentence, tool
 
 pytestmark = [pytest.mark.bus, needs_bus]
@@ -198,5 +197,4 @@ def test_watch_ends_with_ctrl_c_and_leaves_the_bus(chain: Bench) -> None:
     out, err = watching.communicate(timeout=10)
     assert (watching.returncode, complaints(err)) == (0, [])
     assert "sensor 1: " in out.splitlines()[-1]
-    time.sleep(0.05)
-    assert stats(sensor)["al_state"] == "INIT"
+    wait_until(lambda: stats(sensor)["al_state"] == "INIT", "INIT")
