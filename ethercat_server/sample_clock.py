@@ -38,6 +38,8 @@ _HALF: Final = 0.45
 _QUARTER: Final = 0.25
 _SURELY_ONE: Final = 0.8
 """Only one sample can have come in this part of a period, even if the bracket is somewhat off."""
+_LONGEST_LOOK: Final = 0.5
+"""The sensor looks at its data within this part of a period after the frame was sent."""
 _CREEP_NS: Final = 150.0
 _MAX_CREEP: Final = 0.2
 _MIN_WIDTH_NS: Final = 10_000.0
@@ -143,14 +145,17 @@ class SampleClock:
             # Only what fell into the time the sensor was not watched can have been lost.
             self.steps = 1 + int(unwatched // period)
             self.uncertain = unwatched >= period
-            self.instant_ns = received_ns - min(unwatched, period) / 2
+            self.instant_ns = min(received_ns, sent_ns + period) - min(unwatched, period) / 2
             return
         expected = (self._low + self._high) / 2
         if unwatched < _NARROW * period:
             self.steps = max(0, 1 + round(((after + received_ns) / 2 - expected) / period))
         else:
             # Several samples may lie in a wide bracket: the newest is the last one due before the exchange.
-            self.steps = max(1, 1 + int(((sent_ns + received_ns) / 2 - expected) // period))
+            # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought
+            # is dated from before, never as younger than it may be.
+            into = min((received_ns - sent_ns) / 2, _LONGEST_LOOK * period)
+            self.steps = max(1, 1 + int((sent_ns + into - expected) // period))
         # The sensor looks at its data about half-way through an exchange of the usual length.
         looking = _HALF * self._flight_ns
         self.uncertain = (

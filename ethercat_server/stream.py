@@ -106,8 +106,8 @@ class SensorStream:
             self._handed_out = data
             clock.predict(sent_ns, back_ns)
             flags = self._new_sample(back_ns)
-            if clock.locked:
-                moment_ns = int(clock.instant_ns)
+            # After a stall in the exchange its end says nothing of when the sample came to be.
+            moment_ns = int(clock.instant_ns if clock.locked else min(back_ns, sent_ns + clock.period_ns))
         elif back_ns >= self._idle_at_ns and self.process_data:
             self._discard = 0  # a sensor that is stuck from the start is to be seen too
             self._handed_out = self._handed_out or self.process_data

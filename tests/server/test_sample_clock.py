@@ -38,6 +38,7 @@ def simulate(
     seconds: float = 5,
     period_ns: float = NOMINAL_NS,
     stall_chance: float = 0.0,
+    stall_in_exchange_chance: float = 0.0,
     frame_loss: float = 0.0,
     silent: Callable[[float], bool] = lambda _: False,
     seed: int = 1,
@@ -55,6 +56,8 @@ def simulate(
             sent += noise.expovariate(1 / 3e6)
         evaluated = sent + noise.gammavariate(4, 6_000)
         received = evaluated + noise.gammavariate(4, 6_000)
+        if other.random() < stall_in_exchange_chance:
+            received += other.expovariate(1 / 20e6)
         now = received + 20_000
         run.polls += 1
         if noise.random() < frame_loss:
@@ -118,6 +121,14 @@ def test_holds_through_stalls_and_counts_exactly_what_they_cost() -> None:
     assert run.counted_lost == run.lost
     assert clock.locked
     assert run.locked_samples > 0.98 * run.samples
+
+
+def test_a_sample_fetched_before_a_stall_is_not_dated_into_it() -> None:
+    run, clock = simulate(150, seconds=20, stall_in_exchange_chance=0.002)
+    assert run.lost > 0, "the stalls must be long enough to matter"
+    assert run.counted_lost == run.lost
+    assert clock.locked
+    assert max(run.stamp_error_ns) < 0.6 * NOMINAL_NS
 
 
 def test_lost_frames_cost_no_lock() -> None:

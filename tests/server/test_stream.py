@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import time
+
 from ethercat_server.stream import DISCARDED_AT_START, GAP, INVALID, REPEATED, SensorStream
 from protocol.framing import DataMessage, FrameDecoder
 
 PERIOD_NS = 1_250_000
+START_NS = time.monotonic_ns() + 3600 * 10**9
+"""Of the simulated clock: after the streams were made, which read the real one."""
 
 
 class Feeder:
@@ -13,19 +17,19 @@ class Feeder:
 
     def __init__(self) -> None:
         self.stream = SensorStream(0, PERIOD_NS)
-        self.now = 10**12
+        self.now = START_NS
         self.sample = 0
         self.prepares = True
 
     def exchange(
-        self, *, new: bool, valid: bool = True, after_ns: int = PERIOD_NS // 4
+        self, *, new: bool, valid: bool = True, after_ns: int = PERIOD_NS // 4, took_ns: int = 50_000
     ) -> DataMessage | None:
         self.now += after_ns
         self.sample += new
         data = self.sample.to_bytes(61, "little")
         if self.prepares:
-            self.stream.prepare(self.now - 50_000, 3)
-        made = self.stream.take(data, 3 if valid else -1, valid, self.now - 50_000, self.now)
+            self.stream.prepare(self.now - took_ns, 3)
+        made = self.stream.take(data, 3 if valid else -1, valid, self.now - took_ns, self.now)
         self.stream.learn()
         if made is None:
             return None
@@ -54,6 +58,20 @@ def test_each_sample_makes_one_frame_and_polls_between_make_none() -> None:
         sequences.append(message.sequence)
         assert [feeder.exchange(new=False) for _ in range(3)] == [None] * 3
     assert sequences == list(range(20))
+
+
+def test_what_an_exchange_brought_that_was_held_up_is_not_dated_from_its_end() -> None:
+    feeder, stall_ns = Feeder().start(), 50 * PERIOD_NS
+    for _ in range(2000):  # before the clock is locked, and after
+        assert feeder.exchange(new=True, after_ns=PERIOD_NS) is not None
+        if feeder.stream.clock.locked or feeder.sample == DISCARDED_AT_START + 2:
+            held_up = feeder.exchange(new=True, after_ns=stall_ns + PERIOD_NS, took_ns=stall_ns)
+            assert held_up is not None
+            assert held_up.flags == GAP
+            assert held_up.monotonic_ns <= feeder.now - stall_ns + PERIOD_NS
+        if feeder.stream.clock.locked:
+            return
+    raise AssertionError("it never locked")
 
 
 def test_a_frame_prepared_on_the_way_is_the_one_that_is_made_afterwards() -> None:
