@@ -5,10 +5,14 @@ taken off, which removes slow motion and drift; what remains, by its degrees of 
 standard deviation. Of all windows the calmer half is kept, by how far the fitted cubics of force and torque
 range: contacts and quick motion go. The noise is the median over those windows. If the accelerometer shows
 that the sensor was shaken even then, vibration cannot be told from noise and no judgement is made.
+
+A median does not see noise that comes and goes. So every window is judged besides, by its second differences,
+which motion and contacts hardly enter. Windows in which the accelerometer was shaken do not count.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,7 +20,7 @@ import numpy as np
 
 from clients.report.channels import ACCELERATION, ANGULAR_RATE, CHANNELS, Channel, noise_limit
 from clients.report.check import Check, Level
-from clients.report.series import Bools, Floats, Series
+from clients.report.series import Bools, Floats, Ints, Series
 from clients.report.words import figure, listing
 
 WINDOW_S: Final = 0.5
@@ -25,6 +29,12 @@ FEWEST_SAMPLES: Final = 32
 ORDER: Final = 3
 FEWEST_WINDOWS: Final = 8
 """That a judgement is made from."""
+_NOISY: Final = 1.5
+"""A window with so many times the limit is noisy; one of few samples needs more, by what chance may do."""
+_VERY_NOISY: Final = 4.0
+_FEWEST_NOISY: Final = 2  # windows: one may be a knock
+_TO_DEVIATION: Final = 1.4826 / math.sqrt(6)
+"""Makes the median size of second differences of white noise its standard deviation."""
 _FILLED: Final = 0.8
 """A window must have this part of its samples."""
 _ODD: Final = 4.0
@@ -48,12 +58,15 @@ class Noise:
     calm: int
     """How many of them were used."""
     window_s: float
+    noisy: Ints
+    """(12,) windows that are clearly above the limit, of all."""
+    worst: Floats
+    """(12,) standard deviation in the worst of these."""
 
     @property
     def shaken(self) -> bool:
-        """Whether at least two axes of the accelerometer are above their limit: that is motion."""
-        first = 3 * 2
-        return bool(np.sum(self.deviation[first : first + 3] > self.limit[first : first + 3]) >= 2)
+        """Whether it was, even in the calm windows."""
+        return bool(_shaken(self.deviation, self.limit))
 
 
 def measure(series: Series) -> Noise:
@@ -66,15 +79,20 @@ def measure(series: Series) -> Noise:
     edges = np.flatnonzero(np.diff(number) != 0) + 1
     starts, ends = np.concatenate(([0], edges)), np.concatenate((edges, [series.count]))
     fewest = max(FEWEST_SAMPLES // 2, int(_FILLED * length / series.period))
-    deviations, ranges = [], []
+    deviations, ranges, roughs, sizes = [], [], [], []
     for start, end in zip(starts, ends, strict=True):
         if end - start < fewest:
             continue
-        deviation, reach = _window(series.time[start:end], series.values[start:end], usable[start:end])
+        values = series.values[start:end]
+        good = np.asarray(usable[start:end].all(axis=0))
+        deviation, reach = _window(series.time[start:end], values, good)
         deviations.append(deviation)
         ranges.append(reach)
+        roughs.append(_rough(values, good))
+        sizes.append(end - start)
     if len(deviations) < FEWEST_WINDOWS:
-        return Noise(np.full(len(CHANNELS), np.nan), limits, len(deviations), 0, length)
+        unknown = np.full(len(CHANNELS), np.nan)
+        return Noise(unknown, limits, len(deviations), 0, length, np.zeros(len(CHANNELS), np.int64), unknown)
     all_deviations, reaches = np.array(deviations), np.array(ranges)[:, :6]
     # A channel that cannot be used in a window has a part in its unrest as large as can be.
     reaches = np.where(np.isfinite(reaches), reaches, np.inf)
@@ -86,7 +104,16 @@ def measure(series: Series) -> Noise:
     measured = np.sum(np.isfinite(kept), axis=0) >= FEWEST_WINDOWS // 2
     deviation = np.full(len(CHANNELS), np.nan)
     deviation[measured] = np.nanmedian(kept[:, measured], axis=0)
-    return Noise(deviation, limits, len(deviations), len(calm), length)
+    rough = np.where(_shaken(all_deviations, limits)[:, None], np.nan, np.array(roughs))
+    noisy = rough > limits * np.maximum(_NOISY, 1 + 5 / np.sqrt(sizes))[:, None]
+    worst = np.where(noisy, rough, 0.0).max(axis=0)
+    return Noise(deviation, limits, len(deviations), len(calm), length, noisy.sum(axis=0), worst)
+
+
+def _shaken(deviation: Floats, limit: Floats) -> Bools:
+    """Whether at least two axes of the accelerometer are above their limit: that is motion."""
+    shaken: Bools = np.sum(deviation[..., 6:9] > limit[6:9], axis=-1) >= 2
+    return shaken
 
 
 def _limit(series: Series, channel: Channel) -> float:
@@ -98,11 +125,17 @@ def _limit(series: Series, channel: Channel) -> float:
     return noise_limit(channel, length)
 
 
-def _window(time: Floats, values: Floats, usable: Bools) -> tuple[Floats, Floats]:
+def _rough(values: Floats, good: Bools) -> Floats:
+    """Standard deviation of each channel as its second differences tell it."""
+    rough = np.full(values.shape[1], np.nan)
+    rough[good] = np.median(np.abs(np.diff(values[:, good], 2, axis=0)), axis=0) * _TO_DEVIATION
+    return rough
+
+
+def _window(time: Floats, values: Floats, good: Bools) -> tuple[Floats, Floats]:
     """Standard deviation of each channel about its cubic, and how far the cubic ranges."""
     middle, half = (time[0] + time[-1]) / 2, max((time[-1] - time[0]) / 2, 1e-12)
     basis = np.polynomial.legendre.legvander((time - middle) / half, ORDER)
-    good = usable.all(axis=0)
     deviation = np.full(values.shape[1], np.nan)
     reach = np.full(values.shape[1], np.nan)
     fit, *_ = np.linalg.lstsq(basis, values[:, good], rcond=None)
@@ -194,6 +227,17 @@ def _judge(name: str, noise: Noise, places: range, matters: str, remedy: str) ->
             for p in above
         ]
         return Check(name, Level.FAULT, f"{listing(texts)}.", matters, remedy)
+    noisy = [place for place in places if noise.noisy[place] >= _FEWEST_NOISY]
+    if noisy:
+        times = noise.worst / noise.limit
+        texts = [
+            f"{CHANNELS[p].title} is noisy in {noise.noisy[p]} of {noise.windows} windows of "
+            f"{figure(noise.window_s, 2)} s, at worst {figure(noise.worst[p])} {CHANNELS[p].group.unit}, "
+            f"{figure(times[p], 2)} times the limit of {figure(noise.limit[p])}"
+            for p in noisy
+        ]
+        level = Level.FAULT if max(times[noisy]) > _VERY_NOISY else Level.ATTENTION
+        return Check(name, level, f"{listing(texts)}.", matters, remedy)
     if unknown:
         return _not_possible(
             name, f"It could not be measured for {listing(unknown)}: saturated, or not numbers, too often.",

@@ -104,6 +104,37 @@ def test_an_injected_fault_is_found_and_nothing_else(command: str, check: str, w
     assert check.lower().replace("imu", "IMU") in examination.verdict.sentence
 
 
+@pytest.mark.parametrize(("sinc_length", "seconds"), [(32, 10), (128, 10), (512, 20)])
+def test_noise_that_comes_and_goes_is_found(sinc_length: int, seconds: float) -> None:
+    script = Script([(0.6 * seconds, "noise force.x 30"), (0.8 * seconds, "noise force.x 0")])
+    examination = examine(sensor(seconds, script=script, sinc_length=sinc_length, seed=5))
+    assert wrong(examination) == {"Noise of force and torque": Level.FAULT}
+    assert "Force x is noisy in" in found(examination, "Noise of force and torque")
+    assert examination.noise.noisy[1:].sum() == 0
+
+
+def test_a_little_noise_that_comes_and_goes_is_pointed_out() -> None:
+    script = Script([(5.0, "noise torque.y 0.025"), (8.0, "noise torque.y 0")])
+    examination = examine(sensor(10, script=script, seed=5))
+    assert wrong(examination) == {"Noise of force and torque": Level.ATTENTION}
+    assert "Torque y is noisy in" in found(examination, "Noise of force and torque")
+
+
+@pytest.mark.parametrize("sinc_length", [32, 128, 512, 1024])
+@pytest.mark.parametrize("signal", ["scene", "poses", "turn"])
+def test_no_window_of_a_sensor_that_moves_and_touches_things_is_noisy(signal: str, sinc_length: int) -> None:
+    examination = examine(sensor(20, signal=signal, sinc_length=sinc_length, pdo_size=77, seed=2))
+    assert not wrong(examination)
+    assert examination.noise.noisy.sum() == 0
+
+
+def test_a_sensor_that_is_shaken_for_a_while_is_not_called_noisy() -> None:
+    sizes = {"acceleration.x": 0.05, "acceleration.y": 0.05, "force.x": 1.5, "torque.y": 0.05}
+    shaken = [(5.0, f"noise {channel} {size}") for channel, size in sizes.items()]
+    still = [(8.0, f"noise {channel} 0") for channel in sizes]
+    assert not wrong(examine(sensor(10, script=Script([*shaken, *still]))))
+
+
 def test_noise_below_the_limit_is_measured_and_not_called_a_fault() -> None:
     examination = examine(sensor(10, "noise force.x 0.3", seed=5))
     assert not wrong(examination)
