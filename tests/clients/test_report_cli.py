@@ -14,15 +14,19 @@ import pytest
 
 from clients.report import cli, program
 from clients.report.live import Received
-from protocol.framing import DataMessage
+from protocol.framing import DataFlag, DataMessage
 from tests.clients.recordings import writer
 from tests.clients.simulated import STARTED_AT_NS, described, simulate
 from tests.server.running import PATIENCE_S, free_port, needs_bus, server
 
 
+def describe(*rows: object) -> dict[str, object]:
+    return {"reply": "describe", "ok": True, "protocol": 1, "sensors": list(rows)}
+
+
 def record(path: Path, frames: list[DataMessage], *rows: object, end: bool = True) -> Path:
     made = writer(path)
-    made.describe(STARTED_AT_NS, {"reply": "describe", "ok": True, "protocol": 1, "sensors": list(rows)})
+    made.describe(STARTED_AT_NS, describe(*rows))
     for number, frame in enumerate(frames):
         made.frame(frame)
         if number % 1000 == 999:
@@ -110,18 +114,73 @@ def test_the_longest_stretch_of_the_same_settings_counts(
 ) -> None:
     made = writer(tmp_path / "changed.mcap")
     other = described(128, fir=True)
-    made.describe(STARTED_AT_NS, {"reply": "describe", "ok": True, "protocol": 1, "sensors": [other]})
+    made.describe(STARTED_AT_NS, describe(other))
     event = {"event": "reconfigured", "sensor": 0, "settings": described()["settings"]}
-    made.event(frames[1000].stamp_ns, event)
-    for frame in frames:
+    for frame in frames[:1000]:
         made.frame(frame)
+    # When it was received says nothing about when a sample was taken: the clocks differ, and it came late.
+    made.event(frames[1100].stamp_ns, event)
+    for frame in frames[1000:]:
+        made.frame(frame)
+    made.describe(frames[-1].stamp_ns, describe(described()))
     made.finish({})
     code, _, _ = ended(capsys, tmp_path / "changed.mcap", "-o", tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text()
     assert code == 0, "the settings are those that were in force"
-    assert "The settings were changed 1 times" in page
+    assert "The settings were changed 1 time while" in page
     assert "reconfigured (1)" in page
     assert f"{len(frames) - 1000:,} samples".replace(",", " ") in page
+
+
+def test_a_change_of_settings_is_no_fault_of_the_sensor(
+    frames: list[DataMessage], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = writer(tmp_path / "changed.mcap")
+    made.describe(STARTED_AT_NS, describe(described()))
+    changing = len(frames) - 40  # 50 ms, in which the sensor is not in OP
+    for number, frame in enumerate(frames):
+        made.frame(frame if number < changing else frame._replace(flags=DataFlag.INVALID))
+    other = described(128)
+    made.event(frames[-1].stamp_ns, {"event": "reconfigured", "sensor": 0, "settings": other["settings"]})
+    later = 10**9 + frames[-1].stamp_ns - frames[0].stamp_ns
+    for number, frame in enumerate(simulate(3, sinc_length=128, seed=4)):
+        moved = frame.stamp_ns + later, frame.monotonic_ns + later
+        made.frame(
+            frame._replace(stamp_ns=moved[0], monotonic_ns=moved[1], flags=0 if number else DataFlag.GAP)
+        )
+        if number == 10:
+            made.describe(moved[0], describe(other))
+    made.finish({})
+    code, out, _ = ended(capsys, tmp_path / "changed.mcap", "-o", tmp_path / "r.html")
+    assert (code, "Healthy" in out) == (0, True)
+    page = (tmp_path / "r.html").read_text()
+    assert "The settings were changed 1 time while" in page
+    assert f"{changing:,} samples".replace(",", " ") in page
+
+
+def test_a_sensor_that_was_exchanged_is_not_taken_for_the_other(
+    frames: list[DataMessage], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = writer(tmp_path / "swapped.mcap")
+    made.describe(STARTED_AT_NS, describe(described()))
+    for frame in frames[:1000]:
+        made.frame(frame)
+    made.describe(frames[1000].stamp_ns, describe({**described(), "serial": 99, "firmware": "2.0.0"}))
+    for frame in frames[1000:]:
+        made.frame(frame)
+    made.finish({})
+    path, page = tmp_path / "swapped.mcap", tmp_path / "r.html"
+    code, out, _ = ended(capsys, path, "-o", page)
+    assert (code, "serial 99): Healthy" in out) == (0, True)
+    for words in ("The sensor was exchanged while", "serial 4711, firmware 1.3.8;", "2.0.0"):
+        assert words in page.read_text()
+    assert f"{len(frames) - 1000:,} samples".replace(",", " ") in page.read_text()
+    assert "The settings were changed" not in page.read_text()
+    _, out, _ = ended(capsys, path, "-o", page, "--sensor", "serial:4711")
+    assert "serial 4711): Not conclusive" in out
+    assert "1 000 samples" in page.read_text()
+    _, _, err = ended(capsys, path, "-o", page, "--sensor", "serial:7")
+    assert "serial 4711), 0 (BFT-SENS-ECAT-M8, serial 99)" in err
 
 
 def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(
