@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 import sys
 from collections.abc import Sequence
@@ -20,7 +21,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         options = parse(argv)
         try:
             return run(options)
-        except BrokenPipeError:
+        except OSError as error:
+            if error.errno not in (errno.EPIPE, errno.EIO):  # the reader, or the terminal, is gone
+                raise
             hush()
             return 0
         except KeyboardInterrupt:

@@ -66,10 +66,12 @@ def _live(options: Options, model: Model) -> int:
     from clients.monitor.app import Monitor  # noqa: PLC0415 - takes a moment that the other views do without
 
     app = Monitor(model, options.address, ASCII if _spelled(options) else UNICODE, seconds=options.seconds)
-    app.run(mouse=False)
-    if app.recorder.running:
-        _say("Finishing the recording")
-    ended = app.recorder.close()
+    try:
+        app.run(mouse=False)
+        if app.recorder.running:
+            _say("Finishing the recording")
+    finally:
+        ended = app.recorder.close()
     if ended:
         _say(ended)
     return app.return_code or 0

@@ -62,9 +62,9 @@ class Recorder:
         try:
             # A session of its own: Ctrl-C on our terminal is for us, and we stop it in order.
             self._process = subprocess.Popen(
-                [*command, name, str(self._address)],
+                [*command, name, str(self._address), "--until-eof"],
                 cwd=self._directory,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,  # closed when we end, however that is
                 stdout=said,
                 stderr=said,
                 start_new_session=True,
@@ -85,7 +85,10 @@ class Recorder:
         """What to say of a recording that has ended, and whether it is bad news; None if none has."""
         if self._process is None or self._process.poll() is None:
             return None
-        code, self._process = self._process.returncode, None
+        code, stdin = self._process.returncode, self._process.stdin
+        self._process = None
+        if stdin is not None:
+            stdin.close()
         last = self._last_words().removeprefix(f"{PROGRAM}: ")
         if code == 0:
             return f"Recorded {last}" if last else "The recording has ended", False

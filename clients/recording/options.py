@@ -37,6 +37,7 @@ class RecordOptions:
     force: bool
     wait: bool
     reconnect: bool
+    until_eof: bool
 
 
 def parse_options(argv: Sequence[str] | None) -> RecordOptions:
@@ -64,6 +65,8 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add("--wait", action="store_true", help="wait for a server that is not there yet")
     add("--no-reconnect", action="store_false", dest="reconnect",
         help="end when the server does, instead of waiting for its return")  # fmt: skip
+    add("--until-eof", action="store_true",
+        help="end when standard input does, so with the program that holds its other end")  # fmt: skip
     add("--version", action="version", version=f"%(prog)s {VERSION}")
     given = parser.parse_intermixed_args(argv)
     if given.namespaces is not None and not given.ros:
@@ -73,6 +76,7 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
         given.path, given.address, sensors, given.seconds, given.ros,
         tuple(given.namespaces) if given.namespaces else None, ImuUnits(given.imu_raw_units),
         given.rotate_size, given.rotate_seconds, given.force, given.wait, given.reconnect,
+        given.until_eof,
     )  # fmt: skip
 
 

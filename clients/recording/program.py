@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import select
 import socket
 import sys
 import time
@@ -63,7 +65,7 @@ def _connect(source: Source, options: RecordOptions, signals: Signals) -> Batch 
         if not told:
             _say(f"waiting for a server at {options.address}")
             told = True
-        if signals.asked:
+        if _asked(options, signals):
             return None
         time.sleep(_WAIT_S)
 
@@ -81,7 +83,7 @@ def _record(
                 if recorder.failed:
                     code = 1
                     break
-                if signals.asked:
+                if _asked(options, signals):
                     break
                 if options.seconds is not None and time.monotonic() - began >= options.seconds:
                     reason = "time is up"
@@ -102,6 +104,13 @@ def _record(
         code = 1
     _say(_summary(recorder, parts, seconds))
     return code
+
+
+def _asked(options: RecordOptions, signals: Signals) -> bool:
+    """Whether it is to stop."""
+    if options.until_eof and not signals.asked and select.select([0], [], [], 0)[0]:
+        signals.asked = not os.read(0, 4096)
+    return signals.asked
 
 
 def _tell(batch: Batch, progress: Progress) -> None:

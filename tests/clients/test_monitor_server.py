@@ -14,6 +14,7 @@ import sys
 import termios
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,6 +24,7 @@ from clients.monitor.options import parse
 from clients.monitor.reader import Reader
 from clients.monitor.state import State
 from clients.monitor.tare import tare
+from clients.recording.reader import RecordingError, open_recording
 from protocol.address import Address
 from tests.server.running import PATIENCE_S, Server, free_port, needs_bus, wait_until
 
@@ -54,14 +56,14 @@ def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]
 class Terminal:
     """The monitor in a terminal of 80 by 24."""
 
-    def __init__(self, *arguments: str, **environment: str) -> None:
+    def __init__(self, *arguments: str, cwd: Path | None = None, **environment: str) -> None:
         self.near, far = pty.openpty()
         termios.tcsetwinsize(far, (24, 80))
         self.before = termios.tcgetattr(far)
         self.far = far
         self.seen = b""
         self.process = subprocess.Popen(
-            [*COMMAND, *arguments], stdin=far, stdout=far, stderr=far, start_new_session=True,
+            [*COMMAND, *arguments], stdin=far, stdout=far, stderr=far, start_new_session=True, cwd=cwd,
             env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "", "LINES": "", **environment},
         )  # fmt: skip
 
@@ -72,7 +74,8 @@ class Terminal:
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
-        os.close(self.near)
+        if self.near >= 0:
+            os.close(self.near)
         os.close(self.far)
 
     def read(self) -> bytes:
@@ -86,6 +89,12 @@ class Terminal:
 
     def type(self, keys: str) -> None:
         os.write(self.near, keys.encode())
+
+    def hang_up(self) -> None:
+        """Close the window: what is written from then on fails."""
+        os.close(self.near)
+        self.near = -1
+        self.process.send_signal(signal.SIGHUP)
 
     def end(self) -> int:
         """Its exit code, once it has ended."""
@@ -200,6 +209,29 @@ def test_the_terminal_is_as_it_was(shared: Server, way: str) -> None:
         assert terminal.end() == 0
         assert terminal.is_as_it_was()
         assert b"Traceback" not in terminal.read()
+
+
+@pytest.mark.parametrize("way", ["the terminal closes", "SIGKILL"])
+def test_a_recording_ends_with_the_monitor(shared: Server, way: str, tmp_path: Path) -> None:
+    with Terminal(str(shared.port), cwd=tmp_path) as terminal:
+        terminal.wait_for("BFT-SENS-ECAT-M8")
+        terminal.type("r")
+        wait_until(lambda: bool(list(tmp_path.glob("*.mcap"))), "the recording's file")
+        if way == "SIGKILL":
+            terminal.process.kill()
+        else:
+            terminal.hang_up()
+        terminal.process.wait(PATIENCE_S)
+        (made,) = tmp_path.glob("*.mcap")
+
+        def ended() -> bool:
+            try:
+                with open_recording(made) as recording:
+                    return recording.end is not None
+            except RecordingError:  # it has only begun to write
+                return False
+
+        wait_until(ended, "the end of the recording")
 
 
 def test_no_color_has_none_and_q_ends_it(shared: Server) -> None:

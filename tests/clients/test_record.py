@@ -107,6 +107,24 @@ def test_one_sensor_of_two(endless: Replay, out: Path) -> None:
         assert {item.sensor for item in recording.frames()} == {1}
 
 
+def test_it_ends_with_its_standard_input(endless: Replay, out: Path) -> None:
+    recorder = Recorder(out, endless.port, "--until-eof")
+    try:
+        wait_until(lambda: recorder.size() > 5000, "frames")
+        assert recorder.process.stdin
+        recorder.process.stdin.write("this is not the end\n")
+        recorder.process.stdin.flush()
+        size = recorder.size()
+        wait_until(lambda: recorder.size() > size, "more frames")
+        recorder.process.stdin.close()
+        assert recorder.wait() == 0
+    finally:
+        recorder.close()
+    with open_recording(out) as recording:
+        assert recording.end is not None
+        assert recording.end["reason"] == "asked to stop"
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_cleanly(endless: Replay, out: Path, number: int) -> None:
     recorder = Recorder(out, endless.port)
