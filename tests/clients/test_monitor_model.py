@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections import deque
+from types import SimpleNamespace
+from typing import Any, cast
+from unittest import mock
 
 import pytest
 
 from clients.monitor.model import Model
+from clients.monitor.reader import Reader
 from clients.monitor.state import SensorState
+from protocol.address import Address
+from protocol.client import Client
 from protocol.control import Event
 from protocol.framing import DataFlag, DataMessage
 from tests.clients import monitor_states as made
@@ -202,6 +208,25 @@ def test_the_age_is_that_of_a_new_sample_on_arrival(model: Model) -> None:
     age = only(model, now(4)).stream.age_us
     assert age is not None
     assert tuple(age) == pytest.approx((300, 900), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("came", "noted"),
+    [([[0, 1], [2], [], [3]], [3]), ([[k] for k in range(99)], [])],
+    ids=["some", "endless"],
+)
+def test_an_age_is_noted_only_of_what_was_waited_for(
+    came: list[list[int]], noted: list[int], model: Model
+) -> None:
+    batches = iter([[frame(k) for k in batch] for batch in came])
+    client = SimpleNamespace(
+        receive=lambda _: next(batches), events=deque(), connection=SimpleNamespace(same_machine=True)
+    )
+    ages: list[int] = []
+    with mock.patch.object(model, "note_age", lambda made, _: ages.append(made.sequence)):
+        Reader(Address("localhost", 1), model)._take(cast("Client", client))
+    assert ages == noted
+    assert only(model, now(4)).stream.samples >= 4
 
 
 def test_the_servers_clients_have_rates_and_one_of_them_is_this(model: Model) -> None:
