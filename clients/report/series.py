@@ -28,6 +28,11 @@ _SURELY_LONGER: Final = 2.5
 """One of more than this has lost some whether they are marked or not."""
 _SHORT: Final = 0.75
 """An interval shorter than this follows one that a late stamp made too long."""
+_COVERED_PERIODS: Final = 4
+_COVERED_S: Final = 0.01
+"""A frame without a sample tells of a silence as far as this, or `_COVERED_PERIODS`, from a sample, ..."""
+_COVERED_BETWEEN_S: Final = 0.1
+"""... and as far as this from the next such frame: the server looks less often after a sensor it has lost."""
 
 
 @dataclass(frozen=True)
@@ -118,15 +123,19 @@ class Series:
     @cached_property
     def silent(self) -> Bools:
         """(n - 1,) whether REPEATED or INVALID frames lie between one sample and the next."""
-        places = np.flatnonzero(self.frames.fresh)
-        return np.diff(places) > 1
+        return self.others > 0
+
+    @cached_property
+    def others(self) -> Ints:
+        """(n - 1,) how many REPEATED or INVALID frames that are."""
+        return np.diff(np.flatnonzero(self.frames.fresh)) - 1
 
     @cached_property
     def missing(self) -> Ints:
-        """(n - 1,) how many samples are missing between one and the next, where the sensor was not silent.
+        """(n - 1,) how many samples are missing between one and the next, beside those of a silent sensor.
 
         Told by the time that passed and by the mark GAP. A stamp that is late makes one interval long and the
-        next one short: that is no loss.
+        next one short: that is no loss. Where the sensor was silent, it is the time of which no frame tells.
         """
         wide = self.intervals / self.period
         if not len(wide):
@@ -137,7 +146,17 @@ class Series:
         missing = np.round(np.clip(periods, 0, 1e12)).astype(np.int64) - 1
         marked = (self.samples.flags[1:] & DataFlag.GAP != 0) | (np.diff(self.samples.sequence) > self.step)
         lost = ((wide > _LONGER) & marked) | (wide > _SURELY_LONGER)
-        return np.where(lost & ~self.silent, np.maximum(missing, 0), 0)
+        return np.where(self.silent, self._untold, np.where(lost, np.maximum(missing, 0), 0))
+
+    @cached_property
+    def _untold(self) -> Ints:
+        """(n - 1,) samples that have room between frames too far apart to tell of a silence."""
+        fresh, intervals = self.frames.fresh, np.diff(self.frame_time)
+        near = np.where(fresh[:-1] | fresh[1:], _COVERED_S, _COVERED_BETWEEN_S)
+        wide = intervals > np.maximum(near, _COVERED_PERIODS * self.period)
+        room = np.round(np.clip(intervals / self.period, 0, 1e12)).astype(np.int64) - 1
+        summed = np.concatenate(([0], np.cumsum(np.where(wide, room, 0))))
+        return np.diff(summed[np.flatnonzero(fresh)])
 
     @cached_property
     def broken(self) -> Bools:

@@ -36,14 +36,14 @@ class Timing:
 
     @cached_property
     def lost(self) -> int:
-        """Samples that are missing where the sensor was not silent."""
+        """Samples that are missing, beside those of a silent sensor."""
         return int(self.series.missing.sum())
 
     @cached_property
     def withheld(self) -> int:
         """Those of the lost ones that the server had numbered: the client or recorder was too slow."""
         s = self.series
-        jumps = np.diff(s.samples.sequence) // s.step - 1
+        jumps = np.diff(s.samples.sequence) // s.step - 1 - s.others
         return int(np.minimum(np.maximum(jumps, 0), s.missing).sum())
 
     @cached_property
@@ -67,7 +67,7 @@ class Timing:
     def silences(self) -> Floats:
         """How long the sensor was silent each time, s, the time before the first and after the last too."""
         s = self.series
-        spans: Floats = s.intervals[s.silent] - s.period
+        spans: Floats = (s.intervals - (1 + s.missing) * s.period)[s.silent]
         if len(s.frame_time) == 0:
             return np.zeros(0)
         if s.count == 0:

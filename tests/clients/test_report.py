@@ -231,6 +231,35 @@ def test_invalid_frames_are_a_silence() -> None:
     assert examination.timing.lost == 0
 
 
+@pytest.mark.parametrize("flag", [DataFlag.INVALID, DataFlag.REPEATED])
+@pytest.mark.parametrize("withheld", [True, False])
+def test_one_frame_of_a_silence_hides_no_loss(flag: DataFlag, withheld: bool) -> None:
+    frames = [
+        frame._replace(flags=flag) if number == 2100 else frame
+        for number, frame in enumerate(simulate(8))
+        if not 2000 <= number < 2400 or number == 2100
+    ]
+    if not withheld:  # the server saw none of them, and numbered none
+        frames = [frame._replace(sequence=number) for number, frame in enumerate(frames)]
+    frames[2001] = frames[2001]._replace(flags=DataFlag.GAP)
+    examination = examine(subject_of(frames))
+    assert wrong(examination) == {"Lost samples": Level.FAULT, "Silent or stuck sensor": Level.ATTENTION}
+    assert examination.timing.lost == pytest.approx(399, abs=2)
+    assert examination.timing.withheld == (examination.timing.lost if withheld else 0)
+    assert examination.timing.silences.max() < 0.01
+
+
+def test_a_sensor_that_is_lost_is_looked_after_less_often_and_that_is_no_loss() -> None:
+    frames = [
+        frame._replace(flags=DataFlag.INVALID) if 2000 <= number < 3000 else frame
+        for number, frame in enumerate(simulate(8))
+        if not 2010 <= number < 2990 or number % 33 == 0
+    ]
+    examination = examine(subject_of(frames))
+    assert wrong(examination) == {"Silent or stuck sensor": Level.FAULT}
+    assert examination.timing.silences.max() == pytest.approx(1.25, abs=0.01)
+
+
 def test_a_wall_clock_that_was_set_and_stamps_that_go_back_are_found(healthy: Subject) -> None:
     stamps = healthy.columns.stamp_ns.copy()
     stamps[4000:] += 2_500_000_000
