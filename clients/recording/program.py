@@ -140,6 +140,7 @@ def _notes(options: RecordOptions, source: Source) -> dict[str, str]:
         "server_version": printable(source.description.get("version"), 40),
         "host": socket.gethostname(),
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        **({"sensors": " ".join(map(str, options.sensors))} if options.sensors else {}),
     }
 
 

@@ -36,6 +36,9 @@ __all__ = ["DamagedError", "Description", "Event", "Identity", "NotARecordingErr
 _MAX_NOTES: Final = 1_000_000
 """Descriptions and events that are kept while a recording is open."""
 
+_LONGEST_CHOICE: Final = 1024
+"""Characters; there are 256 places."""
+
 
 class Recording:
     """An open recording. Use it as a context manager, or `close` it.
@@ -43,6 +46,7 @@ class Recording:
     Attributes:
         path: where it is.
         metadata: what the recorder noted at the start, texts by name (docs/recording.md).
+        chosen: places of the sensors that were to be recorded; empty for all.
         end: what it noted at the end, None if it was cut off.
         cut_off: None if the recording was ended, else a clause that says what is wrong with its end.
         sensors: the sensors that the server described or that have frames, by place.
@@ -74,6 +78,8 @@ class Recording:
                 f"{FORMAT_VERSION}: use the version that wrote it"
             )
         self.metadata: Mapping[str, str] = found
+        chosen = found.get("sensors", "")[:_LONGEST_CHOICE].split()
+        self.chosen = {int(place) for place in chosen if place.isascii() and place.isdecimal()}
         self.end: Mapping[str, str] | None = self._file.metadata.get(END_METADATA)
         self._sensor_of: dict[int, int] = {}
         self._topic_of: dict[int, str] = {}

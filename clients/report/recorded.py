@@ -15,7 +15,7 @@ from clients.recording.sensors import Histories
 from clients.report.errors import ReportError
 from clients.report.series import Bools
 from clients.report.subject import Subject, subject
-from clients.report.words import count, moment
+from clients.report.words import count, listing, moment
 from protocol.framing import DataMessage
 from protocol.pdo import ImuUnits
 from protocol.sensor_choice import SensorChoice
@@ -33,11 +33,17 @@ def subjects(path: Path, choice: SensorChoice | None, imu_units: ImuUnits) -> li
     RecordingError says why it cannot be read, ReportError that it has no such sensor.
     """
     with open_recording(path) as recording:
-        found = [sensor for sensor in recording.sensors if _meant(sensor, choice)]
+        recorded = [sensor for sensor in recording.sensors if _recorded(recording, sensor)]
+        found = [sensor for sensor in recorded if _meant(sensor, choice)]
         if not found:
-            there = [(s.sensor, who.name, who.serial) for s in recording.sensors for *_, who in s.history]
+            there = [(s.sensor, who.name, who.serial) for s in recorded for *_, who in s.history]
             raise no_sensor(str(path), choice, dict.fromkeys(there))
         return [_subject(recording, sensor, choice, imu_units) for sensor in found]
+
+
+def _recorded(recording: Recording, sensor: RecordedSensor) -> bool:
+    """Whether it was to be recorded."""
+    return not recording.chosen or sensor.sensor in recording.chosen
 
 
 def no_sensor(
@@ -100,6 +106,9 @@ def _subject(
     made = subject(row, settings.values if settings else None, every, recording.path.name, sensor.sensor)
     if recording.cut_off:
         remarks.append(f"The recording was cut off: {recording.cut_off}.")
+    others = [str(s.sensor) for s in recording.sensors if not _recorded(recording, s)]
+    if others:
+        remarks.append(f"Not recorded, because others were chosen: sensor {listing(others)}.")
     return made.with_remarks([*remarks, *event_remarks(event.name for event in recording.events)])
 
 

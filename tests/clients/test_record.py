@@ -105,6 +105,7 @@ def test_one_sensor_of_two(endless: Replay, out: Path) -> None:
     assert code == 0
     with open_recording(out) as recording:
         assert {item.sensor for item in recording.frames()} == {1}
+        assert recording.chosen == {1}
 
 
 def test_it_ends_with_its_standard_input(endless: Replay, out: Path) -> None:

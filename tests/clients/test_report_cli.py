@@ -183,6 +183,23 @@ def test_a_sensor_that_was_exchanged_is_not_taken_for_the_other(
     assert "serial 4711), 0 (BFT-SENS-ECAT-M8, serial 99)" in err
 
 
+def test_a_sensor_that_was_not_to_be_recorded_is_not_judged(
+    frames: list[DataMessage], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, page = tmp_path / "one.mcap", tmp_path / "r.html"
+    made = writer(path, sensors="0 4")
+    rows = [{**described(), "sensor": place, "serial": 100 + place} for place in (0, 1, 2)]
+    made.describe(STARTED_AT_NS, describe(*rows))
+    for frame in frames:
+        made.frame(frame)
+    made.finish({})
+    code, out, _ = ended(capsys, path, "-o", page)
+    assert (code, out.count("serial")) == (0, 1)
+    assert "Not recorded, because others were chosen: sensor 1 and 2." in page.read_text()
+    code, _, err = ended(capsys, path, "-o", page, "--sensor", "1")
+    assert (code, "has no sensor 1: it has 0 (BFT-SENS-ECAT-M8, serial 100)\n" in err) == (1, True)
+
+
 def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(
     frames: list[DataMessage], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
