@@ -65,10 +65,8 @@ class Progress:
             rates.append(f"{rate:.0f}")
         self._seen_at = now
         state = f"{' + '.join(rates) or '0'} frames/s" if connected else "no server, waiting for it"
-        missing = recorder.tally.missing
-        loss = f"{missing} lost" if missing else "nothing lost"
-        size = human_size(recorder.bytes_written)
-        return f"{self._name}: {clock(now - self._began)}, {recorder.saved} frames, {size}, {state}, {loss}"
+        size, lost = human_size(recorder.bytes_written), recorder.tally.brief()
+        return f"{self._name}: {clock(now - self._began)}, {recorder.saved} frames, {size}, {state}, {lost}"
 
 
 def clock(seconds: float) -> str:

@@ -57,10 +57,18 @@ class Tally:
         """Frames of all sensors."""
         return sum(sensor.frames for sensor in self.sensors.values())
 
-    @property
-    def missing(self) -> int:
-        """Frames that are known to be missing."""
-        return self.dropped + sum(sensor.withheld for sensor in self.sensors.values())
+    def brief(self) -> str:
+        """The same as `losses` in few words, the sensors' counts one after the other; from any thread."""
+        sensors = [sensor for _, sensor in sorted(dict(self.sensors).items())]
+        missing = self.dropped + sum(sensor.withheld for sensor in sensors)
+        found = [f"{missing} lost"] if missing else []
+        for name, counts in (
+            ("gaps", [sensor.gaps for sensor in sensors]),
+            ("invalid", [sensor.invalid for sensor in sensors]),
+        ):
+            if any(counts):
+                found.append(f"{'+'.join(map(str, counts))} {name}")
+        return ", ".join(found) or "nothing lost"
 
     def as_json(self) -> dict[str, dict[str, int]]:
         """By place on the bus."""
