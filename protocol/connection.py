@@ -38,8 +38,7 @@ class FramedConnection:
         try:
             self.sock = socket.create_connection((host, port), timeout=timeout_s)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot be one
-            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
-            raise UnreachableError(reason) from None
+            raise UnreachableError(_reason(error)) from None
         try:
             self._prepare_socket()
         except OSError as error:
@@ -118,6 +117,13 @@ class FramedConnection:
         """Close the socket."""
         self.shutdown()
         self.sock.close()
+
+
+def _reason(error: OSError | UnicodeError) -> str:
+    """Why there is no connection, without numbers."""
+    if isinstance(error, socket.gaierror):  # has numbers of its own
+        return error.strerror or str(error)
+    return os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
 
 
 def _timeval(seconds: float) -> bytes:

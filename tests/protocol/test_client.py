@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -130,6 +131,15 @@ def test_nobody_there() -> None:
         connect(free_port())
     with pytest.raises(UnreachableError):
         connect(70000)
+
+
+def test_a_host_that_is_not_known_is_said_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    with pytest.raises(UnreachableError, match=r"^Name or service not known$"):
+        connect(12001, "sensor-cell-3")
 
 
 def test_a_refused_subscription_closes_the_connection(scripted: ScriptedServer) -> None:
