@@ -9,9 +9,34 @@ import contextlib
 import errno
 import fcntl
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from clients.recording.errors import DiskError
+
+
+def _lock(fd: int) -> None:
+    """Have it for us alone, until it is closed; OSError."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise OSError(error.errno, "another ethercat-record is writing to it") from None
+
+
+def remove(paths: Sequence[Path]) -> None:
+    """Remove these files, or none of them if one is being written; DiskError."""
+    for really in (False, True):
+        for path in paths:
+            try:
+                fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+                try:
+                    _lock(fd)
+                    if really:
+                        path.unlink()
+                finally:
+                    os.close(fd)
+            except OSError as error:
+                raise DiskError(f"{path} cannot be replaced: {error.strerror}") from None
 
 
 class DiskFile:
@@ -33,13 +58,11 @@ class DiskFile:
         except OSError as error:
             raise DiskError(f"{path} cannot be made: {error.strerror}") from None
         try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(self._fd)
             os.truncate(self._fd, 0)
         except OSError as error:
             os.close(self._fd)
-            busy = error.errno == errno.EWOULDBLOCK
-            reason = "another ethercat-record is writing to it" if busy else error.strerror
-            raise DiskError(f"{path} cannot be written: {reason}") from None
+            raise DiskError(f"{path} cannot be written: {error.strerror}") from None
 
     def write(self, data: bytes) -> int:
         """Have `data` wait for the next flush."""

@@ -6,7 +6,7 @@ import re
 import time
 from pathlib import Path
 
-from clients.recording.disk import DiskFile
+from clients.recording.disk import DiskFile, remove
 from clients.recording.errors import DiskError
 
 
@@ -41,8 +41,7 @@ class Parts:
         """The next file; DiskError."""
         if not self.made and self.rotate:
             # Those that the new row does not reach would seem to belong to it.
-            for old in self._existing():
-                self._remove(old)
+            remove(self._existing())
         path = self._part(len(self.made)) if self.rotate else self.path
         disk = DiskFile(path, overwrite=self._overwrite)
         self.made.append(path)
@@ -62,10 +61,3 @@ class Parts:
             return [self.path] if self.path.exists() else []
         name = re.compile(f"{re.escape(self.path.stem)}_[0-9]+{re.escape(self.path.suffix)}", re.ASCII)
         return sorted(path for path in self.path.parent.iterdir() if name.fullmatch(path.name))
-
-    @staticmethod
-    def _remove(path: Path) -> None:
-        try:
-            path.unlink()
-        except OSError as error:
-            raise DiskError(f"{path} cannot be replaced: {error.strerror}") from None

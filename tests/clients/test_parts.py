@@ -46,6 +46,18 @@ def test_a_row_is_not_mixed_with_an_older_one(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a_0.mcap", "a_b.mcap"]
 
 
+def test_a_row_that_is_being_written_is_not_replaced(tmp_path: Path) -> None:
+    first = parts(tmp_path / "a.mcap", size=1000)
+    first.open().close()
+    writing = first.open()
+    with pytest.raises(DiskError, match=r"a_1.mcap .* another ethercat-record is writing to it"):
+        parts(tmp_path / "a.mcap", size=1000, overwrite=True).open()
+    assert [path.exists() for path in first.made] == [True, True], "none is gone"
+    writing.close()
+    parts(tmp_path / "a.mcap", size=1000, overwrite=True).open().close()
+    assert [path.exists() for path in first.made] == [True, False]
+
+
 def test_what_the_disk_does_not_take_is_taken_off_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
