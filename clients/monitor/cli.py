@@ -29,7 +29,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             return 1 if options.once else 0
     except KeyboardInterrupt:
-        return 0
+        # The options are not known yet, or wrong.
+        given = sys.argv[1:] if argv is None else argv
+        return int(any(len(word) > len("--") and "--once".startswith(word) for word in given))
     except ImportError as error:
         return not_installed("ethercat-monitor", error)
 
