@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import time
 from pathlib import Path
@@ -47,6 +48,12 @@ class Parts:
         self.made.append(path)
         self._opened = time.monotonic()
         return disk
+
+    def remove(self) -> None:
+        """Remove what was made, as far as it can be; they must be closed."""
+        for path in self.made:
+            with contextlib.suppress(OSError):
+                path.unlink()
 
     def is_full(self, size: int) -> bool:
         """Whether the file, which has `size` bytes, is done."""

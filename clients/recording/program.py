@@ -73,7 +73,7 @@ def _connect(source: Source, options: RecordOptions, signals: Signals) -> Batch 
 def _record(
     source: Source, recorder: Recorder, batch: Batch, options: RecordOptions, parts: Parts, signals: Signals
 ) -> int:
-    began, reason, code = time.monotonic(), "asked to stop", 0
+    began, reason, code, refused = time.monotonic(), "asked to stop", 0, ""
     with Progress(options.path.name) as progress:
         progress.say(f"recording {options.address} to {parts.made[0]}; Ctrl-C ends it")
         try:
@@ -95,10 +95,16 @@ def _record(
                 batch = source.receive()
         except ProtocolError as error:
             reason, code = f"the server refused: {error}", 1
-            progress.say(reason)
+            refused = reason
         seconds = time.monotonic() - began
         source.close()
         recorder.stop(reason)
+    if refused:
+        _say(refused)
+        if not recorder.saved and recorder.error is None:
+            # A file with nothing in it would only be in the way of the next attempt.
+            parts.remove()
+            return code
     if recorder.error is not None:
         _say(f"{recorder.error}; what was written before is whole")
         code = 1

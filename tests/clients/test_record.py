@@ -308,6 +308,20 @@ def test_two_recorders_do_not_write_to_one_file(endless: Replay, out: Path) -> N
 # -- arguments and servers that are not there
 
 
+@pytest.mark.parametrize("rotate", [(), ("--rotate-size", "1M")])
+def test_a_refusal_is_one_sentence_and_leaves_no_file(
+    endless: Replay, out: Path, rotate: tuple[str, ...]
+) -> None:
+    code, said = run(out, endless.port, "--sensor", "3", "--seconds", "30", *rotate)
+    assert code == 1
+    last = said.splitlines()[-1]
+    assert last.startswith("ethercat-record: the server refused: ")
+    assert "nothing was lost" not in said
+    assert not list(out.parent.glob("out*.mcap"))
+    code, said = run(out, endless.port, "--sensor", "1", "--seconds", "0.3", *rotate)
+    assert code == 0, said
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
