@@ -83,6 +83,12 @@ def _choose(recording: Recording, place: int | None) -> RecordedSensor:
         raise SensorChoiceError(f"{recording.path} holds several sensors ({places}): say which with --sensor")
     for sensor in there:
         if place in (None, sensor.sensor):
+            serials = list(dict.fromkeys(row.identity.serial for row in sensor.history))
+            if len(serials) > 1:
+                raise SensorChoiceError(
+                    f"{recording.path}: sensor {sensor.sensor} was exchanged in it (serial numbers "
+                    f"{', '.join(map(str, serials))}), and each has its own bias: record one of them by itself"
+                )
             return sensor
     raise SensorChoiceError(f"{recording.path} holds no samples of sensor {place}")
 
