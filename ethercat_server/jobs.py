@@ -6,6 +6,7 @@ sensor does one job at a time, in the order asked.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -24,6 +25,8 @@ _AT_LEAST_EVERY_NS: Final = 20_000_000
 """On a bus that leaves no time, a step is taken all the same now and then."""
 _MOST_WAITING: Final = 32
 _AWAY: Final = "is lost, or was taken out of OP to be set up"
+
+log = logging.getLogger(__name__)
 
 Done = Callable[[Any, RequestError | None], None]
 """Called with the job's result, or with why there is none."""
@@ -104,6 +107,11 @@ class Jobs:
             error = RequestError(refused.code, str(refused), **refused.extra)
         except BusError as failed:
             error = refusal(failed)
+        except Exception:  # no request, however odd, may end the acquisition
+            log.exception("a request to sensor %d failed", place)
+            error = RequestError(
+                ErrorCode.INTERNAL, "the request failed by a fault of this program: see its log"
+            )
         steps.close()
         self._queues[place].popleft()
         self.waiting -= 1

@@ -129,7 +129,13 @@ class ObjectEntry:
 
     def decode_setting(self, data: bytes, is_bool: bool) -> SettingValue:
         """The setting value in `data`; ValueError if it is none that the setting can have."""
-        raw = self.type.unpack(data)
+        try:
+            raw = self.type.unpack(data)
+        except struct.error:
+            raise ValueError(
+                f"object 0x{self.index:04X}:{self.subindex} holds {data.hex() or 'nothing'}, which is no "
+                f"{self.type.name}"
+            ) from None
         if self.codes:
             for value, code in self.codes.items():
                 if code == raw:

@@ -182,7 +182,7 @@ def _setting_text(name: str, data: bytes) -> str:
     """For people: the setting in what was read of its object."""
     try:
         return _text(objects.BY_SETTING[name].decode_setting(data, SETTINGS[name].is_bool))
-    except (ValueError, struct.error):
+    except ValueError:
         return f"0x{data.hex()}"
 
 
@@ -194,14 +194,27 @@ def read_offset(sdo: Sdo) -> Steps[tuple[float, ...]]:
     """The six force/torque offsets in force."""
     found = []
     for address in _OFFSETS:
-        found.append(float(objects.BY_ADDRESS[address].type.unpack((yield from sdo.read(*address)))))
+        entry, data = objects.BY_ADDRESS[address], (yield from sdo.read(*address))
+        try:
+            found.append(float(entry.type.unpack(data)))
+        except struct.error:
+            raise BusError(
+                f"the offset {entry.name} is {data.hex() or 'nothing'}, which is no {entry.type.name}"
+            ) from None
     return tuple(found)
+
+
+def pack_offset(offset: Sequence[float]) -> list[bytes]:
+    """The six offsets as the sensor holds them; ValueError if one is too large."""
+    try:
+        return [objects.BY_ADDRESS[address].type.pack(v) for address, v in zip(_OFFSETS, offset, strict=True)]
+    except OverflowError:
+        raise ValueError(f"{max(offset, key=abs):g} is larger than a REAL32 can be") from None
 
 
 def write_offset(sdo: Sdo, offset: Sequence[float]) -> Steps[None]:
     """Write the six offsets and verify them; BusError if one does not take."""
-    for address, value in zip(_OFFSETS, offset, strict=True):
-        data = objects.BY_ADDRESS[address].type.pack(value)
+    for address, value, data in zip(_OFFSETS, offset, pack_offset(offset), strict=True):
         yield from sdo.write(*address, data)
         if (yield from sdo.read(*address)) != data:
             raise BusError(f"the offset {objects.BY_ADDRESS[address].name} = {value:g} did not take")

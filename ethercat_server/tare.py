@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from ethercat_server.errors import BusError, CutOffError, extended
 from ethercat_server.sdo import Sdo, Steps
-from ethercat_server.sensor import Sensor, read_offset, write_offset
+from ethercat_server.sensor import Sensor, pack_offset, read_offset, write_offset
 from ethercat_server.stream import SensorStream
 from protocol.control import ErrorCode
 from protocol.errors import RequestError
@@ -35,14 +35,17 @@ _PATIENCE: Final = 4.0
 def tare(
     sdo: Sdo, sensor: Sensor, stream: SensorStream, samples: int, target: Sequence[float]
 ) -> Steps[dict[str, Any]]:
-    """Steps of the action `tare`; returns what its reply carries. RequestError if the sensor is not at rest.
+    """Steps of the action `tare`; returns what its reply carries. RequestError if the sensor is not at rest,
+    or cannot hold the offset.
 
     If it fails half-way the old offset is put back.
     """
+    _check_fits(target, "the key 'target'")
     mean, deviation = yield from _average(sensor, stream, samples)
     _check_rest(sensor, deviation)
     old = yield from read_offset(sdo)
     new = tuple(t - m + o for t, m, o in zip(target, mean, old, strict=True))
+    _check_fits(new, "the offset that the key 'target' asks for")
     try:
         yield from write_offset(sdo, new)
         yield from _wait(sensor, stream, _SETTLING)
@@ -56,6 +59,13 @@ def tare(
         "residual": [m - t for m, t in zip(mean, target, strict=True)],
         "deviation": deviation[:6],
     }
+
+
+def _check_fits(offset: Sequence[float], what: str) -> None:
+    try:
+        pack_offset(offset)
+    except ValueError as error:
+        raise RequestError(ErrorCode.BAD_REQUEST, f"{what} cannot be: {error}") from None
 
 
 def _take_back(

@@ -28,6 +28,7 @@ from ethercat_server.stream import SensorStream
 from ethercat_server.tare import tare
 from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, failed_change, signals_held_back
 from ethercat_server.virtual_bus import VirtualBus
+from protocol.control import ErrorCode
 from protocol.errors import RequestError, SettingError
 from protocol.framing import DataMessage, FrameDecoder
 from protocol.settings import SettingValue
@@ -159,7 +160,8 @@ class _Running:
         with self._hear_signals(lambda: None):
             self._cycle.run()
         if errors:
-            raise BusError(str(errors[0]))
+            kind = UsageError if errors[0].code == ErrorCode.BAD_REQUEST else BusError
+            raise kind(str(errors[0]))
         return results[0]
 
     def _stoppable(self, steps: Steps[T]) -> Steps[T]:

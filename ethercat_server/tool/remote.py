@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from ethercat_server.errors import BusError, SdoAbortError, ServerError
+from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
 from ethercat_server.sdo import Steps
 from ethercat_server.sensor import Identity
 from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, signals_held_back
@@ -59,13 +59,14 @@ class ServerLink(Link):
         self._client.close()
 
     def ask(self, action: str, timeout_s: float = _ANSWER_TIMEOUT_S, **values: object) -> JsonObject:
-        """The reply to a request; SdoAbortError or BusError if it is refused."""
+        """The reply to a request; SdoAbortError, UsageError or BusError if it is refused."""
         try:
             return self._client.ask(action, timeout_s, **values)
         except RefusedError as error:
             if error.code == ErrorCode.SENSOR:
                 raise SdoAbortError(str(error), error.abort_code or 0) from None
-            raise BusError(str(error)) from None
+            kind = UsageError if error.code == ErrorCode.BAD_REQUEST else BusError
+            raise kind(str(error)) from None
         except NoReplyError as error:
             raise BusError(f"{self._name} gave {error}: ask again") from None
         except ConnectionFailedError as error:

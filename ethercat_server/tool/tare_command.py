@@ -7,6 +7,7 @@ import math
 from typing import Final
 
 from ethercat_server.errors import UsageError
+from ethercat_server.sensor import pack_offset
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.settings_commands import UNSAVED
 from ethercat_server.tool.show import columns, say, say_json
@@ -33,6 +34,10 @@ def _tare(args: argparse.Namespace) -> int:
         raise UsageError(f"--samples {args.samples}: it must be from 1 to {MAX_TARE_SAMPLES}")
     if not all(map(math.isfinite, args.target)):
         raise UsageError("--target must be six finite numbers: Fx Fy Fz in N, Mx My Mz in Nm")
+    try:
+        pack_offset(args.target)
+    except ValueError as error:
+        raise UsageError(f"--target: {error}") from None
     with link(args) as opened:
         found = opened.choose(args.sensor)
         tared = opened.tare(found.place, args.samples, args.target)

@@ -11,6 +11,7 @@ import pytest
 
 from protocol.framing import DataFlag, encode_json
 from tests.server.running import Client, Server, needs_bus, server, virtual_sensor
+from tests.server.steady import steady_bench, steady_sensor
 from tests.server.test_end_to_end import sample_number
 from tests.server.test_recovery import Bench
 
@@ -286,6 +287,17 @@ def test_a_sensor_that_moves_is_not_tared(streaming: tuple[Server, Client, Clien
     assert refused["code"] == "not_ready"
     assert "not at rest" in refused["message"]
     assert asking.ask("sdo_read", index=OFFSET, subindex=1, type="f32")["value"] == 0
+
+
+def test_an_offset_that_no_sensor_can_hold_is_refused_before_anything_is_written() -> None:
+    with steady_sensor() as sensor, steady_bench(sensor) as bench:
+        for target in ([1e300, 0, 0, 0, 0, 0], [0, 0, -3.5e38, 0, 0, 0]):
+            refused = error(bench.asking.ask("tare", samples=20, target=target))
+            assert refused["code"] == "bad_request"
+            assert "'target' cannot be" in refused["message"]
+        assert sensor.stats()["sdo_writes"] == []
+        assert len(bench.client.fresh(50)) == 50, "the stream goes on"
+        assert bench.asking.ask("tare", samples=20)["ok"]
 
 
 def test_a_sensor_does_one_change_at_a_time(streaming: tuple[Server, Client, Client]) -> None:

@@ -102,6 +102,7 @@ def test_the_rate_decides_which_sinc_length_is_in_force(
         (["plan", "ens5", "--config", "/nonexistent.toml"], "/nonexistent.toml"),
         (["tare", "ens5", "--samples", "0"], "from 1 to 20000"),
         (["tare", "ens5", "--target", "1", "2", "3", "4", "5", "inf"], "six finite numbers"),
+        (["tare", "ens5", "--target", "1e300", "0", "0", "0", "0", "0"], "larger than a REAL32 can be"),
         (["watch", "ens5", "--samples", "0"], "1 or more"),
         (["restore", "ens5", "/nonexistent.json"], "/nonexistent.json"),
     ],
