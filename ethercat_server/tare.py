@@ -18,6 +18,7 @@ from protocol.control import ErrorCode
 from protocol.errors import RequestError
 from protocol.pdo import layout_for
 
+LATER: Final = "; it gets its old offset when it is back"
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _LOAD: Final = slice(2, 8)
 _RATE: Final = slice(13, 16)
@@ -75,7 +76,7 @@ def _take_back(
     addition = "; the old offset is in force"
     if isinstance(error, CutOffError):
         sensor.offset, sensor.unsettled = old, True
-        addition = "; it gets its old offset when it is back"
+        addition = LATER
     else:
         try:
             yield from write_offset(sdo, old)

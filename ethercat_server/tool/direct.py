@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from ethercat_server import realtime
 from ethercat_server.bus import Bus
 from ethercat_server.configuration import Change, save
 from ethercat_server.cycle import Cycle
-from ethercat_server.errors import BusError, UsageError
+from ethercat_server.errors import BusError, ServerError, UsageError
 from ethercat_server.interface import check_interface
 from ethercat_server.jobs import Jobs
 from ethercat_server.notify import Notifier
@@ -25,7 +26,7 @@ from ethercat_server.sii import has_coe
 from ethercat_server.soem import SlaveIdentity
 from ethercat_server.start_up import check_sii, enter_op, find_sensors
 from ethercat_server.stream import SensorStream
-from ethercat_server.tare import tare
+from ethercat_server.tare import LATER, tare
 from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, failed_change, signals_held_back
 from ethercat_server.virtual_bus import VirtualBus
 from protocol.control import ErrorCode
@@ -34,6 +35,9 @@ from protocol.framing import DataMessage, FrameDecoder
 from protocol.settings import SettingValue
 
 T = TypeVar("T")
+
+_BACK_S: Final = 10.0
+"""So long a sensor that was lost in a tare may take to come back for its old offset."""
 
 
 def open_bus(ifname: str, cleanup: contextlib.ExitStack) -> Bus:
@@ -161,22 +165,43 @@ class _Running:
             self._cycle.run()
         if errors:
             kind = UsageError if errors[0].code == ErrorCode.BAD_REQUEST else BusError
-            raise kind(str(errors[0]))
+            text = str(errors[0])
+            if self.sensors[place].unsettled:
+                text = text.removesuffix(LATER) + self._put_back(place)
+            raise kind(text)
         return results[0]
 
     def _stoppable(self, steps: Steps[T]) -> Steps[T]:
         told = False
+        raised: BusError | None = None
         while True:
+            if self._stopped and not told and raised is None:
+                told, raised = True, BusError("stopped before it was done")
             try:
-                if self._stopped and not told:
-                    told = True
-                    steps.throw(BusError("stopped before it was done"))
-                else:
+                if raised is None:
                     next(steps)
+                else:
+                    steps.throw(raised)
             except StopIteration as stop:
                 result: T = stop.value
                 return result
-            yield
+            raised = None
+            try:
+                yield
+            except BusError as error:  # the sensor is lost: the steps have something to say to that
+                raised = error
+
+    def _put_back(self, place: int) -> str:
+        """Give a sensor that was lost in a tare the time to come back; returns what became of its offset."""
+        sensor, stream, deadline = self.sensors[place], self.streams[place], time.monotonic() + _BACK_S
+        self.on_idle = lambda: not stream.alive and time.monotonic() < deadline
+        self._cycle.stopping = False
+        with self._hear_signals(lambda: None), contextlib.suppress(ServerError):
+            self._cycle.run()
+        if not sensor.unsettled:
+            return "; it is back, and its old offset is in force"
+        old = " ".join(f"{value:g}" for value in sensor.offset or ())
+        return f"; its offset may be half written (it was {old}): tare it again"
 
     @contextlib.contextmanager
     def _hear_signals(self, stop: Callable[[], None]) -> Iterator[None]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from protocol.filters import FORCE_TORQUE_FILTERS
+from tests.ended import run
 from tests.server.commands import command, stats, written
 from tests.server.running import Program, Veth, needs_bus, virtual_sensor, wait_until
 from tests.tool.running import MODULE, complaints, one_sentence, tool
@@ -181,6 +182,27 @@ def test_a_tare_that_is_stopped_changes_nothing() -> None:
         _, err = taring.communicate(timeout=10)
         assert (taring.returncode, complaints(err)) == (1, ["ethercat-sensor: stopped before it was done"])
         assert written(sensor) == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("deaf 0.5", "; it is back, and its old offset is in force"),
+        ("power cycle 0.3", "; it is back, and its old offset is in force"),
+        ("deaf", "; its offset may be half written (it was -1.5 2.25 9.75 -0.125 0.0625 -0.03125): tare it"),
+    ],
+)
+def test_a_tare_cut_off_half_way_leaves_the_old_offset_or_tells_it(fault: str, said: str) -> None:
+    with virtual_sensor("--signal", "rest") as (veth, sensor):
+        tool("tare", veth.near, "--samples", 20)
+        command(sensor, f"on-write 0x8000 3 {fault}")
+        target = ("1", "2", "3", "4", "5", "6")
+        failed = run(MODULE, "tare", veth.near, "--samples", 20, "--target", *target)
+        assert failed.code == 1
+        assert said in failed.err.splitlines()[-1]
+        if "force" in said:
+            read = tool("read", veth.near, "Force/Torque Offset", "--json").json["sensors"][0]["objects"]
+            assert [row["value"] for row in read[1:]] == [-1.5, 2.25, 9.75, -0.125, 0.0625, -0.03125]
 
 
 def test_a_snapshot_is_restored_as_far_as_it_differs(bench: Bench, tmp_path: Path) -> None:
