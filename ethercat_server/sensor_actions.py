@@ -133,7 +133,15 @@ class SensorActions:
         sensor = self.sensors[values["sensor"]]
         sdo = self._recovery.sdo(sensor.place)
         data = bytes_to_write(values)
-        self._start(connection, request, write(sdo, sensor, values["index"], values["subindex"], data))
+
+        def steps() -> Steps[Mapping[str, Any]]:
+            before = sensor.settings
+            written = yield from write(sdo, sensor, values["index"], values["subindex"], data)
+            if sensor.settings != before:
+                self._tell_reconfigured(sensor)
+            return written
+
+        self._start(connection, request, steps())
 
     def _tare(self, connection: Connection, request: Request) -> None:
         values = request.values
@@ -179,10 +187,11 @@ class SensorActions:
         sdo = self._recovery.sdo(sensor.place)
         yield from apply_in_op(sdo, sensor, change)
         if change.names:
-            self._hub.broadcast(
-                event(Event.RECONFIGURED, sensor=sensor.place, settings=dict(sensor.settings))
-            )
+            self._tell_reconfigured(sensor)
         return (yield from self._finish_change(sensor, save_too))
+
+    def _tell_reconfigured(self, sensor: Sensor) -> None:
+        self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.place, settings=dict(sensor.settings)))
 
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
         if save_too:

@@ -111,6 +111,19 @@ def test_objects_are_written_but_never_the_factory_calibration(
     assert (refused["code"], refused["abort_code"]) == ("sensor", 0x08000022), "in PREOP only"
 
 
+def test_a_setting_that_is_written_as_an_object_is_told_to_all(
+    streaming: tuple[Server, Client, Client],
+) -> None:
+    _, _, asking = streaming
+    for value in (0, 0, 1):
+        assert asking.ask("sdo_write", index=0x8010, subindex=1, type="u8", value=value)["ok"]
+    assert asking.ask("sdo_write", index=OFFSET, subindex=2, type="f32", value=1.5)["ok"], "no setting"
+    assert asking.ask("configure", settings={"imu_active": 3})["ok"]
+    told = [event["settings"] for event in asking.events if event["event"] == "reconfigured"]
+    matrix_and_imu = [(settings["calibration_matrix"], settings["imu_active"]) for settings in told]
+    assert matrix_and_imu == [(False, 1), (True, 1), (True, 3)]
+
+
 @pytest.mark.parametrize(
     ("keys", "named"),
     [
