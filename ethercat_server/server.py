@@ -12,7 +12,7 @@ from ethercat_server.actions import Actions
 from ethercat_server.bus import Bus
 from ethercat_server.cycle import Cycle
 from ethercat_server.hub import Hub
-from ethercat_server.interface import check_interface
+from ethercat_server.interface import claimed
 from ethercat_server.jobs import Jobs
 from ethercat_server.notify import Notifier
 from ethercat_server.options import parse_options
@@ -39,7 +39,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         ifname, priority = options.ifname, options.server["rt_priority"]
         if options.is_virtual:
             ifname = cleanup.enter_context(VirtualBus(options.virtual_arguments, priority)).ifname
-        check_interface(ifname)
+        cleanup.enter_context(claimed(ifname))
         bus = Bus(ifname)
         cleanup.callback(bus.close)
         bus.open()

@@ -67,7 +67,7 @@ class Master:
         self._socket: RawSocket
 
     def open(self) -> None:
-        """Open the raw socket. BusError if that fails; `interface.check_interface` says why beforehand."""
+        """Open the raw socket. BusError if that fails; `interface.claimed` says why beforehand."""
         before = packet_sockets()
         try:
             self._master.open(self.ifname)

@@ -14,7 +14,7 @@ from ethercat_server.bus import Bus
 from ethercat_server.configuration import Change, save
 from ethercat_server.cycle import Cycle
 from ethercat_server.errors import BusError, ServerError, UsageError
-from ethercat_server.interface import check_interface
+from ethercat_server.interface import claimed
 from ethercat_server.jobs import Jobs
 from ethercat_server.notify import Notifier
 from ethercat_server.options import VIRTUAL_INTERFACE, ServerOptions
@@ -44,7 +44,7 @@ def open_bus(ifname: str, cleanup: contextlib.ExitStack) -> Bus:
     """The open bus on `ifname`; `virtual` brings up a virtual one. `cleanup` takes all down."""
     if ifname == VIRTUAL_INTERFACE:
         ifname = cleanup.enter_context(VirtualBus()).ifname
-    check_interface(ifname)
+    cleanup.enter_context(claimed(ifname))
     bus = Bus(ifname)
     cleanup.callback(bus.close)
     bus.open()

@@ -9,8 +9,10 @@ import pytest
 
 from ethercat_server.bus import Bus
 from ethercat_server.errors import BusError
+from ethercat_server.interface import claimed
 from ethercat_server.raw_socket import packet_sockets
-from tests.server.running import Veth, needs_bus
+from tests.server.running import Veth, needs_bus, server, virtual_sensor
+from tests.tool.running import one_sentence, tool
 
 pytestmark = [pytest.mark.bus, needs_bus]
 
@@ -37,3 +39,16 @@ def test_an_interface_that_goes_away_while_it_is_opened() -> None:
         with contextlib.closing(bus), pytest.raises(BusError, match=f"the interface {veth.near} went away"):
             bus.open()
         assert packet_sockets() == before
+
+
+def test_whoever_was_first_keeps_all_others_out_before_it_has_opened_the_bus() -> None:
+    with virtual_sensor("--signal", "rest") as (veth, _):
+        with claimed(veth.near):
+            said = one_sentence(tool("objects", veth.near, code=1))
+            assert f"{veth.near} is in use by another EtherCAT master" in said
+        with server(veth.near) as running:
+            running.process.kill()
+            running.wait()
+            with server(veth.near):
+                pass
+        assert tool("objects", veth.near).code == 0
