@@ -29,6 +29,10 @@ _MOST_READS: Final = 8
 """Everyone may read objects: with so many jobs waiting no more reads, so that changes have their turn."""
 
 
+_CHANGES: Final = frozenset({"configure", "tare"})
+"""Of these a sensor does one at a time."""
+
+
 class SensorActions:
     """One method an action; each starts work between the exchanges and answers through the hub."""
 
@@ -58,6 +62,8 @@ class SensorActions:
     def handle(self, connection: Connection, request: Request) -> None:
         """Start what `request` asks for; RequestError refuses it."""
         place = self._place(request.values["sensor"])
+        if request.action in _CHANGES:
+            self._check_unchanging(place)  # a change may be why the sensor is out of OP
         self._jobs.check_present(place)
         values = {**request.values, "sensor": place}
         self.handlers[request.action](connection, request._replace(values=values))
@@ -161,6 +167,7 @@ class SensorActions:
 
         RequestError refuses it at once.
         """
+        self._check_unchanging(place)
         self._jobs.check_present(place)
         sensor = self.sensors[place]
         try:
@@ -170,7 +177,6 @@ class SensorActions:
         if not change.needs_preop:
             self._start_change(place, self._change_in_op(sensor, change, save_too), done)
             return
-        self._check_unchanging(place)
 
         def changed(error: BusError | None) -> None:
             if error is not None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from protocol.framing import DataFlag, encode_json
-from tests.server.running import Client, Server, needs_bus, server, virtual_sensor
+from tests.server.running import Client, Server, needs_bus, server, virtual_sensor, wait_until
 from tests.server.steady import steady_bench, steady_sensor
 from tests.server.test_end_to_end import sample_number
 from tests.server.test_recovery import Bench
@@ -321,6 +321,19 @@ def test_a_sensor_does_one_change_at_a_time(streaming: tuple[Server, Client, Cli
         assert error(other.ask("configure", settings={"fir": True}))["code"] == "busy"
         assert error(other.ask("tare"))["code"] == "busy"
         assert other.ask("sdo_read", index=RATE)["ok"], "reading is no change"
+
+
+def test_a_change_by_way_of_preop_is_a_change_too(bench: tuple[Bench, Client]) -> None:
+    sensor, asking = bench
+    with sensor.running.connect() as other:
+        # The sensor swallows what asks it for its settings, so it stays out of OP until the change fails.
+        sensor.command("on-write 0x8006 2 mute-mailbox 100000")
+        asking.sock.sendall(encode_json({"action": "configure", "settings": {"fir": True}, "id": 1}))
+        wait_until(lambda: other.ask("describe")["sensors"][0]["state"] == "PREOP", "PREOP")
+        for action, keys in (("configure", {"settings": {"imu_active": 3}}), ("tare", {"samples": 20})):
+            assert error(other.ask_once(action, **keys))["code"] == "busy"
+        assert error(other.ask_once("sdo_read", index=RATE))["code"] == "not_ready"
+        sensor.command("mute-mailbox 0")
 
 
 def test_a_client_that_leaves_while_its_request_is_done_leaves_nothing_behind(
