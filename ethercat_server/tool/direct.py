@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from types import FrameType
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, TypeVar
 
 from ethercat_server import realtime
@@ -27,7 +25,15 @@ from ethercat_server.soem import SlaveIdentity
 from ethercat_server.start_up import check_sii, enter_op, find_sensors
 from ethercat_server.stream import SensorStream
 from ethercat_server.tare import LATER, tare
-from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, failed_change, signals_held_back
+from ethercat_server.tool.link import (
+    Found,
+    GuardedSdo,
+    Link,
+    OnFrame,
+    failed_change,
+    signals_call,
+    signals_held_back,
+)
 from ethercat_server.virtual_bus import VirtualBus
 from protocol.control import ErrorCode
 from protocol.errors import RequestError, SettingError
@@ -143,7 +149,7 @@ class _Running:
 
     def run(self) -> None:
         """Until it is told to stop; KeyboardInterrupt if by a signal."""
-        with self._hear_signals(self._cycle.stop):
+        with signals_call(self._stop):
             self._cycle.run()
         if self._stopped:
             raise KeyboardInterrupt
@@ -161,7 +167,7 @@ class _Running:
             self._cycle.stop()
 
         self._jobs.start(place, self._stoppable(steps), done)
-        with self._hear_signals(lambda: None):
+        with signals_call(self._note_signal):
             self._cycle.run()
         if errors:
             kind = UsageError if errors[0].code == ErrorCode.BAD_REQUEST else BusError
@@ -196,25 +202,19 @@ class _Running:
         sensor, stream, deadline = self.sensors[place], self.streams[place], time.monotonic() + _BACK_S
         self.on_idle = lambda: not stream.alive and time.monotonic() < deadline
         self._cycle.stopping = False
-        with self._hear_signals(lambda: None), contextlib.suppress(ServerError):
+        with signals_call(self._note_signal), contextlib.suppress(ServerError):
             self._cycle.run()
         if not sensor.unsettled:
             return "; it is back, and its old offset is in force"
         old = " ".join(f"{value:g}" for value in sensor.offset or ())
         return f"; its offset may be half written (it was {old}): tare it again"
 
-    @contextlib.contextmanager
-    def _hear_signals(self, stop: Callable[[], None]) -> Iterator[None]:
-        def hear(_number: int, _frame: FrameType | None) -> None:
-            self._stopped = True
-            stop()
+    def _note_signal(self) -> None:
+        self._stopped = True
 
-        before = {number: signal.signal(number, hear) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+    def _stop(self) -> None:
+        self._stopped = True
+        self._cycle.stop()
 
 
 def _change(sdo: Sdo, sensor: Sensor, change: Change, and_save: bool) -> Steps[None]:

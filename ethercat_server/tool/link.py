@@ -169,6 +169,17 @@ def signals_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+@contextlib.contextmanager
+def signals_call(hear: Callable[[], None]) -> Iterator[None]:
+    """Within it SIGINT and SIGTERM call `hear` and do nothing else."""
+    before = {number: signal.signal(number, lambda *_: hear()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def failed_change(error: BusError) -> BusError:
     """The same, saying that nothing has changed."""
     return BusError(f"{error}; the former settings are in force")

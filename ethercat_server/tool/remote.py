@@ -9,7 +9,7 @@ from typing import Any, Final
 from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
 from ethercat_server.sdo import Steps
 from ethercat_server.sensor import Identity
-from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, signals_held_back
+from ethercat_server.tool.link import Found, GuardedSdo, Link, OnFrame, signals_call, signals_held_back
 from ethercat_server.tool.show import note
 from protocol.address import Address
 from protocol.client import Client
@@ -88,7 +88,22 @@ class ServerLink(Link):
     def tare(self, place: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
         """See `Link`."""
         timeout_s = _ANSWER_TIMEOUT_S + samples * _SLOWEST_SAMPLE_S
-        return self.ask("tare", timeout_s, sensor=place, samples=samples, target=list(target))
+        with signals_call(self._stay()):
+            return self.ask("tare", timeout_s, sensor=place, samples=samples, target=list(target))
+
+    def _stay(self) -> Callable[[], None]:
+        """What a signal does while the server tares, which it goes on to do whether one waits or not."""
+        heard: list[None] = []
+
+        def hear() -> None:
+            if heard:
+                raise ServerError(
+                    f"left before {self._name} had answered: it may tare the sensor all the same"
+                )
+            heard.append(None)
+            note(f"{self._name} tares on: waiting for what comes of it; once more to leave without that")
+
+        return hear
 
     def watch(self, places: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
         """See `Link`."""

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.server.commands import command, stats, written
-from tests.server.running import Program, Server, Veth, needs_bus, server, virtual_sensor
-from tests.tool.running import one_sentence, tool
+from tests.server.running import (
+    PATIENCE_S,
+    Program,
+    Server,
+    Veth,
+    needs_bus,
+    server,
+    virtual_sensor,
+    wait_until,
+)
+from tests.server.steady import steady_bench, steady_sensor
+from tests.tool.running import MODULE, one_sentence, tool
 
 pytestmark = [pytest.mark.bus, needs_bus]
 Bench = tuple[Veth, Program, Server]
@@ -132,6 +145,34 @@ def test_tare(bench: Bench) -> None:
     tared = tool("tare", "--sensor", 0, "--samples", 50, *address(running), "--json").json
     assert len(tared["new_offset"]) == 6
     assert {row[0] for row in written(sensor)} == {"0x8000"}
+
+
+def test_a_tare_that_is_stopped_tells_what_came_of_it() -> None:
+    with steady_sensor() as sensor, steady_bench(sensor) as bench:
+        command = [
+            sys.executable,
+            "-m",
+            MODULE,
+            "tare",
+            "--samples",
+            "2000",
+            "--json",
+            *address(bench.running),
+        ]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as taring:
+
+            def under_way() -> bool:
+                # Contradictory settings change nothing: refused as they are, or as busy.
+                refused = bench.asking.ask("configure", settings={"fir": False, "fast": True})
+                return bool(refused["error"]["code"] == "busy")
+
+            wait_until(under_way, "the tare")
+            taring.send_signal(signal.SIGINT)
+            out, err = taring.communicate(timeout=PATIENCE_S)
+        assert "tares on: waiting for what comes of it" in err
+        assert taring.returncode == 0, err
+        held = bench.asking.ask("sdo_read", index=0x8000, subindex=1, type="f32")["value"]
+        assert json.loads(out)["new_offset"][0] == held == -1.5
 
 
 def test_snapshot_and_restore(bench: Bench, tmp_path: Path) -> None:
