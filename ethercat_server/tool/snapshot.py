@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import datetime
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +18,7 @@ from ethercat_server.tool.link import Found, Link, failed_change, signals_held_b
 from ethercat_server.tool.objects_command import read_object
 from ethercat_server.tool.settings_commands import UNSAVED, add_save, change_lines, changes, save_now, verify
 from ethercat_server.tool.show import columns, note, say, say_json, value_text
-from ethercat_server.tool.snapshot_file import RESTORABLE, Snapshot, read_snapshot, write_snapshot
+from ethercat_server.tool.snapshot_file import RESTORABLE, Snapshot, SnapshotFile, read_snapshot
 from protocol.settings import SettingValue
 
 
@@ -33,6 +34,11 @@ def _restore_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _snapshot(args: argparse.Namespace) -> int:
+    with contextlib.closing(SnapshotFile(args.file)) as file:
+        return _take(args, file)
+
+
+def _take(args: argparse.Namespace, file: SnapshotFile) -> int:
     with link(args) as opened:
         found = opened.choose(args.sensor)
         sensor, sdo = opened.in_force(found), opened.sdo(found.place)
@@ -47,7 +53,7 @@ def _snapshot(args: argparse.Namespace) -> int:
         "settings": sensor.settings,
         "objects": [_as_json(row.address, row.name, values) for row, values in read],
     }
-    write_snapshot(args.file, content)
+    file.write(content)
     readable = sum("hex" in values for _, values in read)
     if args.json:
         say_json({"through": opened.used, **found.as_json(), "file": str(args.file), "objects": readable})

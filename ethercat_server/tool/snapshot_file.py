@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -35,15 +37,48 @@ class Snapshot(NamedTuple):
     """Of those that can be restored."""
 
 
-def write_snapshot(path: Path, content: Mapping[str, Any]) -> None:
-    """Write the file, whole or not at all."""
-    text = json.dumps({"format": _FORMAT, "version": _VERSION, **content}, indent=1, allow_nan=False)
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_text(text + "\n", encoding="utf-8")
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+class SnapshotFile:
+    """A file to write, opened before there is anything to be written; UsageError if it cannot be.
+
+    It is written whole or not at all; what is no regular file, such as /dev/stdout, as it comes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            if path.exists() and not path.is_file():
+                self._target = self._beside = path
+            else:
+                self._target = Path(os.path.realpath(path))  # what a link leads to is written, the link stays
+                self._beside = self._target.with_name(f".snapshot-{secrets.token_hex(4)}")
+            self._file = self._beside.open("w" if self._is_written_to else "x", encoding="utf-8")
+        except OSError as error:
+            raise self._refusal(error) from None
+
+    @property
+    def _is_written_to(self) -> bool:
+        return self._beside == self._target
+
+    def write(self, content: Mapping[str, Any]) -> None:
+        """Write it; UsageError if that fails."""
+        text = json.dumps({"format": _FORMAT, "version": _VERSION, **content}, indent=1, allow_nan=False)
+        try:
+            self._file.write(text + "\n")
+            self._file.close()
+            if not self._is_written_to:
+                self._beside.replace(self._target)
+        except OSError as error:
+            raise self._refusal(error) from None
+
+    def close(self) -> None:
+        """If nothing was written, nothing is left."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+        if not self._is_written_to:
+            self._beside.unlink(missing_ok=True)
+
+    def _refusal(self, error: OSError) -> UsageError:
+        return UsageError(f"cannot write {self._path}: {error.strerror}")
 
 
 def read_snapshot(path: Path) -> Snapshot:

@@ -104,6 +104,10 @@ def test_the_rate_decides_which_sinc_length_is_in_force(
         (["tare", "ens5", "--target", "1", "2", "3", "4", "5", "inf"], "six finite numbers"),
         (["tare", "ens5", "--target", "1e300", "0", "0", "0", "0", "0"], "larger than a REAL32 can be"),
         (["watch", "ens5", "--samples", "0"], "1 or more"),
+        (["snapshot", "ens5", "/nonexistent/a.json"], "cannot write /nonexistent/a.json: No such file"),
+        (["snapshot", "ens5", "/"], "cannot write /: Is a directory"),
+        (["snapshot", "ens5", ""], "cannot write .: Is a directory"),
+        (["snapshot", "ens5", "/tmp/" + "x" * 300], "File name too long"),
         (["restore", "ens5", "/nonexistent.json"], "/nonexistent.json"),
     ],
 )

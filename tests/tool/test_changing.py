@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -229,6 +230,24 @@ def test_a_snapshot_is_restored_as_far_as_it_differs(bench: Bench, tmp_path: Pat
     }, "the command is the save's, and the factory calibration is left alone"  # fmt: skip
     assert later.count(("0x8030", 1, "01")) == 1
     assert "nothing to restore" in tool("restore", veth.near, path).out
+
+
+def test_a_snapshot_follows_links_and_replaces_no_device(chain: Bench, tmp_path: Path) -> None:
+    near, path, link, pipe = chain[0].near, tmp_path / "a.json", tmp_path / "link", tmp_path / "pipe"
+    link.symlink_to(path)
+    os.mkfifo(pipe)
+    with open(pipe, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as reading:
+        for file in (link, pipe):
+            tool("snapshot", near, file, "--sensor", 0)
+        assert json.load(reading)["serial"] == 10
+    assert link.is_symlink()
+    assert json.loads(path.read_text())["serial"] == 10
+    assert pipe.is_fifo()
+    assert '"serial": 10' in tool("snapshot", near, "/dev/stdout", "--sensor", 0).out
+    failed = tool("snapshot", near, "/dev/full", "--sensor", 0, code=2)
+    assert "cannot write /dev/full: No space left" in one_sentence(failed)
+    tool("snapshot", near, path, "--sensor", 7, code=2)
+    assert sorted(tmp_path.iterdir()) == [path, link, pipe], "nothing else is left"
 
 
 def test_another_sensors_snapshot_is_refused(chain: Bench, tmp_path: Path) -> None:
