@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, NamedTuple
 
 from ethercat_server.errors import BusError, CutOffError, extended
 from ethercat_server.sdo import Sdo, Steps
@@ -19,14 +19,24 @@ from protocol.errors import RequestError
 from protocol.pdo import layout_for
 
 LATER: Final = "; it gets its old offset when it is back"
-_AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+_NAMES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz", "Rx", "Ry", "Rz")
+_CHANNELS: Final = len(_NAMES)
 _LOAD: Final = slice(2, 8)
 _RATE: Final = slice(13, 16)
 """Where force and torque, and the angular rate, are among the process data's fields."""
+_LEAST_SAMPLES: Final = 20
+"""Fewer would not show whether the sensor is at rest."""
 _REST_FORCE_N: Final = 1.0
 _REST_TORQUE_NM: Final = 0.05
 _REST_RATE_DPS: Final = 3.0
 """Standard deviations that a sensor at rest stays below: more than Bota's own limits for a healthy one."""
+_REST_TURN_DPS: Final = math.degrees(0.05)
+"""Length of the mean angular rate. A gyroscope at rest may read 0.03 rad/s."""
+_REST_CHANGE_N: Final = 0.3
+_REST_CHANGE_NM: Final = 0.01
+"""How far the means of the two halves of the window may lie apart, beyond what noise explains."""
+_BY_CHANCE: Final = 5.0
+"""By so many of its standard errors a difference of means is hardly ever chance."""
 _SETTLING: Final = 8
 """Samples after which a new offset is surely in what the sensor gives."""
 _PATIENCE: Final = 4.0
@@ -42,23 +52,24 @@ def tare(
     If it fails half-way the old offset is put back.
     """
     _check_fits(target, "the key 'target'")
-    mean, deviation = yield from _average(sensor, stream, samples)
-    _check_rest(sensor, deviation)
+    samples = max(samples, _LEAST_SAMPLES)
+    before = yield from _average(sensor, stream, samples)
+    _check_rest(sensor, before)
     old = yield from read_offset(sdo)
-    new = tuple(t - m + o for t, m, o in zip(target, mean, old, strict=True))
+    new = tuple(t - m + o for t, m, o in zip(target, before.mean[:6], old, strict=True))
     _check_fits(new, "the offset that the key 'target' asks for")
     try:
         yield from write_offset(sdo, new)
         yield from _wait(sensor, stream, _SETTLING)
-        mean, _ = yield from _average(sensor, stream, samples)
+        after = yield from _average(sensor, stream, samples)
     except (BusError, RequestError) as error:
         raise (yield from _take_back(sdo, sensor, old, error)) from None
     sensor.offset = new
     return {
         "old_offset": list(old),
         "new_offset": list(new),
-        "residual": [m - t for m, t in zip(mean, target, strict=True)],
-        "deviation": deviation[:6],
+        "residual": [m - t for m, t in zip(after.mean[:6], target, strict=True)],
+        "deviation": before.deviation[:6],
     }
 
 
@@ -88,14 +99,46 @@ def _take_back(
     return extended(error, addition)
 
 
-def _average(sensor: Sensor, stream: SensorStream, samples: int) -> Steps[tuple[list[float], list[float]]]:
-    """Mean of force and torque; deviation of these and the angular rate (deg/s): over the next samples."""
+class _Window(NamedTuple):
+    """Force, torque and angular rate (deg/s) over some samples."""
+
+    mean: list[float]
+    deviation: list[float]
+    change: list[float]
+    """From the mean of the first half to that of the second."""
+    by_chance: list[float]
+    """What noise explains of that."""
+
+
+class _Block:
+    """Sums over some samples."""
+
+    def __init__(self, channels: int) -> None:
+        self.taken = 0
+        self.sums = [0.0] * channels
+        self.squares = [0.0] * channels
+
+    def add(self, row: Sequence[float]) -> None:
+        self.taken += 1
+        for place, value in enumerate(row):
+            self.sums[place] += value
+            self.squares[place] += value * value
+
+    def statistics(self) -> Iterator[tuple[float, float]]:
+        """Mean and variance of each channel."""
+        for total, squares in zip(self.sums, self.squares, strict=True):
+            mean = total / self.taken
+            yield mean, max(0.0, squares / self.taken - mean * mean)
+
+
+def _average(sensor: Sensor, stream: SensorStream, samples: int) -> Steps[_Window]:
+    """Over the next samples."""
     unpack = layout_for(sensor.pdo_size).struct.unpack
     deadline = time.monotonic() + 1.0 + _PATIENCE * samples * sensor.period_ns * 1e-9
-    taken, seen = 0, stream.fresh
-    sums, squares = [0.0] * 9, [0.0] * 9
+    seen = stream.fresh
+    whole, halves = _Block(_CHANNELS), (_Block(_CHANNELS), _Block(_CHANNELS))
     first: list[float] = []
-    while taken < samples:
+    while whole.taken < samples:
         yield
         if time.monotonic() > deadline:
             raise RequestError(ErrorCode.NOT_READY, f"sensor {sensor.place} gives too few samples to tare it")
@@ -109,14 +152,17 @@ def _average(sensor: Sensor, stream: SensorStream, samples: int) -> Steps[tuple[
                 ErrorCode.NOT_READY, f"sensor {sensor.place} is overloaded: it gives no finite numbers"
             )
         first = first or row
-        for place, (value, start) in enumerate(zip(row, first, strict=True)):
-            # From the first on, so that a large load does not drown its small changes.
-            sums[place] += value - start
-            squares[place] += (value - start) ** 2
-        taken += 1
-    mean = [s / taken for s in sums]
-    deviation = [math.sqrt(max(0.0, q / taken - m * m)) for q, m in zip(squares, mean, strict=True)]
-    return [m + f for m, f in zip(mean, first, strict=True)][:6], deviation
+        # From the first on, so that a large load does not drown its small changes.
+        row = [value - start for value, start in zip(row, first, strict=True)]
+        halves[2 * whole.taken >= samples].add(row)
+        whole.add(row)
+    found = list(whole.statistics())
+    mean = [m + start for (m, _), start in zip(found, first, strict=True)]
+    change, by_chance = [], []
+    for (one, noise), (other, more_noise) in zip(*(half.statistics() for half in halves), strict=True):
+        change.append(abs(other - one))
+        by_chance.append(_BY_CHANCE * math.sqrt((noise + more_noise) / halves[0].taken))
+    return _Window(mean, [math.sqrt(variance) for _, variance in found], change, by_chance)
 
 
 def _wait(sensor: Sensor, stream: SensorStream, samples: int) -> Steps[None]:
@@ -127,14 +173,26 @@ def _wait(sensor: Sensor, stream: SensorStream, samples: int) -> Steps[None]:
         yield
 
 
-def _check_rest(sensor: Sensor, deviation: Sequence[float]) -> None:
-    names = (*_AXES, "Rx", "Ry", "Rz")
+def _check_rest(sensor: Sensor, found: _Window) -> None:
+    turn = math.hypot(*found.mean[6:])
+    if turn > _REST_TURN_DPS:
+        raise _not_at_rest(sensor, f"it turns by {turn:.3g} deg/s (mean; at most {_REST_TURN_DPS:.3g})")
     limits = (_REST_FORCE_N,) * 3 + (_REST_TORQUE_NM,) * 3 + (_REST_RATE_DPS,) * 3
     units = ("N",) * 3 + ("Nm",) * 3 + ("deg/s",) * 3
-    for name, found, limit, unit in zip(names, deviation, limits, units, strict=True):
-        if found > limit:
-            raise RequestError(
-                ErrorCode.NOT_READY,
-                f"sensor {sensor.place} is not at rest: {name} varies by {found:.3g} {unit} "
-                f"(standard deviation; at most {limit:g}): hold it still and tare again",
+    for name, deviation, limit, unit in zip(_NAMES, found.deviation, limits, units, strict=True):
+        if deviation > limit:
+            raise _not_at_rest(
+                sensor, f"{name} varies by {deviation:.3g} {unit} (standard deviation; at most {limit:g})"
             )
+    least = (_REST_CHANGE_N,) * 3 + (_REST_CHANGE_NM,) * 3
+    changes = zip(_NAMES[:6], found.change[:6], found.by_chance[:6], least, units[:6], strict=True)
+    for name, change, by_chance, limit, unit in changes:
+        if change > limit + by_chance:
+            text = f"{name} changes by {change:.3g} {unit} (mean; at most {limit + by_chance:.3g})"
+            raise _not_at_rest(sensor, text)
+
+
+def _not_at_rest(sensor: Sensor, why: str) -> RequestError:
+    return RequestError(
+        ErrorCode.NOT_READY, f"sensor {sensor.place} is not at rest: {why}: hold it still and tare again"
+    )

@@ -79,7 +79,7 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def _bench(listener: Listener) -> Iterator[Bench]:
-    with virtual_sensor("--pdo", "77", "--signal", "scene") as (veth, sensor):
+    with virtual_sensor("--pdo", "77", "--signal", "poses") as (veth, sensor):
         bench = Bench(veth.near, sensor, listener)
         try:
             yield bench
@@ -141,7 +141,7 @@ def test_settings(bench: Bench, listener: Listener) -> None:
 
 
 def test_tare(bench: Bench, listener: Listener) -> None:
-    for _ in range(20):  # the wrist turns, and touches something now and then
+    for _ in range(20):  # between its poses the wrist turns
         done, text = bench.answer(lambda: listener.trigger("sensor_tare"))
         if done:
             break

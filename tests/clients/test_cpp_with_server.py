@@ -33,7 +33,7 @@ STRICT_AGE = {"max_age_ms": 300}
 
 @pytest.fixture(scope="module")
 def shared() -> Iterator[Server]:
-    with server("virtual") as running:
+    with server("virtual", "--virtual", "--signal poses") as running:
         yield running
 
 
@@ -239,7 +239,7 @@ def test_describe_status_tare_and_refusals(shared: Server) -> None:
         assert status["sensors"][0]["fresh"] > 0
         tared: Reading = {}
 
-        def at_rest() -> bool:  # the virtual sensor is moved now and then, and refuses meanwhile
+        def at_rest() -> bool:  # the virtual sensor is moved from pose to pose, and refuses meanwhile
             tared.update(running.do("tare", 200, 1.5, -2, 0, 0.25, 0, 0))
             assert tared["ok"] or (tared["code"] == "not_ready" and "not at rest" in tared["error"])
             return bool(tared["ok"])

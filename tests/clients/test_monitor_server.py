@@ -30,7 +30,7 @@ from tests.server.running import PATIENCE_S, Server, free_port, needs_bus, wait_
 
 pytestmark = [pytest.mark.bus, needs_bus]
 
-VIRTUAL = ("--virtual", "--sensors 2 --model BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8 --pdo 77")
+VIRTUAL = ("--virtual", "--signal poses --sensors 2 --model BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8 --pdo 77")
 COMMAND = (sys.executable, "-m", "clients.monitor.cli")
 LEAVE_ALTERNATE_SCREEN = b"\x1b[?1049l"
 SHOW_CURSOR = b"\x1b[?25h"
@@ -282,7 +282,7 @@ def test_rate_jitter_age_and_the_own_row_among_the_clients_are_known(shared: Ser
 
 
 def test_tare_says_what_is_left(shared: Server) -> None:
-    for _ in range(5):  # the virtual tool touches something every seven seconds
+    for _ in range(30):  # the virtual tool is moved from pose to pose
         text, bad = tare(Address("localhost", shared.port), 1)
         if not bad:
             break

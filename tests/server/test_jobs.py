@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import random
 import struct
 import time
 from collections.abc import Iterator
@@ -125,3 +126,26 @@ def test_a_tare_whose_sum_is_too_large_is_refused_before_it_writes() -> None:
         run_tare(sdo, 20, [3e38, 0, 0, 0, 0, 0], itertools.repeat(-3e38))
     assert refused.value.code == ErrorCode.BAD_REQUEST
     assert sdo.written == []
+
+
+def noise(seed: int, deviation: float) -> Iterator[float]:
+    gauss = random.Random(seed).gauss
+    while True:
+        yield gauss(0.0, deviation)
+
+
+def test_fewer_samples_than_show_rest_are_not_taken() -> None:
+    force = iter(range(1000))
+    with pytest.raises(RequestError, match="Fx varies by"):
+        run_tare(ScriptedSdo(), 1, [0.0] * 6, (float(n) for n in force))
+    assert next(force) >= 20
+
+
+def test_a_load_that_creeps_is_not_rest_and_noise_is() -> None:
+    with pytest.raises(RequestError, match=r"Fx changes by 0\.4 N"):
+        run_tare(ScriptedSdo(), 400, [0.0] * 6, (n * 0.002 for n in itertools.count()))
+    with pytest.raises(RequestError, match="Fx changes by"):
+        run_tare(ScriptedSdo(), 400, [0.0] * 6, (n * 0.004 + x for n, x in enumerate(noise(1, 0.5))))
+    for seed in range(100):
+        tared = run_tare(ScriptedSdo(), 20, [0.0] * 6, noise(seed, 0.6))
+        assert abs(tared["residual"][0]) < 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
@@ -35,7 +34,7 @@ def streaming() -> Iterator[tuple[Server, Client, Client]]:
 def bench() -> Iterator[tuple[Bench, Client]]:
     """A virtual sensor that takes commands, and two clients: one that listens, one that asks."""
     with (
-        virtual_sensor("--signal", "scene") as (veth, sensor),
+        virtual_sensor("--signal", "rest") as (veth, sensor),
         server(veth.near) as running,
         running.connect() as listener,
         running.connect() as asking,
@@ -268,17 +267,15 @@ def test_saved_settings_are_in_the_flash(bench: tuple[Bench, Client]) -> None:
 
 
 def tare_at_rest(asking: Client, **keys: object) -> dict[str, Any]:
-    """Tare until nothing touched the virtual tool meanwhile: now and then something does.
-
-    On a busy machine the sensor's watchdog may be quicker than the server.
-    """
+    """Tare until the sensor was not lost meanwhile: on a busy machine its watchdog may be quicker."""
     for _ in range(20):
         tared = asking.ask("tare", samples=200, **keys)
         if not tared["ok"]:
-            assert re.search("not at rest|is lost", error(tared)["message"])
-        elif all(abs(r) < limit for r, limit in zip(tared["residual"], [1.5] * 3 + [0.15] * 3, strict=True)):
+            assert "is lost" in error(tared)["message"]
+        else:
+            assert max(map(abs, tared["residual"])) < 1e-5
             return tared
-    raise AssertionError(f"never at rest: {tared}")
+    raise AssertionError(f"always lost: {tared}")
 
 
 def test_tare_makes_the_mean_the_target(bench: tuple[Bench, Client]) -> None:
@@ -287,11 +284,20 @@ def test_tare_makes_the_mean_the_target(bench: tuple[Bench, Client]) -> None:
     tared = tare_at_rest(asking, target=target)
     again = tare_at_rest(asking)
     for before, after, wanted in zip(tared["new_offset"], again["new_offset"], target, strict=True):
-        assert after == pytest.approx(before - wanted, abs=3.0 if abs(wanted) >= 10 else 0.3)
+        assert after == pytest.approx(before - wanted, abs=1e-5)
     for place, value in enumerate(again["new_offset"], 1):
         held = asking.ask("sdo_read", index=OFFSET, subindex=place, type="f32")["value"]
         assert held == pytest.approx(value, rel=1e-6)
     assert len(sensor.client.fresh(50)) == 50
+
+
+def test_a_sensor_that_turns_steadily_is_not_tared() -> None:
+    with steady_sensor("--signal turn") as sensor, steady_bench(sensor) as bench:
+        for samples in (1, 400):
+            refused = error(bench.asking.ask("tare", samples=samples))
+            assert refused["code"] == "not_ready"
+            assert "is not at rest: it turns by" in refused["message"]
+        assert sensor.stats()["sdo_writes"] == []
 
 
 def test_a_sensor_that_moves_is_not_tared(streaming: tuple[Server, Client, Client]) -> None:
@@ -367,7 +373,7 @@ def test_sdo_traffic_costs_no_sample(streaming: tuple[Server, Client, Client]) -
 
 
 def test_a_sensor_of_a_chain_is_named_by_place_serial_number_or_name() -> None:
-    chain = "--model BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8,BFT-ROKS-ECAT-M8 --serial 11,22,33"
+    chain = "--signal rest --model BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8,BFT-ROKS-ECAT-M8 --serial 11,22,33"
     with server("virtual", "--virtual", chain) as running, running.connect() as asking:
         for choice, place in ((1, 1), ("2", 2), ("serial:22", 1), ("BFT-SENS-ECAT-M8", 0)):
             assert asking.ask("tare", sensor=choice, samples=1, target=[float(place)] * 6)["ok"]
