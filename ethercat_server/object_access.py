@@ -11,7 +11,7 @@ from ethercat_server.object_names import find_objects, full_name
 from ethercat_server.objects import ObjectEntry
 from ethercat_server.sdo import Sdo, Steps
 from ethercat_server.sensor import Sensor, read_offset
-from protocol.control import ErrorCode
+from protocol.control import MAX_SDO_BYTES, ErrorCode
 from protocol.errors import RequestError
 from protocol.sdo_types import SDO_TYPES, SdoType
 from protocol.settings import SETTINGS
@@ -64,9 +64,12 @@ def bytes_to_write(values: Mapping[str, Any]) -> bytes:
         return data
     assert kind is not None
     try:
-        return kind.pack(values["value"])
+        data = kind.pack(values["value"])
+        if not 0 < len(data) <= MAX_SDO_BYTES:
+            raise ValueError(f"1 to {MAX_SDO_BYTES} bytes")
     except ValueError as error:
         raise RequestError(ErrorCode.BAD_REQUEST, f"the key 'value' must be {error}") from None
+    return data
 
 
 def write(sdo: Sdo, sensor: Sensor, index: int, subindex: int, data: bytes) -> Steps[Mapping[str, Any]]:

@@ -39,6 +39,8 @@ _EXPEDITED: Final = 0x03
 _SIZE_GIVEN: Final = 0x01
 _ABORT: Final = 0x80
 _LONGEST_EXPEDITED: Final = 4
+_SIZE_BYTES: Final = 4
+"""The size goes before what is longer."""
 
 
 class Sdo(Protocol):
@@ -121,6 +123,12 @@ class CyclicSdo:
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """See `Sdo`; at most what fits the mailbox in one piece."""
         check_writable(index)
+        most = self._out_size - _MAILBOX_HEADER.size - _SDO_HEADER.size - _SIZE_BYTES
+        if not 0 < len(data) <= most:
+            raise BusError(
+                f"object 0x{index:04X}:{subindex} of sensor {self._slave} cannot be written: 1 to {most} "
+                f"bytes fit its mailbox, not {len(data)}"
+            )
         if len(data) <= _LONGEST_EXPEDITED:
             command = _DOWNLOAD | _EXPEDITED | (_LONGEST_EXPEDITED - len(data)) << 2
         else:

@@ -17,7 +17,7 @@ from ethercat_server.errors import BusError
 from ethercat_server.jobs import Jobs
 from ethercat_server.object_access import write
 from ethercat_server.objects import BY_SETTING
-from ethercat_server.sdo import Steps, finish
+from ethercat_server.sdo import CyclicSdo, Steps, finish
 from ethercat_server.sensor import Identity, Sensor, read_offset, read_settings, write_offset
 from ethercat_server.stream import SensorStream
 from ethercat_server.tare import tare
@@ -126,6 +126,13 @@ def test_a_tare_whose_sum_is_too_large_is_refused_before_it_writes() -> None:
         run_tare(sdo, 20, [3e38, 0, 0, 0, 0, 0], itertools.repeat(-3e38))
     assert refused.value.code == ErrorCode.BAD_REQUEST
     assert sdo.written == []
+
+
+@pytest.mark.parametrize("size", [0, 113])
+def test_what_does_not_fit_the_mailbox_is_not_sent(size: int) -> None:
+    sdo = CyclicSdo(cast(Bus, NoBus()), 0, ((0x1000, 128), (0x1080, 128)))
+    with pytest.raises(BusError, match=f"1 to 112 bytes fit its mailbox, not {size}"):
+        finish(sdo.write(0x1008, 0, bytes(size)))
 
 
 def noise(seed: int, deviation: float) -> Iterator[float]:

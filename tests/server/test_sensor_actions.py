@@ -134,6 +134,8 @@ def test_a_setting_that_is_written_as_an_object_is_told_to_all(
         ({"index": OFFSET, "type": "quaternion", "value": 1}, "'type' must be one of bool, i8"),
         ({"index": OFFSET, "hex": "0"}, "'hex'"),
         ({"index": OFFSET, "hex": "00" * 113}, "'hex' must be 1 to 112 bytes"),
+        ({"index": 0x1008, "type": "string", "value": "x" * 113}, "'value' must be 1 to 112 bytes"),
+        ({"index": 0x1008, "type": "string", "value": ""}, "'value' must be 1 to 112 bytes"),
         ({"index": 65536, "hex": "00"}, "'index'"),
         ({"index": OFFSET, "subindex": -1, "hex": "00"}, "'subindex'"),
         ({"hex": "00"}, "needs the key 'index'"),
