@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+from collections.abc import Callable
 from typing import Any
 
+from ethercat_server.command_line import FAILED
+from ethercat_server.errors import BusError
 from ethercat_server.sdo import finish
 from ethercat_server.sensor import Identity
 from ethercat_server.sii import read_sii
@@ -16,7 +19,7 @@ from ethercat_server.tool.direct import scan_only
 from ethercat_server.tool.holder import find_holder
 from ethercat_server.tool.link import Found, choose
 from ethercat_server.tool.reach import find_server
-from ethercat_server.tool.show import columns, say, say_json
+from ethercat_server.tool.show import columns, note, say, say_json
 
 
 def _no_arguments(_: argparse.ArgumentParser) -> None:
@@ -60,34 +63,62 @@ def _eeprom_arguments(parser: argparse.ArgumentParser) -> None:
     add_link_arguments(parser, all_if_none=True)
 
 
-def _images(args: argparse.Namespace) -> list[bytes]:
-    """The SII of every slave, by place."""
+def _images(args: argparse.Namespace) -> dict[int, bytes | BusError]:
+    """The SII of each slave that is asked for, or why it cannot be read, by place."""
     with contextlib.ExitStack() as cleanup:
         link = find_server(args.iface, args.server)
         if link is not None:
             cleanup.callback(link.close)
-            return [sii.read_image(functools.partial(link.sii, sensor.place)) for sensor in link.sensors]
+            return {
+                sensor.place: _image(functools.partial(link.sii, sensor.place))
+                for sensor in link.chosen(args.sensor)
+            }
         bus, slaves = scan_only(args.iface, cleanup)
 
         def read(place: int, word: int, words: int) -> bytes:
             return finish(read_sii(bus, place, word, words), pause_s=0)
 
-        return [sii.read_image(functools.partial(read, place)) for place in range(len(slaves))]
+        images = {place: _image(functools.partial(read, place)) for place in range(len(slaves))}
+    if args.sensor is None:
+        return images
+    found = [_identified(place, image) for place, image in images.items()]
+    place = choose(found, args.sensor).place
+    return {place: images[place]}
+
+
+def _image(read: Callable[[int, int], bytes]) -> bytes | BusError:
+    try:
+        return sii.read_image(read)
+    except BusError as error:
+        return error
+
+
+def _identified(place: int, image: bytes | BusError) -> Found:
+    row: dict[str, Any] = {"name": "", "serial": 0}
+    if isinstance(image, bytes):
+        row = sii.decode(image)
+    return Found(place, Identity(row["name"], row["serial"], "", ""))
 
 
 def _eeprom(args: argparse.Namespace) -> int:
     images = _images(args)
-    decoded = [sii.decode(image) for image in images]
-    found = [Found(n, Identity(row["name"], row["serial"], "", "")) for n, row in enumerate(decoded)]
-    places = [choose(found, args.sensor).place] if args.sensor is not None else range(len(found))
+    read = {n: image for n, image in images.items() if isinstance(image, bytes)}
+    errors = {n: image for n, image in images.items() if isinstance(image, BusError)}
+    if not read:
+        raise next(iter(errors.values()))
+    decoded = {n: sii.decode(image) for n, image in read.items()}
     if args.json:
-        say_json({"slaves": [{"sensor": n, **decoded[n], "raw": images[n].hex()} for n in places]})
-        return DONE
-    for n in places:
-        say(f"slave {n}: {decoded[n]['name'] or 'nameless'}")
-        say("\n".join(sii.raw_lines(images[n])))
-        say(columns(_rows(decoded[n]), indent=2))
-    return DONE
+        rows = [{"sensor": n, **row, "raw": read[n].hex()} for n, row in decoded.items()]
+        rows += [{"sensor": n, "error": str(error)} for n, error in errors.items()]
+        say_json({"slaves": sorted(rows, key=lambda row: row["sensor"])})
+    else:
+        for n, row in decoded.items():
+            say(f"slave {n}: {row['name'] or 'nameless'}")
+            say("\n".join(sii.raw_lines(read[n])))
+            say(columns(_rows(row), indent=2))
+    for error in errors.values():
+        note(str(error))
+    return FAILED if errors else DONE
 
 
 def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:

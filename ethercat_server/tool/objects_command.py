@@ -5,15 +5,17 @@ from __future__ import annotations
 import argparse
 import struct
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+from ethercat_server.command_line import FAILED
 from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError, UsageError
 from ethercat_server.known_objects import KNOWN_OBJECTS
 from ethercat_server.object_names import find_objects, similar_names
 from ethercat_server.objects import FACTORY_CALIBRATION, ObjectEntry
 from ethercat_server.sdo import Sdo, Steps, finish
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
-from ethercat_server.tool.show import columns, say, say_json, value_text
+from ethercat_server.tool.link import Found, Link
+from ethercat_server.tool.show import columns, note, say, say_json, value_text
 from protocol.meaning import value_meaning
 
 _MOST_SILENT: Final = 3
@@ -44,6 +46,30 @@ def _meaning(row: ObjectEntry, value: float | str) -> str:
     if row.allowed is None:
         return row.unit
     return row.allowed.get(int(value), "" if row.setting is None else "means nothing")
+
+
+class _Sensor(NamedTuple):
+    """What could be read of a sensor, and why no more."""
+
+    found: Found
+    objects: list[tuple[ObjectEntry, dict[str, Any]]]
+    error: BusError | None
+
+    def as_json(self) -> dict[str, Any]:
+        """For programs."""
+        objects = [{**_row_as_json(row), **read} for row, read in self.objects]
+        error = {"error": str(self.error)} if self.error else {}
+        return {**self.found.as_json(), "objects": objects, **error}
+
+
+def _read_sensor(opened: Link, found: Found, rows: Sequence[ObjectEntry]) -> _Sensor:
+    objects: list[tuple[ObjectEntry, dict[str, Any]]] = []
+    try:
+        if found.has_objects:
+            objects.extend(_read_rows(opened.sdo(found.place), rows))
+    except BusError as error:
+        return _Sensor(found, objects, error)
+    return _Sensor(found, objects, None)
 
 
 def _read_rows(sdo: Sdo, rows: Sequence[ObjectEntry]) -> Iterator[tuple[ObjectEntry, dict[str, Any]]]:
@@ -94,24 +120,28 @@ def _objects(args: argparse.Namespace) -> int:
 
 def _show(args: argparse.Namespace, rows: Sequence[ObjectEntry]) -> int:
     with link(args, any_slave=True) as opened:
-        found = [
-            (sensor, list(_read_rows(opened.sdo(sensor.place), rows)) if sensor.has_objects else [])
-            for sensor in opened.chosen(args.sensor)
-        ]
+        sensors = [_read_sensor(opened, found, rows) for found in opened.chosen(args.sensor)]
+    errors = [sensor.error for sensor in sensors if sensor.error]
+    if len(errors) == len(sensors):
+        raise errors[0]
     if args.json:
-        sensors = [
-            {**sensor.as_json(), "objects": [{**_row_as_json(row), **read} for row, read in objects]}
-            for sensor, objects in found
-        ]
-        say_json({"through": opened.used, "sensors": sensors})
-        return DONE
-    for sensor, objects in found:
-        say(str(sensor))
-        if not objects:
-            say("  it has no CoE mailbox, and so no objects")
-            continue
-        say(columns([_HEAD, *(_line(row, read) for row, read in objects)], indent=2))
-    return DONE
+        say_json({"through": opened.used, "sensors": [sensor.as_json() for sensor in sensors]})
+    else:
+        for sensor in sensors:
+            _say_sensor(sensor)
+    for error in errors:
+        note(str(error))
+    return FAILED if errors else DONE
+
+
+def _say_sensor(sensor: _Sensor) -> None:
+    say(str(sensor.found))
+    if sensor.objects:
+        say(columns([_HEAD, *(_line(row, read) for row, read in sensor.objects)], indent=2))
+    elif not sensor.error:
+        say("  it has no CoE mailbox, and so no objects")
+    if sensor.error:
+        say(f"  {sensor.error}")
 
 
 def _row_as_json(row: ObjectEntry) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.ended import run
 from tests.server.commands import command, stats, written
 from tests.server.running import (
     PATIENCE_S,
@@ -173,6 +174,22 @@ def test_a_tare_that_is_stopped_tells_what_came_of_it() -> None:
         assert taring.returncode == 0, err
         held = bench.asking.ask("sdo_read", index=0x8000, subindex=1, type="f32")["value"]
         assert json.loads(out)["new_offset"][0] == held == -1.5
+
+
+def test_a_sensor_that_is_out_does_not_hide_the_other() -> None:
+    with steady_sensor("--signal rest --sensors 2 --serial 10,20") as sensor, steady_bench(sensor) as bench:
+        where = address(bench.running)
+        sensor.command("power off @1")
+        bench.wait_event("sensor_lost")
+        assert tool("eeprom", *where, "--sensor", 0, "--json").json["slaves"][0]["serial"] == 10
+        assert tool("eeprom", *where, "--sensor", 10).code == 0
+        for name, key in (("eeprom", "slaves"), ("objects", "sensors")):
+            shown = run(MODULE, name, *where)
+            assert shown.code == 1
+            assert "sensor 1 is lost" in shown.err
+            found = run(MODULE, name, *where, "--json").json[key]
+            assert ("error" in found[0], "error" in found[1]) == (False, True)
+            assert found[0]["serial"] == 10
 
 
 def test_snapshot_and_restore(bench: Bench, tmp_path: Path) -> None:
