@@ -74,14 +74,15 @@ def save(sdo: Sdo, sensor: Sensor) -> Steps[None]:
             if answer == 0:
                 return
             if time.monotonic() > deadline:
-                raise BusError(
-                    f"sensor {sensor.place} did not save its settings (status {answer}): they are in force "
-                    "until its power goes; save again"
-                )
+                break
             yield
     except SdoAbortError as error:
         raise extended(error, "; its settings are in force until its power goes, but not saved") from None
-    except CutOffError as error:
+    except BusError as error:  # lost, or without an answer
         raise extended(
             error, "; whether it saved all, some or none of its settings is not known: save again"
         ) from None
+    raise BusError(
+        f"sensor {sensor.place} did not save its settings (status {answer}): they are in force until its "
+        "power goes; save again"
+    )

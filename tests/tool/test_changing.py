@@ -89,6 +89,13 @@ def test_apply_and_save_keep_it_over_a_power_cut(bench: Bench) -> None:
     assert "nothing to change" in tool("plan", veth.near, *asked).out
 
 
+def test_a_power_cut_in_the_save_says_what_holds(bench: Bench) -> None:
+    veth, sensor = bench
+    command(sensor, "cut-save 5")
+    said = one_sentence(tool("apply", veth.near, "--set", "fir=true", "--save", code=1))
+    assert said.endswith("; whether it saved all, some or none of its settings is not known: save again")
+
+
 def test_every_sinc_length_of_the_table_gives_its_rate(chain: Bench) -> None:
     for length, row in FORCE_TORQUE_FILTERS.items():
         applied = tool(
