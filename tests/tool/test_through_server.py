@@ -183,11 +183,11 @@ def test_a_sensor_that_is_out_does_not_hide_the_other() -> None:
         bench.wait_event("sensor_lost")
         assert tool("eeprom", *where, "--sensor", 0, "--json").json["slaves"][0]["serial"] == 10
         assert tool("eeprom", *where, "--sensor", 10).code == 0
-        for name, key in (("eeprom", "slaves"), ("objects", "sensors")):
-            shown = run(MODULE, name, *where)
+        for words, key in ((("eeprom",), "slaves"), (("read", "Force/Torque Offset"), "sensors")):
+            shown = run(MODULE, *words, *where)
             assert shown.code == 1
             assert "sensor 1 is lost" in shown.err
-            found = run(MODULE, name, *where, "--json").json[key]
+            found = run(MODULE, *words, *where, "--json").json[key]
             assert ("error" in found[0], "error" in found[1]) == (False, True)
             assert found[0]["serial"] == 10
 
