@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from ethercat_server import __version__
 from ethercat_server.config_file import EMPTY, read_config
@@ -17,6 +17,9 @@ from ethercat_server.server_settings import SERVER_SETTINGS, ServerSetting
 from protocol.errors import SettingError
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
+
+if TYPE_CHECKING:
+    from ethercat_server.sensor import Identity
 
 VIRTUAL_INTERFACE: Final = "virtual"
 """The interface name that stands for a virtual bus with a virtual sensor on it."""
@@ -59,6 +62,16 @@ class ServerOptions:
         wanted = {**start_up_defaults(), **self.asked_settings(place, name, serial)}
         check_combination(wanted)
         return wanted
+
+    def check_sensors(self, found: Mapping[int, Identity]) -> None:
+        """UsageError if there are settings for a sensor that is not among those `found`, by place."""
+        for choice in self.sensor_settings:
+            if not any(choice.matches(place, who.name, who.serial) for place, who in found.items()):
+                there = "; ".join(f"{place}: {who}" for place, who in found.items())
+                raise UsageError(
+                    f"the configuration has settings for sensor {choice}, but the bus has only {there}: "
+                    "correct the table's name"
+                )
 
     def check(self) -> None:
         """SettingError if what is asked of any one sensor contradicts itself."""

@@ -98,6 +98,7 @@ def _look(
 ) -> tuple[Found, dict[str, SettingValue], Sensor]:
     """The chosen sensor, what is asked of it, and what it holds."""
     found = opened.choose(args.sensor)
+    options.check_sensors({sensor.place: sensor.identity for sensor in opened.sensors})
     asked = options.asked_settings(found.place, found.identity.name, found.identity.serial)
     if not asked:
         raise UsageError(f"{args.config} asks for nothing of {found}: correct its tables, or give --set")

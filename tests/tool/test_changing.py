@@ -65,17 +65,21 @@ def test_plan_says_what_would_change_and_writes_nothing(bench: Bench) -> None:
 def test_apply_does_what_plan_says_and_a_file_says_it_too(bench: Bench, tmp_path: Path) -> None:
     veth, sensor = bench
     config = tmp_path / "sensor.toml"
-    config.write_text("[sensor]\nsinc_length = 205\nacceleration_range_g = 8\n[sensor.1]\nfir = true\n")
-    applied = tool("apply", veth.near, "--config", config, "--set", "chop=true", "--json").json
+    config.write_text("[sensor]\nsinc_length = 205\nacceleration_range_g = 8\n[sensor.0]\nchop = true\n")
+    applied = tool("apply", veth.near, "--config", config, "--json").json
     assert (applied["rate_hz"], applied["saved"]) == (250, False)
     assert {"sinc_length": 205, "acceleration_range_g": 8, "chop": True, "fir": False}.items() <= applied[
         "settings"
     ].items()
-    again = tool("apply", veth.near, "--config", config, "--set", "chop=true")
+    again = tool("apply", veth.near, "--config", config)
     assert "nothing to change" in again.out
     assert tool("plan", veth.near, "--config", config).code == 0
     command(sensor, "power cycle 0.1")
     assert tool("plan", veth.near, "--config", config, code=3), "it was not saved"
+    config.write_text("[sensor]\nsinc_length = 205\n[sensor.7]\nfir = true\n")
+    for name in ("plan", "apply"):
+        said = one_sentence(tool(name, veth.near, "--config", config, code=2))
+        assert "has settings for sensor 7, but the bus has only 0: BFT-SENS-ECAT-M8 with serial 4711" in said
 
 
 def test_apply_and_save_keep_it_over_a_power_cut(bench: Bench) -> None:
