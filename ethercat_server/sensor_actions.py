@@ -109,10 +109,14 @@ class SensorActions:
             raise RequestError(
                 ErrorCode.BAD_REQUEST, "sdo_read needs the key 'index', or the key 'name' in its place"
             )
+        if values["name"] is not None and values["subindex"] is not None:
+            raise RequestError(
+                ErrorCode.BAD_REQUEST, "the key 'subindex' goes with the key 'index': a name has its own"
+            )
         if values["name"] is not None:
             steps = read_named(sdo, entry_named(values["name"]), values["type"])
         else:
-            steps = read(sdo, values["index"], values["subindex"], values["type"])
+            steps = read(sdo, values["index"], values["subindex"] or 0, values["type"])
         self._start_reading(connection, request, steps)
 
     def _sii_read(self, connection: Connection, request: Request) -> None:

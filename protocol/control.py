@@ -158,10 +158,11 @@ def _object_name(value: object) -> str:
 
 _SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(place=0))
 _INDEX: Final = _object_number(0xFFFF)
+_SUBINDEX: Final = _object_number(0xFF)
 _ENTRY: Final = {
     "sensor": _SENSOR,
     "index": Parameter(_INDEX, required=True),
-    "subindex": Parameter(_object_number(0xFF), default=0),
+    "subindex": Parameter(_SUBINDEX, default=0),
     "type": Parameter(sdo_type),
 }
 
@@ -193,7 +194,14 @@ ACTIONS: Final[Mapping[str, Action]] = {
         },
         controls=True,
     ),
-    "sdo_read": Action({**_ENTRY, "index": Parameter(_INDEX), "name": Parameter(_object_name)}),
+    "sdo_read": Action(
+        {
+            **_ENTRY,
+            "index": Parameter(_INDEX),
+            "subindex": Parameter(_SUBINDEX),
+            "name": Parameter(_object_name),
+        }
+    ),
     "sdo_write": Action(
         {**_ENTRY, "value": Parameter(_anything), "hex": Parameter(_hex_bytes)}, controls=True
     ),

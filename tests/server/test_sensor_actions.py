@@ -77,6 +77,8 @@ def test_objects_are_read_by_name(streaming: tuple[Server, Client, Client]) -> N
         refused = error(asking.ask("sdo_read", name=name))
         assert refused["code"] == "bad_request"
         assert said in refused["message"]
+    both = error(asking.ask("sdo_read", name="Sampling rate", subindex=0))
+    assert (both["code"], "'subindex'" in both["message"]) == ("bad_request", True)
     for keys in ({}, {"index": RATE, "name": "Sampling rate"}):
         assert "needs the key 'index', or" in error(asking.ask("sdo_read", **keys))["message"]
 
