@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Any, Final, NoReturn
 
 from ethercat_server import __version__, command_line
 from ethercat_server.tool import (
@@ -17,6 +18,7 @@ from ethercat_server.tool import (
     watch,
 )
 from ethercat_server.tool.command import Command
+from ethercat_server.tool.show import say_json
 
 _PROGRAM: Final = "ethercat-sensor"
 _EXIT_CODES: Final = (
@@ -30,11 +32,29 @@ COMMANDS: Final[Mapping[str, Command]] = {
 }
 
 
+_NEGATIVE: Final = re.compile(r"-(\.?\d|inf|nan)")
+
+
+class _Parser(argparse.ArgumentParser):
+    """It takes all negative numbers for numbers, and says what is wrong to programs too."""
+
+    as_json = False
+
+    def __init__(self, **values: Any) -> None:
+        super().__init__(**values)
+        self._negative_number_matcher = _NEGATIVE  # argparse's own takes -1e-3 for an option
+
+    def error(self, message: str) -> NoReturn:
+        if self.as_json:
+            say_json({"error": message}, indent=None)
+        super().error(message)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The command line up to the subcommand's name."""
     width = max(map(len, COMMANDS))
     summaries = "\n".join(f"  {name:{width}}  {command.summary}" for name, command in COMMANDS.items())
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=_PROGRAM,
         usage="%(prog)s COMMAND [ARGUMENT ...]",
         description="Looks at Bota EtherCAT sensors and sets them up, on the interface or through a server.",
@@ -48,7 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def build_command_parser(command: Command) -> argparse.ArgumentParser:
     """The command line of one subcommand."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=f"{_PROGRAM} {command.name}",
         description=f"{command.summary[0].upper()}{command.summary[1:]}.",
         epilog=_EXIT_CODES,
@@ -63,6 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     command_line.begin(_PROGRAM)
     arguments = sys.argv[1:] if argv is None else list(argv)
     # What stands behind the command is its own parser's, options and arguments mixed as one likes.
+    _Parser.as_json = "--json" in arguments
     command = COMMANDS[build_parser().parse_args(arguments[:1]).command]
     args = build_command_parser(command).parse_intermixed_args(arguments[1:])
     return command_line.run(_PROGRAM, lambda: command.run(args), as_json=args.json)

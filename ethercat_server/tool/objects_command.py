@@ -100,6 +100,10 @@ def _read_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _read(args: argparse.Namespace) -> int:
     names: list[str] = args.names
+    if args.server is None and args.iface is None:
+        raise UsageError(
+            f"a NAME is missing, or the interface beside {names[0]!r}: for example read ens5 'Sampling rate'"
+        )
     if args.server is not None and args.iface is not None:
         # With --server there is no interface: what came first is a name too.
         names, args.iface = [args.iface, *names], None

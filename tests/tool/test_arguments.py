@@ -100,6 +100,8 @@ def test_the_rate_decides_which_sinc_length_is_in_force(
         (["apply", "ens5", "--set", "colour=1"], "no setting 'colour'"),
         (["apply", "ens5", "--set", "sinc_length=0"], "from 32 to 2048"),
         (["plan", "ens5", "--config", "/nonexistent.toml"], "/nonexistent.toml"),
+        (["read", "ens5"], "a NAME is missing, or the interface beside 'ens5'"),
+        (["tare", "ens5", "--target", "-1e-3", "-.5", "0", "0", "0", "-inf"], "six finite numbers"),
         (["tare", "ens5", "--samples", "0"], "from 1 to 20000"),
         (["tare", "ens5", "--target", "1", "2", "3", "4", "5", "inf"], "six finite numbers"),
         (["tare", "ens5", "--target", "1e300", "0", "0", "0", "0", "0"], "larger than a REAL32 can be"),
@@ -121,6 +123,7 @@ def test_wrong_arguments_are_one_sentence_and_exit_code_2(arguments: list[str], 
 )
 def test_what_argparse_finds_is_exit_code_2(arguments: list[str]) -> None:
     assert "usage: ethercat-sensor" in tool(*arguments, code=2).err
+    assert tool(*arguments, "--json", code=2).json["error"] in tool(*arguments, "--json", code=2).err
 
 
 def test_help_names_every_command_and_the_exit_codes() -> None:
