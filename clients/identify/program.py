@@ -87,7 +87,7 @@ def _choose(recording: Recording, place: int | None) -> RecordedSensor:
             if len(serials) > 1:
                 raise SensorChoiceError(
                     f"{recording.path}: sensor {sensor.sensor} was exchanged in it (serial numbers "
-                    f"{', '.join(map(str, serials))}), and each has its own bias: record one of them by itself"
+                    f"{', '.join(map(str, serials))}), and each has its own bias: record one by itself"
                 )
             return sensor
     raise SensorChoiceError(f"{recording.path} holds no samples of sensor {place}")

@@ -22,7 +22,7 @@ from clients.recording.reader import open_recording
 from ethercat_server.virtual_sensor import scene
 from ethercat_server.virtual_sensor.motion import MOVE_LENGTH, POSE_LENGTH, POSES
 from protocol.framing import DataFlag, DataMessage
-from tests.clients.recordings import START_NS, record
+from tests.clients.recordings import START_NS, describe, record, writer
 from tests.compensation.making import written_parameters
 from tests.compensation.streaming import OFFSET, POSES_TAKE, process_data
 
@@ -241,3 +241,20 @@ def test_what_is_not_installed_is_said(tmp_path: Path) -> None:
     assert hidden.returncode == 1
     said = "ethercat-identify: numpy is not installed: pip install 'bota-ethercat-bridge[tools]'\n"
     assert hidden.stderr == said
+
+
+def test_a_sensor_that_was_exchanged_meanwhile_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, half = tmp_path / "swapped.mcap", len(POSED) // 2
+    made = writer(path)
+    description = describe(0)
+    made.describe(START_NS, description)
+    for frame in POSED[:half]:
+        made.frame(frame)
+    other = {**description, "sensors": [{**description["sensors"][0], "serial": 7}]}
+    made.describe(POSED[half].stamp_ns, other)
+    for frame in POSED[half:]:
+        made.frame(frame)
+    made.finish({})
+    assert "sensor 0 was exchanged in it (serial numbers 100, 7)" in refused(capsys, path)
