@@ -110,10 +110,18 @@ def veth_pair(near: str) -> Iterator[str]:
 
 def main(argv: Sequence[str]) -> int:
     """The sensor's process: `argv` is the near end's name, a priority, the sensor's options."""
-    from ethercat_server.virtual_sensor import cli  # noqa: PLC0415 - only this process needs it
+    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - only this process needs it
+
+    from ethercat_server.virtual_sensor import cli  # noqa: PLC0415 - likewise
 
     near, priority, *arguments = argv
-    with veth_pair(near) as far:
+    with contextlib.ExitStack() as made:
+        try:
+            far = made.enter_context(veth_pair(near))
+        except (OSError, NetlinkError) as error:
+            why = os.strerror(error.code) if isinstance(error, NetlinkError) else error.strerror or error
+            sys.stderr.write(f"ethercat-virtual-sensor: a veth pair cannot be made here: {why}\n")
+            return 1
         if int(priority):
             with contextlib.suppress(PermissionError):
                 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(priority)))

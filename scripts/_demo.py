@@ -26,7 +26,7 @@ from typing import Any, Final
 
 from protocol.client import Client
 from protocol.errors import ConnectionFailedError, ProtocolError
-from scripts._measure import Measurement, verdict
+from scripts._measure import FULL_RATE, Measurement, verdict
 from scripts._show import Screen, print_summary
 
 PORT: Final = 12001
@@ -212,6 +212,8 @@ def run(seconds: float | None, directory: Path) -> int:
     trouble = verdict(summary, float(sensor["rate_hz"])) or next(filter(None, troubles), None)
     if trouble is not None:
         raise DemoError(trouble)
+    if summary.rate_hz < FULL_RATE * float(sensor["rate_hz"]):
+        print(f"Only {summary.rate_hz:.0f} messages/s arrived: this machine was too busy to keep up.")
     return 0
 
 
@@ -252,8 +254,16 @@ def ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.5 <= value <= 1e6:
+        raise argparse.ArgumentTypeError("must be from 0.5 to 1000000")
+    return value
+
+
 def main() -> int:
     """Parse the arguments and run."""
+    sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
     directory = Path(os.environ.get("DEMO_DIRECTORY") or tempfile.mkdtemp())
@@ -262,11 +272,14 @@ def main() -> int:
         parser = argparse.ArgumentParser(
             prog="scripts/demo", description="The whole chain, without hardware."
         )
-        parser.add_argument("--seconds", type=float, help="end after so many seconds; else Ctrl-C ends it")
+        parser.add_argument("--seconds", type=_seconds, help="end after so many seconds; else Ctrl-C ends it")
         return run(parser.parse_args().seconds, directory)
     except Stopped:
         print("stopped before anything was measured")
         return 0
+    except BrokenPipeError:  # nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except DemoError as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1

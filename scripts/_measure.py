@@ -17,8 +17,12 @@ from protocol.pdo import Sample, SampleDecoder
 
 _REMEMBERED: Final = 8192
 """Samples that are remembered: some seconds' worth."""
-_PATIENCE_NS: Final = 1_000_000_000
-"""A message may overtake its sample by this much; after that it was no sample's."""
+_AROUND_A_GAP_NS: Final = 1_000_000_000
+"""So long after samples were withheld a message may still be of one of them."""
+FULL_RATE: Final = 0.95
+"""Fewer messages than this part of the samples: something could not keep up."""
+_LEAST_RATE: Final = 0.6
+"""Fewer than this part, and something is wrong."""
 
 Values = tuple[float, ...]
 
@@ -69,6 +73,10 @@ class Measurement:
     _waiting: deque[tuple[Values, int]] = field(default_factory=deque)
     _decoders: dict[int, SampleDecoder] = field(default_factory=dict)
     _places: list[int] = field(default_factory=list)
+    _passed_ns: int = 0
+    """Samples up to this instant have come from the server, if they were not withheld."""
+    _gap_ns: int = -(10**18)
+    """When the latest gap in what comes from the server ended."""
     _first_ns: int = 0
     _last_ns: int = 0
 
@@ -84,6 +92,8 @@ class Measurement:
         """A frame came from the server."""
         missing = frame.sequence - self._sequence - 1 if self._sequence is not None else 0
         self._sequence = frame.sequence
+        if frame.flags & DataFlag.GAP:
+            self._gap_ns = frame.monotonic_ns
         if frame.flags & DataFlag.GAP and self._places:
             self.lost_before += max(missing, 1)
         if frame.flags & (DataFlag.REPEATED | DataFlag.INVALID):
@@ -92,6 +102,7 @@ class Measurement:
         decoder = self._decoders.get(size) or self._decoders.setdefault(size, SampleDecoder(size))
         self.latest = decoder.decode(frame.process_data)
         self._samples += 1
+        self._passed_ns = frame.monotonic_ns
         self.tcp_ages_ns.append(now_ns - frame.monotonic_ns)
         values = tuple(self.latest.array)
         self._known[values] = Known(self._samples, frame.monotonic_ns)
@@ -101,26 +112,27 @@ class Measurement:
             if old in self._known and self._known[old].place <= self._samples - _REMEMBERED:
                 del self._known[old]
         if self._waiting:
-            self._look_up_waiting(now_ns)
+            self._look_up_waiting()
 
     def take_message(self, values: Sequence[float], now_ns: int) -> None:
         """A message came on the ROS topic."""
         if not all(map(math.isfinite, values)):
             self.not_finite += 1
         self._waiting.append((tuple(values), now_ns))
-        self._look_up_waiting(now_ns)
+        self._look_up_waiting()
 
-    def _look_up_waiting(self, now_ns: int) -> None:
+    def _look_up_waiting(self) -> None:
         while self._waiting:
             values, arrived_ns = self._waiting[0]
             known = self._known.get(values)
             if known is not None:
                 self._count(known, arrived_ns)
-            elif now_ns - arrived_ns < _PATIENCE_NS:
-                return
+            elif self._passed_ns <= arrived_ns:
+                return  # its sample may still come
             elif self._places:  # before the first match the two streams need not overlap
                 self.messages += 1
-                self.unknown += 1
+                # Where samples were withheld from the server's client, this one may be among them.
+                self.unknown += arrived_ns > self._gap_ns + _AROUND_A_GAP_NS
             self._waiting.popleft()
 
     def _count(self, known: Known, arrived_ns: int) -> None:
@@ -183,6 +195,6 @@ def verdict(summary: Summary, nominal_hz: float) -> str | None:
         return "a message on the ROS topic is no sample of the sensor"
     if summary.repeated:
         return f"{summary.repeated} messages came twice"
-    if not 0.95 * nominal_hz <= summary.rate_hz <= 1.05 * nominal_hz:
+    if not _LEAST_RATE * nominal_hz <= summary.rate_hz <= 1.05 * nominal_hz:
         return f"{summary.rate_hz:.1f} messages/s arrived and the sensor makes {nominal_hz:g} samples/s"
     return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from types import TracebackType
@@ -21,13 +20,18 @@ _ROWS: Final = (
     ("Angular rate", "angular_rate", "rad/s", 4),
 )
 
+_TABLE_WIDTH: Final = 66
+"""A narrower terminal gets a line a second: a number that is cut off is a wrong one."""
+
 
 class Screen:
     """Shows the measurement as it grows."""
 
     def __init__(self, sensor: Mapping[str, Any]) -> None:
         self._title = f"{sensor['name']}, serial {sensor['serial']}, {sensor['rate_hz']} Hz, virtual"
-        self._live = Live(console=Console(), auto_refresh=False) if sys.stdout.isatty() else None
+        console = Console()
+        fits = console.is_terminal and not console.is_dumb_terminal and console.width >= _TABLE_WIDTH
+        self._live = Live(console=console, auto_refresh=False) if fits else None
         self.period_s = 0.25 if self._live else 1.0
         self._messages = 0
         self._at_s = time.monotonic()

@@ -46,6 +46,26 @@ def test_a_message_may_overtake_its_sample() -> None:
     assert measurement.age_ns == 100_000
 
 
+def test_a_message_whose_sample_is_long_in_coming_is_not_judged_before() -> None:
+    measurement = measured()
+    late_ns = 3 * SECOND_NS  # this process was held up
+    measurement.take_message(values(801), 801 * PERIOD_NS + 100_000)
+    measurement.take_message(values(802), 802 * PERIOD_NS + 100_000)
+    for number in range(801, 900):
+        measurement.take_frame(frame(number), late_ns)
+    assert measurement.summary().all_decoded_right
+    assert measurement.messages == 803
+
+
+def test_a_message_whose_sample_was_withheld_is_not_judged() -> None:
+    measurement = measured()
+    measurement.take_message(values(801), 801 * PERIOD_NS + 100_000)
+    for number in range(802, 900):
+        measurement.take_frame(frame(number, DataFlag.GAP if number == 802 else 0), number * PERIOD_NS)
+    assert measurement.summary().all_decoded_right
+    assert measurement.messages == 802
+
+
 def test_each_fault_is_found() -> None:
     lost = measured()
     lost.take_frame(frame(801), 801 * PERIOD_NS)

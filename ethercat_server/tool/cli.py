@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -81,6 +82,8 @@ def build_command_parser(command: Command) -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; returns its exit code. argparse exits with 2 for what it finds."""
     command_line.begin(_PROGRAM)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal that lacks a character is no reason to end
     arguments = sys.argv[1:] if argv is None else list(argv)
     # What stands behind the command is its own parser's, options and arguments mixed as one likes.
     _Parser.as_json = "--json" in arguments

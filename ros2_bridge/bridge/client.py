@@ -1,6 +1,7 @@
 """The program `ros2 run bridge client`, on PATH as `bridge-client`: arguments, signals, exit codes.
 
-Exit codes: 0 ended as asked (SIGINT, SIGTERM, supervisor), 1 could not start or failed, 2 wrong usage.
+Exit codes: 0 ended as asked (SIGINT, SIGTERM, supervisor), 1 could not start or failed, 2 wrong arguments or
+parameters.
 Everything of ROS is imported only after the signals are in hand, so that Ctrl-C is never a traceback.
 """
 

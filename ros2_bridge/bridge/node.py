@@ -100,18 +100,20 @@ def run(arguments: Sequence[str]) -> int:
             return _refuse(f"unknown argument {unknown[0]!r}: see --help", 2)
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # noqa: BLE001 - rclpy raises several unrelated ones, most about arguments
-        return _refuse(f"ROS cannot start: {' '.join(str(error).split())}", 1)
+        # rclpy has no public names for these.
+        wrong_arguments = type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
+        return _refuse(f"ROS cannot start: {' '.join(str(error).split())}", 2 if wrong_arguments else 1)
     try:
         try:
             node = BridgeNode()
             node.compensation.start()
         except (ParameterError, InvalidTopicNameException, ParameterException) as error:
-            return _refuse(" ".join(str(error).split()), 1)
+            return _refuse(" ".join(str(error).split()), 2)
         except RuntimeError as error:  # rclpy says no more, and not of what
             return _refuse(
                 f"ROS cannot make the node's topics and services ({' '.join(str(error).split())}): check "
                 "qos_overrides, and that array_topic and the remappings give no two topics one name",
-                1,
+                2,
             )
         return _spin(node)
     finally:

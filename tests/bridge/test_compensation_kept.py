@@ -237,7 +237,7 @@ def test_a_wrong_parameter_ends_the_node_with_a_sentence(
     server: ScriptedServer, start: Start, wrong: dict[str, Any]
 ) -> None:
     node = start(server.port, orientation_source="topic_imu", **wrong)
-    assert node.ends() == 1
+    assert node.ends() == 2
     (line,) = node.log.splitlines()
     assert line.startswith("bridge-client: ")
     assert next(iter(wrong)) in line

@@ -342,7 +342,7 @@ def test_nothing_listens_where_no_source_is_chosen(
 def test_tf_that_is_missing_ends_the_node_with_a_sentence(listener: Listener) -> None:
     with starter(listener) as start:
         node = start(1, orientation_source="tf")
-        assert node.ends() == 1
+        assert node.ends() == 2
         assert "parameter orientation_source is 'tf': it needs tf2_ros" in node.log
         assert "Traceback" not in node.log
 

@@ -118,7 +118,7 @@ def test_a_limit_and_the_notes_parameter_names(listener: Listener, start: Start)
 
 def test_a_wrong_parameter_is_one_sentence(start: Start) -> None:
     node = start(70000)
-    assert node.ends() == 1
+    assert node.ends() == 2
     (line,) = node.log.splitlines()
     assert line == "bridge-client: parameter server_port is 70000: it must be a whole number from 1 to 65535"
 
@@ -140,7 +140,7 @@ def test_topics_that_cannot_be_made_are_one_sentence(
     start: Start, listener: Listener, wrong: dict[str, object], words: str
 ) -> None:
     node = start(12001, **{name.replace("NS", f"/{listener.tag}"): value for name, value in wrong.items()})
-    assert node.ends() == 1
+    assert node.ends() == 2
     lines = [line for line in node.log.splitlines() if line.startswith("bridge-client: ")]
     assert words in lines[-1]
     assert "Traceback" not in node.log
@@ -148,14 +148,14 @@ def test_topics_that_cannot_be_made_are_one_sentence(
 
 def test_a_wrong_setting_at_start_is_one_sentence(start: Start) -> None:
     node = start(12001, **{"settings.acceleration_range_g": 3})
-    assert node.ends() == 1
+    assert node.ends() == 2
     (line,) = node.log.splitlines()
     assert line.startswith("bridge-client: parameter settings.acceleration_range_g: ")
     assert "2, 4, 8, 16" in line
 
 
 def test_arguments_that_are_not_understood() -> None:
-    for arguments, code in ((("dance",), 2), (("--ros-args", "-p"), 1), (("--help",), 0)):
+    for arguments, code in ((("dance",), 2), (("--ros-args", "-p"), 2), (("--help",), 0)):
         node = NodeProcess(*arguments)
         assert node.ends() == code
         assert "Traceback" not in node.log

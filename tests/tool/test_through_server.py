@@ -67,7 +67,7 @@ def test_a_master_that_is_no_server_is_named(bench: Bench) -> None:
 def test_the_eeprom_is_read_while_the_server_streams(bench: Bench) -> None:
     veth, _, running = bench
     with running.connect() as client:
-        before = client.ask("status")["sensors"]
+        before = client.ask("status")
         found = tool("eeprom", *address(running), "--json").json["slaves"]
         assert [(row["serial"], row["check_byte_right"]) for row in found] == [(10, True), (20, True)]
         assert [row["name"] for row in found] == ["BFT-SENS-ECAT-M8"] * 2
@@ -75,8 +75,9 @@ def test_the_eeprom_is_read_while_the_server_streams(bench: Bench) -> None:
         only = tool("eeprom", veth.near, "--sensor", "20")
         assert f"process {running.process.pid}" in one_sentence(only)
         assert "\n000e: 14|00|00|00\n" in only.out
-        after = client.ask("status")["sensors"]
-        assert [row["recoveries"] for row in after] == [row["recoveries"] for row in before]
+        after = client.ask("status")
+        was, now = ([row["recoveries"] for row in status["sensors"]] for status in (before, after))
+        assert now == was or after["lost_frames"] > before["lost_frames"], "or it was starved"
 
 
 def test_objects_are_read_by_name(bench: Bench) -> None:
