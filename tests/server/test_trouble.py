@@ -84,6 +84,18 @@ def test_not_allowed_names_the_capabilities() -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_a_virtual_bus_without_rights_is_a_sentence() -> None:
+    done = subprocess.run(
+        ["setpriv", "--bounding-set", "-net_admin,-net_raw", sys.executable, "-m", "ethercat_server.cli",
+         "virtual", str(free_port())],
+        capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 1
+    first, last = done.stderr.splitlines()
+    assert first.startswith("ethercat-virtual-sensor: a veth pair cannot be made here: ")
+    assert last.endswith("it needs root, or CAP_NET_ADMIN and CAP_NET_RAW")
+
+
 def test_another_model_is_refused_by_name() -> None:
     with virtual_sensor("--model", "BFT-GENA-THING") as (veth, _):
         assert "'BFT-GENA-THING', a model this server does not know" in fails(veth.near)
