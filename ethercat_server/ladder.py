@@ -126,8 +126,7 @@ class Ladder:
         """Request an AL state and wait for it; an error is acknowledged first."""
         status = self.al_status()
         if status is not None and status.error:
-            self._write(AL_CONTROL, status.acknowledge())
-            yield
+            yield from self._acknowledge(status)
         self._write(AL_CONTROL, state.request())
         deadline = time.monotonic() + _STATE_TIMEOUT_S
         while True:
@@ -139,6 +138,25 @@ class Ladder:
                 return
             if status.error or time.monotonic() > deadline:
                 raise BusError(f"sensor {self._place} does not go to {state.name}: it is in {status}")
+
+    def _acknowledge(self, status: AlStatus) -> Steps[None]:
+        """Acknowledge an error and wait until it is gone: a request before would overwrite the acknowledge.
+
+        The sensor looks at AL control when it comes to it, and sees only what was written last.
+        """
+        self._write(AL_CONTROL, status.acknowledge())
+        deadline = time.monotonic() + _STATE_TIMEOUT_S
+        while True:
+            yield
+            now = self.al_status()
+            if now is None:
+                raise GoneError
+            if not now.error:
+                return
+            if time.monotonic() > deadline:
+                raise BusError(
+                    f"sensor {self._place} does not take the acknowledge of its error: it is in {now}"
+                )
 
     def _remember(self, address: int, size: int) -> bytes:
         deadline = time.monotonic() + _REMEMBER_TIMEOUT_S

@@ -108,6 +108,29 @@ def no_mailbox() -> None:
     firmware.Firmware._mailbox_fault = lambda self: 0  # type: ignore[method-assign]
 
 
+_AL_DELAY_NS = 3_000_000
+
+
+def slow_al() -> None:
+    """Looks at AL control a few exchanges after it was written, and finds what was written last."""
+    from ethercat_server.virtual_sensor import firmware
+
+    act, work = firmware.Firmware.al_control, firmware.Firmware.check_watchdog
+    waiting: dict[firmware.Firmware, tuple[int, int]] = {}
+
+    def remember(self: firmware.Firmware, value: int) -> None:
+        due, _ = waiting.get(self, (self.now + _AL_DELAY_NS, 0))
+        waiting[self] = due, value
+
+    def look(self: firmware.Firmware, now: int) -> None:
+        work(self, now)
+        if self in waiting and now >= waiting[self][0]:
+            act(self, waiting.pop(self)[1])
+
+    firmware.Firmware.al_control = remember  # type: ignore[method-assign]
+    firmware.Firmware.check_watchdog = look  # type: ignore[method-assign]
+
+
 WAYS = {
     "foreign": foreign,
     "mailbox": no_mailbox,
@@ -117,6 +140,7 @@ WAYS = {
     "product": other_product,
     "fewer": fewer_objects,
     "refusing": refusing,
+    "slow": slow_al,
 }
 
 if __name__ == "__main__":

@@ -254,6 +254,24 @@ def test_a_server_that_was_stopped_carries_on(bench: Bench) -> None:
     assert bench.state() == "OP"
 
 
+def test_a_sensor_that_is_slow_to_change_its_state_comes_back_too() -> None:
+    with (
+        virtual_sensor("--signal", "clock", module="tests.server.odd_sensor", first=("slow",)) as (
+            veth,
+            sensor,
+        ),
+        server(veth.near) as running,
+        running.connect() as client,
+    ):
+        bench = Bench(veth, sensor, running, client)
+        bench.command("safeop 0x1B")
+        bench.wait_event("sensor_lost")
+        bench.wait_event("sensor_back")
+        assert len(client.fresh(50)) == 50
+        # As long as the acknowledge is on its way the error is no refusal of OP.
+        assert "does not go to OP" not in running.said()
+
+
 @pytest.mark.long
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("fault", FAULTS)
