@@ -125,23 +125,33 @@ class Recovery:
         if self._climbing:
             for place in list(self._climbing):
                 self._step(place)
-        elif now_ns >= self._watch_ns:
+        if now_ns >= self._watch_ns:
             self._watch_ns = now_ns + _WATCH_EVERY_NS // len(self._sensors)
-            self._watched = (self._watched + 1) % len(self._sensors)
-            status = self._ladders[self._watched].al_status()
-            # No answer is none: as long as the working counter is right, one datagram got lost.
-            if status is not None and not status.is_op:
-                self._lose(self._watched, f"it is in {status}")
+            self._watch_next()
+
+    def _watch_next(self) -> None:
+        if alive := self._alive():
+            self._watched = next((place for place in alive if place > self._watched), alive[0])
+            # One that is out may be counted in place of one that is not there any more.
+            self._look_at(self._watched, counted=not self._climbing)
 
     def _look_for_lost(self) -> None:
-        for place in range(len(self._sensors)):
-            if place in self._climbing:
-                continue
-            status = self._ladders[place].al_status() or self._ladders[place].al_status()
-            if status is None:
-                self._lose(place, "it does not answer")
-            elif not status.is_op:
-                self._lose(place, f"it is in {status}")
+        for place in self._alive():
+            self._look_at(place, counted=False)
+
+    def _look_at(self, place: int, *, counted: bool) -> None:
+        status = self._ladders[place].al_status()
+        if status is None:
+            if counted:
+                return  # as long as the working counter is right, one datagram got lost
+            status = self._ladders[place].al_status()
+        if status is None:
+            self._lose(place, "it does not answer")
+        elif not status.is_op:
+            self._lose(place, f"it is in {status}")
+
+    def _alive(self) -> list[int]:
+        return [place for place in range(len(self._sensors)) if place not in self._climbing]
 
     def _lose(self, place: int, reason: str) -> None:
         if place not in self._climbing:
@@ -163,7 +173,7 @@ class Recovery:
         self._count_alive()
 
     def _count_alive(self) -> None:
-        alive = [place for place in range(len(self._sensors)) if place not in self._climbing]
+        alive = self._alive()
         self.alive_wkc = sum(self._bus.working_counter(place) for place in alive)
         self.all_lost = not alive
         self._bus.be_patient(self.all_lost)

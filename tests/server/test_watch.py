@@ -1,0 +1,107 @@
+"""Who is told to be lost, and by what: `Recovery` on a bus whose answers are given, without time passing."""
+
+from __future__ import annotations
+
+import struct
+import time
+from types import SimpleNamespace
+from typing import Any, cast
+
+from ethercat_server.al import AL_STATUS, AlState
+from ethercat_server.bus import Bus
+from ethercat_server.recovery import Recovery
+from ethercat_server.sensor import Sensor
+from ethercat_server.stream import SensorStream
+
+MS = 1_000_000
+
+
+class GivenBus:
+    """Two sensors in the AL states given; None does not answer."""
+
+    ifname, ifindex = "lo", 1
+
+    def __init__(self) -> None:
+        self.states: list[AlState | None] = [AlState.OP, AlState.OP]
+        self.lose = 0
+        """So many datagrams more are lost."""
+
+    def read_register(self, place: int, address: int, size: int) -> bytes | None:
+        if address != AL_STATUS:
+            return bytes(size)
+        if self.lose:
+            self.lose -= 1
+            return None
+        state = self.states[place]
+        return None if state is None else struct.pack("<HHH", state, 0, 0)
+
+    def write_register(self, place: int, address: int, data: bytes) -> bool:
+        return self.states[place] is not None
+
+    def working_counter(self, place: int) -> int:
+        return 3
+
+    def reclaim(self, place: int) -> bool:
+        return False
+
+    def be_patient(self, patient: bool) -> None:
+        pass
+
+
+class Watched:
+    """A `Recovery` and a time that passes by exchanges only."""
+
+    def __init__(self) -> None:
+        self.bus = GivenBus()
+        self.told: list[dict[str, Any]] = []
+        sensors = [SimpleNamespace(place=n, identity="a sensor", state="OP") for n in range(2)]
+        self.streams = [SimpleNamespace(alive=True) for _ in range(2)]
+        self.recovery = Recovery(
+            cast(Bus, self.bus),
+            cast(list[Sensor], sensors),
+            cast(list[SensorStream], self.streams),
+            self.told.append,
+        )
+        self.now = time.monotonic_ns()
+
+    def exchange(self, wkc: int, count: int = 1, after_ms: int = 1) -> None:
+        for _ in range(count):
+            self.now += after_ms * MS
+            self.recovery.attend(wkc, self.now)
+
+    def lost(self) -> list[tuple[int, str]]:
+        return [(row["sensor"], row["reason"]) for row in self.told]
+
+
+def test_one_that_dies_while_another_is_out_and_counted_is_lost_too() -> None:
+    watched = Watched()
+    watched.bus.states[0] = AlState.SAFEOP
+    watched.exchange(6, 300)
+    assert watched.lost() == [(0, "it is in SAFEOP")]
+    # The one in SAFEOP is counted, so the working counter is the one of the other.
+    watched.bus.states[1] = None
+    watched.exchange(3, 300)
+    assert watched.lost()[1:] == [(1, "it does not answer")]
+    assert not watched.streams[1].alive
+
+
+def test_one_that_leaves_op_while_another_is_out_is_lost_too() -> None:
+    watched = Watched()
+    watched.bus.states[1] = None
+    watched.exchange(3, 10)
+    watched.bus.states[0] = AlState.SAFEOP
+    watched.exchange(3, 300)
+    assert watched.lost() == [(1, "it does not answer"), (0, "it is in SAFEOP")]
+
+
+def test_a_lost_datagram_is_no_lost_sensor() -> None:
+    watched = Watched()
+    for _ in range(10):
+        watched.bus.lose = 1
+        watched.exchange(6, 200)
+    watched.bus.states[1] = None
+    watched.exchange(3, 10)
+    for _ in range(10):
+        watched.bus.lose = 1
+        watched.exchange(3, 200)
+    assert watched.lost() == [(1, "it does not answer")]
