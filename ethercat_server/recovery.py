@@ -27,7 +27,7 @@ from protocol.settings import SettingValue
 _SHORT_EXCHANGES: Final = 2
 """So many exchanges in a row with a short working counter are looked into."""
 _SILENCE_NS: Final = 50_000_000
-"""So long with no frame coming back, and all sensors are lost; single lost frames are not."""
+"""So long with no frame coming back, and all sensors are lost; single lost frames are not, however slow."""
 _SILENT: Final = "no frame comes back: check cable and power"
 _SILENT_CHANGE_NS: Final = 1_000_000_000
 """So long it may be in the middle of a change, which goes on when the frames do."""
@@ -71,6 +71,8 @@ class Recovery:
         self._changing: dict[int, _Reconfiguration] = {}
         self._short = 0
         self._frame_ns = time.monotonic_ns()
+        self._missed_since_ns = 0
+        """When the frame came that was the last before the first that is missing."""
         self._watch_ns = 0
         self._watched = 0
         self.alive_wkc: int
@@ -113,6 +115,8 @@ class Recovery:
                     if now_ns - self._frame_ns > _SILENT_CHANGE_NS:
                         for place in list(self._changing):
                             self._lose_in_change(place, _SILENT)
+            elif self._missed_since_ns != self._frame_ns:
+                self._missed_since_ns = self._frame_ns  # one only: at a low rate the time alone says nothing
             elif now_ns - self._frame_ns > _SILENCE_NS:
                 for place in range(len(self._sensors)):
                     self._lose(place, _SILENT)

@@ -105,3 +105,13 @@ def test_a_lost_datagram_is_no_lost_sensor() -> None:
         watched.bus.lose = 1
         watched.exchange(3, 200)
     assert watched.lost() == [(1, "it does not answer")]
+
+
+def test_at_a_low_rate_too_one_lost_frame_is_no_lost_sensor() -> None:
+    watched = Watched()
+    for _ in range(3):
+        watched.exchange(6, after_ms=40)
+        watched.exchange(-1, after_ms=80)
+    assert watched.lost() == []
+    watched.exchange(-1, after_ms=40)
+    assert [place for place, _ in watched.lost()] == [0, 1]
