@@ -20,6 +20,8 @@ from ethercat_server.sii import OF_FIRMWARE, SII_OWNER
 _STATE_TIMEOUT_S: Final = 2.0
 _ABSENT_PAUSE_S: Final = 0.005
 _REFUSED_PAUSE_S: Final = 0.1
+_REMOVED_READS: Final = 3
+"""So many unanswered reads in a row are a removal; one is a lost datagram."""
 _REMEMBER_TIMEOUT_S: Final = 1.0
 
 _COUNTS: Final = 0x0004
@@ -86,7 +88,9 @@ class Ladder:
 
     def wait_for_removal(self) -> Steps[bool]:
         """Leave a refused sensor in INIT until it is taken away, then climb."""
-        while self.al_status() is not None:
+        unanswered = 0
+        while unanswered < _REMOVED_READS:
+            unanswered = 0 if self.al_status() is not None else unanswered + 1
             yield from pause(_REFUSED_PAUSE_S)
         return (yield from self.climb())
 

@@ -7,8 +7,12 @@ import time
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
+
+from ethercat_server import ladder
 from ethercat_server.al import AL_STATUS, AlState
 from ethercat_server.bus import Bus
+from ethercat_server.ladder import Ladder
 from ethercat_server.recovery import Recovery
 from ethercat_server.sensor import Sensor
 from ethercat_server.stream import SensorStream
@@ -20,15 +24,18 @@ class GivenBus:
     """Two sensors in the AL states given; None does not answer."""
 
     ifname, ifindex = "lo", 1
+    reclaimed = False
 
     def __init__(self) -> None:
         self.states: list[AlState | None] = [AlState.OP, AlState.OP]
+        self.read = self.written = 0
         self.lose = 0
         """So many datagrams more are lost."""
 
     def read_register(self, place: int, address: int, size: int) -> bytes | None:
         if address != AL_STATUS:
             return bytes(size)
+        self.read += 1
         if self.lose:
             self.lose -= 1
             return None
@@ -36,12 +43,14 @@ class GivenBus:
         return None if state is None else struct.pack("<HHH", state, 0, 0)
 
     def write_register(self, place: int, address: int, data: bytes) -> bool:
+        self.written += 1
         return self.states[place] is not None
 
     def working_counter(self, place: int) -> int:
         return 3
 
     def reclaim(self, place: int) -> bool:
+        self.reclaimed = True
         return False
 
     def be_patient(self, patient: bool) -> None:
@@ -115,3 +124,20 @@ def test_at_a_low_rate_too_one_lost_frame_is_no_lost_sensor() -> None:
     assert watched.lost() == []
     watched.exchange(-1, after_ms=40)
     assert [place for place, _ in watched.lost()] == [0, 1]
+
+
+def test_a_refused_sensor_is_not_set_up_again_because_of_a_lost_datagram(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(ladder, "_REFUSED_PAUSE_S", 0.001)
+    bus = GivenBus()
+    bus.states[0] = AlState.INIT
+    waiting = Ladder(cast(Bus, bus), cast(Sensor, SimpleNamespace(place=0))).wait_for_removal()
+    for reads in range(10, 100, 10):
+        bus.lose = 1
+        while bus.read < reads:
+            next(waiting)
+    assert not bus.written
+    bus.states[0] = None
+    while not bus.reclaimed:
+        next(waiting)
