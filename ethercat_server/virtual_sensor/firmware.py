@@ -70,6 +70,7 @@ class Firmware:
     def outputs(self, data: bytes) -> None:
         """The master wrote the outputs; they count in OP only."""
         self._fed = self.now
+        self.esc.memory[reg.WATCHDOG_STATUS] = 1
         if self.al.state is AlState.OP:
             self.dictionary.set_output(data)
 
@@ -136,6 +137,7 @@ class Firmware:
         if ticks and now - self._fed > ticks * (divider + 2) * _WATCHDOG_UNIT_NS:
             counter = memory[reg.WATCHDOG_COUNTER]
             memory[reg.WATCHDOG_COUNTER] = min(counter + 1, 0xFF)
+            memory[reg.WATCHDOG_STATUS] = 0  # until outputs come again
             self._fed = 0
             self.fail(AlState.SAFEOP, AlCode.SYNC_MANAGER_WATCHDOG)
 

@@ -120,12 +120,17 @@ def test_the_watchdog_bites_when_outputs_stay_away() -> None:
     master.wait(99 * MS)
     master.cycle()
     master.wait(99 * MS)
-    assert master.read16(0x0130) == OP
+    assert (master.read16(0x0130), master.read16(0x0440)) == (OP, 1)
     master.wait(2 * MS)
     assert (master.read16(0x0130), master.read16(0x0134)) == (SAFEOP | ERROR, 0x001B)
     assert master.read(0x0442, 1) == b"\1"
+    assert master.read16(0x0440) == 0, "expired"
     master.write(0x0442, b"\0")
     assert master.read(0x0442, 1) == b"\0"
+    assert master.request(SAFEOP | ACK) == (SAFEOP, 0)
+    assert master.read16(0x0440) == 0, "not before the next output"
+    master.cycle()
+    assert master.read16(0x0440) == 1
 
 
 def test_the_watchdog_bites_while_other_frames_come() -> None:
