@@ -35,6 +35,8 @@ _COE_SDO_REQUEST: Final = 2
 _COE_SDO_RESPONSE: Final = 3
 _UPLOAD: Final = 0x40
 _DOWNLOAD: Final = 0x20
+_DOWNLOADED: Final = 0x60
+_COMMAND_MASK: Final = 0xE0
 _EXPEDITED: Final = 0x03
 _SIZE_GIVEN: Final = 0x01
 _ABORT: Final = 0x80
@@ -107,10 +109,6 @@ class CyclicSdo:
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """See `Sdo`."""
         command, rest = yield from self._transfer(index, subindex, _UPLOAD, b"")
-        if command & 0xE0 != _UPLOAD:
-            raise BusError(
-                self._unanswered("reading", index, subindex, f"unexpected command 0x{command:02X}")
-            )
         if command & 0x02:  # expedited; bit 0 tells that the size is given
             return rest[: 4 - (command >> 2 & 3)] if command & 0x01 else rest[:4]
         size = int.from_bytes(rest[:4], "little")
@@ -136,7 +134,7 @@ class CyclicSdo:
         yield from self._transfer(index, subindex, command, data)
 
     def _transfer(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
-        doing = "reading" if command == _UPLOAD else "writing"
+        doing, expected = ("reading", _UPLOAD) if command == _UPLOAD else ("writing", _DOWNLOADED)
         give_up = time.monotonic() + _GIVE_UP_S
         while time.monotonic() < give_up:
             yield from self._drain()
@@ -149,7 +147,7 @@ class CyclicSdo:
                 while time.monotonic() < deadline:
                     yield
                     try:
-                        answer = self._answer(index, subindex)
+                        answer = self._answer(index, subindex, expected)
                     except _AnswerLostError:
                         break  # ask again: reading and writing twice does no harm
                     if answer is None:
@@ -174,8 +172,11 @@ class CyclicSdo:
             self._bus.read_register(self._slave, self._in, self._in_size)
             yield
 
-    def _answer(self, index: int, subindex: int) -> tuple[int, bytes] | None:
-        """Command and data of the answer about this object if it is there; other messages are dropped."""
+    def _answer(self, index: int, subindex: int, expected: int) -> tuple[int, bytes] | None:
+        """Command and data of the answer if it is there; other messages are dropped.
+
+        Such as the late answer to a request that was repeated: about the same object, but another command's.
+        """
         status = self._bus.read_register(self._slave, SM_READ_STATUS, 1)
         if status is None or not status[0] & _MAILBOX_FULL:
             return None
@@ -190,6 +191,8 @@ class CyclicSdo:
         coe, command, its_index, its_subindex = _SDO_HEADER.unpack_from(body)
         is_sdo = coe >> 12 == _COE_SDO_RESPONSE or (coe >> 12 == _COE_SDO_REQUEST and command == _ABORT)
         if not is_sdo or (its_index, its_subindex) != (index, subindex):
+            return None
+        if command != _ABORT and command & _COMMAND_MASK != expected:
             return None
         return command, body[_SDO_HEADER.size :]
 

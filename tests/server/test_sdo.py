@@ -1,0 +1,62 @@
+"""SDO transfers by single datagrams, with a mailbox whose answers are given."""
+
+from __future__ import annotations
+
+import struct
+from typing import cast
+
+import pytest
+
+from ethercat_server.bus import Bus
+from ethercat_server.errors import SdoAbortError
+from ethercat_server.sdo import SM_READ_STATUS, CyclicSdo, Steps, T, finish
+
+MAILBOXES = ((0x1000, 128), (0x1080, 128))
+READ, WRITTEN, ABORTED = 0x43, 0x60, 0x80
+
+
+class GivenBus:
+    """A sensor that puts these answers into its mailbox once it is asked: command, index, data."""
+
+    def __init__(self, *answers: tuple[int, int, bytes]) -> None:
+        self.answers = list(answers)
+        self.asked = 0
+
+    def read_register(self, slave: int, address: int, size: int) -> bytes:
+        if address == SM_READ_STATUS:
+            return bytes([0x08 if self.asked and self.answers else 0])
+        command, index, data = self.answers.pop(0)
+        service = 2 if command == ABORTED else 3
+        body = struct.pack("<HBHB", service << 12, command, index, 1) + data
+        return (struct.pack("<HHBB", len(body), 0, 0, 3) + body).ljust(size, b"\0")
+
+    def write_register(self, slave: int, address: int, data: bytes) -> bool:
+        self.asked += 1
+        return True
+
+
+def run(bus: GivenBus, steps: Steps[T]) -> T:
+    done = finish(steps)
+    assert bus.asked == 1
+    assert not bus.answers
+    return done
+
+
+def mailbox(bus: GivenBus) -> CyclicSdo:
+    return CyclicSdo(cast(Bus, bus), 0, MAILBOXES)
+
+
+def test_a_read_leaves_the_late_answer_to_a_repeated_write_alone() -> None:
+    bus = GivenBus((WRITTEN, 0x8001, bytes(4)), (READ, 0x8001, b"abcd"))
+    assert run(bus, mailbox(bus).read(0x8001, 1)) == b"abcd"
+
+
+def test_a_write_leaves_the_late_answer_to_a_repeated_read_alone() -> None:
+    bus = GivenBus((READ, 0x8001, b"abcd"), (WRITTEN, 0x8001, bytes(4)))
+    run(bus, mailbox(bus).write(0x8001, 1, b"efgh"))
+
+
+def test_an_answer_about_another_object_is_left_alone_and_a_refusal_is_not() -> None:
+    bus = GivenBus((READ, 0x8000, b"abcd"), (ABORTED, 0x8001, struct.pack("<I", 0x06090030)))
+    with pytest.raises(SdoAbortError, match="refused reading object 0x8001:1 "):
+        finish(mailbox(bus).read(0x8001, 1))
