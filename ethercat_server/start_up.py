@@ -65,7 +65,7 @@ def enter_op(bus: Bus, sensors: list[Sensor], check_interrupt: Callable[[], None
 
 
 def _tell_offset(sdo: Sdo, sensor: Sensor) -> None:
-    """A tare that was saved, or a part of one, is in all samples: it is to be known."""
+    """A tare of before, saved or not, is in all samples: it is to be known, and to outlive a power cut."""
     try:
         offset = finish(read_offset(sdo))
     except SdoAbortError:
@@ -73,7 +73,8 @@ def _tell_offset(sdo: Sdo, sensor: Sensor) -> None:
     rows = [objects.BY_ADDRESS[objects.FORCE_TORQUE_OFFSET, sub] for sub in range(1, 7)]
     texts = [f"{row.name} {value:g} {row.unit}" for row, value in zip(rows, offset, strict=True) if value]
     if texts:
-        log.info("sensor %d has a tare in its flash: %s", sensor.place, ", ".join(texts))
+        sensor.offset = offset
+        log.info("sensor %d has a tare in force (saved or not): %s", sensor.place, ", ".join(texts))
 
 
 def check_sii(ifname: str, place: int, slave: SlaveIdentity) -> None:

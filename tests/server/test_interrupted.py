@@ -210,7 +210,7 @@ def test_a_power_cut_during_save_is_met_by_the_next_start() -> None:
             assert "sensor 0 held fir = true (wanted: false)" in said, said
             assert "a sampling rate of 400 Hz (wanted: 800 Hz)" in said
             assert "chop" not in said, "its turn had not come"
-            assert "sensor 0 has a tare in its flash: Fx offset 3.5 N" in said
+            assert "sensor 0 has a tare in force (saved or not): Fx offset 3.5 N" in said
             with running.connect() as asking:
                 found = row(asking)
                 assert (found["state"], found["rate_hz"]) == ("OP", 800)

@@ -12,7 +12,8 @@ from collections.abc import Iterator
 import pytest
 
 from protocol.errors import ConnectionFailedError
-from tests.server.running import Client, Server, needs_bus, virtual_sensor, wait_until
+from tests.server.commands import command
+from tests.server.running import Client, Server, needs_bus, server, virtual_sensor, wait_until
 
 pytestmark = [pytest.mark.bus, needs_bus]
 
@@ -96,3 +97,18 @@ def test_connections_that_the_killed_one_left_do_not_hold_the_port() -> None:
         time.sleep(0.1)
         with again.connect() as client:
             assert len(client.ask("status")["clients"]) == 1
+
+
+def test_a_tare_that_was_not_saved_outlives_the_server_and_then_a_power_cut() -> None:
+    with virtual_sensor("--signal", "rest") as (veth, sensor):
+        with server(veth.near) as running, running.connect() as client:
+            client.ask("subscribe")
+            tared = client.ask("tare", samples=20, target=[5.0, 0, 0, 0, 0, 0])
+            assert tared["ok"], tared
+        with server(veth.near) as running, running.connect() as client:
+            assert "sensor 0 has a tare in force (saved or not): Fx offset" in running.said()
+            client.ask("subscribe")
+            command(sensor, "power cycle 0.3")
+            client.wait_event("sensor_back")
+            held = client.ask("sdo_read", index=0x8000, subindex=1, type="f32")["value"]
+            assert held == pytest.approx(tared["new_offset"][0])
