@@ -51,17 +51,34 @@ class ServerOptions:
 
     def asked_settings(self, place: int, name: str, serial: int) -> dict[str, SettingValue]:
         """The settings a person asked for, for the sensor at `place` with this name and serial number."""
-        asked = dict(self.common_settings)
-        for choice in sorted(self.sensor_settings, key=lambda choice: choice.precedence):
-            if choice.matches(place, name, serial):
-                asked |= self.sensor_settings[choice]
-        return asked | self.assigned_settings
+        asked: dict[str, SettingValue] = {}
+        for _, settings in self._sources(place, name, serial):
+            asked |= settings
+        return asked
 
     def wanted_settings(self, place: int, name: str, serial: int) -> dict[str, SettingValue]:
-        """The same over the start-up defaults; SettingError if they contradict one another."""
+        """The same over the start-up defaults; UsageError if they contradict one another."""
         wanted = {**start_up_defaults(), **self.asked_settings(place, name, serial)}
-        check_combination(wanted)
+        try:
+            check_combination(wanted)
+        except SettingError as error:
+            sources = ", ".join(source for source, _ in self._sources(place, name, serial))
+            raise UsageError(
+                f"what is asked of sensor {place} ({name} with serial {serial}) contradicts itself: {error}; "
+                f"correct one of {sources}"
+            ) from None
         return wanted
+
+    def _sources(self, place: int, name: str, serial: int) -> list[tuple[str, dict[str, SettingValue]]]:
+        """Where something is asked of this sensor, and what; the later wins."""
+        single = [choice for choice in self.sensor_settings if choice.matches(place, name, serial)]
+        single.sort(key=lambda choice: choice.precedence)
+        sources = [
+            ("[sensor]", self.common_settings),
+            *((f"[sensor.{choice}]", self.sensor_settings[choice]) for choice in single),
+            ("--set", self.assigned_settings),
+        ]
+        return [(source, settings) for source, settings in sources if settings]
 
     def check_sensors(self, found: Mapping[int, Identity]) -> None:
         """UsageError if there are settings for a sensor that is not among those `found`, by place."""

@@ -21,6 +21,7 @@ from ethercat_server.sensor import Sensor
 from ethercat_server.sensor_actions import SensorActions
 from ethercat_server.server_settings import SERVER_SETTINGS
 from protocol.errors import RequestError
+from protocol.settings import SettingValue
 
 log = logging.getLogger(__name__)
 
@@ -90,8 +91,12 @@ class Service:
 
     def _take_over(self) -> None:
         fresh, self._fresh = self._fresh, None
-        if not isinstance(fresh, Policy):
-            log.error("the configuration stays as it was: %s", fresh or "it could not be read")
+        try:
+            if not isinstance(fresh, Policy):
+                raise fresh or UsageError("it could not be read")
+            changes = [self._changes(sensor, fresh.options) for sensor in self._on_sensors.sensors]
+        except UsageError as error:
+            log.error("the configuration stays as it was: %s", error)
             return
         was, now = self._policy.options, fresh.options
         fresh.apply(self._hub)
@@ -100,18 +105,21 @@ class Service:
         later = [f"[server] {name}" for name in changed if not SERVER_SETTINGS[name].at_once]
         at_once = [name for name in changed if SERVER_SETTINGS[name].at_once]
         log.info(
-            "configuration read again: %s", f"changed {', '.join(at_once)}" if at_once else "nothing new"
+            "configuration read again: [server]: %s",
+            f"changed {', '.join(at_once)}" if at_once else "nothing new",
         )
         if later:
             log.warning("a change of %s takes effect at the next start", ", ".join(later))
-        for sensor in self._on_sensors.sensors:
-            self._configure(sensor, was, now)
+        for place, settings in enumerate(changes):
+            self._configure(place, settings)
 
-    def _configure(self, sensor: Sensor, was: ServerOptions, now: ServerOptions) -> None:
-        place = sensor.place
-        who = (place, sensor.identity.name, sensor.identity.serial)
-        before = was.wanted_settings(*who)
-        changed = {n: value for n, value in now.wanted_settings(*who).items() if before.get(n) != value}
+    def _changes(self, sensor: Sensor, now: ServerOptions) -> dict[str, SettingValue]:
+        """What is to be changed of this sensor; UsageError if `now` contradicts itself."""
+        who = (sensor.place, sensor.identity.name, sensor.identity.serial)
+        before = self._policy.options.wanted_settings(*who)
+        return {n: value for n, value in now.wanted_settings(*who).items() if before.get(n) != value}
+
+    def _configure(self, place: int, changed: dict[str, SettingValue]) -> None:
         if not changed:
             return
         names = ", ".join(f"{name} = {value}" for name, value in changed.items())

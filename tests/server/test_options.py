@@ -91,6 +91,16 @@ def test_single_sensors_have_tables_by_place_serial_number_and_name(tmp_path: Pa
     assert asked(1, "BFT-ROKS-ECAT-M8", 77) == (341, 3)
 
 
+def test_tables_that_contradict_one_another_for_one_sensor_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text("[sensor]\nfir = true\n[sensor.BFT-SENS-ECAT-M8]\nfir = false\n[sensor.0]\nfast = true\n")
+    options = parse_options(["ens5", "1", "--config", str(file)])
+    assert options.wanted_settings(0, "BFT-ROKS-ECAT-M8", 7)["fast"] is True
+    with pytest.raises(UsageError, match=r"sensor 0 .BFT-SENS-ECAT-M8 with serial 7. contradicts") as error:
+        options.wanted_settings(0, "BFT-SENS-ECAT-M8", 7)
+    assert str(error.value).endswith("correct one of [sensor], [sensor.BFT-SENS-ECAT-M8], [sensor.0]")
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [

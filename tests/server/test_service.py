@@ -97,7 +97,7 @@ def test_sighup_puts_in_force_what_can_be_and_names_the_rest(tmp_path: Path) -> 
     file.write_text("[server]\n")
     with server("virtual", "--config", str(file)) as running, running.connect() as client:
         client.ask("subscribe")
-        reload(running, "nothing new")
+        reload(running, "configuration read again: [server]: nothing new")
         file.write_text("[server]\nidle_timeout_s = 0.2\nrt_priority = 3\n[sensor]\nfir = true\n")
         with running.connect() as idle:
             reload(running, "changed idle_timeout_s")
@@ -112,3 +112,22 @@ def test_sighup_puts_in_force_what_can_be_and_names_the_rest(tmp_path: Path) -> 
         reload(running, "not valid TOML")
         frames = client.fresh(400)
         assert len(frames) == 400, "the stream goes on"
+
+
+def test_sighup_refuses_tables_that_contradict_one_another_and_the_stream_goes_on(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text("[server]\n")
+    with server("virtual", "--config", str(file)) as running, running.connect() as client:
+        client.ask("subscribe")
+        file.write_text(
+            "[server]\nidle_timeout_s = 5\n[sensor]\nfir = true\nimu_active = 3\n"
+            "[sensor.BFT-SENS-ECAT-M8]\nfir = false\n[sensor.0]\nfast = true\n"
+        )
+        reload(running, "the configuration stays as it was: what is asked of sensor 0")
+        assert "Traceback" not in running.said()
+        assert len(client.fresh(400)) == 400
+        assert client.ask("describe")["sensors"][0]["settings"]["imu_active"] == 1, (
+            "nothing of it is in force"
+        )
+        file.write_text("[server]\nidle_timeout_s = 5\n")
+        reload(running, "changed idle_timeout_s")

@@ -193,6 +193,16 @@ def test_settings_for_a_sensor_that_is_not_there(tmp_path_factory: pytest.TempPa
     )
 
 
+def test_tables_that_contradict_one_another(tmp_path_factory: pytest.TempPathFactory) -> None:
+    config = tmp_path_factory.mktemp("config") / "c.toml"
+    config.write_text(
+        "[sensor]\nfir = true\n[sensor.BFT-SENS-ECAT-M8]\nfir = false\n[sensor.0]\nfast = true\n"
+    )
+    assert "contradicts itself: fast is true but fir is false" in fails(
+        "virtual", "--config", str(config), code=2
+    )
+
+
 def test_an_object_that_aborts_is_named() -> None:
     with virtual_sensor() as (veth, sensor):
         assert sensor.process.stdin is not None
