@@ -82,13 +82,17 @@ class ServerOptions:
 
     def check_sensors(self, found: Mapping[int, Identity]) -> None:
         """UsageError if there are settings for a sensor that is not among those `found`, by place."""
-        for choice in self.sensor_settings:
-            if not any(choice.matches(place, who.name, who.serial) for place, who in found.items()):
-                there = "; ".join(f"{place}: {who}" for place, who in found.items())
-                raise UsageError(
-                    f"the configuration has settings for sensor {choice}, but the bus has only {there}: "
-                    "correct the table's name"
-                )
+        missing = [
+            str(choice)
+            for choice in self.sensor_settings
+            if not any(choice.matches(place, who.name, who.serial) for place, who in found.items())
+        ]
+        if missing:
+            there = "; ".join(f"{place}: {who}" for place, who in found.items())
+            raise UsageError(
+                f"the configuration has settings for sensor {', '.join(missing)}, but the bus has only "
+                f"{there}: switch that sensor on, or correct the table's name"
+            )
 
     def check(self) -> None:
         """SettingError if what is asked of any one sensor contradicts itself."""

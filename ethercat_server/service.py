@@ -62,6 +62,8 @@ class Service:
         self._fresh: Policy | UsageError | None = None
         self._reading: threading.Thread | None = None
         self._again = False
+        self._pending: list[dict[str, SettingValue]] = [{} for _ in on_sensors.sensors]
+        """By place: what a reload asked for that is not in force; the next one tries again."""
 
     def ready(self) -> None:
         """The server streams."""
@@ -110,25 +112,37 @@ class Service:
         )
         if later:
             log.warning("a change of %s takes effect at the next start", ", ".join(later))
+        try:
+            now.check_sensors({sensor.place: sensor.identity for sensor in self._on_sensors.sensors})
+        except UsageError as error:
+            log.warning("%s", error)  # it is no reason to keep the rest from the sensors that are there
         for place, settings in enumerate(changes):
             self._configure(place, settings)
 
     def _changes(self, sensor: Sensor, now: ServerOptions) -> dict[str, SettingValue]:
         """What is to be changed of this sensor; UsageError if `now` contradicts itself."""
         who = (sensor.place, sensor.identity.name, sensor.identity.serial)
-        before = self._policy.options.wanted_settings(*who)
-        return {n: value for n, value in now.wanted_settings(*who).items() if before.get(n) != value}
+        before, pending = self._policy.options.wanted_settings(*who), self._pending[sensor.place]
+        wanted = now.wanted_settings(*who)
+        return {n: value for n, value in wanted.items() if n in pending or before.get(n) != value}
 
     def _configure(self, place: int, changed: dict[str, SettingValue]) -> None:
         if not changed:
             return
         names = ", ".join(f"{name} = {value}" for name, value in changed.items())
+        pending = self._pending[place]
+        pending.update(changed)
 
         def done(_: object, error: RequestError | None) -> None:
-            if error is None:
-                log.info("sensor %d now has %s", place, names)
-            else:
-                log.error("sensor %d: %s", place, error)
+            if error is not None:
+                log.error(
+                    "sensor %d does not have %s, which the next reload tries again: %s", place, names, error
+                )
+                return
+            log.info("sensor %d now has %s", place, names)
+            for name, value in changed.items():
+                if pending.get(name) == value:  # no later reload asked for another meanwhile
+                    del pending[name]
 
         try:
             self._on_sensors.configure(place, changed, save_too=False, done=done)

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from ethercat_server.notify import Notifier
-from tests.server.running import Server, needs_bus, server, wait_until
+from tests.server.commands import command
+from tests.server.running import Server, needs_bus, server, virtual_sensor, wait_until
 
 pytestmark = [pytest.mark.bus, needs_bus]
 
@@ -131,3 +132,32 @@ def test_sighup_refuses_tables_that_contradict_one_another_and_the_stream_goes_o
         )
         file.write_text("[server]\nidle_timeout_s = 5\n")
         reload(running, "changed idle_timeout_s")
+
+
+def test_sighup_tries_again_what_could_not_be_put_in_force(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text("[server]\n")
+    with virtual_sensor() as (veth, sensor), server(veth.near, "--config", str(file)) as running:
+        command(sensor, "power off")
+        running.wait_for("is lost")
+        file.write_text("[sensor]\nsinc_length = 128\n")
+        reload(running, "sensor 0 does not have sinc_length = 128, which the next reload tries again")
+        file.write_text("[sensor]\nsinc_length = 256\nfir = true\n")
+        reload(running, "sensor 0 does not have sinc_length = 256, fir = True, which")
+        command(sensor, "power on")
+        running.wait_for("is back")
+        reload(running, "sensor 0 now has sinc_length = 256, fir = True")
+        with running.connect() as client:
+            found = client.ask("describe")["sensors"][0]
+            assert (found["rate_hz"], found["settings"]["fir"]) == (200, True)
+        file.write_text("[sensor]\nsinc_length = 256\n")
+        reload(running, "sensor 0 now has fir = False\n")
+
+
+def test_sighup_tells_of_a_table_that_no_sensor_has_and_puts_the_rest_in_force(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text("[server]\n")
+    with server("virtual", "--config", str(file)) as running:
+        file.write_text("[sensor]\nimu_active = 3\n[sensor.4]\nfir = true\n[sensor.5]\nfir = true\n")
+        reload(running, "sensor 0 now has imu_active = 3")
+        assert "settings for sensor 4, 5, but the bus has only 0: BFT-SENS-ECAT-M8" in running.said()
