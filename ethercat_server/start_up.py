@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from ethercat_server import objects
 from ethercat_server.bus import Bus
-from ethercat_server.errors import BusError, SdoAbortError
+from ethercat_server.errors import BusError, SdoAbortError, UsageError
 from ethercat_server.options import ServerOptions
 from ethercat_server.sdo import BlockingSdo, Sdo, finish
 from ethercat_server.sensor import Sensor, identify, is_known_model, read_offset, set_up
@@ -121,4 +121,7 @@ def _check_places(sensors: list[Sensor], options: ServerOptions) -> None:
             f"the sensor on {options.ifname} is a {sensors[0].identity.name}, not a {options.sensor_name}: "
             "correct the name on the command line or leave it out"
         )
-    options.check_sensors({sensor.place: sensor.identity for sensor in sensors})
+    try:
+        options.check_sensors({sensor.place: sensor.identity for sensor in sensors})
+    except UsageError as error:
+        raise BusError(str(error)) from None  # a sensor that is switched on later: the service tries again

@@ -185,12 +185,20 @@ def test_wrong_arguments(arguments: tuple[str, ...], complaint: str) -> None:
     assert complaint in fails("virtual", *arguments, code=code)
 
 
-def test_settings_for_a_sensor_that_is_not_there(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_settings_for_a_sensor_that_is_not_switched_on_yet(tmp_path_factory: pytest.TempPathFactory) -> None:
     config = tmp_path_factory.mktemp("config") / "c.toml"
-    config.write_text("[sensor.3]\nfir = true\n")
-    assert "sensor 3, but the bus has only 0: BFT-SENS-ECAT-M8" in fails(
-        "virtual", "--config", str(config), code=2
-    )
+    config.write_text("[sensor.1]\nfir = true\n")
+    with virtual_sensor("--sensors", "2") as (veth, sensor):
+        command(sensor, "power off @1")
+        said = fails(veth.near, "--config", str(config), code=1)  # with 2 the service would stay as it is
+        assert "settings for sensor 1, but the bus has only 0: BFT-SENS-ECAT-M8" in said
+        assert said.endswith("switch that sensor on, or correct the table's name")
+        command(sensor, "power on @1")
+        running = Server(veth.near, "--config", str(config))
+        try:
+            running.wait_streaming()
+        finally:
+            running.close()
 
 
 def test_tables_that_contradict_one_another(tmp_path_factory: pytest.TempPathFactory) -> None:
