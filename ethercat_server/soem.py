@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 
 class SlaveIdentity(NamedTuple):
-    """What the SII of a slave says; zeros if it cannot be read."""
+    """What the SII of a slave says; zeros, and no name, if it cannot be read."""
 
     vendor: int
     product: int
@@ -108,7 +108,7 @@ class Master:
             raise BusError(
                 f"a slave on {self.ifname} stopped answering in the middle of the scan: check cable and power"
             ) from None
-        return [SlaveIdentity(s.man, s.id, s.rev, s.name) for s in self._slaves]
+        return [SlaveIdentity(s.man, s.id, s.rev, _name(s)) for s in self._slaves]
 
     def _config_init(self, check_interrupt: Callable[[], None]) -> int:
         # SOEM tries every byte of the SII for long if a slave goes away meanwhile, two minutes in all, and no
@@ -232,6 +232,13 @@ class Master:
                     "power it off and on, then start again"
                 )
         return f"the bus on {self.ifname} does not reach {state.name}: start again"
+
+
+def _name(slave: Any) -> str:
+    try:
+        return str(slave.name)
+    except UnicodeDecodeError:  # a name in another encoding than pysoem's UTF-8
+        return ""
 
 
 def _al_status(slave: Any) -> AlStatus:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import struct
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ethercat_server import objects
@@ -94,17 +95,29 @@ def foreign() -> None:
     dictionary.Dictionary.read = read_some  # type: ignore[method-assign]
 
 
-def no_mailbox() -> None:
-    """No mailbox at all, as a simple slave."""
+def change_eeprom(change: Callable[[bytes], bytes]) -> None:
     from ethercat_server.virtual_sensor import firmware, sii
 
     build = sii.build_image
+    firmware.build_image = lambda *values: change(build(*values))  # type: ignore[attr-defined]
 
-    def without(model: str, serial: int, pdo_size: int) -> bytes:
-        image = build(model, serial, pdo_size)
-        return image[:0x30] + bytes(10) + image[0x3A:]
 
-    firmware.build_image = without  # type: ignore[attr-defined]
+def latin() -> None:
+    """A name in the EEPROM that is no UTF-8."""
+    change_eeprom(lambda image: image.replace(b"BFT-", b"K\xfch-"))
+
+
+def latin_foreign() -> None:
+    """The same of another vendor's."""
+    other_vendor()
+    latin()
+
+
+def no_mailbox() -> None:
+    """No mailbox at all, as a simple slave."""
+    from ethercat_server.virtual_sensor import firmware
+
+    change_eeprom(lambda image: image[:0x30] + bytes(10) + image[0x3A:])
     firmware.Firmware._mailbox_fault = lambda self: 0  # type: ignore[method-assign]
 
 
@@ -133,6 +146,8 @@ def slow_al() -> None:
 
 WAYS = {
     "foreign": foreign,
+    "latin": latin,
+    "latin foreign": latin_foreign,
     "mailbox": no_mailbox,
     "size": odd_size,
     "rate": wrong_rate,

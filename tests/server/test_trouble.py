@@ -13,7 +13,7 @@ import time
 import pytest
 
 from tests.server.commands import command
-from tests.server.running import Server, Veth, free_port, needs_bus, virtual_sensor
+from tests.server.running import Server, Veth, free_port, needs_bus, server, virtual_sensor
 
 pytestmark = [pytest.mark.bus, needs_bus]
 
@@ -109,6 +109,7 @@ def test_another_model_is_refused_by_name() -> None:
             (),
             "place 0 of .* is 'BFT-SENS-ECAT-M8' .vendor 0x0000DEAD, .* not a Bota",
         ),
+        ("latin foreign", (), "place 0 of .* is 'nameless' .vendor 0x0000DEAD"),
         ("product", (), "vendor 0x0000B07A, product 0x00000007"),
         (
             "size",
@@ -125,6 +126,15 @@ def test_a_slave_that_is_wrong_in_one_way(way: str, arguments: tuple[str, ...], 
         sensor.process.stdin.write("stats\n")
         sensor.process.stdin.flush()
         sensor.wait_for('"INIT"')
+
+
+def test_a_name_in_the_eeprom_that_is_no_utf_8() -> None:
+    with (
+        virtual_sensor(module="tests.server.odd_sensor", first=("latin",)) as (veth, _),
+        server(veth.near) as running,
+        running.connect() as client,
+    ):
+        assert client.ask("describe")["sensors"][0]["name"] == "BFT-SENS-ECAT-M8"
 
 
 def test_a_slave_without_a_coe_mailbox() -> None:
