@@ -131,9 +131,9 @@ class Master:
         self._abandoned = False
         return counts[0] if counts else 0
 
-    def check_preop(self) -> None:
-        """Wait until every slave is in PREOP or above; BusError names one that is not."""
-        self._wait_state(AlState.PREOP)
+    def check_preop(self, check_interrupt: Callable[[], None]) -> None:
+        """Wait until every slave is in PREOP or above; BusError names one that is not. See `scan`."""
+        self._wait_state(AlState.PREOP, check_interrupt)
 
     def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
         """Upload an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
@@ -161,13 +161,17 @@ class Master:
             slave.output = bytes(len(slave.output))
         return [len(slave.input) for slave in self._slaves]
 
-    def go_operational(self) -> None:
-        """Take every slave to OP, exchanging process data all the while; BusError names one that refuses."""
-        self._wait_state(AlState.SAFEOP)
+    def go_operational(self, check_interrupt: Callable[[], None]) -> None:
+        """Take every slave to OP, exchanging process data all the while; BusError names one that refuses.
+
+        See `scan`.
+        """
+        self._wait_state(AlState.SAFEOP, check_interrupt)
         self._master.state = pysoem.OP_STATE
         self._master.write_state()
         deadline = time.monotonic() + _OP_TIMEOUT_S
         while time.monotonic() < deadline:
+            check_interrupt()
             for _ in range(5):
                 self._master.send_processdata()
                 self._master.receive_processdata(2000)
@@ -213,8 +217,9 @@ class Master:
                 last = _texts([error])
         raise BusError(f"sensor {slave} did not answer {what}: {last}; check cable and power")
 
-    def _wait_state(self, state: AlState) -> None:
+    def _wait_state(self, state: AlState, check_interrupt: Callable[[], None]) -> None:
         for _ in range(_STATE_ATTEMPTS[state]):
+            check_interrupt()
             if self._master.state_check(int(state), 50_000) == state:
                 return
             # state_check wants the state itself; a slave that is above it is fine as well.

@@ -12,7 +12,7 @@ from ethercat_server import objects
 from ethercat_server.bus import Bus
 from ethercat_server.errors import BusError, SdoAbortError, UsageError
 from ethercat_server.options import ServerOptions
-from ethercat_server.sdo import BlockingSdo, Sdo, finish
+from ethercat_server.sdo import BlockingSdo, Sdo, Steps, finish
 from ethercat_server.sensor import Sensor, identify, is_known_model, read_offset, set_up
 from ethercat_server.sii import has_coe
 from ethercat_server.soem import SlaveIdentity
@@ -20,6 +20,24 @@ from protocol.errors import PdoSizeError
 from protocol.pdo import layout_for
 
 log = logging.getLogger(__name__)
+
+
+class _InterruptibleSdo(BlockingSdo):
+    """A sensor that is slow to answer makes a start of many transfers long: one may give up between them."""
+
+    def __init__(self, bus: Bus, slave: int, check_interrupt: Callable[[], None]) -> None:
+        super().__init__(bus, slave)
+        self._check_interrupt = check_interrupt
+
+    def read(self, index: int, subindex: int) -> Steps[bytes]:
+        """See `Sdo`."""
+        self._check_interrupt()
+        return super().read(index, subindex)
+
+    def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
+        """See `Sdo`."""
+        self._check_interrupt()
+        return super().write(index, subindex, data)
 
 
 def bring_up(bus: Bus, options: ServerOptions, check_interrupt: Callable[[], None]) -> list[Sensor]:
@@ -30,8 +48,7 @@ def bring_up(bus: Bus, options: ServerOptions, check_interrupt: Callable[[], Non
     """
     sensors = find_sensors(bus, options, check_interrupt)
     for sensor in sensors:
-        check_interrupt()
-        sdo = BlockingSdo(bus, sensor.place)
+        sdo = _InterruptibleSdo(bus, sensor.place, check_interrupt)
         finish(set_up(sdo, sensor))
         _tell_offset(sdo, sensor)
     check_interrupt()
@@ -44,8 +61,8 @@ def find_sensors(bus: Bus, options: ServerOptions, check_interrupt: Callable[[],
     slaves = bus.scan(check_interrupt)
     for place, slave in enumerate(slaves):
         _check_vendor(bus.ifname, place, slave)
-    bus.check_preop()
-    sensors = [_find(bus, place, slave, options) for place, slave in enumerate(slaves)]
+    bus.check_preop(check_interrupt)
+    sensors = [_find(bus, place, slave, options, check_interrupt) for place, slave in enumerate(slaves)]
     _check_places(sensors, options)
     return sensors
 
@@ -58,8 +75,7 @@ def enter_op(bus: Bus, sensors: list[Sensor], check_interrupt: Callable[[], None
         except PdoSizeError as error:
             bus.check_answers(sensor.place)
             raise BusError(f"sensor {sensor.place} ({sensor.identity.name}) maps {error}") from None
-    check_interrupt()
-    bus.go_operational()
+    bus.go_operational(check_interrupt)
     for sensor in sensors:
         sensor.state = "OP"
 
@@ -96,9 +112,11 @@ def _check_vendor(ifname: str, place: int, slave: SlaveIdentity) -> None:
         )
 
 
-def _find(bus: Bus, place: int, slave: SlaveIdentity, options: ServerOptions) -> Sensor:
+def _find(
+    bus: Bus, place: int, slave: SlaveIdentity, options: ServerOptions, check_interrupt: Callable[[], None]
+) -> Sensor:
     try:
-        identity = finish(identify(BlockingSdo(bus, place), slave.name))
+        identity = finish(identify(_InterruptibleSdo(bus, place, check_interrupt), slave.name))
     except BusError:
         if finish(has_coe(bus, place)):
             raise

@@ -243,7 +243,7 @@ def _identify_all(bus: Bus) -> list[Found]:
     slaves = bus.scan(_no_check)
     for place, slave in enumerate(slaves):
         check_sii(bus.ifname, place, slave)
-    bus.check_preop()
+    bus.check_preop(_no_check)
     for place, slave in enumerate(slaves):
         try:
             identity = finish(identify(GuardedSdo(BlockingSdo(bus, place)), slave.name))

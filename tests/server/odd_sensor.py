@@ -144,7 +144,29 @@ def slow_al() -> None:
     firmware.Firmware.check_watchdog = look  # type: ignore[method-assign]
 
 
+def stays_below(state: int) -> Callable[[], None]:
+    """Does not go to `state` when it is told to, and says so."""
+
+    def change() -> None:
+        from ethercat_server.virtual_sensor.al import AlStateMachine
+
+        request = AlStateMachine.request
+
+        def ignore(self: AlStateMachine, control: int) -> None:
+            if control & 0x0F == state:
+                print("ignored", flush=True)
+            else:
+                request(self, control)
+
+        AlStateMachine.request = ignore  # type: ignore[method-assign]
+
+    return change
+
+
 WAYS = {
+    "below PREOP": stays_below(2),
+    "below SAFEOP": stays_below(4),
+    "below OP": stays_below(8),
     "foreign": foreign,
     "latin": latin,
     "latin foreign": latin_foreign,

@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 
 from ethercat_server.bus import Bus
-from ethercat_server.errors import BusError
+from ethercat_server.errors import BusError, StopRequestedError
 from ethercat_server.interface import claimed
+from ethercat_server.options import ServerOptions
 from ethercat_server.raw_socket import packet_sockets
+from ethercat_server.start_up import bring_up
 from tests.server.running import Veth, needs_bus, server, virtual_sensor
 from tests.tool.running import one_sentence, tool
 
@@ -39,6 +41,37 @@ def test_an_interface_that_goes_away_while_it_is_opened() -> None:
         with contextlib.closing(bus), pytest.raises(BusError, match=f"the interface {veth.near} went away"):
             bus.open()
         assert packet_sockets() == before
+
+
+class Asked(Bus):
+    """A bus that the start is to give up on after a certain transfer."""
+
+    def __init__(self, ifname: str, last: str) -> None:
+        super().__init__(ifname)
+        self.last = last
+        self.transfers: list[str] = []
+
+    def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
+        self.transfers.append("read")
+        return super().sdo_read(slave, index, subindex)
+
+    def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
+        self.transfers.append("write")
+        super().sdo_write(slave, index, subindex, data)
+
+    def check_interrupt(self) -> None:
+        if self.last in self.transfers:
+            raise StopRequestedError("asked to stop while starting")
+
+
+@pytest.mark.parametrize("last", ["read", "write"])
+def test_a_start_is_given_up_between_two_transfers(last: str) -> None:
+    with virtual_sensor() as (veth, _), contextlib.closing(Asked(veth.near, last)) as bus:
+        bus.open()
+        options = ServerOptions(veth.near, 1, assigned_settings={"fir": True})
+        with pytest.raises(StopRequestedError):
+            bring_up(bus, options, bus.check_interrupt)
+        assert bus.transfers.index(last) == len(bus.transfers) - 1, "nothing after it"
 
 
 def test_whoever_was_first_keeps_all_others_out_before_it_has_opened_the_bus() -> None:

@@ -246,6 +246,19 @@ def test_stopped_while_starting() -> None:
             running.close()
 
 
+@pytest.mark.parametrize("way", ["below PREOP", "below SAFEOP", "below OP"])
+def test_stopped_while_a_sensor_does_not_change_its_state(way: str) -> None:
+    with virtual_sensor(module="tests.server.odd_sensor", first=(way,)) as (veth, sensor):
+        running = Server(veth.near)
+        try:
+            sensor.wait_for("ignored")
+            running.signal(15)
+            assert running.wait() == 0, "it does not wait until the sensor has had its time and is blamed"
+            assert running.said().endswith("stopped before it was up\n")
+        finally:
+            running.close()
+
+
 def test_a_slave_that_vanishes_during_the_scan_does_not_hang_the_server() -> None:
     with virtual_sensor() as (veth, sensor):
         running = Server(veth.near)
