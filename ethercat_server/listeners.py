@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import errno
+import ipaddress
 import socket
 from collections.abc import Sequence
 from typing import Final
 
-from ethercat_server.errors import ServerError
+from ethercat_server.errors import ServerError, UsageError
 
 _BACKLOG: Final = 128
 
@@ -15,10 +16,10 @@ _BACKLOG: Final = 128
 def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
     """A non-blocking listener for each address of `hosts`; ServerError says why there is none.
 
-    ::1 may be missing on this machine if there is another address.
+    ::1 may be missing on this machine if there is another address. One that is given twice counts once.
     """
     listeners: list[socket.socket] = []
-    for host in hosts:
+    for host in _distinct(hosts):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             listener = socket.socket(family, socket.SOCK_STREAM)
@@ -47,3 +48,16 @@ def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
         listener.setblocking(False)
         listeners.append(listener)
     return listeners
+
+
+def _distinct(hosts: Sequence[str]) -> list[str]:
+    """`hosts`, each once; UsageError if one of them has another in it, whose port it would take."""
+    addresses = list(dict.fromkeys(ipaddress.ip_address(host) for host in hosts))
+    for every in addresses:
+        for address in addresses:
+            if every.is_unspecified and address != every and address.version == every.version:
+                raise UsageError(
+                    f"the addresses to listen on overlap: {every} is every address of this machine, "
+                    f"{address} too; leave one of the two out"
+                )
+    return [str(address) for address in addresses]

@@ -20,7 +20,7 @@ from ethercat_server.connection import (
     Limits,
     Subscription,
 )
-from ethercat_server.errors import ServerError
+from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.hub import Hub
 from ethercat_server.outbox import MAX_QUEUED_DATA
 from protocol.control import parse_request, reply
@@ -320,6 +320,23 @@ def test_taken_port_is_said_at_once() -> None:
         port = other.getsockname()[1]
         with pytest.raises(ServerError, match=f"port {port} on 127.0.0.1 is taken"):
             Hub(("127.0.0.1",), port)
+
+
+def test_an_address_that_is_given_twice_is_listened_on_once() -> None:
+    port = free_port()
+    hub = Hub(("127.0.0.1", "::1", "127.0.0.1", "0:0:0:0:0:0:0:1"), port)
+    try:
+        with socket.create_connection(("127.0.0.1", port)):
+            pass
+    finally:
+        hub.close()
+
+
+@pytest.mark.parametrize(("every", "one"), [("0.0.0.0", "127.0.0.1"), ("::", "::1")])
+def test_an_address_within_another_is_not_called_another_program(every: str, one: str) -> None:
+    for hosts in ((every, one), (one, every)):
+        with pytest.raises(UsageError, match=f"overlap: {every} is every address of this machine, {one} too"):
+            Hub(hosts, free_port())
 
 
 def test_close_delivers_what_waits_and_is_bounded(served: Served) -> None:
