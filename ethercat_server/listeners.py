@@ -37,17 +37,19 @@ def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
                 continue  # no address ::1 on this machine
             for other in listeners:
                 other.close()
-            reason = (
-                "is taken by another program"
-                if error.errno == errno.EADDRINUSE
-                else f"cannot be used: {error.strerror}"
-            )
-            raise ServerError(
-                f"port {port} on {host} {reason}; stop that program or choose another port"
-            ) from None
+            raise ServerError(f"port {port} on {host} {_reason(error)}") from None
         listener.setblocking(False)
         listeners.append(listener)
     return listeners
+
+
+def _reason(error: OSError) -> str:
+    """What is wrong with an address, and what to do."""
+    if error.errno == errno.EADDRINUSE:
+        return "is taken by another program; stop that program or choose another port"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return "cannot be used: this machine has no such address; 'ip address' lists them"
+    return f"cannot be used: {error.strerror}; choose another"
 
 
 def _distinct(hosts: Sequence[str]) -> list[str]:

@@ -313,6 +313,11 @@ def test_too_many_clients_are_turned_away(served: Served, monkeypatch: pytest.Mo
             assert served.read(sock) == [{"reply": "describe", "ok": True}]
 
 
+def test_an_address_that_this_machine_does_not_have_is_said() -> None:
+    with pytest.raises(ServerError, match=r"192\.0\.2\.1 cannot be used: this machine has no such address"):
+        Hub(["192.0.2.1"], free_port())
+
+
 def test_taken_port_is_said_at_once() -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
