@@ -24,17 +24,15 @@ _CHANNELS: Final = len(_NAMES)
 _LOAD: Final = slice(2, 8)
 _RATE: Final = slice(13, 16)
 """Where force and torque, and the angular rate, are among the process data's fields."""
-_LEAST_SAMPLES: Final = 20
+LEAST_SAMPLES: Final = 20
 """Fewer would not show whether the sensor is at rest."""
 _REST_FORCE_N: Final = 1.0
 _REST_TORQUE_NM: Final = 0.05
 _REST_RATE_DPS: Final = 3.0
 """Standard deviations that a sensor at rest stays below: more than Bota's own limits for a healthy one."""
-_REST_TURN_DPS: Final = math.degrees(0.05)
-"""Length of the mean angular rate. A gyroscope at rest may read 0.03 rad/s."""
-_REST_CHANGE_N: Final = 0.3
-_REST_CHANGE_NM: Final = 0.01
-"""How far the means of the two halves of the window may lie apart, beyond what noise explains."""
+_REST_TURN_DPS: Final = math.degrees(0.5)
+"""Length of the mean angular rate: beyond it a robot is plainly moving. The residual tells what a slower turn
+costs."""
 _BY_CHANCE: Final = 5.0
 """By so many of its standard errors a difference of means is hardly ever chance."""
 _SETTLING: Final = 8
@@ -52,7 +50,7 @@ def tare(
     If it fails half-way the old offset is put back.
     """
     _check_fits(target, "the key 'target'")
-    samples = max(samples, _LEAST_SAMPLES)
+    samples = max(samples, LEAST_SAMPLES)
     before = yield from _average(sensor, stream, samples)
     _check_rest(sensor, before)
     old = yield from read_offset(sdo)
@@ -184,8 +182,8 @@ def _check_rest(sensor: Sensor, found: _Window) -> None:
             raise _not_at_rest(
                 sensor, f"{name} varies by {deviation:.3g} {unit} (standard deviation; at most {limit:g})"
             )
-    least = (_REST_CHANGE_N,) * 3 + (_REST_CHANGE_NM,) * 3
-    changes = zip(_NAMES[:6], found.change[:6], found.by_chance[:6], least, units[:6], strict=True)
+    # The means of the two halves may lie as far apart as single samples, and what noise explains.
+    changes = zip(_NAMES[:6], found.change[:6], found.by_chance[:6], limits[:6], units[:6], strict=True)
     for name, change, by_chance, limit, unit in changes:
         if change > limit + by_chance:
             text = f"{name} changes by {change:.3g} {unit} (mean; at most {limit + by_chance:.3g})"

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import argparse
 import math
-from typing import Final
+from typing import Any, Final
 
 from ethercat_server.errors import UsageError
 from ethercat_server.sensor import pack_offset
+from ethercat_server.tare import LEAST_SAMPLES
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.settings_commands import UNSAVED
-from ethercat_server.tool.show import columns, say, say_json
+from ethercat_server.tool.show import columns, note, say, say_json
 from protocol.control import ACTIONS, MAX_TARE_SAMPLES
 
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+_ALLOWED_N: Final = 0.3
+_ALLOWED_NM: Final = 0.01
+_BY_CHANCE: Final = 5.0
+"""A residual of a sensor at rest is less than that, and so many standard errors."""
 _DEFAULT_SAMPLES: Final = ACTIONS["tare"].parameters["samples"].default
 
 
@@ -42,6 +47,8 @@ def _tare(args: argparse.Namespace) -> int:
         found = opened.choose(args.sensor)
         tared = opened.tare(found.place, args.samples, args.target)
     keys = ("old_offset", "new_offset", "residual", "deviation")
+    if moved := _moved(tared, max(args.samples, LEAST_SAMPLES)):
+        note(f"{moved} is more than noise explains: the load changed meanwhile; hold it still and tare again")
     if args.json:
         say_json({"through": opened.used, **found.as_json(), **{key: tared[key] for key in keys}})
         return DONE
@@ -52,6 +59,17 @@ def _tare(args: argparse.Namespace) -> int:
     say(columns(rows, indent=2))
     say(UNSAVED.replace("--save, or the command save,", "the command save"))
     return DONE
+
+
+def _moved(tared: dict[str, Any], samples: int) -> str | None:
+    """The first residual that says that the sensor was not at rest after all."""
+    for n, axis in enumerate(_AXES):
+        residual, unit = tared["residual"][n], "N" if n < 3 else "Nm"
+        allowed = _ALLOWED_N if n < 3 else _ALLOWED_NM
+        # Of the difference of two means of so many samples.
+        if abs(residual) > allowed + _BY_CHANCE * tared["deviation"][n] * math.sqrt(2 / samples):
+            return f"the residual of {axis}, {residual:.3g} {unit},"
+    return None
 
 
 COMMANDS = (

@@ -104,13 +104,16 @@ def test_of_six_offsets_none_is_written_if_one_is_too_large() -> None:
     assert sdo.written == []
 
 
-def run_tare(sdo: ScriptedSdo, samples: int, target: list[float], force: Iterator[float]) -> dict[str, Any]:
-    """Tare a sensor whose Fx, without its offset, is the next of `force` with every step."""
+def run_tare(
+    sdo: ScriptedSdo, samples: int, target: list[float], force: Iterator[float], rate_dps: float = 0.0
+) -> dict[str, Any]:
+    """Tare a sensor whose Fx, without offset, is the next of `force` with every step; it turns about z."""
     stream, layout = SensorStream(0, 1_250_000), LAYOUTS[61]
     steps = tare(sdo, new_sensor(), stream, samples, target)
     while True:
         values = list(layout.struct.unpack(bytes(layout.size)))
         values[2] = next(force) + struct.unpack("<f", sdo.held.get((0x8000, 1), bytes(4)))[0]
+        values[15] = rate_dps
         stream.process_data = layout.struct.pack(*values)
         stream.fresh += 1
         try:
@@ -149,10 +152,17 @@ def test_fewer_samples_than_show_rest_are_not_taken() -> None:
 
 
 def test_a_load_that_creeps_is_not_rest_and_noise_is() -> None:
-    with pytest.raises(RequestError, match=r"Fx changes by 0\.4 N"):
-        run_tare(ScriptedSdo(), 400, [0.0] * 6, (n * 0.002 for n in itertools.count()))
+    with pytest.raises(RequestError, match=r"Fx changes by 1\.2 N"):
+        run_tare(ScriptedSdo(), 400, [0.0] * 6, (n * 0.006 for n in itertools.count()))
     with pytest.raises(RequestError, match="Fx changes by"):
-        run_tare(ScriptedSdo(), 400, [0.0] * 6, (n * 0.004 + x for n, x in enumerate(noise(1, 0.5))))
+        run_tare(ScriptedSdo(), 400, [0.0] * 6, (n * 0.007 + x for n, x in enumerate(noise(1, 0.3))))
     for seed in range(100):
         tared = run_tare(ScriptedSdo(), 20, [0.0] * 6, noise(seed, 0.6))
         assert abs(tared["residual"][0]) < 1
+
+
+def test_a_sensor_that_turns_fast_is_not_at_rest_however_steadily() -> None:
+    with pytest.raises(RequestError, match="it turns by 30 deg/s"):
+        run_tare(ScriptedSdo(), 100, [0.0] * 6, itertools.repeat(1.0), rate_dps=30.0)
+    tared = run_tare(ScriptedSdo(), 100, [0.0] * 6, itertools.repeat(1.0), rate_dps=20.0)
+    assert tared["residual"] == [0.0] * 6

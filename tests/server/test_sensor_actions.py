@@ -296,15 +296,6 @@ def test_tare_makes_the_mean_the_target(bench: tuple[Bench, Client]) -> None:
     assert len(sensor.client.fresh(50)) == 50
 
 
-def test_a_sensor_that_turns_steadily_is_not_tared() -> None:
-    with steady_sensor("--signal turn") as sensor, steady_bench(sensor) as bench:
-        for samples in (1, 400):
-            refused = error(bench.asking.ask("tare", samples=samples))
-            assert refused["code"] == "not_ready"
-            assert "is not at rest: it turns by" in refused["message"]
-        assert sensor.stats()["sdo_writes"] == []
-
-
 def test_a_sensor_that_moves_is_not_tared(streaming: tuple[Server, Client, Client]) -> None:
     _, _, asking = streaming
     refused = error(asking.ask("tare", samples=50))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -179,6 +180,14 @@ def test_a_sensor_that_moves_is_not_tared() -> None:
     with virtual_sensor("--signal", "sine") as (veth, sensor):
         assert "not at rest" in one_sentence(tool("tare", veth.near, "--samples", 50, code=1))
         assert written(sensor) == []
+
+
+def test_a_slow_motion_during_a_tare_is_told() -> None:
+    with virtual_sensor("--signal", "turn") as (veth, _):
+        tared = tool("tare", veth.near, "--samples", 800)
+        assert max(map(abs, tool("tare", veth.near, "--samples", 800, "--json").json["residual"][:3])) > 0.3
+    assert re.search("the residual of F[xyz], -?[0-9.]+ N, is more than noise explains", tared.err)
+    assert "old offset" in tared.out
 
 
 def test_a_tare_that_is_stopped_changes_nothing() -> None:
