@@ -39,7 +39,7 @@ class CompensationControl:
         parameters: Parameters,
         output: CompensatedOutput,
         link: Link,
-        count_bad: Callable[[], int],
+        count_not_finite: Callable[[], int],
         on_failure: Callable[[str], object],
     ) -> None:
         """ParameterError if the parameters cannot be had here."""
@@ -55,8 +55,8 @@ class CompensationControl:
         self._listener: OrientationListener | None = None
         self._angular_rate_offset = ZERO
         self._keeper = BiasKeeper(self._log)
-        self.count_bad = count_bad
-        """Frames so far that should have been samples and were not: invalid, or not finite."""
+        self.count_not_finite = count_not_finite
+        """Samples so far that were not finite somewhere."""
         self._next_origin = FROM_PARAMETER
         self._check(self.parameters)
         self._history = BiasHistory(self.parameters.bias, self.parameters.bias_ramp_time)

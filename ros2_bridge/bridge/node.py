@@ -49,7 +49,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.requests = Requests(parameters, link)
         self.sensor_settings = SettingsParameters(self, link, self.requests)
         self.compensation = CompensationControl(
-            self, parameters, compensated, link, self.reader.count_bad, self._fail
+            self, parameters, compensated, link, lambda: self.reader.not_finite, self._fail
         )
         self.monitor = Monitor(
             self, parameters.thresholds, self.reader, self.compensation.state, outputs, self._fail

@@ -88,10 +88,6 @@ class Reader:
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
-    def count_bad(self) -> int:
-        """Frames so far that should have been samples and were not: invalid, or not finite."""
-        return self.counts.invalid + self.not_finite
-
     def _run(self) -> None:
         try:
             self._connect_for_ever()

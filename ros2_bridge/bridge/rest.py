@@ -28,7 +28,7 @@ def take_window(control: CompensationControl) -> RestWindow:
     window = RestWindow(seconds, limits, control.source)
     patience_s = 1.5 * seconds + _PATIENCE_S
     deadline_s = time.monotonic() + patience_s
-    sensors, bad = control.sensors, control.count_bad()
+    sensors, bad = control.sensors, control.count_not_finite()
     control.output.window = window
     try:
         while not window.done.wait(_LOOK_S):
@@ -42,9 +42,9 @@ def take_window(control: CompensationControl) -> RestWindow:
         control.output.window = None
     if control.sensors != sensors:
         raise CompensationError("the sensor was replaced by another meanwhile: call again")
-    if bad := control.count_bad() - bad:
+    if bad := control.count_not_finite() - bad:
         raise CompensationError(
-            f"the window is spoiled: {bad} of its samples were invalid or not finite; see /diagnostics, "
-            "stream, and call again"
+            f"the window is spoiled: {bad} of its samples were not finite; see /diagnostics, stream, and "
+            "call again"
         )
     return window
