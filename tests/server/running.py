@@ -168,7 +168,13 @@ def server(ifname: str, *arguments: str) -> Iterator[Server]:
         running.close()
 
 
-_STARVED = ("no EtherCAT slave answers", "does not answer in", "is lost: no frame comes back")
+_STARVED = (
+    "no EtherCAT slave answers",
+    "stopped answering",
+    "did not answer",
+    "does not answer in",
+    "is lost: no frame comes back",
+)
 """What it says at start where a busy machine lets the virtual sensor's process wait for too long."""
 _ATTEMPTS = 3
 
