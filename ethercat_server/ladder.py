@@ -159,7 +159,7 @@ class Ladder:
                 return
             if time.monotonic() > deadline:
                 raise BusError(
-                    f"sensor {self._place} does not take the acknowledge of its error: it is in {now}"
+                    f"sensor {self._place} keeps its error when that is acknowledged: it is in {now}"
                 )
 
     def _remember(self, address: int, size: int) -> bytes:

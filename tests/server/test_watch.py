@@ -12,12 +12,15 @@ import pytest
 from ethercat_server import ladder
 from ethercat_server.al import AL_STATUS, AlState
 from ethercat_server.bus import Bus
+from ethercat_server.errors import BusError
 from ethercat_server.ladder import Ladder
 from ethercat_server.recovery import Recovery
+from ethercat_server.sdo import finish
 from ethercat_server.sensor import Sensor
 from ethercat_server.stream import SensorStream
 
 MS = 1_000_000
+_ERROR_BIT = 0x10
 
 
 class GivenBus:
@@ -28,6 +31,8 @@ class GivenBus:
 
     def __init__(self) -> None:
         self.states: list[AlState | None] = [AlState.OP, AlState.OP]
+        self.error = 0
+        """AL status code of all, with the error bit if there is one."""
         self.read = self.written = 0
         self.lose = 0
         """So many datagrams more are lost."""
@@ -40,7 +45,9 @@ class GivenBus:
             self.lose -= 1
             return None
         state = self.states[place]
-        return None if state is None else struct.pack("<HHH", state, 0, 0)
+        if state is None:
+            return None
+        return struct.pack("<HHH", state | (_ERROR_BIT if self.error else 0), 0, self.error)
 
     def write_register(self, place: int, address: int, data: bytes) -> bool:
         self.written += 1
@@ -141,3 +148,15 @@ def test_a_refused_sensor_is_not_set_up_again_because_of_a_lost_datagram(
     bus.states[0] = None
     while not bus.reclaimed:
         next(waiting)
+
+
+def test_a_sensor_that_keeps_its_error_is_not_asked_for_op(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(ladder, "_STATE_TIMEOUT_S", 0.01)
+    bus = GivenBus()
+    bus.states[0], bus.error = AlState.SAFEOP, 0x001B
+    climbing = Ladder(cast(Bus, bus), cast(Sensor, SimpleNamespace(place=0)))._go(AlState.OP)
+    with pytest.raises(BusError, match="sensor 0 keeps its error when that is acknowledged: it is in SAFEOP"):
+        finish(climbing, pause_s=0.001)
+    assert bus.written == 1
