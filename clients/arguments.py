@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 
+from clients.program import VERSION
 from protocol.address import DEFAULT_HOST, DEFAULT_PORT, Address
 from protocol.pdo import ImuUnits
+from protocol.sensor_choice import MOST_PLACES
+
+
+def parser(prog: str, description: str, epilog: str, usage: str | None = None) -> argparse.ArgumentParser:
+    """The parser of a program, with --version."""
+    made = argparse.ArgumentParser(prog=prog, usage=usage, description=description, epilog=epilog)
+    made.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
+    return made
 
 
 def add_address(parser: argparse.ArgumentParser) -> None:
-    """HOST:PORT of the server, which may be left out."""
+    """HOST:PORT of the server, optional."""
     default = Address(DEFAULT_HOST, DEFAULT_PORT)
     parser.add_argument(
         "address", type=address, nargs="?", default=default, metavar="HOST:PORT",
@@ -18,28 +28,53 @@ def add_address(parser: argparse.ArgumentParser) -> None:
 
 
 def add_imu_units(parser: argparse.ArgumentParser, purpose: str = "") -> None:
-    """What the firmware sends acceleration and angular rate in; the help says for which `purpose`."""
-    what = f"what the sensor sends acceleration and angular rate in{purpose and f', for {purpose}'}"
+    """Units in which the firmware sends acceleration and angular rate; `purpose` is for the help."""
     parser.add_argument(
-        "--imu-raw-units", choices=[units.value for units in ImuUnits], default=ImuUnits.G_DPS.value,
-        help=f"{what} (default {ImuUnits.G_DPS.value})",
+        "--imu-raw-units", type=_units, default=ImuUnits.G_DPS, dest="imu_units",
+        metavar=f"{{{','.join(units.value for units in ImuUnits)}}}",
+        help=f"units in which the sensor sends acceleration and angular rate{purpose and f', for {purpose}'} "
+        f"(default {ImuUnits.G_DPS.value})",
     )  # fmt: skip
 
 
+def _units(text: str) -> ImuUnits:
+    try:
+        return ImuUnits(text)
+    except ValueError:
+        known = " or ".join(units.value for units in ImuUnits)
+        raise argparse.ArgumentTypeError(f"{text!r}: it must be {known}") from None
+
+
 def address(text: str) -> Address:
-    """A server's address; ArgumentTypeError says what is wrong with it."""
+    """A server's address."""
     try:
         return Address.parse(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def seconds(text: str) -> float:
-    """A time, s, more than none; ArgumentTypeError says what is wrong with it."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if 0 < value <= 1e9:
-        return value
-    raise argparse.ArgumentTypeError(f"{text!r}: it must be seconds, such as 60")
+def number(low: float, high: float, what: str = "") -> Callable[[str], float]:
+    """The type of an argument that is a number from `low` to `high`; `what` is said if it is not."""
+
+    def convert(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = low - 1
+        if low <= value <= high:
+            return value
+        raise argparse.ArgumentTypeError(f"{text!r}: it must be {what or f'from {low:g} to {high:g}'}")
+
+    return convert
+
+
+seconds = number(1e-9, 1e9, "a number of seconds, such as 60")
+
+
+def position(text: str) -> int:
+    """A sensor's position on the bus."""
+    if text.isascii() and text.isdecimal() and int(text) < MOST_PLACES:
+        return int(text)
+    raise argparse.ArgumentTypeError(
+        f"{text!r}: it must be a position on the bus, from 0 to {MOST_PLACES - 1}"
+    )

@@ -1,4 +1,4 @@
-"""HOST:PORT as people write it, for every program here."""
+"""HOST:PORT as written on a command line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Address(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """From HOST:PORT, HOST, :PORT or PORT, an IPv6 address in brackets; ValueError if it is none."""
+        """Parse HOST:PORT, HOST, :PORT or PORT, an IPv6 address in brackets; ValueError for anything else."""
         host, colon, port = text.rpartition(":")
         if text.isdecimal():
             host, port = "", text
@@ -30,5 +30,5 @@ class Address(NamedTuple):
         return cls(host.strip("[]") or DEFAULT_HOST, int(port))
 
     def __str__(self) -> str:
-        """As it is written."""
+        """As written on a command line."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"

@@ -1,7 +1,6 @@
-"""Control messages: the actions, what each may carry, error codes, events, and how replies are built.
+"""Control messages: actions and their keys, error codes, events, replies.
 
-One table, `ACTIONS`, says what a request may carry; `parse_request` checks a request against it before any
-code acts on it.
+`ACTIONS` is the table of what a request may carry; `parse_request` checks a request against it.
 """
 
 from __future__ import annotations
@@ -12,15 +11,16 @@ from collections.abc import Callable, Mapping
 from enum import StrEnum
 from typing import Any, Final, NamedTuple
 
-from protocol.errors import RequestError, SettingError
-from protocol.json_text import JsonObject
-from protocol.sdo_types import sdo_type
+from protocol.errors import ConnectionFailedError, RequestError, SettingError
+from protocol.sensor.sdo_types import sdo_type
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import check_settings
+from protocol.text.json_text import JsonObject
+from protocol.text.visible import printable
 
 PROTOCOL_VERSION: Final = 1
 MAX_SDO_BYTES: Final = 112
-"""What fits a mailbox of 128 bytes in one piece."""
+"""Largest SDO that fits a mailbox of 128 bytes unsegmented."""
 MAX_TARE_SAMPLES: Final = 20_000
 _LONGEST_NAME: Final = 80
 MAX_SII_WORDS: Final = 128
@@ -40,7 +40,7 @@ class ErrorCode(StrEnum):
 
 
 class Event(StrEnum):
-    """What the server tells framed connections without being asked."""
+    """What the server sends to framed connections unasked."""
 
     SENSOR_LOST = "sensor_lost"
     SENSOR_BACK = "sensor_back"
@@ -49,7 +49,7 @@ class Event(StrEnum):
 
 
 Check = Callable[[object], Any]
-"""Returns the checked value; raises ValueError whose text says what it must be, or SettingError."""
+"""Returns the checked value; raises SettingError, or ValueError whose text is what is allowed."""
 
 
 class Parameter(NamedTuple):
@@ -61,17 +61,17 @@ class Parameter(NamedTuple):
 
 
 class Action(NamedTuple):
-    """One action: the keys it takes beside `action` and `id`."""
+    """One action and its keys besides `action` and `id`."""
 
     parameters: Mapping[str, Parameter]
     controls: bool = False
-    """Changes something, so only those with authority may ask for it."""
+    """Changes something, so it needs control rights."""
     framed_only: bool = False
-    """Makes sense only on a framed connection."""
+    """For framed connections only."""
 
 
 class Request(NamedTuple):
-    """A checked request. `values` holds every key of the action, defaults filled in."""
+    """A checked request. `values` has every key of the action, with defaults."""
 
     action: str
     id: object
@@ -103,11 +103,11 @@ def _boolean(value: object) -> bool:
 def _sensor_list(value: object) -> tuple[int, ...]:
     if isinstance(value, list) and value and all(_is_int(item) and 0 <= item <= 255 for item in value):
         return tuple(value)
-    raise ValueError("a list of sensors' places on the bus, such as [0]")
+    raise ValueError("a list of sensor positions on the bus, such as [0]")
 
 
 def six_numbers(value: object) -> tuple[float, ...]:
-    """A check for six finite numbers: a wrench."""
+    """Check for a wrench: six finite numbers."""
     if isinstance(value, list) and len(value) == 6:
         numbers = [v for v in value if isinstance(v, int | float) and not isinstance(v, bool)]
         with contextlib.suppress(OverflowError):  # JSON has whole numbers that no float can be
@@ -156,7 +156,7 @@ def _object_name(value: object) -> str:
     raise ValueError(f"a text of 1 to {_LONGEST_NAME} characters, such as 'Sampling rate'")
 
 
-_SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(place=0))
+_SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(position=0))
 _INDEX: Final = _object_number(0xFFFF)
 _SUBINDEX: Final = _object_number(0xFF)
 _ENTRY: Final = {
@@ -210,7 +210,8 @@ ACTIONS: Final[Mapping[str, Action]] = {
             "sensor": _SENSOR,
             "word": Parameter(_object_number(0xFFFF), required=True),
             "words": Parameter(whole_number(1, MAX_SII_WORDS), default=2),
-        }
+        },
+        controls=True,
     ),
     "shutdown": Action({}, controls=True),
 }
@@ -265,6 +266,16 @@ def request(action: str, id: object = None, **values: object) -> JsonObject:  # 
     return message
 
 
+def check_version(description: Mapping[str, Any]) -> None:
+    """ConnectionFailedError if the server that describes itself so speaks another version of the protocol."""
+    version = description.get("protocol")
+    if version != PROTOCOL_VERSION or isinstance(version, bool):
+        raise ConnectionFailedError(
+            f"the server speaks protocol {printable(version, 20)} and this client {PROTOCOL_VERSION}: "
+            "install the same version of both"
+        )
+
+
 def reply(message: Request, **values: object) -> JsonObject:
     """The reply that grants `message`."""
     head: JsonObject = {"reply": message.action}
@@ -274,7 +285,7 @@ def reply(message: Request, **values: object) -> JsonObject:
 
 
 def error_reply(message: JsonObject | None, code: str, text: str, **extra: object) -> JsonObject:
-    """The reply that refuses `message`, which may be anything or None if it could not be read at all."""
+    """The reply that refuses `message`; None if no message could be read."""
     message = message or {}
     action = message.get("action")
     head: JsonObject = {"reply": action if isinstance(action, str) else None}

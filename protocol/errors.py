@@ -6,7 +6,7 @@ ProtocolError
 +-- BadMessageError       one message was no JSON object: answer it and carry on
 +-- RequestError          one request cannot be granted: answer it and carry on
 +-- SettingError          a setting's name or value is wrong
-+-- ConnectionFailedError the connection cannot be made or used any more: close it
++-- ConnectionFailedError the connection cannot be made or has ended: close it
 |   +-- UnreachableError  there is no server at that address
 |   +-- NoReplyError      a request was not answered in time
 +-- RefusedError          the server refused a request; the connection goes on
@@ -17,11 +17,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from protocol.text import printable
+from protocol.text.visible import printable
 
 
 class ProtocolError(Exception):
-    """Base of all errors here; its text is one sentence for a person."""
+    """Base of all errors here; the text is one sentence for users."""
 
 
 class PdoSizeError(ProtocolError):
@@ -51,23 +51,23 @@ class RequestError(ProtocolError):
 
 
 class SettingError(ProtocolError):
-    """A setting that does not exist, or a value that it cannot have."""
+    """A setting that does not exist, or a value that is not allowed."""
 
 
 class ConnectionFailedError(ProtocolError):
-    """The connection cannot be made or used any more; the text says why. Close it."""
+    """The connection cannot be made or has ended; the text says why. Close it."""
 
 
 class UnreachableError(ConnectionFailedError):
-    """There is no server at that address, as far as can be told."""
+    """Nothing answers at that address."""
 
 
 class NoReplyError(ConnectionFailedError):
-    """A request was not answered in time; whether it was done is not known."""
+    """A request was not answered in time; it may have been carried out."""
 
 
 class RefusedError(ProtocolError):
-    """The server refused a request: its own sentence, made safe to print.
+    """The server refused a request; the text is its message, made safe to print.
 
     `code` is one of `protocol.control.ErrorCode`, `abort_code` the SDO abort code behind it, if any.
     """
@@ -79,7 +79,7 @@ class RefusedError(ProtocolError):
 
     @classmethod
     def of(cls, reply: Mapping[str, Any]) -> RefusedError:
-        """The error that `reply`, which does not grant a request, says."""
+        """The error of a `reply` that refuses a request."""
         error = reply.get("error")
         if not isinstance(error, dict):
             return cls("internal", "the server gave no reason")

@@ -3,8 +3,8 @@
 The rules it keeps:
 
 - A framed message is `length` u32 big-endian, `type` u8, body; length counts type and body.
-- Hostile lengths are refused as soon as the length is there: nothing is buffered for them.
-- RemoteProtocolError is final: the decoder raises it again on every later call and keeps nothing more.
+- An impossible length is refused as soon as it is received: nothing is buffered for it.
+- RemoteProtocolError is final: the decoder raises it again on every later call and buffers nothing.
 - BadMessageError concerns one message: it has been consumed, and the next call goes on after it.
 """
 
@@ -16,8 +16,8 @@ from enum import IntEnum, IntFlag
 from typing import Final, NamedTuple, NoReturn
 
 from protocol.errors import RemoteProtocolError
-from protocol.json_text import MAX_JSON_LENGTH, JsonObject, encode_json_text, parse_json_object
 from protocol.pdo import LAYOUTS
+from protocol.text.json_text import MAX_JSON_LENGTH, JsonObject, encode_json_text, parse_json_object
 
 
 class MessageType(IntEnum):
@@ -31,7 +31,7 @@ class DataFlag(IntFlag):
     """The `flags` byte of a DATA message."""
 
     REPEATED = 1
-    """Same process data as the frame before: the sensor had nothing new."""
+    """Same process data as the frame before: nothing new from the sensor."""
     INVALID = 2
     """Working counter short; the process data is the last good one."""
     GAP = 4
@@ -58,7 +58,7 @@ _DATA: Final = int(MessageType.DATA)
 _TYPE_SIZE: Final = 1
 _BODY_OFFSET: Final = _PREFIX.size
 DATA_FLAGS_OFFSET: Final = _PREFIX.size + struct.calcsize(">QQQB")
-"""Where the flags byte stands in an encoded DATA message."""
+"""Offset of the flags byte in an encoded DATA message."""
 _DATA_LENGTHS: Final = frozenset(_TYPE_SIZE + _DATA_HEADER.size + size for size in LAYOUTS)
 MAX_DATA_MESSAGE_SIZE: Final = _LENGTH.size + max(_DATA_LENGTHS)
 
@@ -67,16 +67,9 @@ def encode_data(
     sequence: int, stamp_ns: int, monotonic_ns: int, sensor: int, flags: int, wkc: int, process_data: bytes
 ) -> bytes:
     """A whole DATA message, ready to send. struct.error if a number does not fit its field."""
-    size = len(process_data)
-    return encode_data_head(sequence, stamp_ns, monotonic_ns, sensor, flags, wkc, size) + process_data
-
-
-def encode_data_head(
-    sequence: int, stamp_ns: int, monotonic_ns: int, sensor: int, flags: int, wkc: int, size: int
-) -> bytes:
-    """A DATA message up to its process data, which is `size` bytes and must follow."""
-    length = _TYPE_SIZE + _DATA_HEADER.size + size
-    return _DATA_MESSAGE.pack(length, _DATA, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc)
+    length = _TYPE_SIZE + _DATA_HEADER.size + len(process_data)
+    head = _DATA_MESSAGE.pack(length, _DATA, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc)
+    return head + process_data
 
 
 def encode_json(message: JsonObject) -> bytes:
@@ -88,13 +81,13 @@ def encode_json(message: JsonObject) -> bytes:
 class FrameDecoder:
     """Decodes a framed connection's bytes.
 
-    Put bytes in with `feed`, or without a copy by reading into `get_buffer()` and telling `received()`.
-    Then call `next_message()` until it gives None. What is buffered never exceeds one unfinished message
-    plus what was last put in.
+    Pass bytes to `feed`, or avoid a copy by reading into `get_buffer()` and calling `received()`. Then call
+    `next_message()` until it returns None. The buffer never has more than one unfinished message and what was
+    last received.
     """
 
     def __init__(self, *, max_json_length: int = MAX_JSON_LENGTH, accept_data: bool = True) -> None:
-        """`accept_data=False` makes DATA an unknown type: a server never receives any."""
+        """`accept_data=False`, for servers, makes DATA an unknown type."""
         self._max_json_length = max_json_length
         self._accept_data = accept_data
         self._buffer = bytearray(65536)
@@ -122,17 +115,8 @@ class FrameDecoder:
 
     @property
     def pending(self) -> int:
-        """Bytes of an unfinished message that are waiting for the rest."""
+        """Bytes buffered of an unfinished message."""
         return self._end - self._start
-
-    @property
-    def next_size(self) -> int:
-        """Bytes of the message that is next, as far as they have come."""
-        available = self._end - self._start
-        if available < _LENGTH.size:
-            return available
-        (length,) = _LENGTH.unpack_from(self._buffer, self._start)
-        return int(min(available, _LENGTH.size + length))
 
     def next_message(self) -> DataMessage | JsonObject | None:
         """The next whole message, or None if more bytes are needed.
@@ -169,15 +153,14 @@ class FrameDecoder:
         return parse_json_object(bytes(self._buffer[body:end]))
 
     def __iter__(self) -> Iterator[DataMessage | JsonObject]:
-        """The whole messages there are now."""
+        """The whole messages received so far."""
         while (message := self.next_message()) is not None:
             yield message
 
     def take_data(self, into: list[DataMessage]) -> JsonObject | None:
         """Append the DATA messages that are next and whole to `into`; returns the JSON message after them.
 
-        The same as calling `next_message` until it gives something else, in less time: for a stream's
-        receiver. None and errors as there.
+        As `next_message` until it returns something else, but faster, for streams. None and errors as there.
         """
         buffer, start, end = self._buffer, self._start, self._end
         if self._accept_data and self._broken is None:

@@ -1,8 +1,8 @@
 """The sensor's process data: one table of fields, and everything that follows from it.
 
-Source: Table III.2 of the design note (object 0x6000, 61 bytes) and the dump of a real Rokubi, which maps
-an orientation quaternion after it (77 bytes). All values are little-endian and packed. Offsets, sizes and
-struct formats are worked out from the rows; no other file knows one.
+Object 0x6000, mapped as 61 bytes; newer firmware maps an orientation quaternion after it (77 bytes, as in the
+dictionary of a Rokubi). All values are little-endian and packed. Offsets, sizes and struct formats follow
+from the rows, here and nowhere else.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class PdoField(NamedTuple):
     unit: str
     """Unit on the wire, before any conversion."""
     title: str
-    """The name that Table III.2 and the sensor's own dictionary give it."""
+    """Its name in the sensor's object dictionary."""
 
 
 _U8, _U16, _U32, _F32 = PdoType.USINT, PdoType.UINT, PdoType.UDINT, PdoType.REAL
@@ -81,7 +81,7 @@ _BASE_FIELD_COUNT: Final = next(i for i, f in enumerate(PDO_FIELDS) if f.name.st
 
 
 class ImuUnits(Enum):
-    """What the sensor's firmware sends acceleration and angular rate in."""
+    """Units in which the sensor's firmware sends acceleration and angular rate."""
 
     G_DPS = "g_dps"
     SI = "si"
@@ -117,7 +117,7 @@ class PdoLayout:
 LAYOUTS: Final[dict[int, PdoLayout]] = {
     layout.size: layout for layout in (PdoLayout(PDO_FIELDS[:_BASE_FIELD_COUNT]), PdoLayout(PDO_FIELDS))
 }
-"""The process data sizes a Gen-0 sensor has: 61, and 77 with orientation."""
+"""Layouts of Gen-0 sensors by size: 61 bytes, and 77 with orientation."""
 
 
 def layout_for(size: int) -> PdoLayout:
@@ -143,7 +143,7 @@ class Sample(NamedTuple):
     torque: Vector3
     """Nm"""
     acceleration: Vector3
-    """m/s²; a sensor at rest measures +g along the axis that points up"""
+    """m/s²; a stationary sensor measures +g along the axis that points up"""
     angular_rate: Vector3
     """rad/s"""
     temperature: float
@@ -151,7 +151,7 @@ class Sample(NamedTuple):
     orientation: tuple[float, float, float, float] | None
     status: int
     warnings: int
-    """The warnings register; see `protocol.warnings_register`."""
+    """The warnings register; see `protocol.sensor.warnings_register`."""
     force_torque_saturated: int
     acceleration_saturated: int
     angular_rate_saturated: int

@@ -1,4 +1,4 @@
-"""How one sensor of a chain is named: by its place on the bus, its serial number or its name."""
+"""Selects one sensor of a chain: by position on the bus, serial number or name."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from typing import Final, NamedTuple
 MOST_PLACES: Final = 256
 _SERIAL: Final = "serial:"
 
-MEANING: Final = 'a place such as 0, "serial:1234", or a name such as "BFT-SENS-ECAT-M8"'
+MEANING: Final = 'a position such as 0, "serial:1234", or a name such as "BFT-SENS-ECAT-M8"'
 
 
 class SensorChoice(NamedTuple):
-    """One of the three is given."""
+    """Exactly one field is set."""
 
-    place: int | None = None
+    position: int | None = None
     serial: int | None = None
     name: str | None = None
 
     @classmethod
     def parse(cls, value: object) -> SensorChoice:
-        """From a number or a text; ValueError says what it must be."""
+        """From a number or a text; the text of ValueError is what is allowed."""
         if isinstance(value, str) and value.isdecimal():
             value = int(value)
         if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < MOST_PLACES:
-            return cls(place=value)
+            return cls(position=value)
         if isinstance(value, str) and value.startswith(_SERIAL):
             number = value.removeprefix(_SERIAL)
             if number.isdecimal() and int(number) < 1 << 32:
@@ -32,21 +32,21 @@ class SensorChoice(NamedTuple):
             return cls(name=value)
         raise ValueError(MEANING)
 
-    def matches(self, place: int, name: str, serial: int) -> bool:
-        """Whether the sensor at `place` with this name and serial number is meant."""
-        if self.place is not None:
-            return self.place == place
+    def matches(self, position: int, name: str, serial: int) -> bool:
+        """Whether it selects the sensor at `position` with this name and serial number."""
+        if self.position is not None:
+            return self.position == position
         if self.serial is not None:
             return self.serial == serial
         return self.name == name
 
     @property
     def precedence(self) -> int:
-        """What is said of a place wins over what is said of a serial number, and that over a name."""
-        return 2 if self.place is not None else 1 if self.serial is not None else 0
+        """Settings for a position override those for a serial number, and those override a name's."""
+        return 2 if self.position is not None else 1 if self.serial is not None else 0
 
     def __str__(self) -> str:
-        """As it is written."""
-        if self.place is not None:
-            return str(self.place)
+        """As written on a command line."""
+        if self.position is not None:
+            return str(self.position)
         return f"{_SERIAL}{self.serial}" if self.serial is not None else str(self.name)

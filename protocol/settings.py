@@ -1,7 +1,7 @@
 """The sensor's settings by name: type, allowed values, start-up default, meaning.
 
-One table for the command line, the configuration file, the control channel and the ROS parameters. Which
-object of the sensor holds a setting is the server's business (`ethercat_server.objects`).
+One table for the command line, the configuration file, the control channel and the ROS parameters. Their
+objects are in `ethercat_server.sensor.dictionary`.
 """
 
 from __future__ import annotations
@@ -10,21 +10,21 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from protocol.errors import SettingError
-from protocol.filters import FORCE_TORQUE_FILTERS
+from protocol.sensor.filters import FORCE_TORQUE_FILTERS
 
 SettingValue = bool | int
 
 
 class Setting(NamedTuple):
-    """One setting. `choices` is what it may be; bool settings have none."""
+    """One setting. `choices` are its allowed values, None for bool."""
 
     name: str
     default: SettingValue | None
-    """What the server sets at start-up unless told otherwise (the note's Listing V.1); None = left alone."""
+    """What the server writes at start-up unless configured otherwise; None = not written."""
     choices: range | tuple[int, ...] | None
     meaning: str
     preop_only: bool
-    """The device takes it in the state PREOP only."""
+    """Can be written in PREOP only."""
 
     @property
     def is_bool(self) -> bool:
@@ -32,7 +32,7 @@ class Setting(NamedTuple):
         return self.choices is None
 
     def check(self, value: object) -> SettingValue:
-        """Return `value` if the setting can have it, else raise SettingError with the choices."""
+        """Return `value` if it is allowed, else raise SettingError with the choices."""
         if self.is_bool:
             if isinstance(value, bool):
                 return value
@@ -42,7 +42,7 @@ class Setting(NamedTuple):
         return value
 
     def parse(self, text: str) -> SettingValue:
-        """The value that `text` on a command line means; SettingError if none."""
+        """The value of `text` from a command line; SettingError if it is not allowed."""
         if self.is_bool:
             word = text.strip().lower()
             if word in {"true", "yes", "on", "1"}:
@@ -64,7 +64,7 @@ class Setting(NamedTuple):
 SETTINGS: Final[Mapping[str, Setting]] = {
     row.name: row
     for row in (
-        Setting("calibration_matrix", True, None, "give N and Nm instead of raw counts", False),
+        Setting("calibration_matrix", True, None, "force and torque in N and Nm, not raw counts", False),
         Setting("temperature_compensation", False, None, "correct the force/torque for temperature", False),
         Setting("imu_active", 1, range(0, 4), "IMU: 0 none, 1 internal, 2 external, 3 both", False),
         Setting("coordinate_system", None, None, "use the configured coordinate system", False),
@@ -74,9 +74,9 @@ SETTINGS: Final[Mapping[str, Setting]] = {
         Setting("orientation_estimation", None, None, "the sensor estimates its orientation", False),
         Setting("acceleration_range_g", 2, (2, 4, 8, 16), "accelerometer full scale, g", True),
         Setting("angular_rate_range_dps", 250, (250, 500, 1000, 2000), "gyroscope full scale, °/s", True),
-        Setting("acceleration_filter", 1, range(1, 9), "accelerometer filter profile (Table III.6)", True),
-        Setting("angular_rate_filter", 3, range(3, 10), "gyroscope filter profile (Table III.5)", True),
-        # The sensor takes more lengths than the table has; which ones depends on the other filters.
+        Setting("acceleration_filter", 1, range(1, 9), "accelerometer filter profile", True),
+        Setting("angular_rate_filter", 3, range(3, 10), "gyroscope filter profile", True),
+        # The sensor accepts more lengths than its manual lists; which ones depends on the other filters.
         Setting(
             "sinc_length", 64, range(32, 2049), "SINC filter length; sampling rate = 51200 / length", True
         ),
@@ -92,7 +92,7 @@ BASE_SAMPLING_RATE_HZ: Final = 51200
 PUBLISHED_RATES_HZ: Final[Mapping[int, int]] = {
     length: row.rate_hz for length, row in FORCE_TORQUE_FILTERS.items()
 }
-"""SINC length to the rate in object 0x8011, as Table III.4 has it (51 is rounded down, 205 up)."""
+"""Rate in object 0x8011 by SINC length, for the lengths of the manual (51 is rounded down, 205 up)."""
 
 
 def sampling_rate_hz(sinc_length: int) -> int:
@@ -118,5 +118,5 @@ def check_combination(values: Mapping[str, SettingValue]) -> None:
 
 
 def start_up_defaults() -> dict[str, SettingValue]:
-    """The settings that the server writes at start-up unless told otherwise."""
+    """The settings that the server writes at start-up unless configured otherwise."""
     return {row.name: row.default for row in SETTINGS.values() if row.default is not None}

@@ -5,7 +5,7 @@ What goes to share/bridge is what lies in these folders; the pyproject.toml name
 
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 SHARED_FOLDERS = ("launch", "config", "urdf")
 
@@ -21,7 +21,7 @@ def data_files():
 setup(
     name="bridge",
     version="0.1.0",
-    packages=["bridge", "bridge.compensation", "protocol"],
+    packages=find_packages(exclude=["test"]),
     package_data={"": ["py.typed"], "bridge": ["fastdds.xml"]},
     data_files=list(data_files()),
     install_requires=["setuptools"],

@@ -1,14 +1,21 @@
-"""What holds for all tests: two run at a time, and their ROS nodes do not hear each other."""
+"""For all tests: isolation of runs and workers, seeds of random tests, the summary of what was not tested."""
 
 from __future__ import annotations
 
 import os
 import random
+import re
+from collections import defaultdict
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
+from scripts.demonstration.program import loopback_up
+
 _DOMAINS = 101
-"""Those whose ports every system leaves free."""
+"""ROS domains whose ports every system leaves free."""
+_OPERATORS = {"and", "or"}
 
 
 def _choose_domain() -> None:
@@ -19,6 +26,35 @@ def _choose_domain() -> None:
 
 
 _choose_domain()
-# How long an example takes is no property of the code: the machine may be busy.
-settings.register_profile("without deadline", deadline=None)
-settings.load_profile("without deadline")
+if "TEST_NAMESPACE" in os.environ:  # scripts/test made a network namespace, in which loopback is down
+    loopback_up()
+# Without a deadline: how long an example takes is no property of the code, the machine may be busy.
+settings.register_profile("fixed", deadline=None, derandomize=True)
+settings.register_profile("fresh", deadline=None, print_blob=True)
+settings.load_profile("fresh" if "TEST_SEED" in os.environ else "fixed")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With `-k WORD`, skip the files in which the word does not occur: importing all takes seconds."""
+    expression = config.option.keyword
+    if not re.fullmatch(r"[\w\s()]+", expression) or "not" in expression.split():
+        return None
+    words = set(re.findall(r"\w+", expression.lower())) - _OPERATORS
+    if collection_path.suffix != ".py" or not words:
+        return None
+    text = str(collection_path).lower() + collection_path.read_text(encoding="utf-8").lower()
+    return not any(word in text for word in words) or None
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say what was not tested on this machine, and what to install for it."""
+    reasons: defaultdict[str, int] = defaultdict(int)
+    for report in terminalreporter.stats.get("skipped", []):
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        reasons[reason.removeprefix("Skipped: ")] += 1
+    if "TEST_NO_NAMESPACE" in os.environ:
+        terminalreporter.write_line(f"not isolated from other programs: {os.environ['TEST_NO_NAMESPACE']}")
+    if reasons:
+        terminalreporter.section("not tested here")
+    for reason, count in sorted(reasons.items(), key=lambda item: -item[1]):
+        terminalreporter.write_line(f"{count:4} test{'s' if count > 1 else ' '}: {reason}")

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import signal
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from tests.server.running import PATIENCE_S
@@ -23,10 +28,27 @@ class Result(NamedTuple):
         return found
 
 
-def run(module: str, *arguments: object, under: tuple[str, ...] = ()) -> Result:
+def run_here(main: Callable[[Sequence[str]], int], *arguments: object) -> Result:
+    """Run a program's `main` in this process."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    out, err = io.StringIO(), io.StringIO()
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = main([*map(str, arguments)])
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    return Result(code, out.getvalue(), err.getvalue())
+
+
+def run(
+    module: str, *arguments: object, under: tuple[str, ...] = (), python: str | Path = sys.executable
+) -> Result:
     """Run `python -m module arguments...`, whose error must be no traceback."""
     ended = subprocess.run(
-        [*under, sys.executable, "-m", module, *map(str, arguments)],
+        [*under, python, "-m", module, *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from protocol.framing import DataMessage
-from protocol.json_text import JsonObject
 from protocol.pdo import Sample
+from protocol.text.json_text import JsonObject
 
 _FOLDER: Final = Path(__file__).parent / "protocol" / "golden"
 
@@ -71,6 +71,28 @@ BY_NAME: Final = {vector.name: vector for vector in (*DATA, *JSON, *BROKEN)}
 STREAMS: Final = {
     entry["name"]: [BY_NAME[name] for name in entry["vectors"]] for entry in _read("streams.json")
 }
+
+
+class AccountedStream(NamedTuple):
+    """Frames of one sensor, and what `protocol.accounting` makes of them."""
+
+    name: str
+    every: int
+    fresh_only: bool
+    rate_hz: float
+    steps: list[tuple[int, int, int, str] | None]
+    """`sequence`, `monotonic_ns`, `flags` and kind of each frame; None where a new subscription begins."""
+    counts: dict[str, int]
+    """At the end; 0 where none is given."""
+
+
+def _accounted(entry: JsonObject) -> AccountedStream:
+    steps = [None if step == "begin" else tuple(step) for step in entry["frames"]]
+    options = entry.get("every", 1), entry.get("fresh_only", True), entry.get("rate_hz", 0)
+    return AccountedStream(entry["name"], *options, steps, entry["counts"])
+
+
+ACCOUNTED: Final = [_accounted(entry) for entry in _read("accounting.json")]
 
 
 def expected(vectors: Sequence[Vector]) -> list[Outcome]:

@@ -19,12 +19,12 @@ import pytest
 
 np = pytest.importorskip("numpy")
 
-from scripts import _benchmark as benchmark  # noqa: E402
-from scripts import _benchmark_statistics as statistics  # noqa: E402
-from scripts._benchmark_records import Recording, began, write  # noqa: E402
-from scripts._benchmark_report import rows  # noqa: E402
-from scripts._benchmark_soak import Tally, slope_kb_per_hour  # noqa: E402
-from scripts._benchmark_statistics import Arrivals, Counts, Ints  # noqa: E402
+from scripts.benchmarks import program as benchmark  # noqa: E402
+from scripts.benchmarks import statistics  # noqa: E402
+from scripts.benchmarks.modes.soak import Tally, slope_kb_per_hour  # noqa: E402
+from scripts.benchmarks.records import Recording, began, write  # noqa: E402
+from scripts.benchmarks.report import rows  # noqa: E402
+from scripts.benchmarks.statistics import Arrivals, Counts, Ints  # noqa: E402
 from tests.server.running import needs_bus  # noqa: E402
 
 ROOT = Path(__file__).parent.parent
@@ -151,7 +151,7 @@ def test_memory_slope_leaves_the_start_out() -> None:
 def test_table_has_what_there_is() -> None:
     result = {
         "project": {"tcp": {"made": 200, "lost": 1, "age_us": {"p50": 80.0, "p99": 120.0, "p999": 150.0}}},
-        "note": None,
+        "polling": None,
         "floor": {"age_us": {"p50": 40.0}},
     }
     table = {row.name: row[1:] for row in rows(result)}
@@ -176,7 +176,7 @@ def test_wrong_arguments_are_refused(wrong: list[str], capsys: pytest.CaptureFix
 def run(tmp_path: Path, *arguments: str) -> subprocess.Popen[str]:
     """The benchmark in a network namespace of its own."""
     files = ("--json", str(tmp_path / "b.json"), "--plot", str(tmp_path / "b.png"))
-    command = ["unshare", "--net", sys.executable, "-m", "scripts._benchmark", *files, *arguments]
+    command = ["unshare", "--net", sys.executable, "-m", "scripts.benchmarks.program", *files, *arguments]
     return subprocess.Popen(
         command,
         cwd=ROOT,
@@ -207,11 +207,11 @@ def test_a_run_with_ros_and_two_sensors(tmp_path: Path) -> None:
     content = json.loads((tmp_path / "b.json").read_text())
     assert all(map(math.isfinite, numbers(content)))
     one, two = content["configurations"]
-    assert two["note"] is None
+    assert two["polling"] is None
     for figures, made in (
         (one["project"]["ros"], 400),
         (two["project"]["ros"], 800),
-        (one["note"]["ros"], 400),
+        (one["polling"]["ros"], 400),
     ):
         assert 0.9 * made < figures["made"] < 1.1 * made
         assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"]
@@ -230,7 +230,7 @@ def test_a_short_run(tmp_path: Path) -> None:
     (result,) = content["configurations"]
     assert all(map(math.isfinite, numbers(content)))
     assert (result["rate_hz"], result["sensors"]) == (800, 1)
-    for program in ("project", "note"):
+    for program in ("project", "polling"):
         figures = result[program]["tcp"]
         assert 700 < figures["made"] < 900
         assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"]

@@ -10,10 +10,10 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 from rich.console import Console
 
-from scripts import _benchmark as benchmark
-from scripts import _benchmark_compensation as compensation
-from scripts._benchmark_chain import Setup
-from scripts._demo import DemoError
+from scripts.benchmarks import program as benchmark
+from scripts.benchmarks.chain import Setup
+from scripts.benchmarks.modes import compensation
+from scripts.demonstration.program import DemoError
 
 pytestmark = pytest.mark.ros
 SETUP = Setup(800, 1, 1.0, 0.0, 0, ppm=0.0)

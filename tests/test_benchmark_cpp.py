@@ -8,9 +8,9 @@ import pytest
 
 pytest.importorskip("numpy")
 
-from scripts import _benchmark as benchmark
-from scripts._benchmark_cpp import build, figures, run
-from scripts._demo import DemoError
+from scripts.benchmarks import program as benchmark
+from scripts.benchmarks.modes.cpp import build, figures, run
+from scripts.demonstration.program import DemoError
 from tests.clients.cpp_programs import needs_gxx, patient
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scripts import _benchmark as benchmark
-from scripts._benchmark_node import compare, first_after
-from scripts._benchmark_node_client import check_sum
-from scripts._benchmark_statistics import Ints
+from scripts.benchmarks import program as benchmark
+from scripts.benchmarks.modes.node import compare, first_after
+from scripts.benchmarks.processes.node_client import check_sum
+from scripts.benchmarks.statistics import Ints
 
 MS = 1_000_000
 COUNT = 1000
@@ -61,4 +61,4 @@ def test_check_sum_sees_the_last_bit() -> None:
 def test_it_is_an_option_of_its_own() -> None:
     options = benchmark.parse(["--node"])
     assert options.node
-    assert not options.clients
+    assert not options.cpp

@@ -6,7 +6,7 @@ import math
 
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import SampleDecoder, encode
-from scripts._measure import Measurement, percentile, verdict
+from scripts.demonstration.measure import Measurement, percentile, verdict
 
 PERIOD_NS = 1_250_000
 SECOND_NS = 1_000_000_000

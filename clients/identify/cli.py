@@ -1,4 +1,4 @@
-"""`ethercat-identify`: what is started. Everything else is loaded after Ctrl-C has been made harmless."""
+"""`ethercat-identify`: entry point; everything else is imported after Ctrl-C is handled."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from clients.endings import not_installed
+from clients.program import not_installed
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Identify; returns the exit code."""
-    # It only reads, so Ctrl-C may end it anywhere, and at once.
+    # It only reads, so Ctrl-C may end it at any time.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         from clients.identify.program import run  # noqa: PLC0415 - NumPy takes a while to load

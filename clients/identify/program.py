@@ -1,30 +1,33 @@
-"""What `ethercat-identify FILE.mcap` does: finds the static poses, solves, prints, writes the parameters."""
+"""What `ethercat-identify FILE.mcap` does: finds the stationary poses, solves, prints, writes parameters."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Sequence
+from functools import partial
 
 from rich.console import Console
 
-from bridge.compensation.parameter_file import write_yaml
-from bridge.compensation.payload import Identified, identify
-from bridge.compensation.poses import MOST_POSES, Pose, pose_of
-from bridge.compensation.quantities import CompensationError
-from bridge.compensation.session import summary
-from clients.endings import hush
+from clients.errors import RecordingError
 from clients.identify.options import IdentifyOptions, parse_options
 from clients.identify.report import as_json, show_poses, show_result
 from clients.identify.stills import Still, Stills, find_stills
+from clients.program import discard_output, say
 from clients.recording.columns import columns
-from clients.recording.errors import RecordingError
 from clients.recording.reader import RecordedSensor, Recording, open_recording
+from ft_compensation.identification.parameter_file import write_yaml
+from ft_compensation.identification.payload import Identified, identify
+from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
+from ft_compensation.identification.session import summary
+from ft_compensation.quantities import CompensationError
 from protocol.pdo import STANDARD_GRAVITY
+
+_say = partial(say, "ethercat-identify")
 
 
 class SensorChoiceError(CompensationError):
-    """The recording does not hold the sensor that is asked for, or holds several."""
+    """The recording does not have the sensor asked for, or has several."""
 
 
 def run(argv: Sequence[str] | None = None) -> int:
@@ -35,7 +38,7 @@ def run(argv: Sequence[str] | None = None) -> int:
         _say(str(error))
         return 1
     except BrokenPipeError:
-        hush()
+        discard_output()
         return 1
 
 
@@ -43,13 +46,13 @@ def _identify(options: IdentifyOptions) -> int:
     with open_recording(options.path) as recording:
         sensor = _choose(recording, options.sensor)
         if recording.cut_off is not None:
-            _say(f"{options.path} was cut off ({recording.cut_off}): what is whole is used")
+            _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
         data = columns(recording, sensor.sensor, options.imu_units)
     found = find_stills(data, options.least_seconds, options.limits)
     if len(found.stills) > MOST_POSES:
         longest = sorted(found.stills, key=lambda still: -still.seconds)[:MOST_POSES]
         found = found._replace(stills=tuple(sorted(longest)))
-        _say(f"there are more than {MOST_POSES} rests: the longest are used")
+        _say(f"there are more than {MOST_POSES} poses: the longest are used")
     result, error, taken, poses = _solve(found, options)
     if options.json:
         answer = as_json(found._replace(stills=tuple(taken)), poses, result, error)
@@ -62,9 +65,9 @@ def _identify(options: IdentifyOptions) -> int:
         if result is not None:
             show_result(console, result)
     for sentence in found.rejected if result is None or not options.json else ():
-        _say(f"not taken: {sentence}")
+        _say(f"rejected: {sentence}")
     if result is None:
-        _say(error or "no answer")
+        _say(error or "no result")
         return 1
     if options.yaml is not None:
         who = f"{sensor.name}, serial number {sensor.serial}, from {options.path.name}"
@@ -74,29 +77,31 @@ def _identify(options: IdentifyOptions) -> int:
     return 0
 
 
-def _choose(recording: Recording, place: int | None) -> RecordedSensor:
+def _choose(recording: Recording, position: int | None) -> RecordedSensor:
     there = [sensor for sensor in recording.sensors if sensor.frames]
     if not there:
-        raise SensorChoiceError(f"{recording.path} holds no samples")
-    if place is None and len(there) > 1:
-        places = ", ".join(str(sensor.sensor) for sensor in there)
-        raise SensorChoiceError(f"{recording.path} holds several sensors ({places}): say which with --sensor")
+        raise SensorChoiceError(f"{recording.path} has no samples")
+    if position is None and len(there) > 1:
+        positions = ", ".join(str(sensor.sensor) for sensor in there)
+        raise SensorChoiceError(
+            f"{recording.path} has several sensors ({positions}): choose one with --sensor"
+        )
     for sensor in there:
-        if place in (None, sensor.sensor):
+        if position in (None, sensor.sensor):
             serials = list(dict.fromkeys(row.identity.serial for row in sensor.history))
             if len(serials) > 1:
                 raise SensorChoiceError(
-                    f"{recording.path}: sensor {sensor.sensor} was exchanged in it (serial numbers "
-                    f"{', '.join(map(str, serials))}), and each has its own bias: record one by itself"
+                    f"{recording.path}: sensor {sensor.sensor} was replaced during it (serial numbers "
+                    f"{', '.join(map(str, serials))}), and each has its own bias: record only one"
                 )
             return sensor
-    raise SensorChoiceError(f"{recording.path} holds no samples of sensor {place}")
+    raise SensorChoiceError(f"{recording.path} has no samples of sensor {position}")
 
 
 def _solve(
     found: Stills, options: IdentifyOptions
 ) -> tuple[Identified | None, str | None, list[Still], list[Pose]]:
-    """The answer or why there is none, and the rests that are poses."""
+    """The result or why there is none, and the stationary periods that are poses."""
     taken, poses = [], []
     reason = None
     for still in found.stills:
@@ -109,13 +114,9 @@ def _solve(
         if not poses:
             raise CompensationError(
                 reason
-                or f"the sensor is nowhere at rest for {options.least_seconds:g} s: hold it still, or widen "
-                "what counts as rest with --limit or --least-seconds"
+                or f"the sensor is never stationary for {options.least_seconds:g} s: hold it still, or relax "
+                "the limits with --limit or --least-seconds"
             )
         return identify(poses, confidence=options.confidence, one_axis=options.one_axis), None, taken, poses
     except CompensationError as error:
         return None, str(error), taken, poses
-
-
-def _say(sentence: str) -> None:
-    sys.stderr.write(f"ethercat-identify: {sentence}\n")

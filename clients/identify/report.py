@@ -1,4 +1,4 @@
-"""What was found, as a table for people and as JSON for programs."""
+"""The result as a table and as JSON."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from bridge.compensation.payload import Identified
-from bridge.compensation.poses import Pose
-from bridge.compensation.quantities import Wrench
 from clients.identify.stills import Still, Stills
+from ft_compensation.identification.payload import Identified
+from ft_compensation.identification.poses import Pose
+from ft_compensation.quantities import Wrench
 
 
 def show_poses(
     console: Console, stills: Sequence[Still], poses: Sequence[Pose], result: Identified | None
 ) -> None:
-    """The poses, with what the answer leaves of each."""
+    """The poses with their residuals."""
     table = Table(title="poses", title_justify="left")
-    for head in ("", "at s", "for s", "samples", "up x", "up y", "up z", "left over N", "left over Nm"):
+    for head in ("", "at s", "for s", "samples", "up x", "up y", "up z", "residual N", "residual Nm"):
         table.add_column(head, justify="right")
     for number, (still, pose) in enumerate(zip(stills, poses, strict=True)):
         left = ["", ""]
@@ -34,19 +34,19 @@ def show_poses(
 
 
 def show_result(console: Console, result: Identified) -> None:
-    """The ten numbers with their intervals, and what a person should know."""
+    """The ten parameters with their intervals, and notes."""
     table = Table(title="payload and bias", title_justify="left")
     table.add_column("")
     table.add_column("value", justify="right")
     table.add_column(f"± ({100 * result.confidence:g} %)", justify="right")
     table.add_column("unit")
     table.add_row("mass", f"{result.payload.mass:.4f}", f"{result.mass_interval:.4f}", "kg")
-    for axis, value, interval in zip("xyz", result.payload.centre, result.centre_interval, strict=True):
-        table.add_row(f"centre of gravity {axis}", f"{1000 * value:.2f}", f"{1000 * interval:.2f}", "mm")
+    for axis, value, interval in zip("xyz", result.payload.center, result.centre_interval, strict=True):
+        table.add_row(f"center of gravity {axis}", f"{1000 * value:.2f}", f"{1000 * interval:.2f}", "mm")
     _add_bias(table, result.bias, result.bias_interval)
     console.print(table)
     console.print(
-        f"left over: {result.force_rms:.3g} N, {result.torque_rms:.3g} Nm; condition of the problem "
+        f"residual: {result.force_rms:.3g} N, {result.torque_rms:.3g} Nm; condition number "
         f"{result.condition:.2f} (1.2 is ideal)"
     )
     for note in result.notes:
@@ -63,7 +63,7 @@ def _add_bias(table: Table, bias: Wrench, interval: Wrench) -> None:
 def as_json(
     found: Stills, poses: Sequence[Pose], result: Identified | None, error: str | None
 ) -> dict[str, Any]:
-    """Everything, in SI units; `ok` tells whether there is an answer."""
+    """Everything, in SI units; `ok` is whether there is a result."""
     rows = [
         {
             "begin_s": still.begin_s, "seconds": still.seconds, "samples": pose.samples,
@@ -80,7 +80,7 @@ def as_json(
         "ok": True,
         "tool_mass": result.payload.mass,
         "tool_mass_interval": result.mass_interval,
-        "tool_center_of_gravity": result.payload.centre,
+        "tool_center_of_gravity": result.payload.center,
         "tool_center_of_gravity_interval": result.centre_interval,
         "bias": result.bias.values,
         "bias_interval": result.bias_interval.values,

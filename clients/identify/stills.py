@@ -1,8 +1,8 @@
-"""Finds the stretches of a recording in which the sensor was at rest, by itself.
+"""Finds the periods of a recording in which the sensor was stationary.
 
-The recording is cut into short blocks. Blocks that are quiet and see the same pose make a stretch; its first
-and last block are left out, where the hand still touched it or the robot still swung, and the rest must pass
-the test of a window at rest.
+The recording is divided into short blocks. Quiet blocks in a row with the same pose make a period. Its first
+and last block, in which a hand may have touched it or the robot may have swung, are excluded; the remainder
+must pass the same test as a pose that is taken live.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bridge.compensation.still import BAD_WRENCH, NotStillError, StillLimits, StillMeans, still_means
 from clients.recording.columns import Columns
+from ft_compensation.still import BAD_WRENCH, NotStillError, StillLimits, StillMeans, still_means
 
 _BLOCK_S: Final = 0.1
 _BLOCK_SAMPLES: Final = 8
-"""A block holds at least so many, however slow the sensor is."""
+"""Minimum number of samples in a block, however slow the sensor is."""
 _LONGEST_GAP_S: Final = 0.5
 _SAME_POSE: Final = math.cos(math.radians(1.5))
 _ALLOWANCE: Final = 5.0
@@ -30,7 +30,7 @@ Bools = npt.NDArray[np.bool_]
 
 
 class Still(NamedTuple):
-    """A stretch at rest."""
+    """A stationary period."""
 
     begin_s: float
     """s from the beginning of the recording."""
@@ -39,15 +39,15 @@ class Still(NamedTuple):
 
 
 class Stills(NamedTuple):
-    """What was found."""
+    """The stationary periods of a recording."""
 
     stills: tuple[Still, ...]
     rejected: tuple[str, ...]
-    """Stretches that were nearly at rest, and why they were not taken; sentences."""
+    """Sentences about periods that were nearly stationary, and why they were rejected."""
 
 
 def find_stills(columns: Columns, least_seconds: float = 1.0, limits: StillLimits | None = None) -> Stills:
-    """The stretches of at least `least_seconds` at rest, in order."""
+    """The stationary periods of at least `least_seconds`, in order."""
     limits = limits or StillLimits()
     fresh = columns.where(columns.fresh)
     if len(fresh) < _BLOCK_SAMPLES:
@@ -73,7 +73,7 @@ def find_stills(columns: Columns, least_seconds: float = 1.0, limits: StillLimit
 
 
 def _good(columns: Columns, rows: Floats) -> Bools:
-    """Samples that may be used: finite, and nothing saturated."""
+    """Samples that can be used: finite and not saturated."""
     saturated = columns.force_torque_saturated | columns.acceleration_saturated
     saturated = saturated | columns.angular_rate_saturated | (columns.warnings & int(BAD_WRENCH))
     good: Bools = np.isfinite(rows).all(axis=1) & (saturated == 0)
@@ -81,7 +81,7 @@ def _good(columns: Columns, rows: Floats) -> Bools:
 
 
 def _parts(times: Floats) -> Iterator[slice]:
-    """Where the recording goes on without a gap; a server that was started again may have another clock."""
+    """The parts without a gap; a server on a restarted machine has another monotonic clock."""
     steps = np.diff(times)
     breaks = np.flatnonzero((steps < -_BLOCK_S) | (steps > _LONGEST_GAP_S)) + 1
     bounds = [0, *breaks.tolist(), len(times)]
@@ -91,43 +91,43 @@ def _parts(times: Floats) -> Iterator[slice]:
 
 
 def _stretches(times: Floats, rows: Floats, good: Bools, limits: StillLimits) -> Iterator[tuple[int, int]]:
-    """First row and the row after the last one of every stretch, without its first and last block."""
+    """First row and the row after the last one of every period, without its first and last block."""
     period = float(times[-1] - times[0]) / (len(times) - 1)
     size = max(_BLOCK_SAMPLES, round(_BLOCK_S / period))
     count = len(rows) // size
     blocks = rows[: count * size].reshape(count, size, rows.shape[1])
-    mean, spread = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
-    quiet = good[: count * size].reshape(count, size).all(axis=1) & _quiet(mean, spread, limits)
+    mean, deviation = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
+    quiet = good[: count * size].reshape(count, size).all(axis=1) & _quiet(mean, deviation, limits)
     start = 0
     for number in range(1, count + 1):
-        if number < count and _goes_on(mean, spread, quiet, start, number, size, limits):
+        if number < count and _goes_on(mean, deviation, quiet, start, number, size, limits):
             continue
         if quiet[start] and number - start >= 3:
             yield (start + 1) * size, (number - 1) * size
         start = number
 
 
-def _quiet(mean: Floats, spread: Floats, limits: StillLimits) -> Bools:
+def _quiet(mean: Floats, deviation: Floats, limits: StillLimits) -> Bools:
     quiet: Bools = (
-        (spread[:, 0:3].max(axis=1) <= limits.force_spread)
-        & (spread[:, 3:6].max(axis=1) <= limits.torque_spread)
-        & (spread[:, 6:9].max(axis=1) <= limits.acceleration_spread)
-        & (spread[:, 9:12].max(axis=1) <= limits.angular_rate_spread)
+        (deviation[:, 0:3].max(axis=1) <= limits.force_spread)
+        & (deviation[:, 3:6].max(axis=1) <= limits.torque_spread)
+        & (deviation[:, 6:9].max(axis=1) <= limits.acceleration_spread)
+        & (deviation[:, 9:12].max(axis=1) <= limits.angular_rate_spread)
         & (np.linalg.norm(mean[:, 9:12], axis=1) <= limits.angular_rate)
     )
     return quiet
 
 
 def _goes_on(
-    mean: Floats, spread: Floats, quiet: Bools, start: int, number: int, size: int, limits: StillLimits
+    mean: Floats, deviation: Floats, quiet: Bools, start: int, number: int, size: int, limits: StillLimits
 ) -> bool:
-    """Whether block `number` belongs to the stretch that began with block `start`."""
+    """Whether block `number` belongs to the period that began with block `start`."""
     if not (quiet[start] and quiet[number]):
         return False
     a, b = mean[start], mean[number]
     sizes = float(np.linalg.norm(a[6:9]) * np.linalg.norm(b[6:9]))
     if float(a[6:9] @ b[6:9]) < _SAME_POSE * sizes:
         return False
-    by_chance = _ALLOWANCE * (spread[start] + spread[number]) / math.sqrt(size)
+    by_chance = _ALLOWANCE * (deviation[start] + deviation[number]) / math.sqrt(size)
     moved = np.abs(b - a) - by_chance
     return bool(moved[0:3].max() <= limits.force_wander and moved[3:6].max() <= limits.torque_wander)

@@ -1,5 +1,5 @@
-"""`ethercat-monitor`: what the server streams, seen in a terminal or printed.
+"""`ethercat-monitor`: the stream of the server, live in a terminal or printed.
 
-`reader` feeds `model` from the server; `model` gives a `state`, which is all that the views know: `screen`,
-`table` and `json_line`. `app` is the only file that knows Textual.
+`reader` feeds `model` from the server; `model` gives a `state`, which the views show: `screen`, `table` and
+`json_line`. Only `app` uses Textual.
 """

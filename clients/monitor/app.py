@@ -1,6 +1,6 @@
-"""The live view. The only file that knows Textual: it has the terminal, the keys and the clock.
+"""The live view: terminal, keys and clock. The only file that uses Textual.
 
-Ten times a second the state becomes rows of text, and only the rows that changed are drawn again.
+Ten times a second the state is rendered as rows of text, and only rows that changed are drawn.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
 
-from clients.monitor import words
-from clients.monitor.glyphs import Glyphs
-from clients.monitor.model import Model, clock_text
+from clients.monitor.model.server import Model, clock_text
+from clients.monitor.model.state import SensorState, State
 from clients.monitor.recorder import Recorder
-from clients.monitor.screen import Look, render
-from clients.monitor.state import SensorState, State
 from clients.monitor.tare import start_tare
+from clients.monitor.view.glyphs import Glyphs
+from clients.monitor.view.screen import Look, render
+from clients.numbers import duration
 from protocol.address import Address
 
 REFRESH_S: Final = 0.1
 
 
 class View(Widget):
-    """Rows of text; what has not changed is not drawn again."""
+    """Rows of text, of which only those that change are drawn."""
 
     can_focus = False
 
@@ -42,7 +42,7 @@ class View(Widget):
         self._strips: list[Strip] = []
 
     def show(self, rows: list[Text]) -> None:
-        """Show these rows instead."""
+        """Show these rows."""
         width = self.size.width
         if len(rows) != len(self._rows):
             self._rows, self._strips = [], []
@@ -61,12 +61,12 @@ class View(Widget):
         return Strip(row.render(self.app.console)).adjust_cell_length(width)
 
     def render_line(self, y: int) -> Strip:
-        """One row, as Textual asks for it."""
+        """One row, for Textual."""
         return self._strips[y] if y < len(self._strips) else Strip.blank(self.size.width)
 
 
 class Monitor(App[None]):
-    """Keys on one side, the model on the other."""
+    """Connects the keys, the model and the view."""
 
     TITLE = "ethercat-monitor"
     CSS = "Screen, View { background: ansi_default; color: ansi_default; width: 100%; height: 100%; }"
@@ -82,8 +82,8 @@ class Monitor(App[None]):
         seconds: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`seconds` ends it by itself."""
-        # The terminal's own ground and no colour but ours: with NO_COLOR there is none.
+        """`seconds`: exit after this time."""
+        # The terminal's own background; Textual obeys NO_COLOR.
         super().__init__(ansi_color=True)
         self._model = model
         self._address = address
@@ -92,16 +92,16 @@ class Monitor(App[None]):
         self._view = View()
         self._seconds = seconds
         self.recorder = Recorder(address)
-        """To be closed by who runs the app, when the terminal is the shell's again."""
+        """The caller closes it after the terminal is restored."""
         self._state: State | None = None
         self._confirmed: Callable[[], None] | None = None
 
     def compose(self) -> ComposeResult:
-        """The one widget."""
+        """The only widget."""
         yield self._view
 
     def on_mount(self) -> None:
-        """Begin."""
+        """Start the timers and the signal handlers."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGHUP):
             loop.add_signal_handler(number, self.exit)
@@ -111,11 +111,11 @@ class Monitor(App[None]):
             self.set_timer(self._seconds, self.exit)
 
     def on_resize(self) -> None:
-        """Draw for the new size at once."""
+        """Draw for the new size."""
         self.call_after_refresh(self.draw)
 
     def draw(self) -> None:
-        """Show how it is now, or what it was when it was paused."""
+        """Show the current state, or that of the time of the pause."""
         now_s = self._clock()
         ended = self.recorder.ended()
         if ended is not None:
@@ -124,20 +124,20 @@ class Monitor(App[None]):
         if self._look.paused and self._state is not None:
             state = replace(self._state, message=state.message)
         self._state = state
-        recording = f"REC {words.duration(self.recorder.seconds(now_s))}" if self.recorder.running else ""
+        recording = f"REC {duration(self.recorder.seconds(now_s))}" if self.recorder.running else ""
         look = replace(self._look, recording=recording)
         self._view.show(render(state, look, *self._view.size))
 
     def repaint(self) -> None:
-        """Draw everything again: something else has written on the terminal."""
+        """Draw everything again, after something else has written to the terminal."""
         self._view.refresh()
 
     def action_help_quit(self) -> None:
-        """Ctrl-C ends it: whoever presses that does not want to be taught another key."""
+        """Ctrl-C quits, instead of Textual's hint at another key."""
         self.exit()
 
     def on_key(self, event: events.Key) -> None:
-        """A key was pressed."""
+        """Handle a key."""
         if event.key in {"ctrl+c", "ctrl+q", "ctrl+z"}:
             return
         event.stop()
@@ -173,15 +173,15 @@ class Monitor(App[None]):
     def _ask_tare(self) -> None:
         sensor = self._selected()
         if sensor is None or self._state is None or not self._state.server.connected:
-            self._say("There is no sensor to tare: the server is not there", True)
+            self._say("No sensor to tare: not connected to the server", True)
             return
 
         def confirmed() -> None:
-            self._say(f"Taring sensor {sensor.place}: leave it at rest")
-            start_tare(self._address, sensor.place, self._say)
+            self._say(f"Taring sensor {sensor.position}: keep it stationary")
+            start_tare(self._address, sensor.position, self._say)
 
         self._confirmed = confirmed
-        question = f"Tare sensor {sensor.place}? Its reading becomes zero. y: yes, any other key: no"
+        question = f"Tare sensor {sensor.position}? Its reading becomes zero. y: yes, any other key: no"
         self._look = replace(self._look, question=question)
 
     def _answer(self, yes: bool) -> None:
@@ -195,7 +195,7 @@ class Monitor(App[None]):
     def _record(self) -> None:
         if self.recorder.running:
             self.recorder.stop()
-            self._say("Ending the recording")
+            self._say("Stopping the recording")
         else:
             self._say(*self.recorder.start(self._clock()))
 

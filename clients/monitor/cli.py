@@ -1,4 +1,4 @@
-"""`ethercat-monitor`: makes ends and errors exit codes: 0 ended or fine, 1 not, 2 wrong usage."""
+"""`ethercat-monitor`: entry point; turns errors into exit codes: 0 fine, 1 not, 2 wrong usage."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from clients.endings import hush, not_installed
+from clients.program import discard_output, not_installed
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the monitor; returns its exit code."""
     try:
-        # SIGTERM ends what prints lines as Ctrl-C does; the live view takes it over.
+        # SIGTERM acts as Ctrl-C; the live view replaces the handler.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         from clients.monitor.options import parse  # noqa: PLC0415 - Ctrl-C is heard while this loads
         from clients.monitor.program import run  # noqa: PLC0415
@@ -22,14 +22,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             return run(options)
         except OSError as error:
-            if error.errno not in (errno.EPIPE, errno.EIO):  # the reader, or the terminal, is gone
+            if error.errno not in (errno.EPIPE, errno.EIO):  # the reader or the terminal was closed
                 raise
-            hush()
+            discard_output()
             return 0
         except KeyboardInterrupt:
             return 1 if options.once else 0
     except KeyboardInterrupt:
-        # The options are not known yet, or wrong.
+        # Before the options were parsed.
         given = sys.argv[1:] if argv is None else argv
         return int(any(len(word) > len("--") and "--once".startswith(word) for word in given))
     except ImportError as error:

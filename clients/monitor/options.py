@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-from clients.arguments import add_address, add_imu_units, seconds
-from clients.version import VERSION
+from clients.arguments import add_address, add_imu_units, parser, seconds
 from protocol.address import Address
 from protocol.pdo import ImuUnits
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """What was asked for."""
+class Options(argparse.Namespace):
+    """What to show, and how."""
 
     address: Address
     once: bool
@@ -25,22 +22,20 @@ class Options:
 
 
 def parse(argv: Sequence[str] | None) -> Options:
-    """The options in `argv`; SystemExit with 2 if they are wrong, with 0 after --help."""
-    parser = argparse.ArgumentParser(
-        prog="ethercat-monitor",
-        description="Shows what ethercat-server streams, live in the terminal. Keys: ? lists them.",
-        epilog="With --once: exit 0 if all is fine, 1 if there is no server or a sensor has an error.",
+    """Read the command line; argparse exits with 2 if it is wrong."""
+    made = parser(
+        "ethercat-monitor",
+        "Shows the stream of ethercat-server live in the terminal. Press ? for the keys.",
+        "With --once: exit code 0 if all is well, 1 if there is no server or a sensor has an error.",
     )
-    add_address(parser)
-    parser.add_argument("--once", action="store_true", help="print a table of one second and end")
-    parser.add_argument("--json", action="store_true", help="print a JSON object a second; with --once, one")
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="end by itself after S seconds")
-    add_imu_units(parser)
-    parser.add_argument("--ascii", action="store_true", help="use ASCII characters only")
-    parser.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
-    given = parser.parse_args(argv)
-    if given.once and given.seconds is not None:
-        parser.error("--seconds does not go with --once, which ends by itself")
-    return Options(
-        given.address, given.once, given.json, given.seconds, ImuUnits(given.imu_raw_units), given.ascii
-    )
+    add_address(made)
+    add = made.add_argument
+    add("--once", action="store_true", help="observe for a second, print a table and exit")
+    add("--json", action="store_true", help="print one JSON object per second; with --once, just one")
+    add("--seconds", type=seconds, metavar="S", help="exit after S seconds")
+    add_imu_units(made)
+    add("--ascii", action="store_true", help="use ASCII characters only")
+    options = made.parse_args(argv, Options())
+    if options.once and options.seconds is not None:
+        made.error("--seconds cannot be combined with --once")
+    return options

@@ -1,4 +1,4 @@
-"""Chooses the view and runs it: the live one on a terminal, else a line a second; or once; or JSON."""
+"""Chooses and runs the view: live on a terminal, else a line per second; or once; or JSON."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from clients.monitor.glyphs import ASCII, UNICODE, can_show, to_ascii
-from clients.monitor.json_line import json_line
-from clients.monitor.model import Model
+from clients.monitor.model.server import Model, clock_text
+from clients.monitor.model.state import State
 from clients.monitor.options import Options
 from clients.monitor.reader import Reader
-from clients.monitor.state import State
-from clients.monitor.table import line, problems, table, time_of_day
-from clients.monitor.words import trouble
+from clients.monitor.view.glyphs import ASCII, UNICODE, can_show, to_ascii
+from clients.monitor.view.json_line import json_line
+from clients.monitor.view.table import line, problems, table
+from clients.monitor.view.words import trouble
 
 _PERIOD_S: Final = 1.0
 _ONCE_S: Final = 1.0
@@ -23,7 +23,7 @@ _ANSWER_S: Final = 6.0
 
 
 def run(options: Options) -> int:
-    """Do what was asked for; returns the exit code."""
+    """Run the monitor; returns the exit code."""
     model = Model(str(options.address), options.imu_units)
     reader = Reader(options.address, model)
     reader.start()
@@ -63,7 +63,7 @@ def _once(options: Options, model: Model, reader: Reader) -> int:
 
 
 def _live(options: Options, model: Model) -> int:
-    from clients.monitor.app import Monitor  # noqa: PLC0415 - takes a moment that the other views do without
+    from clients.monitor.app import Monitor  # noqa: PLC0415 - slow to import
 
     app = Monitor(model, options.address, ASCII if _spelled(options) else UNICODE, seconds=options.seconds)
     try:
@@ -97,12 +97,12 @@ def _seconds(limit_s: float | None) -> Iterator[None]:
 
 def _json(model: Model) -> None:
     _say(json_line(model.state(time.monotonic()), time.time()))
-    # What the next line says of peaks and warnings is of its own second.
+    # Peaks and warnings of the next line are those of its own second.
     model.reset()
 
 
 class _Lines:
-    """A line a sensor and second; what is wrong with the server is said once."""
+    """A line per sensor and second; trouble with the server is reported once."""
 
     def __init__(self, options: Options, model: Model) -> None:
         self._model = model
@@ -114,10 +114,10 @@ class _Lines:
         state: State = self._model.state(time.monotonic())
         wrong = trouble(state.server)
         if wrong is None:
-            now = time_of_day()
+            now = clock_text()
             _say(*(line(sensor, now) for sensor in state.sensors), spelled=self._spelled)
         elif not self._troubled:
-            _say(f"{time_of_day()}  server {wrong}", spelled=self._spelled)
+            _say(f"{clock_text()}  server {wrong}", spelled=self._spelled)
         self._troubled = wrong is not None
 
 

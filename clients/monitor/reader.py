@@ -1,7 +1,7 @@
-"""The thread that reads the server into the model, and connects again whenever it must.
+"""The thread that feeds the model from the server, and reconnects.
 
-It wakes some twenty times a second, not for every sample: it takes all that has piled up, then waits for one
-sample more. For that one it was awake, so the moment it comes tells the age of a sample on arrival.
+It wakes some twenty times a second instead of for every sample: it takes all that is queued, then waits for
+one more sample. As it was awake for that one, its arrival time gives the age of a sample on arrival.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import threading
 import time
 from typing import Final
 
-from clients.monitor.model import Model
+from clients.monitor.model.server import Model
 from protocol.address import Address
 from protocol.client import Client
 from protocol.control import Event
@@ -24,11 +24,11 @@ _NEXT_SAMPLE_S: Final = 0.1
 _MOST_READS: Final = 16
 _AGAIN_S: Final = 0.5
 _ANSWER_TIMEOUT_S: Final = 10.0
-"""A server that answers nothing for so long is as good as gone."""
+"""Timeout for a reply of the server."""
 
 
 class Reader:
-    """Reads until it is closed."""
+    """Reads until closed."""
 
     def __init__(self, address: Address, model: Model) -> None:
         self._address = address
@@ -37,13 +37,13 @@ class Reader:
         self._client: Client | None = None
         self._changed = threading.Condition()
         self.attempts = 0
-        """Connections tried and failed so far."""
+        """Number of failed connections."""
         self.statuses = 0
-        """Replies to `status` so far."""
+        """Number of replies to `status`."""
         self._thread = threading.Thread(target=self._run, name="reader", daemon=True)
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:
@@ -51,11 +51,11 @@ class Reader:
         self._closing.set()
         client = self._client
         if client is not None:
-            client.connection.shutdown()  # not close: the thread may be waiting for it
+            client.connection.shutdown()  # not close: the thread may be blocked on it
         self._thread.join(timeout=2.0)
 
     def wait_for_answer(self, timeout_s: float) -> bool:
-        """Wait until the server has answered `status`, or could not be reached; whether it has answered."""
+        """Wait for the first reply to `status` or failed connection; whether there was a reply."""
         with self._changed:
             self._changed.wait_for(lambda: self.statuses or self.attempts, timeout_s)
             return self.statuses > 0
@@ -102,7 +102,7 @@ class Reader:
         fresh = client.receive(_NEXT_SAMPLE_S)
         now_ns = time.monotonic_ns()
         self._model.take(piled_up + fresh, now_ns * 1e-9)
-        # What came while we decoded waited for us: its age says nothing of the server.
+        # What arrived while this thread decoded waited for it: its age is not that of the server.
         if caught_up and client.connection.same_machine:
             first = {frame.sensor: frame for frame in reversed(fresh)}
             for frame in first.values():

@@ -1,4 +1,4 @@
-"""Runs `ethercat-record` beside the monitor: starts it, stops it, says how it went."""
+"""Runs `ethercat-record` as a child process: starts it, stops it, reports the result."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Final
 
-from clients.endings import missing
+from clients.program import missing
 from protocol.address import Address
-from protocol.text import printable
+from protocol.text.visible import printable
 
 PROGRAM: Final = "ethercat-record"
 _STOP_TIMEOUT_S: Final = 20.0
-"""A recording is finished by writing its summary, which takes a moment."""
+"""Timeout for finishing a recording."""
 
 
 def program() -> list[str] | None:
-    """The command: what is beside the interpreter that runs us, or on PATH; None if it is not installed."""
+    """The command, beside this interpreter or on PATH; None if it is not installed."""
     beside = Path(sys.executable).with_name(PROGRAM)
     found = str(beside) if beside.exists() else shutil.which(PROGRAM)
     return None if found is None else [found]
@@ -35,7 +35,7 @@ class Recorder:
     def __init__(
         self, address: Address, directory: Path | None = None, command: Sequence[str] | None = None
     ) -> None:
-        """Recordings go to `directory`, by default the current one; `command` stands in for `program()`."""
+        """Recordings go to `directory`, by default the current one; `command` replaces `program()`."""
         self._address = address
         self._directory = directory or Path.cwd()
         self._command = command
@@ -45,26 +45,26 @@ class Recorder:
 
     @property
     def running(self) -> bool:
-        """Whether a recording was started and has not been seen to end."""
+        """Whether a recording was started and has not been reported as ended."""
         return self._process is not None
 
     def seconds(self, now_s: float) -> float:
-        """How long it has been running."""
+        """Duration of the recording."""
         return now_s - self._since_s
 
     def start(self, now_s: float) -> tuple[str, bool]:
-        """Begin one; what to say of it, and whether it is bad news."""
+        """Start a recording; a message, and whether it is an error."""
         command = self._command or program()
         if command is None:
             return missing(PROGRAM), True
         name = time.strftime("recording-%Y%m%d-%H%M%S.mcap")
         said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         try:
-            # A session of its own: Ctrl-C on our terminal is for us, and we stop it in order.
+            # A session of its own: Ctrl-C is for the monitor, which then stops it.
             self._process = subprocess.Popen(
                 [*command, name, str(self._address), "--until-eof"],
                 cwd=self._directory,
-                stdin=subprocess.PIPE,  # closed when we end, however that is
+                stdin=subprocess.PIPE,  # closed when the monitor ends, however it ends
                 stdout=said,
                 stderr=said,
                 start_new_session=True,
@@ -76,13 +76,13 @@ class Recorder:
         return f"Recording to {name}", False
 
     def stop(self) -> None:
-        """Ask it to end; `ended` tells when it has."""
+        """Request the end; `ended` reports it."""
         if self._process is not None:
             with contextlib.suppress(ProcessLookupError):
                 self._process.send_signal(signal.SIGINT)
 
     def ended(self) -> tuple[str, bool] | None:
-        """What to say of a recording that has ended, and whether it is bad news; None if none has."""
+        """A message about a recording that has ended, and whether it is an error; else None."""
         if self._process is None or self._process.poll() is None:
             return None
         code, stdin = self._process.returncode, self._process.stdin
@@ -95,7 +95,7 @@ class Recorder:
         return f"The recording failed: {last or f'exit code {code}'}", True
 
     def close(self) -> str | None:
-        """End what is running and wait for it; what to say of it, if anything."""
+        """Stop the recording and wait for it; a message, if there was one."""
         if self._process is None:
             return None
         self.stop()

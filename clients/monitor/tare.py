@@ -1,4 +1,4 @@
-"""Tares a sensor through the server, in a thread and on a connection of its own: the stream is left alone."""
+"""Tares a sensor through the server, in a thread and on a connection of its own."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from typing import Any, Final
 from protocol.address import Address
 from protocol.client import Client
 from protocol.errors import NoReplyError, ProtocolError, RefusedError
-from protocol.untrusted import number
+from protocol.text.untrusted import number
 
 _TIMEOUT_S: Final = 60.0
 
 Say = Callable[[str, bool], None]
-"""Takes a sentence, and whether it is bad news."""
+"""Takes a message, and whether it is an error."""
 
 
-def start_tare(address: Address, place: int, say: Say) -> threading.Thread:
-    """Tare the sensor at `place`; `say` is told how it ended, from the thread that is returned."""
-    thread = threading.Thread(target=lambda: say(*tare(address, place)), name="tare", daemon=True)
+def start_tare(address: Address, position: int, say: Say) -> threading.Thread:
+    """Tare the sensor at `position`; the thread, which is returned, calls `say` with the result."""
+    thread = threading.Thread(target=lambda: say(*tare(address, position)), name="tare", daemon=True)
     thread.start()
     return thread
 
 
-def tare(address: Address, place: int) -> tuple[str, bool]:
-    """Tare the sensor; what to say of it, and whether it is bad news."""
+def tare(address: Address, position: int) -> tuple[str, bool]:
+    """Tare the sensor; a message, and whether it is an error."""
     try:
         with Client(address.port, address.host) as client:
-            reply = client.ask("tare", _TIMEOUT_S, sensor=place)
+            reply = client.ask("tare", _TIMEOUT_S, sensor=position)
     except RefusedError as error:
-        return f"Sensor {place} is not tared: {error}", True
+        return f"Sensor {position} was not tared: {error}", True
     except NoReplyError as error:
-        return f"Whether sensor {place} is tared is not known: {error}", True
+        return f"It is unknown whether sensor {position} was tared: {error}", True
     except ProtocolError as error:
-        return f"Sensor {place} is not tared: no connection to the server ({error})", True
-    return f"Sensor {place} is tared{_residual(reply.get('residual'))}", False
+        return f"Sensor {position} was not tared: no connection to the server ({error})", True
+    return f"Sensor {position} was tared{_residual(reply.get('residual'))}", False
 
 
 def _residual(values: Any) -> str:
@@ -43,4 +43,4 @@ def _residual(values: Any) -> str:
     known = [abs(value) for value in found if value is not None]
     if len(known) != 6:
         return ""
-    return f"; what is left is at most {max(known[:3]):.3f} N and {max(known[3:]):.4f} Nm"
+    return f"; residual at most {max(known[:3]):.3f} N and {max(known[3:]):.4f} Nm"

@@ -1,4 +1,4 @@
-"""A sensor's recording as NumPy arrays, one row a frame. Decoded as `protocol.pdo` decodes, to the bit."""
+"""A sensor's frames as NumPy arrays, one row per frame, bit-identical to what `protocol.pdo` decodes."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from typing import Any, Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from protocol.framing import DataFlag, DataMessage
+from protocol.accounting import NOT_NEW
+from protocol.framing import DataMessage
 from protocol.pdo import LAYOUTS, STANDARD_GRAVITY, ImuUnits, PdoLayout
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 _BASE: Final = min(LAYOUTS)
-_NOT_A_SAMPLE: Final = int(DataFlag.REPEATED | DataFlag.INVALID)
 _AXES: Final = ("x", "y", "z")
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """The frames of one sensor in the order in which they came; n rows.
+    """The frames of one sensor in order of arrival; n rows.
 
     Saturation fields have bit 0 for x, 1 for y, ... as the sensor sends them.
     """
@@ -42,7 +42,7 @@ class Columns:
     status: Ints
     """(n,)"""
     warnings: Ints
-    """(n,) protocol.warnings_register.WarningFlag"""
+    """(n,) protocol.sensor.warnings_register.WarningFlag"""
     force: Floats
     """(n, 3) N"""
     torque: Floats
@@ -54,7 +54,7 @@ class Columns:
     temperature: Floats
     """(n,) °C"""
     orientation: Floats
-    """(n, 4) x, y, z, w; NaN where the sensor gives none"""
+    """(n, 4) x, y, z, w; NaN where the sensor sends none"""
     force_torque_saturated: Ints
     """(n,)"""
     acceleration_saturated: Ints
@@ -68,7 +68,7 @@ class Columns:
     @property
     def fresh(self) -> npt.NDArray[np.bool_]:
         """(n,) True where the frame is a new and valid sample."""
-        fresh: npt.NDArray[np.bool_] = (self.flags & _NOT_A_SAMPLE) == 0
+        fresh: npt.NDArray[np.bool_] = (self.flags & NOT_NEW) == 0
         return fresh
 
     def where(self, mask: npt.NDArray[np.bool_]) -> Columns:
@@ -77,23 +77,23 @@ class Columns:
 
 
 class FrameSource(Protocol):
-    """What has frames: a `clients.recording.reader.Recording`, or what was received just now."""
+    """A source of frames: a `clients.recording.reader.Recording`, or frames received live."""
 
     def frames(self, sensor: int | None = None) -> Iterable[DataMessage]:
-        """The frames of the sensor at this place, or of all, in the order in which they came."""
+        """The frames of the sensor at this position, or of all, in the order in which they came."""
 
 
 def columns(recording: FrameSource, sensor: int = 0, imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
-    """All frames of the sensor at this place. DamagedError as `Recording.frames`.
+    """All frames of the sensor at this position. DamagedError as `Recording.frames`.
 
-    `imu_units` is what the sensor's firmware sends acceleration and angular rate in.
+    `imu_units` are the units in which the firmware sends acceleration and angular rate.
     """
     heads = array("q")
     data: dict[int, list[bytes]] = {}
     rows: dict[int, list[int]] = {}
     count = 0
     for frame in recording.frames(sensor):
-        # Times and numbers of 64 bits: those that do not fit an int64 are no times.
+        # 64-bit values that do not fit an int64 are no valid times.
         heads.extend([min(value, (1 << 63) - 1) for value in frame[:6]])
         size = len(frame.process_data)
         data.setdefault(size, []).append(frame.process_data)
@@ -125,12 +125,12 @@ def _dtype(layout: PdoLayout) -> np.dtype[Any]:
 
 
 class _Merged:
-    """Fields of frames that may have process data of either size: a sensor can be exchanged."""
+    """Fields of frames whose process data may have either size, because a sensor can be replaced."""
 
     def __init__(self, count: int, parts: dict[int, npt.NDArray[Any]], rows: dict[int, list[int]]) -> None:
         self._count = count
         self._parts = parts
-        self._rows = {size: np.array(places, dtype=np.int64) for size, places in rows.items()}
+        self._rows = {size: np.array(positions, dtype=np.int64) for size, positions in rows.items()}
 
     def integer(self, name: str) -> Ints:
         merged = np.zeros(self._count, np.int64)

@@ -1,6 +1,6 @@
-"""The file on disk: what was once flushed stays whole, whatever happens to the process or the disk.
+"""The file on disk: what was flushed stays intact, whatever happens to the process or the disk.
 
-A flush is one write of whole MCAP records. If the disk takes only a part of it, that part is taken off again.
+A flush writes complete MCAP records. If the disk takes only a part of them, the file is truncated again.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from clients.recording.errors import DiskError
+from clients.errors import DiskError
 
 
 def _lock(fd: int) -> None:
-    """Have it for us alone, until it is closed; OSError."""
+    """Lock the file until it is closed; OSError."""
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -24,7 +24,7 @@ def _lock(fd: int) -> None:
 
 
 def remove(paths: Sequence[Path]) -> None:
-    """Remove these files, or none of them if one is being written; DiskError."""
+    """Remove these files, or none if one of them is in use; DiskError."""
     for really in (False, True):
         for path in paths:
             try:
@@ -40,23 +40,23 @@ def remove(paths: Sequence[Path]) -> None:
 
 
 class DiskFile:
-    """A new file for writing; has as much of a binary file as `mcap.writer.Writer` needs."""
+    """A new file for writing, with the part of a binary file's interface that `mcap.writer.Writer` needs."""
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
-        """Make the file; DiskError if it cannot be, or is there already and `overwrite` is False."""
+        """Create the file; DiskError if that fails, or if it exists and `overwrite` is False."""
         self.path = path
         self._waiting: list[bytes] = []
         self._position = 0
-        """With what waits."""
+        """Including what is buffered."""
         self._written = 0
         try:
             self._fd = os.open(
                 path, os.O_WRONLY | os.O_CREAT | (0 if overwrite else os.O_EXCL) | os.O_CLOEXEC, 0o666
             )
         except FileExistsError:
-            raise DiskError(f"{path} exists: choose another name, or --force to replace it") from None
+            raise DiskError(f"{path} exists: choose another name, or use --force to replace it") from None
         except OSError as error:
-            raise DiskError(f"{path} cannot be made: {error.strerror}") from None
+            raise DiskError(f"{path} cannot be created: {error.strerror}") from None
         try:
             _lock(self._fd)
             os.truncate(self._fd, 0)
@@ -65,18 +65,18 @@ class DiskFile:
             raise DiskError(f"{path} cannot be written: {error.strerror}") from None
 
     def write(self, data: bytes) -> int:
-        """Have `data` wait for the next flush."""
+        """Buffer `data` until the next flush."""
         if data:
             self._waiting.append(bytes(data))
             self._position += len(data)
         return len(data)
 
     def tell(self) -> int:
-        """Where the next byte goes."""
+        """Position of the next byte."""
         return self._position
 
     def flush(self) -> None:
-        """Write what waits; DiskError if not all of it can be, and then none of it is there."""
+        """Write what is buffered; DiskError if that fails, and then none of it is in the file."""
         data = memoryview(b"".join(self._waiting))
         self._waiting.clear()
         done = 0
@@ -91,7 +91,7 @@ class DiskFile:
         self._written = self._position
 
     def sync(self) -> None:
-        """Have the disk itself keep what was written; DiskError if it cannot."""
+        """Synchronize the file to the disk; DiskError."""
         try:
             os.fsync(self._fd)
         except OSError as error:
@@ -99,7 +99,7 @@ class DiskFile:
                 raise DiskError(f"{self.path} cannot be written: {error.strerror}") from None
 
     def close(self) -> None:
-        """Close the file; what waits is not written."""
+        """Close the file; what is buffered is discarded."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1

@@ -1,7 +1,7 @@
 """The file format: topics, schemas and message bodies that writer and reader share. docs/recording.md.
 
-Everything is CDR (little-endian) under ROS 2 schemas, because a `ros2 bag` must have one encoding throughout.
-So a DATA frame is kept in a message whose fields are the wire's, under a schema that the file itself holds.
+Everything is CDR (little-endian) under ROS 2 schemas, because a `ros2 bag` has a single encoding. So a DATA
+frame is a message with the fields of the wire protocol, under a schema that is in the file.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import re
 import struct
 from typing import Final
 
-from clients.recording.errors import DamagedError
+from clients.errors import DamagedError
 from protocol.errors import BadMessageError
 from protocol.framing import DataMessage
-from protocol.json_text import JsonObject, encode_json_text, parse_json_object
 from protocol.pdo import LAYOUTS
+from protocol.text.json_text import JsonObject, encode_json_text, parse_json_object
 
 FORMAT_VERSION: Final = "1"
 PROFILE: Final = "ros2"
@@ -24,43 +24,43 @@ SCHEMA_ENCODING: Final = "ros2msg"
 METADATA: Final = "bota_ethercat"
 """Name of the metadata record at the start: format, recorder, server, ..."""
 END_METADATA: Final = "bota_ethercat_end"
-"""Name of the metadata record at the end of a recording that was ended: what it holds, what it lost."""
+"""Name of the metadata record at the end of a complete recording: what it has, what it lost."""
 
 DESCRIPTION_TOPIC: Final = "/ethercat/description"
 EVENTS_TOPIC: Final = "/ethercat/events"
 FRAME_SCHEMA: Final = "bota_ethercat/msg/Frame"
 FRAME_DEFINITION: Final = """\
-# A DATA message of ethercat-server as it came, docs/protocol.md
+# A DATA message of ethercat-server as received, docs/protocol.md
 uint64 sequence         # counts this sensor's frames at the server
 uint64 stamp_ns         # CLOCK_REALTIME of the sample, ns since 1970
 uint64 monotonic_ns     # CLOCK_MONOTONIC of the server's machine, same moment
-uint8 sensor            # place on the bus, from 0
+uint8 sensor            # position on the bus, from 0
 uint8 flags             # 1 REPEATED, 2 INVALID, 4 GAP
 uint16 wkc              # EtherCAT working counter
-uint8[] process_data    # as it came off the bus: little-endian, 61 or 77 bytes
+uint8[] process_data    # as read from the bus: little-endian, 61 or 77 bytes
 """
 TEXT_SCHEMA: Final = "std_msgs/msg/String"
 TEXT_DEFINITION: Final = "string data\n"
 
 RECORDER: Final = "recorder"
-"""The value of `source` in events that the recorder itself made; the server's have no `source`."""
+"""The value of `source` in the recorder's own events; the server's have none."""
 
 _CDR: Final = b"\x00\x01\x00\x00"
-"""What every CDR body begins with: little-endian, no options."""
+"""CDR encapsulation header: little-endian, no options."""
 _FRAME: Final = struct.Struct("<4sQQQBBHI")
-"""Needs no padding: after the four bytes of CDR's own, every field stands at a multiple of its size."""
+"""Needs no padding: after the CDR header every field is aligned to its size."""
 _TEXT: Final = struct.Struct("<4sI")
 _FRAME_TOPIC: Final = re.compile(r"/ethercat/sensor_(0|[1-9][0-9]{0,2})/frames", re.ASCII)
 MAX_SENSOR: Final = 255
 
 
 def frame_topic(sensor: int) -> str:
-    """The topic of the frames of the sensor at this place."""
+    """The topic of the frames of the sensor at this position."""
     return f"/ethercat/sensor_{sensor}/frames"
 
 
 def sensor_of_topic(topic: str) -> int | None:
-    """The place of the sensor whose frames are on `topic`; None if it is another topic."""
+    """The position of the sensor whose frames are on `topic`; None if it is another topic."""
     match = _FRAME_TOPIC.fullmatch(topic)
     sensor = int(match[1]) if match else MAX_SENSOR + 1
     return sensor if sensor <= MAX_SENSOR else None

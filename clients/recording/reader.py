@@ -1,11 +1,11 @@
-"""Reads a recording: who the sensors were, how they were set and when, every frame, every event.
+"""Reads a recording: the sensors, their settings over time, all frames and events.
 
     with open_recording(Path("run.mcap")) as recording:
         for frame in recording.frames(sensor=0):
             ...
 
-A recording that was cut off (a killed recorder, a full disk, a power failure) is read up to its last whole
-chunk; `cut_off` says that it was. `columns.py` gives NumPy arrays instead of frames.
+A recording that was cut off (a killed recorder, a full disk, a power failure) is read up to its last complete
+chunk; `cut_off` says so. `columns.py` gives NumPy arrays.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
+from clients.errors import DamagedError, NotARecordingError, RecordingError
 from clients.recording.container import McapFile, RawMessage
-from clients.recording.errors import DamagedError, NotARecordingError, RecordingError
 from clients.recording.file_format import (
     DESCRIPTION_TOPIC,
     END_METADATA,
@@ -34,28 +34,28 @@ __all__ = ["DamagedError", "Description", "Event", "Identity", "NotARecordingErr
            "Recording", "RecordingError", "Settings", "open_recording"]  # fmt: skip
 
 _MAX_NOTES: Final = 1_000_000
-"""Descriptions and events that are kept while a recording is open."""
+"""Maximum number of descriptions and events."""
 
 _LONGEST_CHOICE: Final = 1024
-"""Characters; there are 256 places."""
+"""Characters of the list of chosen positions."""
 
 
 class Recording:
     """An open recording. Use it as a context manager, or `close` it.
 
     Attributes:
-        path: where it is.
-        metadata: what the recorder noted at the start, texts by name (docs/recording.md).
-        chosen: places of the sensors that were to be recorded; empty for all.
-        end: what it noted at the end, None if it was cut off.
-        cut_off: None if the recording was ended, else a clause that says what is wrong with its end.
-        sensors: the sensors that the server described or that have frames, by place.
+        path: its path.
+        metadata: what the recorder wrote at the start, by name (docs/recording.md).
+        chosen: positions given with --sensor; empty for all.
+        end: what the recorder wrote at the end, None if it was cut off.
+        cut_off: None if the recording is complete, else a clause that says how it ends.
+        sensors: the sensors that the server described or that have frames, by position.
         descriptions: every description, oldest first.
         events: every event, oldest first.
     """
 
     def __init__(self, path: Path) -> None:
-        """RecordingError says why it cannot be read."""
+        """RecordingError if it cannot be read."""
         self.path = path
         try:
             self._file = McapFile(path)
@@ -79,7 +79,7 @@ class Recording:
             )
         self.metadata: Mapping[str, str] = found
         chosen = found.get("sensors", "")[:_LONGEST_CHOICE].split()
-        self.chosen = {int(place) for place in chosen if place.isascii() and place.isdecimal()}
+        self.chosen = {int(position) for position in chosen if position.isascii() and position.isdecimal()}
         self.end: Mapping[str, str] | None = self._file.metadata.get(END_METADATA)
         self._sensor_of: dict[int, int] = {}
         self._topic_of: dict[int, str] = {}
@@ -120,26 +120,26 @@ class Recording:
 
     @property
     def frame_count(self) -> int:
-        """How many frames there are, of all sensors."""
+        """Number of frames of all sensors."""
         return sum(self._file.count(number) for number in self._sensor_of)
 
     def frames(self, sensor: int | None = None) -> Iterator[DataMessage]:
-        """The frames of the sensor at this place, or of all, in the order in which they came.
+        """The frames of the sensor at this position, or of all, in the order in which they came.
 
-        DamagedError at the first part that is not as it must be.
+        DamagedError at the first corrupt part.
         """
-        places = self._sensor_of
-        wanted = {number for number, place in places.items() if sensor in (None, place)}
+        positions = self._sensor_of
+        wanted = {number for number, position in positions.items() if sensor in (None, position)}
         for channel, _, body in self._file.messages(wanted):
-            yield unpack_frame(body, places[channel])
+            yield unpack_frame(body, positions[channel])
 
     def everything(self, sensor: int | None = None) -> Iterator[DataMessage | Description | Event]:
-        """Descriptions, events and the frames of the sensor at this place, or of all, as they came."""
-        places = self._sensor_of
-        wanted = {number for number, place in places.items() if sensor in (None, place)}
+        """Descriptions, events and the frames of the sensor at this position, or of all, as they came."""
+        positions = self._sensor_of
+        wanted = {number for number, position in positions.items() if sensor in (None, position)}
         for message in self._file.messages(wanted | self._topic_of.keys()):
-            place = places.get(message.channel)
-            yield self._note(message) if place is None else unpack_frame(message.body, place)
+            position = positions.get(message.channel)
+            yield self._note(message) if position is None else unpack_frame(message.body, position)
 
     def _note(self, message: RawMessage) -> Description | Event:
         topic = self._topic_of[message.channel]

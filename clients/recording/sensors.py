@@ -1,4 +1,4 @@
-"""Who the sensors of a recording are and how they are set, from the notes in it, in the order of the file."""
+"""Identity and settings of the sensors of a recording over time, from its descriptions and events."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 
 from clients.recording.file_format import RECORDER
 from protocol.errors import SettingError
-from protocol.json_text import JsonObject
 from protocol.settings import SETTINGS, sampling_rate_hz
-from protocol.text import visible
-from protocol.untrusted import rows
+from protocol.text.json_text import JsonObject
+from protocol.text.untrusted import rows
+from protocol.text.visible import visible
 
 
 class Description(NamedTuple):
-    """What the server said of itself and its sensors, a reply to `describe`."""
+    """A reply to `describe`."""
 
     stamp_ns: int
     """When it was received, ns since 1970."""
@@ -22,7 +22,7 @@ class Description(NamedTuple):
 
 
 class Event(NamedTuple):
-    """Something that happened: to the server, or to the recorder (`by_recorder`)."""
+    """An event of the server, or of the recorder (`by_recorder`)."""
 
     stamp_ns: int
     """When it was received, ns since 1970."""
@@ -30,17 +30,17 @@ class Event(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Which event."""
+        """Name of the event."""
         return str(self.event.get("event", "?"))
 
     @property
     def by_recorder(self) -> bool:
-        """Whether the recorder itself notes it: connected, disconnected, lost."""
+        """Whether it is the recorder's own: connected, disconnected, lost."""
         return self.event.get("source") == RECORDER
 
 
 class Identity(NamedTuple):
-    """Which sensor it is."""
+    """Identity of a sensor."""
 
     name: str = "?"
     serial: int = 0
@@ -50,17 +50,17 @@ class Identity(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """A sensor's settings and sampling rate from a moment on, and which sensor it is then."""
+    """Settings, sampling rate and identity of a sensor from a time on."""
 
     stamp_ns: int
     values: Mapping[str, Any]
     rate_hz: float
-    """Hz; 0 if it is not known."""
+    """Hz; 0 if unknown."""
     identity: Identity
 
 
 class RecordedSensor(NamedTuple):
-    """A sensor of the recording, as it was described first."""
+    """A sensor of the recording, as first described."""
 
     sensor: int
     """Place on the bus, from 0."""
@@ -70,55 +70,55 @@ class RecordedSensor(NamedTuple):
     firmware: str
     pdo_size: int
     rate_hz: float
-    """Hz, nominal; 0 if it is not known."""
+    """Hz, nominal; 0 if unknown."""
     settings: Mapping[str, Any]
     history: tuple[Settings, ...]
-    """Settings and identity over time, oldest first; the first are those here."""
+    """Settings and identity over time, oldest first; the first are the ones here."""
     frames: int
-    """How many frames of it the recording holds."""
+    """Number of its frames in the recording."""
 
 
 class Histories:
-    """The histories of all sensors, while the notes are read."""
+    """The histories of all sensors, built from descriptions and events in file order."""
 
     def __init__(self) -> None:
         self._of: dict[int, list[Settings]] = {}
 
     def take(self, note: Description | Event) -> None:
-        """Learn what `note`, the next in the file, says."""
+        """Take the next description or event of the file."""
         described = isinstance(note, Description)
         for row in rows(note.reply.get("sensors")) if isinstance(note, Description) else [note.event]:
-            place, values = row.get("sensor"), row.get("settings")
-            if isinstance(place, int) and not isinstance(place, bool) and isinstance(values, dict):
-                self._learn(place, note.stamp_ns, row, values, described=described)
+            position, values = row.get("sensor"), row.get("settings")
+            if isinstance(position, int) and not isinstance(position, bool) and isinstance(values, dict):
+                self._learn(position, note.stamp_ns, row, values, described=described)
 
-    def of(self, place: int) -> Sequence[Settings]:
-        """What is known of the sensor at this place so far."""
-        return self._of.get(place, ())
+    def of(self, position: int) -> Sequence[Settings]:
+        """The history so far of the sensor at this position."""
+        return self._of.get(position, ())
 
     def sensors(self, frames: Mapping[int, int]) -> tuple[RecordedSensor, ...]:
-        """All sensors that were described or that have `frames`, which are counts by place."""
+        """All sensors that were described or that have `frames`, which are counts by position."""
         return tuple(
-            _sensor(place, self.of(place), frames.get(place, 0))
-            for place in sorted(self._of.keys() | frames.keys())
+            _sensor(position, self.of(position), frames.get(position, 0))
+            for position in sorted(self._of.keys() | frames.keys())
         )
 
     def _learn(
-        self, place: int, stamp_ns: int, row: JsonObject, values: dict[str, Any], *, described: bool
+        self, position: int, stamp_ns: int, row: JsonObject, values: dict[str, Any], *, described: bool
     ) -> None:
-        known = self._of.setdefault(place, [])
+        known = self._of.setdefault(position, [])
         last = known[-1] if known else Settings(stamp_ns, {}, 0.0, Identity())
         identity = _identity(row) if described else last.identity
         rate = _number(row.get("rate_hz"))
         if known and last.values == values and last.identity in (identity, Identity()):
-            # An event tells the settings, the description after it the rest of the same.
+            # The description that follows an event completes the same entry.
             known[-1] = last._replace(rate_hz=rate or last.rate_hz, identity=identity)
         else:
             known.append(Settings(stamp_ns, values, rate or _rate(values, last), identity))
 
 
 def _rate(values: Mapping[str, Any], last: Settings) -> float:
-    """The rate that follows from settings that come without one."""
+    """The rate that the settings imply where it is not given."""
     try:
         length = SETTINGS["sinc_length"].check(values.get("sinc_length"))
     except SettingError:
@@ -131,7 +131,7 @@ def _number(value: object) -> float:
 
 
 def _text(value: object) -> str:
-    """Text from a file as it may appear in a line: no control characters, not endless."""
+    """Text from a file, safe to print: no control characters, limited length."""
     return visible(str(value)[:80]) if value is not None else "?"
 
 
@@ -142,6 +142,6 @@ def _identity(row: JsonObject) -> Identity:
     )  # fmt: skip
 
 
-def _sensor(place: int, history: Sequence[Settings], frames: int) -> RecordedSensor:
+def _sensor(position: int, history: Sequence[Settings], frames: int) -> RecordedSensor:
     first = history[0] if history else Settings(0, {}, 0.0, Identity())
-    return RecordedSensor(place, *first.identity, first.rate_hz, first.values, tuple(history), frames)
+    return RecordedSensor(position, *first.identity, first.rate_hz, first.values, tuple(history), frames)

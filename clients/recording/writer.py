@@ -1,6 +1,6 @@
-"""Writes one recording file: frames, descriptions and events as MCAP messages, in chunks soon on disk.
+"""Writes one recording file: frames, descriptions and events as MCAP messages.
 
-`flush` is to be called often; what was flushed survives this process. Not thread-safe.
+Call `flush` often: what was flushed survives this process. Not thread-safe.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from clients.recording.file_format import (
 )
 from clients.recording.ros_messages import DEFINITIONS, RosTopics
 from protocol.framing import DataMessage
-from protocol.json_text import JsonObject
+from protocol.text.json_text import JsonObject
 
 _CHUNK_SIZE: Final = 1024 * 1024
 _U32: Final = 0xFFFFFFFF
@@ -39,13 +39,13 @@ class RecordingWriter:
     """A recording file that is being written.
 
     Attributes:
-        frames: how many frames it was given.
+        frames: number of frames written.
     """
 
     def __init__(
         self, disk: DiskFile, library: str, notes: Mapping[str, str], ros: Mapping[int, RosTopics]
     ) -> None:
-        """Begin the file: `notes` become its metadata, `ros` has the topics of the sensors that get any."""
+        """Start the file: `notes` become its metadata, `ros` has the ROS topics by sensor."""
         self.frames = 0
         self._disk = disk
         self._ros = ros
@@ -66,7 +66,7 @@ class RecordingWriter:
 
     @property
     def size(self) -> int:
-        """Bytes of the file, without the chunk that is being filled."""
+        """Size of the file in bytes, without the current chunk."""
         return self._disk.tell()
 
     def describe(self, stamp_ns: int, description: JsonObject) -> None:
@@ -74,7 +74,7 @@ class RecordingWriter:
         self._note(self._descriptions, stamp_ns, description)
 
     def event(self, stamp_ns: int, event: JsonObject) -> None:
-        """Write an event that came at `stamp_ns`."""
+        """Write an event received at `stamp_ns`."""
         self._note(self._events, stamp_ns, event)
 
     def frame(self, frame: DataMessage) -> None:
@@ -89,15 +89,15 @@ class RecordingWriter:
         ros = self._ros.get(sensor)
         if ros is not None:
             channels = self._ros_channels[sensor]
-            for place, body in ros.messages(frame):
-                add(channels[place], stamp_ns, body, stamp_ns, sequence)
+            for position, body in ros.messages(frame):
+                add(channels[position], stamp_ns, body, stamp_ns, sequence)
 
     def flush(self) -> None:
         """End the chunk and write it to disk; DiskError if it cannot be written."""
         self._mcap.flush()  # type: ignore[no-untyped-call]
 
     def finish(self, notes: Mapping[str, str]) -> None:
-        """Write everything that is left, the index and the end, and have the disk keep it; DiskError."""
+        """Write what is buffered, the index and the footer, and synchronize the disk; DiskError."""
         self.flush()
         self._mcap.add_metadata(END_METADATA, dict(notes))
         self._mcap.finish()  # type: ignore[no-untyped-call]

@@ -1,20 +1,18 @@
-"""`ethercat-replay`: hears signals from the first moment on, says what is not installed."""
+"""`ethercat-replay`: entry point; catches signals while the rest is imported."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
 
-from clients.endings import not_installed
-from clients.signals import Signals
+from clients.program import Signals, not_installed
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
     signals = Signals()
     try:
-        # Takes a moment, in which Ctrl-C is to be heard already.
-        from clients.replay.program import run  # noqa: PLC0415
+        from clients.replay.program import run  # noqa: PLC0415 - after the signals
     except ImportError as error:
         return not_installed("ethercat-replay", error)
     return run(argv, signals)

@@ -3,75 +3,82 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
+from collections.abc import Iterable
 from typing import Any, Final
 
+import numpy as np
+
 from clients.replay.sensors import ReplayedSensors
-from ethercat_server.distribution import SLOT_NS, RecentDistribution
 from protocol.framing import DataFlag, DataMessage
 
 _MISSED_NS: Final = 10_000_000
+_RECENT_NS: Final = 10_000_000_000
+_WINDOW: Final = 100_000
+"""Number of frames that the distributions cover."""
 _REPEATED, _INVALID = int(DataFlag.REPEATED), int(DataFlag.INVALID)
+_NO_BUS: Final = {"p50": 0.0, "p99": 0.0, "p999": 0.0, "max": 0.0}
 
 
 class Meter:
-    """Counts frames by sensor, and how late they went out.
+    """Counts frames by sensor, and how late they were sent.
 
     Attributes:
-        sent: frames handed out.
+        sent: number of frames handed to the hub.
     """
 
     def __init__(self, sensors: ReplayedSensors) -> None:
         self.sent = 0
         self._sensors = sensors
-        self._late = RecentDistribution()
-        self._exchange = RecentDistribution()
-        """Stays empty: there is no bus."""
+        self._late: deque[tuple[int, int]] = deque(maxlen=_WINDOW)
+        """When a frame was sent and how late that was, ns."""
         self._missed = 0
         self._counts: defaultdict[tuple[int, int], int] = defaultdict(int)
         self._started = time.monotonic()
-        self._roll_at_ns = 0
 
     def count(self, frame: DataMessage, due_ns: int, now_ns: int) -> None:
-        """A frame went out; `due_ns` is when it was to, 0 if at no certain time."""
+        """A frame was sent; `due_ns` is when it was due, 0 if it had no time."""
         self.sent += 1
         self._counts[frame.sensor, frame.flags & (_REPEATED | _INVALID)] += 1
         if due_ns:
-            self._late.record(now_ns - due_ns)
+            self._late.append((now_ns, now_ns - due_ns))
             self._missed += now_ns - due_ns > _MISSED_NS
-        if now_ns >= self._roll_at_ns:
-            self._roll_at_ns = now_ns + SLOT_NS
-            self._late.roll()
 
     def status(self) -> dict[str, Any]:
-        """The `status` reply, but for the clients."""
-        late, recent_late = self._late.summaries_us()
-        exchange, recent_exchange = self._exchange.summaries_us()
-        places = range(len(self._sensors.sensors))
+        """The `status` reply, except for the clients."""
+        since_ns = time.monotonic_ns() - _RECENT_NS
+        late = _summary_us(late for _, late in self._late)
+        recent = _summary_us(late for at_ns, late in self._late if at_ns >= since_ns)
+        positions = range(len(self._sensors.sensors))
         return {
             "cycles": self.sent,
             "missed_deadlines": self._missed,
             "lost_frames": 0,
             "wake_us": late,
-            "exchange_us": exchange,
-            "last_10s": {
-                "wake_us": recent_late,
-                "exchange_us": recent_exchange,
-                "age_us": [recent_late for _ in places],
-            },
-            "sensors": [{**self._of_sensor(place), "age_us": late} for place in places],
+            "exchange_us": _NO_BUS,
+            "last_10s": {"wake_us": recent, "exchange_us": _NO_BUS, "age_us": [recent for _ in positions]},
+            "sensors": [{**self._of_sensor(position), "age_us": late} for position in positions],
             "uptime_s": round(time.monotonic() - self._started, 3),
         }
 
-    def _of_sensor(self, place: int) -> dict[str, Any]:
-        rate_hz = self._sensors.sensors[place].row.get("rate_hz")
+    def _of_sensor(self, position: int) -> dict[str, Any]:
+        rate_hz = self._sensors.sensors[position].row.get("rate_hz")
         period_us = 1e6 / rate_hz if isinstance(rate_hz, int | float) and rate_hz > 0 else None
         return {
-            "sensor": place,
-            "fresh": self._counts[place, 0],
-            "repeated": self._counts[place, _REPEATED],
-            "invalid": self._counts[place, _INVALID] + self._counts[place, _INVALID | _REPEATED],
+            "sensor": position,
+            "fresh": self._counts[position, 0],
+            "repeated": self._counts[position, _REPEATED],
+            "invalid": self._counts[position, _INVALID] + self._counts[position, _INVALID | _REPEATED],
             "lost_samples": 0,
             "recoveries": 0,
             "clock": {"mode": "locked", "period_us": period_us, "offset_ppm": 0.0, "uncertainty_us": 0.0},
         }
+
+
+def _summary_us(late_ns: Iterable[int]) -> dict[str, float]:
+    """p50, p99, p999 and max in µs, as `status` gives them."""
+    values = np.fromiter(late_ns, np.float64) / 1000
+    if not len(values):
+        return _NO_BUS
+    found = np.percentile(np.maximum(values, 0.0), (50, 99, 99.9, 100)).round(3)
+    return dict(zip(_NO_BUS, map(float, found), strict=True))

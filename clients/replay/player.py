@@ -1,7 +1,7 @@
-"""Plays recordings to the clients of a hub: each frame at its time, the sockets served in between.
+"""Plays recordings to the clients of a hub: sends each frame when it is due, serves sockets in between.
 
 One thread does everything, as in the server. `Player.run` returns at the end of the recordings or when it is
-told to stop; it raises DamagedError where a recording cannot be read further.
+stopped; it raises DamagedError where a recording is corrupt.
 """
 
 from __future__ import annotations
@@ -13,31 +13,28 @@ from typing import Any, Final
 from clients.recording.reader import Description, Event, Recording
 from clients.replay.meter import Meter
 from clients.replay.sensors import ReplayedSensors
-from clients.replay.steps import Steps
 from clients.replay.timeline import Timeline
-from ethercat_server.hub import Hub
+from ethercat_server.serving.hub import Hub
 from protocol.control import Event as ServerEvent
 from protocol.framing import DataMessage, encode_data
 
 _MARGIN_NS: Final = 80_000
-"""The sockets are left alone this long before a frame is due: select may wake late."""
+"""Sockets are not served this shortly before a frame is due, because select may wake late."""
 _SERVE_EVERY_NS: Final = 10_000_000
-"""Their turn comes this often even if frames are late."""
+"""Longest time between two turns of the sockets, even if frames are late."""
 _SLICE_NS: Final = 50_000_000
 """A signal is noticed within this time."""
-_STEP_NS: Final = 10_000_000
-"""A line is noticed within this time."""
 _DRAIN_NS: Final = 10_000_000_000
-"""So long the last frames wait for clients that do not read."""
+"""Timeout for clients that do not read the last frames."""
 
 
 class Player:
     """What produces the frames, in place of the server's `Cycle`.
 
     Attributes:
-        waits: it does not begin before somebody has subscribed.
-        lossless: no frame is sent while a client still has one waiting, which makes a replay that runs as
-            fast as it can complete.
+        stopping: whether it was asked to stop.
+        passes: how often the end of the recordings was reached.
+        meter: counters for `status`.
     """
 
     def __init__(
@@ -50,12 +47,12 @@ class Player:
         loop: bool,
         waits: bool,
         lossless: bool,
-        steps: Steps | None,
     ) -> None:
-        """`steps` says how many frames may go out by now, instead of the timeline; None for no stepping."""
+        """`waits`: start with the first subscriber. `lossless`: send a frame only when no client has one
+        queued, as fast as the clients read.
+        """
         self.stopping = False
         self.passes = 0
-        """How often the end was reached."""
         self.meter = Meter(sensors)
         self._hub = hub
         self._recordings = recordings
@@ -64,7 +61,6 @@ class Player:
         self._loop = loop
         self._waits = waits
         self._lossless = lossless
-        self._steps = steps
         self._serve_by = 0
 
     def stop(self) -> None:
@@ -80,7 +76,7 @@ class Player:
         self._drain(time.monotonic_ns() + _DRAIN_NS)
 
     def _play_once(self) -> bool:
-        """Play to the end; False if it was told to stop or there is no frame at all."""
+        """Play to the end; False if it was stopped or there is no frame."""
         before = self.meter.sent
         for item in self._items():
             if self.stopping:
@@ -101,7 +97,7 @@ class Player:
     def _items(self) -> Iterator[DataMessage | Description | Event]:
         for number, recording in enumerate(self._recordings):
             if number and recording.metadata.get("part", "0") == "0":
-                self._timeline.begin_again()  # another recording, not the next part of the same
+                self._timeline.begin_again()  # a new recording, not the next part of one
             yield from recording.everything()
 
     def _has_subscriber(self) -> bool:
@@ -110,19 +106,16 @@ class Player:
     def _happen(self, event: Event) -> None:
         if event.by_recorder:
             if event.name == "connected":
-                self._timeline.connected_anew()
+                self._timeline.reconnected()
             return
         self._sensors.take(event)
-        # The server that was recorded ended; this one does not.
+        # It was the recorded server that shut down, not this one.
         if event.name != ServerEvent.SHUTTING_DOWN:
             self._hub.broadcast(event.event)
 
     def _send(self, frame: DataMessage) -> None:
         due_ns = 0
-        if self._steps is not None:
-            self._wait_for_step(self._steps)
-            frame = self._timeline.now(frame)
-        elif self._lossless:
+        if self._lossless:
             self._drain(time.monotonic_ns() + _DRAIN_NS)
             frame = self._timeline.now(frame)
         else:
@@ -133,12 +126,6 @@ class Player:
         now = time.monotonic_ns()
         self._hub.publish(encode_data(*frame), frame.sensor, frame.flags, now)
         self.meter.count(frame, due_ns, now)
-
-    def _wait_for_step(self, steps: Steps) -> None:
-        while not self.stopping and not steps.take():
-            if steps.ended:
-                self.stop()
-            self._hub.serve(time.monotonic_ns() + _STEP_NS)
 
     def _wait(self, due_ns: int) -> None:
         """Serve the sockets until a frame is due."""
@@ -151,8 +138,8 @@ class Player:
             time.sleep(left * 1e-9)
 
     def _drain(self, until_ns: int) -> None:
-        """Let clients take what waits for them."""
-        while any(c.outbox.waiting and not c.dead for c in self._hub.connections.values()):
+        """Let clients read what is queued for them."""
+        while any(c.outbox.waiting for c in self._hub.connections.values()):
             if self.stopping or time.monotonic_ns() > until_ns:
                 return
             self._hub.serve(time.monotonic_ns() + 1_000_000)

@@ -1,4 +1,4 @@
-"""What `ethercat-replay` does: opens the recordings, listens, plays, and makes errors exit codes."""
+"""What `ethercat-replay` does: opens the recordings, listens, plays, and turns errors into exit codes."""
 
 from __future__ import annotations
 
@@ -8,20 +8,22 @@ import math
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 
+from clients.program import Signals, say
 from clients.recording.reader import RecordedSensor, Recording, RecordingError, open_recording
 from clients.replay.options import ReplayOptions, parse_options
 from clients.replay.player import Player
 from clients.replay.sensors import ReplayedSensors
-from clients.replay.steps import Steps
 from clients.replay.timeline import Timeline
-from clients.signals import Signals
-from ethercat_server.actions import Actions
-from ethercat_server.authority import controlling_uids
 from ethercat_server.errors import ServerError
-from ethercat_server.hub import Hub
-from ethercat_server.logs import Repetitions
+from ethercat_server.serving.actions import Actions
+from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.permissions import controlling_uids
+from ethercat_server.serving.transport.sockets import SocketTransport
 from protocol.control import Event, event
+
+_say = partial(say, "ethercat-replay")
 
 
 def run(argv: Sequence[str] | None, signals: Signals) -> int:
@@ -33,7 +35,7 @@ def run(argv: Sequence[str] | None, signals: Signals) -> int:
             recordings = [cleanup.enter_context(open_recording(path)) for path in options.paths]
             for recording in recordings:
                 if recording.cut_off:
-                    _say(f"{recording.path} was cut off: {recording.cut_off}; what it has is played")
+                    _say(f"{recording.path} was cut off: {recording.cut_off}; the intact part is played")
             _play(recordings, options, signals, cleanup)
     except RecordingError as error:
         _say(str(error))
@@ -49,10 +51,10 @@ def _play(
 ) -> None:
     sensors = ReplayedSensors(_all_sensors(recordings))
     if not sensors.sensors:
-        raise RecordingError(f"{recordings[0].path} has no frames and describes no sensor: nothing to play")
-    hub = Hub(options.hosts, options.port)
+        raise RecordingError(f"{recordings[0].path} has neither frames nor sensors: there is nothing to play")
+    hub = Hub(SocketTransport(options.hosts, options.port))
     cleanup.callback(hub.close)
-    hub.door.control_uids = controlling_uids(options.control_users, options.control_groups)
+    hub.permissions.control_uids = controlling_uids(options.control_users, options.control_groups)
     timeline = Timeline(
         options.speed,
         original=options.original,
@@ -67,7 +69,6 @@ def _play(
         loop=options.loop,
         waits=not options.at_once,
         lossless=math.isinf(options.speed),
-        steps=Steps(sys.stdin.fileno()) if options.step else None,
     )
     signals.call(player.stop)
     hub.start(Actions(hub, player, sensors, {"replay": _describe(recordings, options)}).handle)
@@ -81,7 +82,7 @@ def _play(
 
 
 def _all_sensors(recordings: Sequence[Recording]) -> list[RecordedSensor]:
-    """Every sensor of all recordings, described as the first that has it does."""
+    """The sensors of all recordings, as the first recording with each describes it."""
     found: dict[int, RecordedSensor] = {}
     for recording in recordings:
         for sensor in recording.sensors:
@@ -90,13 +91,13 @@ def _all_sensors(recordings: Sequence[Recording]) -> list[RecordedSensor]:
 
 
 def _describe(recordings: Sequence[Recording], options: ReplayOptions) -> dict[str, object]:
-    """What `describe` says of the replay: by this a client can tell it from a server."""
+    """The key `replay` in the reply to `describe`, by which a client can tell a replay."""
     first = recordings[0].metadata
     return {
         "files": [recording.path.name for recording in recordings],
         "recorded": first.get("started", "?"),
         "recorded_version": first.get("server_version", "?"),
-        "pace": "step" if options.step else "max" if math.isinf(options.speed) else options.speed,
+        "pace": "max" if math.isinf(options.speed) else options.speed,
         "loop": options.loop,
         "stamps": "original" if options.original else "moved",
     }
@@ -109,18 +110,8 @@ def _names(recordings: Sequence[Recording]) -> str:
 
 
 def _waiting(options: ReplayOptions) -> str:
-    if options.step:
-        return ", a frame for each line"
-    return "" if options.at_once else ", as soon as somebody subscribes"
+    return "" if options.at_once else ", waiting for a subscriber"
 
 
 def _set_up_logging() -> None:
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("ethercat-replay: %(message)s"))
-    handler.addFilter(Repetitions())
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
-
-
-def _say(sentence: str) -> None:
-    sys.stderr.write(f"ethercat-replay: {sentence}\n")
-    sys.stderr.flush()
+    logging.basicConfig(level=logging.INFO, format="ethercat-replay: %(message)s", stream=sys.stderr)

@@ -1,4 +1,4 @@
-"""The recorded sensors as the server's actions see them: they describe themselves and can do nothing."""
+"""The recorded sensors, as the server's actions see them: they describe themselves and refuse all else."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Final, NoReturn
 
 from clients.recording.reader import Description, Event, RecordedSensor
-from ethercat_server.connection import Connection
+from ethercat_server.serving.connection import Connection
 from protocol.control import ErrorCode, Request
 from protocol.control import Event as ServerEvent
 from protocol.errors import RequestError
@@ -26,25 +26,26 @@ class ReplayedSensor:
 
 
 class ReplayedSensors:
-    """All sensors, by place; also those that have no frames, so that places are as they were."""
+    """All sensors, by position; also those without frames, so that positions are kept."""
 
     handlers: Final = frozenset({"sdo_read", "sdo_write", "configure", "tare"})
 
     def __init__(self, recorded: Iterable[RecordedSensor]) -> None:
         found = {sensor.sensor: sensor for sensor in recorded}
         self.sensors = [
-            ReplayedSensor(_row(place, found.get(place))) for place in range(max(found, default=-1) + 1)
+            ReplayedSensor(_row(position, found.get(position)))
+            for position in range(max(found, default=-1) + 1)
         ]
 
     def describe(self, description: Description) -> None:
-        """The recording describes them anew."""
+        """Take a later description of the recording."""
         rows = description.reply.get("sensors")
         for row in rows if isinstance(rows, list) else ():
             if isinstance(row, dict) and (sensor := self._at(row.get("sensor"))) is not None:
                 sensor.row = row
 
     def take(self, event: Event) -> None:
-        """What an event of the recording changes in what `describe` says."""
+        """Apply an event of the recording to the descriptions."""
         sensor = self._at(event.event.get("sensor"))
         if sensor is None:
             return
@@ -56,22 +57,24 @@ class ReplayedSensors:
             sensor.row = {**sensor.row, "state": state}
 
     def handle(self, connection: Connection, request: Request) -> NoReturn:  # noqa: ARG002
-        """Refuse everything that only a sensor can do."""
+        """Refuse what needs a real sensor."""
         raise RequestError(
             ErrorCode.NOT_READY,
-            f"{request.action} needs a sensor, and this is a replay of a recording: ask the server itself",
+            f"{request.action} needs a sensor, but this is a replay of a recording: connect to the server",
         )
 
-    def _at(self, place: object) -> ReplayedSensor | None:
-        known = isinstance(place, int) and not isinstance(place, bool) and 0 <= place < len(self.sensors)
-        return self.sensors[place] if known and isinstance(place, int) else None
+    def _at(self, position: object) -> ReplayedSensor | None:
+        known = (
+            isinstance(position, int) and not isinstance(position, bool) and 0 <= position < len(self.sensors)
+        )
+        return self.sensors[position] if known and isinstance(position, int) else None
 
 
-def _row(place: int, sensor: RecordedSensor | None) -> dict[str, Any]:
+def _row(position: int, sensor: RecordedSensor | None) -> dict[str, Any]:
     if sensor is None:
-        sensor = RecordedSensor(place, "?", 0, "?", "?", 0, 0.0, {}, (), 0)
+        sensor = RecordedSensor(position, "?", 0, "?", "?", 0, 0.0, {}, (), 0)
     return {
-        "sensor": place,
+        "sensor": position,
         "name": sensor.name,
         "serial": sensor.serial,
         "hardware": sensor.hardware,

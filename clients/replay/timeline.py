@@ -1,13 +1,12 @@
-"""When each frame of a recording is due, and what its number and stamps are then.
+"""When each frame of a recording is due, and with which sequence number and stamps.
 
-The rules it keeps:
 
-- Times between frames are those of the sensors' `monotonic_ns`, divided by the speed, never less than none.
-- Where the recorder had connected anew, the server's clock may be another one: from there on the time between
-  the frames before and after is taken from their `stamp_ns`.
-- Moved stamps: the first frame's are now, and each other's are as far from it as they were, to the nanosecond
-  at speed 1. Numbers go on from one time through the recording to the next.
-- Original stamps: the frames are as they were recorded, all of them.
+- The time between frames is that of their `monotonic_ns`, divided by the speed, never negative.
+- Where the recorder reconnected, the server may have another monotonic clock: the time between the frames
+  before and after is that of their `stamp_ns`.
+- Moved stamps: the first frame's are now, and the others keep their distance to it, exactly at speed 1.
+  Sequence numbers continue when the recording starts again.
+- Original stamps: frames are sent as recorded.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ _MAX: Final = (1 << 64) - 1
 
 
 class Due(NamedTuple):
-    """A frame and the CLOCK_MONOTONIC at which it is to be handed out."""
+    """A frame and the CLOCK_MONOTONIC at which to send it."""
 
     at_ns: int
     frame: DataMessage
 
 
 class Timeline:
-    """Turns recorded frames into those to be sent."""
+    """Turns recorded frames into those to send."""
 
     def __init__(
         self, speed: float, *, original: bool, monotonic_ns: Callable[[], int], realtime_ns: Callable[[], int]
     ) -> None:
-        """`speed` 1 is the original timing; `original` leaves numbers and stamps alone."""
+        """`speed` 1 is the original timing; `original` keeps sequence numbers and stamps."""
         self._speed = speed
         self._original = original
         self._monotonic_ns = monotonic_ns
@@ -48,31 +47,31 @@ class Timeline:
         """The recording's `monotonic_ns` that is `_first_at_ns` on ours."""
         self._last_at_ns = 0
         self._last_stamp_ns = 0
-        self._connected_anew = False
+        self._reconnected = False
         self._sequence: dict[int, tuple[int | None, int]] = {}
-        """By sensor: what is added to its numbers, None if that is not known yet, and the next number."""
+        """By sensor: offset of its sequence numbers, None if not known yet, and the next number."""
         self._moments: dict[int, int] = {}
-        """By sensor: the recorded time of its last frame."""
+        """By sensor: recorded time of its last frame."""
         self._step_ns = 0
-        """The last time between two frames of one sensor, as it is replayed."""
+        """Last replayed interval between two frames of one sensor."""
 
-    def connected_anew(self) -> None:
-        """The recorder connected here: clocks before and after are not the same for sure."""
-        self._connected_anew = self._begun
+    def reconnected(self) -> None:
+        """The recorder reconnected here: the clocks before and after may differ."""
+        self._reconnected = self._begun
 
     def begin_again(self) -> None:
-        """The recording begins anew: its first frame is due one step after the last."""
-        self._begun = self._connected_anew = False
+        """The recording starts again: its first frame is due one interval after the last."""
+        self._begun = self._reconnected = False
         self._sequence = {sensor: (None, number) for sensor, (_, number) in self._sequence.items()}
 
     def now(self, frame: DataMessage) -> DataMessage:
-        """The frame as it is to be sent at this moment, whatever its time was."""
+        """The frame as it is sent now, whenever it was due."""
         if self._original:
             return frame
         return self._numbered(frame, self._realtime_ns(), self._monotonic_ns())
 
     def due(self, frame: DataMessage) -> Due:
-        """When the next frame is due and what it is then."""
+        """When the next frame is due, and the frame to send."""
         if not self._begun:
             self._begun = True
             self._base_ns, self._first_stamp_ns = frame.monotonic_ns, frame.stamp_ns
@@ -80,8 +79,8 @@ class Timeline:
             self._moments.clear()
             self._moved_stamp_ns = self._realtime_ns() + self._first_at_ns - self._monotonic_ns()
             self._last_at_ns = self._first_at_ns
-        elif self._connected_anew:
-            self._connected_anew = False
+        elif self._reconnected:
+            self._reconnected = False
             pause_ns = max(0, frame.stamp_ns - self._last_stamp_ns)
             passed_ns = round((self._last_at_ns - self._first_at_ns) * self._speed)
             self._base_ns = frame.monotonic_ns - passed_ns - pause_ns
@@ -98,7 +97,7 @@ class Timeline:
         return Due(self._last_at_ns, self._numbered(frame, stamp_ns, moment_ns))
 
     def _scaled(self, duration_ns: int) -> int:
-        # A float would not keep every nanosecond of a long recording.
+        # A float would lose nanoseconds in a long recording.
         return duration_ns if self._speed == 1 else round(duration_ns / self._speed)
 
     def _numbered(self, frame: DataMessage, stamp_ns: int, monotonic_ns: int) -> DataMessage:

@@ -1,1 +1,1 @@
-"""`ethercat-report`: one page on how a sensor is, from a recording or a live stream."""
+"""`ethercat-report`: one-page sensor health report (HTML), from a recording or a live stream."""

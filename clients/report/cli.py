@@ -1,12 +1,12 @@
-"""`ethercat-report`: the command; what it does is in `program.py`."""
+"""`ethercat-report`: entry point, progress and output."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
 
-from clients.endings import hush, not_installed
-from clients.report.errors import ReportError
+from clients.errors import ReportError
+from clients.program import discard_output, not_installed
 from clients.report.options import parse_options
 
 
@@ -14,7 +14,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Make a report; returns the exit code."""
     options = parse_options(argv)
     try:
-        # Takes a moment, in which Ctrl-C must not end in a traceback.
+        # Slow to import; Ctrl-C must not end in a traceback meanwhile.
         from clients.report import program  # noqa: PLC0415
 
         with _Progress(options.seconds) as progress:
@@ -28,13 +28,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         print(outcome.words, flush=True)
     except BrokenPipeError:
-        hush()  # the report is written all the same
+        discard_output()  # the report is written all the same
     print(f"ethercat-report: the report is in {options.output}", file=sys.stderr)
     return outcome.exit_code
 
 
 class _Progress:
-    """Says on a terminal how much of the listening is left, on one line that is cleared at the end."""
+    """Shows the remaining time on a terminal, on a line that is cleared at the end."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds, self._shown = seconds, -1

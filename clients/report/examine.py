@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from clients.report import noise, register, spectrum, stuck, surroundings, timing
-from clients.report.check import Check, Verdict, verdict
-from clients.report.series import Series
-from clients.report.subject import Subject
+from clients.report.checks import noise, register, spectrum, stuck, surroundings, timing
+from clients.report.checks.check import Check, Verdict, verdict
+from clients.report.subjects.series import Series
+from clients.report.subjects.subject import Subject
 
 
 @dataclass(frozen=True)

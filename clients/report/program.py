@@ -10,15 +10,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from clients.recording.errors import RecordingError
-from clients.report import live, recorded
-from clients.report.check import Level
-from clients.report.errors import ReportError
+from clients.errors import RecordingError, ReportError
+from clients.program import VERSION
+from clients.report.checks.check import Level
 from clients.report.examine import Examination, examine
 from clients.report.options import ReportOptions
-from clients.report.page import as_json, render
-from clients.report.subject import Subject
-from clients.version import VERSION
+from clients.report.page.page import as_json, render
+from clients.report.subjects import live, recorded
+from clients.report.subjects.subject import Subject
 from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
 
 EXIT_CODES = {Level.OK: 0, Level.NOT_POSSIBLE: 3, Level.ATTENTION: 4, Level.FAULT: 5}
@@ -26,7 +25,7 @@ EXIT_CODES = {Level.OK: 0, Level.NOT_POSSIBLE: 3, Level.ATTENTION: 4, Level.FAUL
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a report came to."""
+    """The result of a report."""
 
     words: str
     """For the standard output."""
@@ -34,7 +33,7 @@ class Outcome:
 
 
 def make(options: ReportOptions, progress: Callable[[float], None]) -> Outcome:
-    """Make the report; ReportError says why there is none. `progress` is told how long it has listened, s."""
+    """Make the report; ReportError. `progress` is called with the time listened so far, s."""
     try:
         examinations = [examine(each) for each in _subjects(options, progress)]
     except UnreachableError as error:
@@ -54,11 +53,12 @@ def make(options: ReportOptions, progress: Callable[[float], None]) -> Outcome:
 def _subjects(options: ReportOptions, progress: Callable[[float], None]) -> list[Subject]:
     if options.recording is not None:
         return recorded.subjects(options.recording, options.sensor, options.imu_units)
+    assert options.server is not None
     return live.subjects(options.server, options.seconds, options.sensor, options.imu_units, progress)
 
 
 def _write(path: Path, page: str) -> None:
-    """Whole or not at all: a report that was there stays until the new one is complete."""
+    """Write atomically: an existing report stays until the new one is complete."""
     made: str | None = None
     try:
         with tempfile.NamedTemporaryFile(
@@ -83,7 +83,7 @@ def _summary(examinations: Sequence[Examination]) -> str:
     lines = []
     for each in examinations:
         subject = each.subject
-        who = f"Sensor {subject.place} ({subject.name}, serial {subject.serial})"
+        who = f"Sensor {subject.position} ({subject.name}, serial {subject.serial})"
         lines.append(f"{who}: {each.verdict.headline}. {each.verdict.sentence}")
         for check in each.checks:
             if check.level >= Level.NOT_POSSIBLE:

@@ -1,1 +1,1 @@
-"""`ethercat-doctor`: what keeps the samples from being fresh, and what mends it."""
+"""`ethercat-doctor`: finds causes of latency and lost samples on machine and bus, and how to fix them."""

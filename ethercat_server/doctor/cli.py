@@ -1,4 +1,4 @@
-"""`ethercat-doctor`: reads the command line, examines, reports, makes the worst finding an exit code."""
+"""`ethercat-doctor`: the command line; the exit code follows from the worst finding."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
-from ethercat_server import __version__, command_line
+from ethercat_server import __version__
+from ethercat_server.daemon.options import VIRTUAL_INTERFACE
+from ethercat_server.daemon.server_settings import SERVER_SETTINGS
 from ethercat_server.errors import ServerError, UsageError
-from ethercat_server.interface import MAX_NAME_LENGTH
-from ethercat_server.options import VIRTUAL_INTERFACE
-from ethercat_server.server_settings import SERVER_SETTINGS
+from ethercat_server.ethercat.nic import MAX_NAME_LENGTH
+from ethercat_server.process import command_line
 
 if TYPE_CHECKING:
     from ethercat_server.doctor.finding import Finding
-    from ethercat_server.doctor.machine import Machine
+    from ethercat_server.doctor.machine.machine import Machine
 
 _PROGRAM: Final = "ethercat-doctor"
 _EXIT_CODES: Final = (
     "exit codes: 0 nothing worse than a note, 1 the doctor itself failed or was stopped, 2 wrong arguments, "
-    "3 the worst is a warning, 4 something is bad"
+    "3 warnings, 4 something is bad"
 )
 _LONGEST_S: Final = 3600.0
 
@@ -33,9 +34,8 @@ def build_parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(
         prog=_PROGRAM,
-        description="Looks for what keeps the samples of sensors from being fresh: kernel, "
-        "processors, network card, who else is there, the bus; then measures. Changes nothing. As "
-        "root it sees all.",
+        description="Diagnoses latency and lost samples: kernel, processors, network card, other software, "
+        "bus; then measures. Read-only. Run as root for a complete report.",
         epilog=_EXIT_CODES,
     )
     parser.add_argument(
@@ -48,15 +48,15 @@ def build_parser() -> argparse.ArgumentParser:
         type=_seconds,
         default=10.0,
         metavar="N",
-        help="measure for so long (default 10; 0: not at all)",
+        help="duration of the measurement (default 10; 0: none)",
     )
     for name in ("rt_priority", "cpu"):
         setting = SERVER_SETTINGS[name]
         parser.add_argument(
             setting.flag, dest=name, type=_whole, metavar=setting.metavar, default=setting.default,
-            help=f"measure as a server with this option would run: {setting.meaning}",
+            help=f"measure like a server with this option: {setting.meaning}",
         )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="JSON for programs")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
@@ -78,16 +78,16 @@ def _whole(text: str) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Examine; returns the exit code. argparse exits with 2 for what it finds."""
+    """Run the doctor; returns the exit code. argparse exits with 2."""
     command_line.begin(_PROGRAM)
-    # What was not granted is a finding.
-    logging.getLogger("ethercat_server.realtime").setLevel(logging.ERROR)
+    # Missing privileges are a finding.
+    logging.getLogger("ethercat_server.process.realtime").setLevel(logging.ERROR)
     args = build_parser().parse_args(argv)
     return command_line.run(_PROGRAM, lambda: _run(args), as_json=args.json)
 
 
 def _run(args: argparse.Namespace) -> int:
-    # Takes a moment, in which Ctrl-C is to be heard already.
+    # Imported late, so that Ctrl-C works from the start.
     from ethercat_server.doctor.report import EXIT_CODES, Report, as_json, worst  # noqa: PLC0415
 
     _check(args)
@@ -110,7 +110,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iterator[Finding]:
-    from ethercat_server.doctor.bus_examination import Request, examine_bus  # noqa: PLC0415
+    from ethercat_server.doctor.bus.examination import Request, examine_bus  # noqa: PLC0415
     from ethercat_server.doctor.examination import examine_machine  # noqa: PLC0415
 
     with contextlib.ExitStack() as cleanup:
@@ -120,12 +120,12 @@ def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iter
 
 
 def _machine(args: argparse.Namespace, cleanup: contextlib.ExitStack) -> Machine:
-    """This machine, and the interface, which for `virtual` is brought up and taken down by `cleanup`."""
-    from ethercat_server.doctor.bus_examination import check_rights  # noqa: PLC0415
-    from ethercat_server.doctor.facts import InterfaceFacts, collect  # noqa: PLC0415
+    """This machine and the interface; a virtual bus for `virtual`, closed by `cleanup`."""
+    from ethercat_server.doctor.bus.examination import check_rights  # noqa: PLC0415
     from ethercat_server.doctor.finding import CannotLookError  # noqa: PLC0415
-    from ethercat_server.doctor.machine import Machine  # noqa: PLC0415
-    from ethercat_server.virtual_bus import VirtualBus  # noqa: PLC0415
+    from ethercat_server.doctor.machine.facts import InterfaceFacts, collect  # noqa: PLC0415
+    from ethercat_server.doctor.machine.machine import Machine  # noqa: PLC0415
+    from ethercat_server.virtual_sensor.virtual_bus import VirtualBus  # noqa: PLC0415
 
     resolution = time.clock_getres(time.CLOCK_MONOTONIC)
     own = {"asked": args.iface, "timer_resolution_s": resolution, "rt_priority": args.rt_priority}
@@ -142,10 +142,10 @@ def _machine(args: argparse.Namespace, cleanup: contextlib.ExitStack) -> Machine
 
 
 def _check(args: argparse.Namespace) -> None:
-    """UsageError for arguments that cannot be meant."""
+    """UsageError for impossible arguments."""
     if not 0 < len(os.fsencode(args.iface)) <= MAX_NAME_LENGTH or "/" in args.iface:
         raise UsageError(
-            f"{args.iface!r} is no name of a network interface: it must have 1 to {MAX_NAME_LENGTH} "
+            f"{args.iface!r} is not an interface name: it must have 1 to {MAX_NAME_LENGTH} "
             "characters; "
             "'ethercat-sensor adapters' lists them"
         )

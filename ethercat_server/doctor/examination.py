@@ -1,4 +1,4 @@
-"""The table of checks of machine and interface, and how any check is done: none can take the others along."""
+"""The table of checks of machine and interface. A check that fails does not stop the others."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from ethercat_server.doctor import company, cpu, interrupts, kernel, nic, rights
-from ethercat_server.doctor.facts import Link
+from ethercat_server.daemon.options import VIRTUAL_INTERFACE
 from ethercat_server.doctor.finding import CannotLookError, Finding, bad, skipped
-from ethercat_server.doctor.machine import Machine
+from ethercat_server.doctor.machine import cpu, interrupts, kernel, nic, other_software, rights
+from ethercat_server.doctor.machine.facts import Link
+from ethercat_server.doctor.machine.machine import Machine
 from ethercat_server.errors import ServerError
-from ethercat_server.options import VIRTUAL_INTERFACE
 
-_ABOUT_THE_INTERFACE: Final = frozenset({"interface", "who else"})
+_ABOUT_THE_INTERFACE: Final = frozenset({"interface", "other software"})
 
 
 class Check(NamedTuple):
@@ -36,7 +36,7 @@ CHECKS: Final = (
     Check("processors", "governor", cpu.governor),
     Check("processors", "idle states", cpu.idle_states),
     Check("processors", "isolation", cpu.isolated),
-    Check("processors", "virtualisation", cpu.virtualisation),
+    Check("processors", "virtualization", cpu.virtualization),
     Check("interface", "link", nic.link),
     Check("interface", "speed", nic.speed),
     Check("interface", "driver", nic.driver),
@@ -46,15 +46,15 @@ CHECKS: Final = (
     Check("interface", "counters", nic.counters),
     Check("interface", "interrupts", interrupts.affinity),
     Check("interface", "interrupt threads", interrupts.threads),
-    Check("who else", "managers", company.managers),
-    Check("who else", "addresses", company.addresses),
-    Check("who else", "membership", company.membership),
-    Check("who else", "listeners", company.listeners),
+    Check("other software", "managers", other_software.managers),
+    Check("other software", "addresses", other_software.addresses),
+    Check("other software", "membership", other_software.membership),
+    Check("other software", "listeners", other_software.listeners),
 )
 
 
 def examine(subject: str, name: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
-    """The findings of one check, with its name; whatever keeps it from looking is a finding too."""
+    """The findings of one check, with its name; an error in the check is a finding too."""
     try:
         for finding in look():
             yield replace(finding, subject=subject, check=name)
@@ -64,21 +64,19 @@ def examine(subject: str, name: str, look: Callable[[], Iterator[Finding]]) -> I
         yield replace(bad(str(error), ""), subject=subject, check=name)
     except OSError as error:
         yield replace(skipped(error.strerror or str(error)), subject=subject, check=name)
-    except Exception as error:  # noqa: BLE001 - one check that fails must not take the others along
-        text = f"{type(error).__name__}: {error}; a fault of the doctor's, please report it"
+    except Exception as error:  # noqa: BLE001 - a check that fails must not stop the others
+        text = f"{type(error).__name__}: {error}; an error in ethercat-doctor, please report it"
         yield replace(skipped(text), subject=subject, check=name)
 
 
 def examine_machine(machine: Machine) -> Iterator[Finding]:
-    """Everything that needs no bus."""
+    """All checks that need no bus."""
     there = isinstance(machine.facts.link, Link)
     for check in CHECKS:
         if there or check.subject not in _ABOUT_THE_INTERFACE or check.look is nic.link:
             for finding in examine(check.subject, check.name, functools.partial(check.look, machine)):
-                # Nobody mends what is gone when the doctor ends.
+                # A virtual bus is gone when the doctor ends: nothing to fix.
                 gone = check.subject in _ABOUT_THE_INTERFACE and machine.asked == VIRTUAL_INTERFACE
                 yield replace(finding, commands=()) if gone else finding
         if check.look is nic.link and not there:
-            yield replace(
-                skipped("without it there is nothing to see"), subject=check.subject, check="the rest"
-            )
+            yield replace(skipped("no interface"), subject=check.subject, check="the rest")

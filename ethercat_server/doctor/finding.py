@@ -1,4 +1,4 @@
-"""What a check finds: one line each, how much it matters, and what mends it."""
+"""The result of a check: severity, description, and the commands that fix it."""
 
 from __future__ import annotations
 
@@ -8,37 +8,37 @@ from typing import Any, NoReturn
 
 
 class Level(IntEnum):
-    """How much a finding matters; the worst one is the doctor's exit code."""
+    """Severity; the worst one determines the exit code."""
 
     OK = 0
     SKIPPED = 1
-    """Could not be looked at, or not by this user: says nothing about the machine."""
+    """Could not be checked, or not by this user."""
     NOTE = 2
-    """Costs little, or only under load."""
+    """Little effect, or only under load."""
     WARNING = 3
-    """Costs samples or makes them older."""
+    """Loses samples or increases their age."""
     BAD = 4
-    """The sensors cannot be read, or not reliably."""
+    """Sensors cannot be read, or not reliably."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of the doctor's."""
+    """One line of the report."""
 
     level: Level
     found: str
-    """What was found."""
+    """Description."""
     why: str = ""
-    """Why it matters, and what to do where no command does it."""
+    """Its effect, and the remedy where no command is one."""
     commands: tuple[str, ...] = ()
-    """What mends it."""
+    """Commands that fix it."""
     values: dict[str, Any] = field(default_factory=dict)
-    """The same for programs."""
+    """Details for the JSON output."""
     subject: str = ""
     check: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """Its JSON form."""
         return {
             "subject": self.subject,
             "check": self.check,
@@ -51,34 +51,34 @@ class Finding:
 
 
 class CannotLookError(Exception):
-    """A check cannot be done here; the text says why."""
+    """A check is impossible here; the text says why."""
 
 
 def cannot_look(why: str) -> NoReturn:
-    """End a check that cannot be done."""
+    """End an impossible check."""
     raise CannotLookError(why)
 
 
 def ok(found: str, why: str = "", /, **values: Any) -> Finding:
-    """All is well."""
+    """Nothing to fix."""
     return Finding(Level.OK, found, why, (), values)
 
 
 def note(found: str, why: str, /, *commands: str, **values: Any) -> Finding:
-    """Costs little, or only under load."""
+    """Little effect, or only under load."""
     return Finding(Level.NOTE, found, why, commands, values)
 
 
 def warning(found: str, why: str, /, *commands: str, **values: Any) -> Finding:
-    """Costs samples or makes them older."""
+    """Loses samples or increases their age."""
     return Finding(Level.WARNING, found, why, commands, values)
 
 
 def bad(found: str, why: str, /, *commands: str, **values: Any) -> Finding:
-    """The sensors cannot be read, or not reliably."""
+    """Sensors cannot be read, or not reliably."""
     return Finding(Level.BAD, found, why, commands, values)
 
 
 def skipped(why: str) -> Finding:
-    """Not looked at."""
-    return Finding(Level.SKIPPED, f"could not look: {why}")
+    """Not checked."""
+    return Finding(Level.SKIPPED, f"not checked: {why}")

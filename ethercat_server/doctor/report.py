@@ -1,4 +1,4 @@
-"""How the doctor writes: a line a finding for people, one JSON object for programs."""
+"""Output of the doctor: text, or one JSON object."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, TextIO
 
 from ethercat_server.doctor.finding import Finding, Level
-from protocol.text import visible
+from protocol.text.visible import visible
 
-_COLOURS: Final = {
+_COLORS: Final = {
     Level.OK: "\x1b[32m", Level.SKIPPED: "\x1b[2m", Level.NOTE: "\x1b[36m", Level.WARNING: "\x1b[33m",
     Level.BAD: "\x1b[1;31m",
 }  # fmt: skip
@@ -29,21 +29,21 @@ EXIT_CODES: Final = {Level.OK: 0, Level.SKIPPED: 0, Level.NOTE: 0, Level.WARNING
 
 
 def worst(findings: Iterable[Finding]) -> Level:
-    """The worst of the findings; what was skipped says nothing."""
+    """The worst level, skipped checks aside."""
     return max((f.level for f in findings if f.level is not Level.SKIPPED), default=Level.OK)
 
 
-def wants_colour(stream: TextIO, environment: Mapping[str, str]) -> bool:
+def wants_color(stream: TextIO, environment: Mapping[str, str]) -> bool:
     """Only a terminal, and not if the user set NO_COLOR (no-color.org)."""
     return stream.isatty() and not environment.get("NO_COLOR") and environment.get("TERM") != "dumb"
 
 
 class Report:
-    """Writes findings for people as they come."""
+    """Writes findings as text, as they come."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stdout
-        self._colour = wants_colour(self._stream, os.environ)
+        self._color = wants_color(self._stream, os.environ)
         width = (
             shutil.get_terminal_size((_USUAL_WIDTH, 24)).columns if self._stream.isatty() else _USUAL_WIDTH
         )
@@ -56,20 +56,20 @@ class Report:
         self._say(text + "\n")
 
     def wait(self, text: str) -> None:
-        """Say on a terminal what takes a while, until the next line."""
+        """Show progress on a terminal, until the next line."""
         if self._stream.isatty():
             self._stream.write(f"{text}\r")
             self._stream.flush()
             self._waiting = True
 
     def write(self, finding: Finding) -> None:
-        """One finding, below its subject."""
+        """One finding, under its subject."""
         if finding.subject != self._subject:
             self._say(("\n" if self._subject else "") + self._painted(finding.subject, _BOLD))
             self._subject = finding.subject
         level = finding.level.name.lower().ljust(_LEVEL_WIDTH)
         first, *rest = self._lines(finding.found)
-        head = self._painted(level, _COLOURS[finding.level])
+        head = self._painted(level, _COLORS[finding.level])
         self._say(f"  {head}  {finding.check.ljust(_NAME_WIDTH)}  {first}")
         for line in (*rest, *self._lines(finding.why)) if finding.why else rest:
             self._say(_INDENT + line)
@@ -77,7 +77,7 @@ class Report:
             self._say(f"{_INDENT}$ {command}")
 
     def summary(self, findings: Sequence[Finding]) -> None:
-        """How many of each, and what that means."""
+        """The number of findings per level."""
         counts = {level: sum(f.level is level for f in findings) for level in reversed(Level)}
         text = ", ".join(f"{count} {_counted(level, count)}" for level, count in counts.items() if count)
         self._say(f"\n{text}")
@@ -85,8 +85,8 @@ class Report:
     def _lines(self, text: str) -> list[str]:
         return textwrap.wrap(text, self._width, break_on_hyphens=False, break_long_words=False) or [""]
 
-    def _painted(self, text: str, colour: str) -> str:
-        return f"{colour}{text}{_END}" if self._colour else text
+    def _painted(self, text: str, color: str) -> str:
+        return f"{color}{text}{_END}" if self._color else text
 
     def _say(self, text: str) -> None:
         if self._waiting:
@@ -102,14 +102,14 @@ def _counted(level: Level, count: int) -> str:
 
 
 def printable(text: str) -> str:
-    """Without what a device or a file could do to the terminal; our own colours stay."""
-    own = {*_COLOURS.values(), _END, _BOLD}
+    """Without control characters from a device or a file; our own colors stay."""
+    own = {*_COLORS.values(), _END, _BOLD}
     parts = text.split("\x1b")
     found = _lines(parts[0])
     for part in parts[1:]:
-        colour = next((c for c in own if ("\x1b" + part).startswith(c)), None)
-        kept = part[len(colour) - 1 :] if colour else "?" + part
-        found += (colour or "") + _lines(kept)
+        color = next((c for c in own if ("\x1b" + part).startswith(c)), None)
+        kept = part[len(color) - 1 :] if color else "?" + part
+        found += (color or "") + _lines(kept)
     return found
 
 
@@ -118,6 +118,6 @@ def _lines(text: str) -> str:
 
 
 def as_json(header: Mapping[str, Any], findings: Sequence[Finding]) -> str:
-    """All of it in one object."""
+    """The whole report as one object."""
     found = {**header, "worst": worst(findings).name.lower(), "findings": [f.as_json() for f in findings]}
     return json.dumps(found, indent=2, ensure_ascii=False, default=str)

@@ -1,1 +1,1 @@
-"""`ethercat-sensor`: looks at sensors and sets them up, on the bus itself or through a running server."""
+"""`ethercat-sensor`: inspects and configures sensors, on the bus itself or through a running server."""

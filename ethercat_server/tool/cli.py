@@ -9,16 +9,10 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NoReturn
 
-from ethercat_server import __version__, command_line
-from ethercat_server.tool import (
-    bus_commands,
-    objects_command,
-    settings_commands,
-    snapshot,
-    tare_command,
-    watch,
-)
+from ethercat_server import __version__
+from ethercat_server.process import command_line
 from ethercat_server.tool.command import Command
+from ethercat_server.tool.commands import bus, objects, settings, snapshot, tare, watch
 from ethercat_server.tool.show import say_json
 
 _PROGRAM: Final = "ethercat-sensor"
@@ -28,7 +22,7 @@ _EXIT_CODES: Final = (
 
 COMMANDS: Final[Mapping[str, Command]] = {
     command.name: command
-    for module in (bus_commands, watch, objects_command, settings_commands, tare_command, snapshot)
+    for module in (bus, watch, objects, settings, tare, snapshot)
     for command in module.COMMANDS
 }
 
@@ -37,13 +31,13 @@ _NEGATIVE: Final = re.compile(r"-(\.?\d|inf|nan)")
 
 
 class _Parser(argparse.ArgumentParser):
-    """It takes all negative numbers for numbers, and says what is wrong to programs too."""
+    """Recognizes all negative numbers, and reports errors as JSON with --json."""
 
     as_json = False
 
     def __init__(self, **values: Any) -> None:
         super().__init__(**values)
-        self._negative_number_matcher = _NEGATIVE  # argparse's own takes -1e-3 for an option
+        self._negative_number_matcher = _NEGATIVE  # argparse takes -1e-3 for an option
 
     def error(self, message: str) -> NoReturn:
         if self.as_json:
@@ -58,11 +52,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog=_PROGRAM,
         usage="%(prog)s COMMAND [ARGUMENT ...]",
-        description="Looks at Bota EtherCAT sensors and sets them up, on the interface or through a server.",
-        epilog=f"commands (COMMAND --help tells more):\n{summaries}\n\n{_EXIT_CODES}",
+        description="Inspects and configures Bota EtherCAT sensors, on the interface or through a server.",
+        epilog=f"commands (see COMMAND --help):\n{summaries}\n\n{_EXIT_CODES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("command", choices=list(COMMANDS), metavar="COMMAND", help="what to do, see below")
+    parser.add_argument("command", choices=list(COMMANDS), metavar="COMMAND", help="see below")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
@@ -75,7 +69,7 @@ def build_command_parser(command: Command) -> argparse.ArgumentParser:
         epilog=_EXIT_CODES,
     )
     command.add_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="JSON for programs")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
     return parser
 
 
@@ -83,9 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; returns its exit code. argparse exits with 2 for what it finds."""
     command_line.begin(_PROGRAM)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # a terminal that lacks a character is no reason to end
+        sys.stdout.reconfigure(errors="replace")  # never fail for a character the terminal lacks
     arguments = sys.argv[1:] if argv is None else list(argv)
-    # What stands behind the command is its own parser's, options and arguments mixed as one likes.
+    # The subcommand has a parser of its own, with options and arguments in any order.
     _Parser.as_json = "--json" in arguments
     command = COMMANDS[build_parser().parse_args(arguments[:1]).command]
     args = build_command_parser(command).parse_intermixed_args(arguments[1:])

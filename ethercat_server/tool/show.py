@@ -1,12 +1,14 @@
-"""How the subcommands write: text for people in columns, one JSON object for programs."""
+"""Output of the subcommands: text in columns, or one JSON object."""
 
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Sequence
 from typing import Any
+
+from ethercat_server.links.link import Found, Link
+from protocol.text.json_text import finite
 
 
 def say(text: str) -> None:
@@ -15,18 +17,21 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
-def note(text: str) -> None:
-    """One line for people on standard error."""
-    sys.stderr.write(f"ethercat-sensor: {text}\n")
+def report(as_json: bool, link: Link, found: Found, values: dict[str, Any], *lines: str) -> None:
+    """The result for one sensor: a JSON object with `values`, or the sensor's name and `lines`."""
+    if as_json:
+        say_json({"through": link.used, **found.as_json(), **values})
+    else:
+        say("\n".join([str(found), *lines]))
 
 
 def say_json(value: dict[str, Any], *, indent: int | None = 2) -> None:
-    """One JSON object; numbers that JSON has not are null."""
-    say(json.dumps(_clean(value), indent=indent, ensure_ascii=False, allow_nan=False))
+    """One JSON object; infinite and NaN become null."""
+    say(json.dumps(finite(value), indent=indent, ensure_ascii=False, allow_nan=False))
 
 
 def columns(rows: Sequence[Sequence[str]], indent: int = 0) -> str:
-    """The rows with their columns aligned; the last column is left as it is."""
+    """The rows with their columns aligned; the last column is not padded."""
     widths = [max(len(row[n]) for row in rows if len(row) > n + 1) for n in range(max(map(len, rows)) - 1)]
     lines = []
     for row in rows:
@@ -36,19 +41,9 @@ def columns(rows: Sequence[Sequence[str]], indent: int = 0) -> str:
 
 
 def value_text(value: object) -> str:
-    """A setting's or an object's value as people write it."""
+    """A setting's or an object's value as text."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
         return f"{value:g}"
     return "--" if value is None else str(value)
-
-
-def _clean(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_clean(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -1,6 +1,5 @@
-"""A virtual Bota EtherCAT force/torque sensor: answers real EtherCAT frames, with faults on command.
+"""A simulated Bota EtherCAT force/torque sensor with fault injection. Standard library only.
 
-Standard library only. From the wire inwards: `link` (raw socket), `wire` (frames), `bus` (a chain of
-sensors), `sensor` (one sensor), `esc` (its EtherCAT controller), `al`, `sii`, `mailbox`, `coe`,
-`dictionary` (its firmware), `signals` and `scene` (what it measures), `faults` (what goes wrong).
+From the wire inwards: `link` (raw socket), `bus` (a chain of sensors, in memory), `sensor`, `esc` (its slave
+controller), `firmware`, `measurement` (its samples), `faults` (the commands).
 """

@@ -1,18 +1,28 @@
-"""A chain of virtual sensors: a frame passes through all of them, first to last, and comes back.
+"""A chain of simulated sensors, in memory: bytes in, bytes out, no sockets, no threads, no clock of its own.
 
-No sockets: bytes in, bytes out, with the time handed in.
+Time is an argument, in ns of any clock that only goes forward; nothing in here asks for it elsewhere:
+
+    bus = Bus(BusOptions((SensorOptions(serial=1), SensorOptions(serial=2))), now=0)
+    answer = bus.exchange(frame, now)       # an Ethernet frame; None if it is lost on the bus
+    bus.idle(now)                           # no frame for a while: watchdogs expire, power returns
+    faults.table.obey(bus, "power off @1")  # a fault, as one line of text; answers "ok" or "error: ..."
+    bus.statistics()                        # AL states, SDO writes, frames: what the command `stats` prints
+
+The same options (with their seeds), frames, commands and times give the same answers. A sensor that loses
+power, its settings and its flash are in `bus.sensors[n]`.
 """
 
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass
 from typing import Any
 
-from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor import wire
-from ethercat_server.virtual_sensor.commands import execute
-from ethercat_server.virtual_sensor.firmware import Firmware
+from ethercat_server.ethercat import wire
+from ethercat_server.virtual_sensor.esc import registers as reg
+from ethercat_server.virtual_sensor.esc.commands import execute
+from ethercat_server.virtual_sensor.firmware.firmware import Firmware
 from ethercat_server.virtual_sensor.options import BusOptions
 from ethercat_server.virtual_sensor.sensor import VirtualSensor
 
@@ -21,7 +31,7 @@ _LONGEST_PERIOD_NS = 50_000_000
 
 @dataclass(slots=True)
 class Damage:
-    """Frames that arrive damaged at one port of one sensor."""
+    """Frames that arrive corrupted at one port of one sensor."""
 
     sensor: VirtualSensor
     port: int
@@ -31,18 +41,20 @@ class Damage:
 
 
 class Bus:
-    """Sensors in the order in which frames reach them.
+    """Sensors in the order in which frames reach them. All times are in ns, on the caller's clock.
 
     Attributes:
-        lose: so many frames more will be lost.
-        deaf_until: no frame comes back before this time (ns); None for not at all deaf.
-        deaf_after: deaf for ever after so many frames more; None for never.
-        damage: what is to happen to the next frames on the cable; None for nothing.
+        now: time of the latest call.
+        lose: number of the next frames that are lost.
+        deaf_until: no frame comes back before this time; None if the bus answers.
+        deaf_after: number of frames after which the bus stops answering; None for never.
+        damage: corruption of the next frames on the cable; None for none.
     """
 
     def __init__(self, options: BusOptions, now: int) -> None:
+        """All sensors are switched on at `now`."""
         self.now = now
-        self.sensors = [VirtualSensor(each, now) for each in options.sensors]
+        self.sensors = [VirtualSensor(each, lambda: self.now) for each in options.sensors]
         self.lose = 0
         self.deaf_until: float | None = None
         self.deaf_after: int | None = None
@@ -54,7 +66,7 @@ class Bus:
         self.rewire()
 
     def rewire(self) -> None:
-        """Power or place of a sensor changed: see who is still reached."""
+        """A sensor was switched on or off: frames reach those before the first without power."""
         self._alive = []
         for sensor in self.sensors:
             if sensor.life is None:
@@ -64,31 +76,28 @@ class Bus:
             life.esc.set_ports(next_slave=life is not self._alive[-1])
 
     def set_time(self, now: int) -> None:
-        """It is `now`, CLOCK_MONOTONIC in ns."""
+        """Let time pass up to `now`, with what is due meanwhile but the watchdogs: frames may be waiting."""
+        while self._power_events and self._power_events[0][0] <= now:
+            self.now, sensor = self._power_events.pop(0)
+            sensor.power(True)
+            self.rewire()
         self.now = now
         if self.deaf_until is not None and now >= self.deaf_until:
             self.deaf_until = None
-        for due, sensor in list(self._power_events):
-            if now >= due:
-                self._power_events.remove((due, sensor))
-                sensor.set_time(now)
-                sensor.power(True)
-                self.rewire()
-        for sensor in self.sensors:
-            sensor.set_time(now)
 
     def power(self, sensor: VirtualSensor, on: bool, seconds: float | None = None) -> None:
-        """Switch a sensor off or on; if off, on again by itself after `seconds`."""
+        """Switch a sensor on or off; on again after `seconds` unless None."""
         self._power_events = [event for event in self._power_events if event[1] is not sensor]
         sensor.power(on)
         if seconds is not None:
             self._power_events.append((self.now + round(seconds * 1e9), sensor))
+            self._power_events.sort(key=operator.itemgetter(0))
         self.rewire()
 
     def process(self, frame: bytearray, size: int, now: int) -> bool:
-        """Let the frame in the first `size` bytes of `frame` pass; False if it does not come back.
+        """Pass the frame in the first `size` bytes of `frame`, in position; False if it does not come back.
 
-        `now` is when it arrived, CLOCK_MONOTONIC in ns.
+        `now` is when it arrived.
         """
         datagrams = wire.parse(frame, size)
         if not datagrams:
@@ -103,11 +112,11 @@ class Bus:
             self.lose = max(self.lose - 1, 0)
             self.frames_lost += 1
             return False
-        place = self._damaged_at()
-        for life in self._alive[:place]:
+        position = self._damaged_at()
+        for life in self._alive[:position]:
             for datagram in datagrams:
                 execute(life.esc, frame, datagram)
-        if place is not None:  # the network card of the master throws it away
+        if position is not None:  # the network card of the master throws it away
             self.frames_lost += 1
             return False
         frame[wire.SOURCE_ADDRESS] |= wire.PROCESSED_BIT
@@ -116,11 +125,17 @@ class Bus:
                 sensor.due.pop(0)()
         return True
 
-    def _damaged_at(self) -> int | None:
-        """Count what a damaged frame makes the controllers count; how many sensors got it whole, None: all.
+    def exchange(self, frame: bytes, now: int) -> bytes | None:
+        """The frame as it comes back from the bus; None if it is lost. Watchdogs expire before it arrives."""
+        self.idle(now)
+        answer = bytearray(frame)
+        return bytes(answer) if self.process(answer, len(answer), now) else None
 
-        The one that finds it damaged marks it; those it then passes, on the way out at port 0 and on the way
-        back at port 1, count it as forwarded.
+    def _damaged_at(self) -> int | None:
+        """Count a corrupted frame in the error counters; how many sensors received it intact, None for all.
+
+        The sensor that detects the error marks the frame; those it passes afterwards, on the way out at
+        port 0 and on the way back at port 1, count it as forwarded.
         """
         damage = self.damage
         if damage is None or damage.sensor.life not in self._alive:
@@ -128,31 +143,31 @@ class Bus:
         damage.frames -= 1
         if damage.frames <= 0:
             self.damage = None
-        place = self._alive.index(damage.sensor.life)
-        self._alive[place].esc.count(reg.RX_ERRORS + 2 * damage.port)
-        self._alive[place].esc.count(reg.RX_ERRORS + 2 * damage.port + 1)
+        position = self._alive.index(damage.sensor.life)
+        self._alive[position].esc.count(reg.RX_ERRORS + 2 * damage.port)
+        self._alive[position].esc.count(reg.RX_ERRORS + 2 * damage.port + 1)
         if damage.port == 1:
-            back = self._alive[:place]
+            back = self._alive[:position]
         else:
-            for life in self._alive[place + 1 :]:
+            for life in self._alive[position + 1 :]:
                 life.esc.count(reg.FORWARDED_ERRORS)
             back = self._alive[:-1]
         for life in back:
             life.esc.count(reg.FORWARDED_ERRORS + 1)
-        return len(self._alive) if damage.port == 1 else place
+        return len(self._alive) if damage.port == 1 else position
 
     def flap(self, sensor: VirtualSensor, port: int) -> None:
-        """The link at a port goes away and comes back: the controllers at both its ends count it."""
-        place = self.sensors.index(sensor)
-        ends = ((place, 0), (place - 1, 1)) if port == 0 else ((place, 1), (place + 1, 0))
+        """A link is lost and returns: the controllers at both ends count it."""
+        position = self.sensors.index(sensor)
+        ends = ((position, 0), (position - 1, 1)) if port == 0 else ((position, 1), (position + 1, 0))
         for end, its_port in ends:
             if 0 <= end < len(self._alive):
                 self._alive[end].esc.count(reg.LOST_LINKS + its_port)
 
     def prepare(self) -> None:
-        """The frames that waited are answered: look at the watchdogs, and work ahead.
+        """All waiting frames are answered: check the watchdogs, and compute the next samples ahead.
 
-        Makes the samples that the next frame will want if frames keep their period.
+        Those are the samples that the next frame will read if frames are periodic.
         """
         period = min(self.now - self._last_frame, _LONGEST_PERIOD_NS)
         expected = self.now + period
@@ -162,13 +177,13 @@ class Bus:
             life.sampler.prepare(expected)
 
     def idle(self, now: int) -> None:
-        """No frame is waiting: let time pass for watchdogs and power."""
+        """No frame is waiting: let time pass up to `now`, watchdogs included."""
         self.set_time(now)
         for life in self._alive:
             life.check_watchdog(now)
 
     def statistics(self) -> dict[str, Any]:
-        """What `stats` says."""
+        """What the command `stats` reports."""
         return {
             "frames": self.frames,
             "frames_lost": self.frames_lost,

@@ -9,14 +9,14 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 
 from ethercat_server import __version__
-from ethercat_server.objects import MODELS
+from ethercat_server.sensor.dictionary import MODELS
 from ethercat_server.virtual_sensor import link
 from ethercat_server.virtual_sensor.control import ControlError
-from ethercat_server.virtual_sensor.fault_command import CommandError, real, whole
-from ethercat_server.virtual_sensor.faults import COMMANDS
-from ethercat_server.virtual_sensor.measurement_faults import PPM_LIMIT
+from ethercat_server.virtual_sensor.faults.command import CommandError, real, whole
+from ethercat_server.virtual_sensor.faults.measurement import PPM_LIMIT
+from ethercat_server.virtual_sensor.faults.table import COMMANDS
+from ethercat_server.virtual_sensor.measurement.signals import SIGNALS
 from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
-from ethercat_server.virtual_sensor.signals import SIGNALS
 from protocol.pdo import LAYOUTS
 from protocol.settings import SETTINGS
 
@@ -24,20 +24,20 @@ MOST_SENSORS = 16
 
 
 class UsageError(Exception):
-    """Arguments that contradict one another; the text is one sentence."""
+    """Contradictory arguments."""
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The command line, and nothing done yet."""
+    """The command line."""
     commands = "\n".join(f"  {c.usage:34} {c.meaning}" for c in COMMANDS)
     parser = argparse.ArgumentParser(
         prog="ethercat-virtual-sensor",
         description="Answer EtherCAT frames on a network interface as Bota force/torque sensors do.",
-        epilog=f"commands, one a line on stdin or on the --control socket:\n{commands}",
+        epilog=f"commands, one per line on stdin or on the --control socket:\n{commands}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     several = "; several, comma separated or repeated, for a chain"
-    parser.add_argument("iface", metavar="IFACE", help="interface, up: one end of a veth pair, say")
+    parser.add_argument("iface", metavar="IFACE", help="interface, for instance one end of a veth pair")
     parser.add_argument("--sensors", metavar="N", help="sensors on the bus (default: as many as named, or 1)")
     parser.add_argument("--model", action="append", metavar="NAME", help=f"default {MODELS[0]}{several}")
     parser.add_argument("--serial", action="append", metavar="N", help=f"default 1, 2, ...{several}")
@@ -46,9 +46,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--sinc", metavar="N", help="SINC length after power-on (default 64)")
     parser.add_argument("--ppm", action="append", metavar="X", help=f"clock error{several}")
-    parser.add_argument("--signal", choices=SIGNALS, default="scene", help="what is measured (default scene)")
+    parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
     parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of the scene")
-    parser.add_argument("--seed", default="0", metavar="N", help="of the noise")
+    parser.add_argument("--seed", default="0", metavar="N", help="seed of the noise")
     parser.add_argument("--control", metavar="PATH", help="Unix socket for commands")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
@@ -60,7 +60,7 @@ def _list(given: Sequence[str] | None) -> list[str]:
 
 
 def options_from(args: argparse.Namespace) -> BusOptions:
-    """The sensors that parsed arguments name; UsageError if they make no sense."""
+    """The options in parsed arguments; UsageError if they are contradictory."""
     models, serials, errors = _list(args.model), _list(args.serial), _list(args.ppm)
     named = max(len(models), len(serials), len(errors), 1)
     sinc_range = SETTINGS["sinc_length"].choices
@@ -74,25 +74,27 @@ def options_from(args: argparse.Namespace) -> BusOptions:
     except CommandError as error:
         raise UsageError(str(error)) from None
     if named > count:
-        raise UsageError(f"{named} sensors are named but --sensors is {count}: name at most as many")
+        raise UsageError(f"{named} sensors are named but --sensors is {count}: name no more than that")
     for model in models:
         if not model.isascii() or len(model) > 20:
             raise UsageError(f"model {model!r} must have at most 20 ASCII characters, such as {MODELS[0]}")
     sensors = []
-    for place in range(count):
+    for position in range(count):
         first_serial = serial_numbers[-1] if serial_numbers else 1
         given = len(serial_numbers) - 1 if serial_numbers else 0
         sensors.append(
             SensorOptions(
-                # The last one named goes for the rest; serial numbers go on counting.
-                model=models[min(place, len(models) - 1)] if models else MODELS[0],
-                serial=serial_numbers[place] if place < len(serial_numbers) else first_serial + place - given,
+                # The last one applies to the rest; serial numbers are consecutive.
+                model=models[min(position, len(models) - 1)] if models else MODELS[0],
+                serial=serial_numbers[position]
+                if position < len(serial_numbers)
+                else first_serial + position - given,
                 pdo_size=int(args.pdo),
                 sinc_length=sinc,
-                ppm=ppms[min(place, len(ppms) - 1)] if ppms else 0.0,
+                ppm=ppms[min(position, len(ppms) - 1)] if ppms else 0.0,
                 signal=args.signal,
                 noise=args.noise == "on",
-                seed=seed + place,
+                seed=seed + position,
             )
         )
     return BusOptions(tuple(sensors))
@@ -100,7 +102,7 @@ def options_from(args: argparse.Namespace) -> BusOptions:
 
 @contextlib.contextmanager
 def _stop_signals() -> Iterator[Callable[[], bool]]:
-    """While open, SIGTERM and SIGINT only set a flag, which is yielded."""
+    """SIGTERM and SIGINT only set a flag; yields its getter."""
     stopped = False
 
     def stop(_number: int, _frame: object) -> None:
@@ -108,7 +110,7 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
         stopped = True
 
     previous = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
-    # In the background of a terminal, what is typed there is not for us: reading it must not stop us.
+    # As a background job, reading from the terminal must not suspend it.
     previous[signal.SIGTTIN] = signal.signal(signal.SIGTTIN, signal.SIG_IGN)
     try:
         yield lambda: stopped
@@ -118,7 +120,7 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the virtual sensor: 0 when told to end, 1 when it cannot go on, 2 for wrong arguments."""
+    """Run the virtual sensor: 0 when ended, 1 on failure, 2 for wrong arguments."""
     args = build_parser().parse_args(argv)
     try:
         options = options_from(args)

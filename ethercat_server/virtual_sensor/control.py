@@ -1,7 +1,4 @@
-"""Where fault commands come from: a text stream (stdin), and a Unix stream socket with many connections.
-
-Commands from the text stream are answered on standard output.
-"""
+"""Sources of fault commands: a text stream (stdin), answered on standard output, and a Unix stream socket."""
 
 from __future__ import annotations
 
@@ -14,21 +11,21 @@ from pathlib import Path
 from typing import Final, Self, TextIO
 
 from ethercat_server.virtual_sensor.bus import Bus
-from ethercat_server.virtual_sensor.faults import LONGEST_LINE, QuitCommand, obey
+from ethercat_server.virtual_sensor.faults.table import LONGEST_LINE, QuitCommand, obey
 
 _MOST_CONNECTIONS: Final = 16
 _CHUNK = 4096
 
 
 class ControlError(Exception):
-    """The control socket cannot be made; the text is one sentence."""
+    """The control socket cannot be created."""
 
 
 class CommandChannel:
-    """Reads commands as they come and writes one line of answer to each.
+    """Reads commands and writes one line of answer to each.
 
     Attributes:
-        ended: the text stream has come to its end.
+        ended: the text stream has ended.
     """
 
     def __init__(
@@ -47,7 +44,7 @@ class CommandChannel:
             self._listener = _listen(control_path)
             poller.register(self._listener, select.POLLIN)
         if commands is not None:
-            with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor has nothing to say
+            with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
                 self._commands = commands.fileno()
                 self._pending[self._commands] = b""
                 poller.register(self._commands, select.POLLIN)
@@ -65,7 +62,7 @@ class CommandChannel:
                 Path(self._path).unlink()
 
     def handle(self, descriptor: int, _event: int) -> None:
-        """Something happened on `descriptor`. QuitCommand if the command was `quit`."""
+        """Handle an event on `descriptor`. QuitCommand if the command was `quit`."""
         if self._listener is not None and descriptor == self._listener.fileno():
             self._accept()
         elif descriptor == self._commands:
@@ -130,7 +127,7 @@ class CommandChannel:
                     raise
                 connection.sendall(answer.encode() + b"\n")
         except OSError:
-            ended = True  # gone, or reads no answers: its commands are done all the same
+            ended = True  # disconnected, or not reading: its commands are executed nevertheless
         if ended:
             self._poller.unregister(descriptor)
             del self._connections[descriptor], self._pending[descriptor]
@@ -147,7 +144,7 @@ class CommandChannel:
 
 def _listen(path: str) -> socket.socket:
     with contextlib.suppress(OSError):
-        # A socket left behind by one that was killed is in the way; anything else is not ours to remove.
+        # Remove a stale socket, left by a killed process; nothing else.
         if stat.S_ISSOCK(Path(path).stat().st_mode) and not _answers(path):
             Path(path).unlink()
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -158,7 +155,7 @@ def _listen(path: str) -> socket.socket:
         listener.setblocking(False)
     except OSError as error:
         listener.close()
-        raise ControlError(f"control socket {path!r} cannot be made: {error.strerror or error}") from None
+        raise ControlError(f"cannot create the control socket {path!r}: {error.strerror or error}") from None
     return listener
 
 

@@ -1,6 +1,6 @@
-"""The raw socket: frames from one network interface through the bus and back, commands in between.
+"""The raw socket: passes frames from a network interface through the bus, and executes commands.
 
-One thread, one poll. It sleeps until there is a frame, a command, or a watchdog to look at.
+One thread, which polls for frames and commands, and checks watchdogs.
 """
 
 from __future__ import annotations
@@ -12,41 +12,40 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final, TextIO
 
+from ethercat_server.ethercat.nic import is_up
+from ethercat_server.ethercat.wire import ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.control import CommandChannel
-from ethercat_server.virtual_sensor.faults import QuitCommand
+from ethercat_server.virtual_sensor.faults.table import QuitCommand
 from ethercat_server.virtual_sensor.options import BusOptions
-from ethercat_server.virtual_sensor.wire import ETHERTYPE
 
 LONGEST_NAME: Final = 15
 """Characters in the name of a network interface."""
 _BUFFER = 2048
 _IDLE_MS = 10
 _FRAMES_PER_TURN = 64
-_IFF_UP = 0x1
 
 
 class LinkError(Exception):
-    """The interface cannot be used, or no longer; the text is one sentence."""
+    """The interface cannot be used, or no longer."""
 
 
 def open_interface(ifname: str) -> socket.socket:
-    """A raw socket for EtherCAT frames on `ifname`; LinkError if there is none to be had."""
+    """A raw socket for EtherCAT frames on `ifname`; LinkError if it cannot be opened."""
     if not ifname or len(ifname.encode()) > LONGEST_NAME:
         raise LinkError(f"interface name {ifname!r}: it must have 1 to {LONGEST_NAME} characters")
     _index(ifname)
     try:
-        # No protocol yet: with one, it would take in the frames of all interfaces until it is bound.
+        # No protocol yet: with one, it would receive frames of all interfaces until it is bound.
         raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     except PermissionError:
         raise LinkError(
             f"not allowed to open a raw socket on {ifname}: it needs CAP_NET_RAW, so run it as root"
         ) from None
     try:
-        if not _is_up(ifname):
+        if not is_up(ifname):
             raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
         raw.bind((ifname, ETHERTYPE))
         raw.setblocking(False)
@@ -63,15 +62,7 @@ def _index(ifname: str) -> int:
     try:
         return socket.if_nametoindex(ifname)
     except OSError:
-        raise LinkError(f"no network interface {ifname!r}: `ip link` lists those there are") from None
-
-
-def _is_up(ifname: str) -> bool:
-    try:
-        flags = int(Path(f"/sys/class/net/{ifname}/flags").read_text(), 16)
-    except (OSError, ValueError):
-        return True  # no sysfs here: sending will tell
-    return bool(flags & _IFF_UP)
+        raise LinkError(f"no network interface {ifname!r}: see `ip link`") from None
 
 
 def run(
@@ -84,10 +75,10 @@ def run(
     on_ready: Callable[[], None] = lambda: None,
     should_stop: threading.Event | Callable[[], bool] = lambda: False,
 ) -> None:
-    """Answer EtherCAT frames on `ifname` until told to stop.
+    """Answer EtherCAT frames on `ifname` until stopped.
 
-    Stops when `should_stop` is set or returns true (looked at every 10 ms), on the command `quit`, and at
-    the end of `commands` if `exit_on_eof`. Leaves nothing behind. LinkError if the interface cannot be
+    Stops when `should_stop` is set or returns true (checked every 10 ms), on the command `quit`, and at
+    the end of `commands` if `exit_on_eof`. LinkError if the interface cannot be
     used, or disappears (one that is only down is waited for); ControlError if `control_path` cannot be used.
     """
     stop = should_stop.is_set if isinstance(should_stop, threading.Event) else should_stop
@@ -121,7 +112,7 @@ def _serve(
         events = poller.poll(_IDLE_MS)
         if not events:
             bus.idle(time.monotonic_ns())
-            if not up:  # like a cable pulled out: it may come back, unless it is gone for good
+            if not up:  # like an unplugged cable: it may come back, unless the interface was deleted
                 _check_there(ifname, index)
             continue
         for ready, event in events:
@@ -133,7 +124,7 @@ def _serve(
 
 
 def _answer_waiting(raw: socket.socket, bus: Bus, buffer: bytearray, ifname: str) -> bool:
-    """Answer the frames that wait; False if the interface is down. Not too many at once: commands wait."""
+    """Answer a bounded number of waiting frames; False if the interface is down."""
     view = memoryview(buffer)
     for _ in range(_FRAMES_PER_TURN):
         try:
@@ -158,4 +149,4 @@ def _check_there(ifname: str, index: int) -> None:
     with contextlib.suppress(OSError):
         if socket.if_nametoindex(ifname) == index:
             return
-    raise LinkError(f"interface {ifname} has disappeared: make it again and start the virtual sensor again")
+    raise LinkError(f"interface {ifname} has disappeared: create it again and restart the virtual sensor")

@@ -1,10 +1,10 @@
-"""What a virtual sensor, or a chain of them, is to be."""
+"""Options of a simulated sensor and of a chain."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ethercat_server.objects import MODELS
+from ethercat_server.sensor.dictionary import MODELS
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,7 +15,7 @@ class SensorOptions:
     serial: int = 1
     pdo_size: int = 61
     sinc_length: int | None = None
-    """None: what the sensor's flash holds, 64 as it leaves the factory."""
+    """None: the value in flash, by default 64."""
     ppm: float = 0.0
     """Error of its clock: positive is fast."""
     signal: str = "scene"

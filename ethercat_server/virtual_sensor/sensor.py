@@ -1,4 +1,4 @@
-"""A sensor on the bench: it can be switched off and on, replaced, and asked what was done to it."""
+"""One simulated sensor: power, replacement, and a record of the SDO writes it received."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from ethercat_server.objects import FACTORY_CALIBRATION
-from ethercat_server.virtual_sensor.al import AlState
-from ethercat_server.virtual_sensor.firmware import Firmware
-from ethercat_server.virtual_sensor.flash import Address, Flash
+from ethercat_server.sensor.dictionary import FACTORY_CALIBRATION
+from ethercat_server.virtual_sensor.firmware.al import AlState
+from ethercat_server.virtual_sensor.firmware.firmware import Firmware
+from ethercat_server.virtual_sensor.firmware.flash import Address, Flash
 from ethercat_server.virtual_sensor.options import SensorOptions
 
 _WRITES_REMEMBERED: Final = 1000
@@ -20,28 +20,28 @@ _WRITES_TOLD: Final = 200
 
 @dataclass(frozen=True, slots=True)
 class SdoWrite:
-    """One SDO write that the sensor was asked for."""
+    """One SDO write request."""
 
     index: int
     subindex: int
     data: bytes
     state: AlState
     abort: int
-    """Abort code; 0 if it was carried out."""
+    """Abort code; 0 if it succeeded."""
 
 
 class VirtualSensor:
-    """A sensor on the bench, powered or not."""
+    """A sensor, powered or not. `clock` gives the time in ns."""
 
-    def __init__(self, options: SensorOptions, now: int) -> None:
-        self.now = now
+    def __init__(self, options: SensorOptions, clock: Callable[[], int]) -> None:
+        self._clock = clock
         self._options = options
         self.flash = Flash()
         self._writes: deque[SdoWrite] = deque(maxlen=_WRITES_REMEMBERED)
         self.sdo_write_count = self.calibration_writes = 0
         self._on_write: dict[Address, Callable[[], None]] = {}
         self.due: list[Callable[[], None]] = []
-        """What is to be done once the frame that is being answered is out of the way."""
+        """Actions for the end of the frame that is being processed."""
         self.life: Firmware | None = None
         self._apply_sinc()
         self.power(True)
@@ -52,12 +52,12 @@ class VirtualSensor:
 
     @property
     def options(self) -> SensorOptions:
-        """What it is."""
+        """Its current options."""
         return self._options
 
     @property
     def sdo_writes(self) -> list[SdoWrite]:
-        """The latest SDO writes, oldest first, through all its lives."""
+        """The latest SDO writes, oldest first, across power cycles."""
         return list(self._writes)
 
     def _remember(self, index: int, subindex: int, data: bytes, state: AlState, abort: int) -> None:
@@ -73,22 +73,16 @@ class VirtualSensor:
         """Do `action` right after the next SDO write to this entry."""
         self._on_write[address] = action
 
-    def set_time(self, now: int) -> None:
-        """It is `now`, CLOCK_MONOTONIC in ns."""
-        self.now = now
-        if self.life is not None:
-            self.life.now = now
-
     def power(self, on: bool) -> None:
-        """Switch it off, or on (again: nothing happens)."""
+        """Switch it off or on; no effect if it already is."""
         if not on:
             self.life = None
-            self.flash.power_cut(self.now)
+            self.flash.power_cut(self._clock())
         elif self.life is None:
-            self.life = Firmware(self._options, self.flash, self.now, self._remember)
+            self.life = Firmware(self._options, self.flash, self._clock, self._remember)
 
     def swap(self, model: str, serial: int) -> None:
-        """Put a new sensor of another model or serial number in its place, just switched on."""
+        """Replace it by a new sensor of another model or serial number, just switched on."""
         self._options = replace(self._options, model=model, serial=serial)
         self.flash = Flash()
         self._apply_sinc()
@@ -96,19 +90,19 @@ class VirtualSensor:
         self.power(True)
 
     def set_ppm(self, ppm: float) -> None:
-        """Another error of its clock, now and after a power cycle."""
+        """Set the error of its clock, now and after a power cycle."""
         self._options = replace(self._options, ppm=ppm)
         if self.life is not None:
-            self.life.sampler.set_ppm(ppm, self.now)
+            self.life.sampler.set_ppm(ppm)
 
     def set_signal(self, signal: str) -> None:
-        """Measure something else, now and after a power cycle."""
+        """Measure another signal, now and after a power cycle."""
         self._options = replace(self._options, signal=signal)
         if self.life is not None:
-            self.life.sampler.set_signal(self._options, self.now)
+            self.life.sampler.set_signal(self._options)
 
     def statistics(self) -> dict[str, Any]:
-        """What `stats` says of it."""
+        """Its part of what the command `stats` reports."""
         life = self.life
         return {
             "model": self._options.model,
@@ -117,7 +111,7 @@ class VirtualSensor:
             "al_state": life.al.state.name if life else None,
             "al_error": life is not None and life.al.error,
             "al_status_code": life.al.code if life else 0,
-            "sample": life.sampler.clock.number_at(self.now) if life else None,
+            "sample": life.sampler.clock.number_at(self._clock()) if life else None,
             "samples_made": life.sampler.made if life else 0,
             "sinc_length": life.sampler.clock.sinc_length if life else None,
             "ppm": self._options.ppm,

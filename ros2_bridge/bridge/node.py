@@ -1,9 +1,14 @@
-"""The node: what is wired to what, and in which order it is taken apart."""
+"""The node: what is wired to what, and in which order it is taken apart.
+
+`run` is the program. `BridgeNode.create` and `spin` are what it does once ROS is up: with them the tests run
+several nodes in one process.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from typing import Self
 
 import rclpy
 from diagnostic_msgs.msg import KeyValue
@@ -14,34 +19,42 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from bridge.bias_services import BiasServices
-from bridge.compensated_output import CompensatedOutput
-from bridge.compensation_control import CompensationControl
-from bridge.identify_services import IdentifyServices
-from bridge.messages import make
-from bridge.monitor import Monitor
-from bridge.parameters import ParameterError, declare
-from bridge.reader import Reader
-from bridge.requests import Requests
-from bridge.services import Services
-from bridge.settings_parameters import SettingsParameters
+from bridge.compensating.control import CompensationControl
+from bridge.diagnostics.monitor import Monitor
+from bridge.parameters.declare import declare
+from bridge.parameters.row import ParameterError
+from bridge.parameters.sensor_settings import SettingsParameters
+from bridge.publishing.compensated_wrench import CompensatedOutput
+from bridge.publishing.messages import make, make_stages
+from bridge.services.bias import BiasServices
+from bridge.services.identify import IdentifyServices
+from bridge.services.sensor import Services
 from bridge.signals import call_on_stop_signal
 from bridge.spinning import Spinner
+from bridge.stream.reader import Reader
+from bridge.stream.requests import Requests
 
 SUPERVISOR_TOPIC = "/supervisor_status_data"
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
 
 
+class StartError(Exception):
+    """The node cannot start with these parameters; the text is one sentence."""
+
+
 class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
     """The node `bridge`. What ends it sets `exit_code` and calls `on_finish`."""
 
-    def __init__(self) -> None:
-        """ParameterError or InvalidTopicNameException if a parameter is wrong."""
-        super().__init__("bridge")
+    def __init__(self, arguments: Sequence[str] | None = None) -> None:
+        """ParameterError or InvalidTopicNameException if a parameter is wrong.
+
+        `arguments` (`--ros-args ...`) are for this node alone; None: those of the process.
+        """
+        super().__init__("bridge", cli_args=arguments, use_global_arguments=arguments is None)
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
         parameters = declare(self)
-        compensated = CompensatedOutput(self, parameters.frame_id)
+        compensated = CompensatedOutput(make_stages(self, parameters.frame_id))
         outputs = make(self, parameters, compensated)
         self.reader = Reader(parameters, outputs, self.get_logger(), self._fail)
         link = self.reader.link
@@ -67,6 +80,21 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
             10,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
+
+    @classmethod
+    def create(cls, arguments: Sequence[str] | None = None) -> Self:
+        """A node that is ready to `spin`; StartError."""
+        try:
+            node = cls(arguments)
+            node.compensation.start()
+        except (ParameterError, InvalidTopicNameException, ParameterException) as error:
+            raise StartError(" ".join(str(error).split())) from None
+        except RuntimeError as error:  # rclpy says no more, and not of what
+            raise StartError(
+                f"ROS cannot create the node's topics and services ({' '.join(str(error).split())}): check "
+                "qos_overrides, and that array_topic and the remappings give no two topics one name"
+            ) from None
+        return node
 
     def _on_link_change(self) -> None:
         self.compensation.link_changed()
@@ -104,24 +132,17 @@ def run(arguments: Sequence[str]) -> int:
         wrong_arguments = type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
         return _refuse(f"ROS cannot start: {' '.join(str(error).split())}", 2 if wrong_arguments else 1)
     try:
-        try:
-            node = BridgeNode()
-            node.compensation.start()
-        except (ParameterError, InvalidTopicNameException, ParameterException) as error:
-            return _refuse(" ".join(str(error).split()), 2)
-        except RuntimeError as error:  # rclpy says no more, and not of what
-            return _refuse(
-                f"ROS cannot make the node's topics and services ({' '.join(str(error).split())}): check "
-                "qos_overrides, and that array_topic and the remappings give no two topics one name",
-                2,
-            )
-        return _spin(node)
+        node = BridgeNode.create()
+        call_on_stop_signal(lambda _signal: node.finish(0))
+        return spin(node)
+    except StartError as error:
+        return _refuse(str(error), 2)
     finally:
         rclpy.try_shutdown()
 
 
-def _spin(node: BridgeNode) -> int:
-    call_on_stop_signal(lambda _signal: node.finish(0))
+def spin(node: BridgeNode) -> int:
+    """Run the node until it is told to finish, and destroy it; returns its exit code."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     spinner = Spinner(executor)
@@ -129,7 +150,7 @@ def _spin(node: BridgeNode) -> int:
     node.reader.start()
     node.monitor.start()
     try:
-        if node.exit_code is not None:  # it was told before there was a spinner
+        if node.exit_code is not None:  # a signal came before there was a spinner
             spinner.stop()
         spinner.run()
         return node.exit_code or 0

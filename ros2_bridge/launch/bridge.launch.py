@@ -17,7 +17,7 @@ TEXT, NUMBER = str, None
 PARAMETERS = {
     "server_host": (TEXT, "Host that ethercat-server runs on"),
     "server_port": (NUMBER, "TCP port of ethercat-server"),
-    "sensor": (NUMBER, "The sensor's place on the bus, from 0"),
+    "sensor": (NUMBER, "The sensor's position on the bus, from 0"),
     "frame_id": (TEXT, "Frame of the wrench"),
     "imu_frame_id": (TEXT, "Frame of the IMU"),
     "array_topic": (TEXT, "Topic of the Float64MultiArray; without a leading slash it is in the namespace"),

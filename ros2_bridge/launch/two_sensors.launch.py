@@ -37,13 +37,13 @@ def generate_launch_description():
                     "bridge.launch.py",
                     server_port=port,
                     namespace=namespace,
-                    sensor=str(place),
+                    sensor=str(position),
                     # Relative: the default is one absolute name, which both would publish on.
                     array_topic="sensor_data",
                     frame_id=f"{namespace}_ft_sensor",
                     imu_frame_id=f"{namespace}_ft_sensor_imu",
                 )
-                for place, namespace in enumerate(SENSORS)
+                for position, namespace in enumerate(SENSORS)
             ),
             include(
                 "virtual_server.launch.py",

@@ -10,7 +10,7 @@ from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
 
-from bridge.compensation.quantities import NO_WRENCH, Payload, Wrench
+from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
 from protocol.pdo import encode
 from tests.bridge.conftest import PATIENCE_S, Listener
 from tests.bridge.streaming import Stream
@@ -42,8 +42,8 @@ def sensed(
     length = math.sqrt(sum(part * part for part in up))
     values = dict(zip(names, [*load(up, payload, bias).values, *(part / length for part in up)], strict=True))
     for name, change in changes.items():
-        place, axis = name.rsplit("_", 1)
-        values[f"{place}.{axis}"] = values.get(f"{place}.{axis}", 0.0) + change
+        position, axis = name.rsplit("_", 1)
+        values[f"{position}.{axis}"] = values.get(f"{position}.{axis}", 0.0) + change
     return encode(size, values)
 
 
@@ -56,10 +56,11 @@ class Stages:
     """Subscriptions to `wrench_compensated` and what was subtracted."""
 
     def __init__(self, listener: Listener) -> None:
-        self.final = listener.subscribe(WrenchStamped, "wrench_compensated")
-        self.bias = listener.subscribe(WrenchStamped, "compensation/bias")
-        self.gravity = listener.subscribe(WrenchStamped, "compensation/gravity")
-        self.inertia = listener.subscribe(WrenchStamped, "compensation/inertia")
+        # On a busy machine the listener falls behind: it is to go on with what is recent.
+        self.final = listener.subscribe(WrenchStamped, "wrench_compensated", depth=20)
+        self.bias = listener.subscribe(WrenchStamped, "compensation/bias", depth=20)
+        self.gravity = listener.subscribe(WrenchStamped, "compensation/gravity", depth=20)
+        self.inertia = listener.subscribe(WrenchStamped, "compensation/inertia", depth=20)
 
     def forget(self) -> None:
         for messages in (self.final, self.bias, self.gravity, self.inertia):

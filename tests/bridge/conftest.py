@@ -1,4 +1,8 @@
-"""A ROS listener in this process, and the node in a process of its own."""
+"""A ROS listener, and the node: in a thread of this process, or in a process of its own.
+
+Nearly every test takes the thread (`start`): the same code without the two seconds that an interpreter takes
+to load ROS. `start_process` is for what needs a process: signals, arguments, exit codes, the middleware.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 
@@ -33,7 +37,18 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
 
 
 _ENDED: list[Any] = []
-"""Nodes of closed listeners: `destroy_node` crashes the process now and then, so they end with it."""
+"""Nodes that are done: `destroy_node` crashes the process now and then, so they end with it."""
+
+
+def retire(node: Any) -> None:
+    """Destroy what a node has but for the node itself."""
+    for client in list(node.clients):
+        node.destroy_client(client)
+    for publisher in list(node.publishers):
+        node.destroy_publisher(publisher)
+    for subscription in list(node.subscriptions):
+        node.destroy_subscription(subscription)
+    _ENDED.append(node)
 
 
 class Listener:
@@ -66,18 +81,12 @@ class Listener:
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
         self._executor.shutdown()
-        for client in list(self._node.clients):
-            self._node.destroy_client(client)
-        for publisher in list(self._node.publishers):
-            self._node.destroy_publisher(publisher)
-        for subscription in list(self._node.subscriptions):
-            self._node.destroy_subscription(subscription)
-        _ENDED.append(self._node)
+        retire(self._node)
 
-    def subscribe(self, message_type: Any, topic: str) -> queue.Queue[Any]:
-        """What comes on a topic of the node's namespace from now on."""
+    def subscribe(self, message_type: Any, topic: str, depth: int = 2000) -> queue.Queue[Any]:
+        """What comes on a topic of the node's namespace from now on. A short `depth`: only what is recent."""
         messages: queue.Queue[Any] = queue.Queue()
-        self._node.create_subscription(message_type, f"/{self.tag}/{topic}", messages.put, 2000)
+        self._node.create_subscription(message_type, f"/{self.tag}/{topic}", messages.put, depth)
         return messages
 
     def _ask(self, client: Any, request: Any) -> queue.Queue[Any]:
@@ -140,6 +149,90 @@ class Listener:
         self._supervisor.publish(self._key_value(key=key, value=value))
 
 
+class Log:
+    """The node's logger: passes on to rclpy's and keeps the text."""
+
+    def __init__(self, logger: Any) -> None:
+        self._logger = logger
+        self.lines: list[str] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._logger, name)
+
+    def info(self, text: str) -> None:
+        self.lines.append(text)
+
+    warning = error = info
+
+
+class NodeThread:
+    """The node in a thread of this process, as `bridge.node.run` runs it."""
+
+    def __init__(self, *arguments: str) -> None:
+        from bridge.node import BridgeNode, StartError, spin
+
+        logs: list[Log] = []
+
+        class LoggedNode(BridgeNode):
+            def get_logger(self) -> Any:
+                if not logs:
+                    logs.append(Log(super().get_logger()))
+                return logs[0]
+
+            def destroy_node(self) -> None:
+                for service in list(self.services):
+                    self.destroy_service(service)
+                retire(self)
+
+        self._logs, self._lines = logs, list[str]()
+        self._exit_code: int | None = None
+        self._node: LoggedNode | None = None
+        try:
+            self._node = LoggedNode.create(arguments)
+        except StartError as error:
+            self._lines.append(f"bridge-client: {error}")
+            self._exit_code = 2
+            return
+        self._thread = threading.Thread(target=self._run, args=(spin, self._node), daemon=True)
+        self._thread.start()
+
+    def _run(self, spin: Callable[[Any], int], node: Any) -> None:
+        try:
+            self._exit_code = spin(node)
+        except BaseException as error:
+            self._lines.append(f"Traceback: {error!r}")
+            raise
+
+    @property
+    def is_running(self) -> bool:
+        return self._node is not None and self._thread.is_alive()
+
+    @property
+    def log(self) -> str:
+        """All that it has said."""
+        return "\n".join([line for log in self._logs for line in log.lines] + self._lines)
+
+    def says(self, words: str, times: int = 1) -> None:
+        """Wait until it has said `words` that often."""
+        wait_until(lambda: self.log.count(words) >= times, f"{words!r} in the log")
+
+    def ends(self) -> int | None:
+        """Wait until it has ended; its exit code."""
+        if self._node is not None:
+            self._thread.join(PATIENCE_S)
+            assert not self._thread.is_alive(), "the node goes on"
+        return self._exit_code
+
+    def finish(self) -> None:
+        """End it as a signal does."""
+        if self._node is not None:
+            self._node.finish(0)
+
+    def close(self) -> None:
+        self.finish()
+        self.ends()
+
+
 class NodeProcess:
     """`bridge-client` in a process of its own."""
 
@@ -148,6 +241,10 @@ class NodeProcess:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "bridge.client", *arguments], stdout=self._log, stderr=subprocess.STDOUT
         )
+
+    @property
+    def is_running(self) -> bool:
+        return self.process.poll() is None
 
     @property
     def log(self) -> str:
@@ -174,7 +271,8 @@ class NodeProcess:
         self._log.close()
 
 
-Start = Callable[..., NodeProcess]
+Start = Callable[..., NodeThread]
+StartProcess = Callable[..., NodeProcess]
 
 
 @pytest.fixture(scope="session")
@@ -199,12 +297,24 @@ def listener(_ros: None) -> Iterator[Listener]:
     opened.close()
 
 
-@contextlib.contextmanager
-def starter(listener: Listener) -> Iterator[Start]:
-    """Gives a function that starts nodes which publish to `listener`; ends them at the end."""
-    started: list[NodeProcess] = []
+Kind = TypeVar("Kind", NodeThread, NodeProcess)
 
-    def start_node(port: int, **parameters: object) -> NodeProcess:
+
+def starter(listener: Listener) -> contextlib.AbstractContextManager[Start]:
+    """Gives a function that starts nodes which publish to `listener`; ends them at the end."""
+    return _starter(listener, NodeThread)
+
+
+def process_starter(listener: Listener) -> contextlib.AbstractContextManager[StartProcess]:
+    """The same with a process for each node."""
+    return _starter(listener, NodeProcess)
+
+
+@contextlib.contextmanager
+def _starter(listener: Listener, kind: Callable[..., Kind]) -> Iterator[Callable[..., Kind]]:
+    started: list[Kind] = []
+
+    def start_node(port: int, **parameters: object) -> Kind:
         values = {"server_port": port, "array_topic": listener.topic, **parameters}
         options = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
         remaps = (
@@ -213,19 +323,25 @@ def starter(listener: Listener) -> Iterator[Start]:
             f"__ns:=/{listener.tag}",
         )
         options += [word for remap in remaps for word in ("-r", remap)]
-        started.append(NodeProcess("--ros-args", *options))
+        started.append(kind("--ros-args", *options))
         return started[-1]
 
     try:
         yield start_node
     finally:
-        for process in started:
-            process.close()
+        for node in started:
+            node.close()
 
 
 @pytest.fixture
 def start(listener: Listener) -> Iterator[Start]:
     with starter(listener) as start_node:
+        yield start_node
+
+
+@pytest.fixture
+def start_process(listener: Listener) -> Iterator[StartProcess]:
+    with process_starter(listener) as start_node:
         yield start_node
 
 

@@ -18,8 +18,8 @@ from typing import Any
 from protocol.control import PROTOCOL_VERSION
 from protocol.errors import ProtocolError
 from protocol.framing import DataMessage, FrameDecoder, encode_data, encode_json
-from protocol.json_text import JsonObject
 from protocol.pdo import encode
+from protocol.text.json_text import JsonObject
 
 Answer = Callable[[JsonObject], JsonObject | None]
 

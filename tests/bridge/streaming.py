@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from protocol.json_text import JsonObject
+from protocol.text.json_text import JsonObject
 from tests.bridge.conftest import PATIENCE_S, Listener
 from tests.bridge.scripted_server import ScriptedServer, description
 

@@ -1,4 +1,4 @@
-"""What the compensation costs the reader while nobody wants it: nothing. Otherwise: scripts/benchmark."""
+"""What the compensation costs the reader while nobody wants it: nothing."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 import rclpy
 
-from bridge.compensated_output import CompensatedOutput, Plan, RestWindow
-from bridge.compensation.bias import BiasRamp
-from bridge.compensation.compensator import Compensator
-from bridge.compensation.quantities import ZERO
-from bridge.compensation.still import StillLimits
-from bridge.compensation_parameters import CompensationParameters
-from bridge.gravity_sources import AccelerometerSource
-from bridge.messages import Outputs
+from bridge.compensating.gravity_sources import AccelerometerSource
+from bridge.parameters.compensation import CompensationParameters
+from bridge.publishing.compensated_wrench import CompensatedOutput, Plan, RestWindow
+from bridge.publishing.messages import Outputs, make_stages
+from ft_compensation.bias import BiasRamp
+from ft_compensation.compensator import Compensator
+from ft_compensation.quantities import ZERO
+from ft_compensation.still import StillLimits
 from tests.compensation.making import BIAS, TOOL
 
 pytestmark = pytest.mark.ros
@@ -29,7 +29,7 @@ _SOURCE = AccelerometerSource(CompensationParameters(payload=TOOL), ZERO)
 @pytest.fixture
 def output(_ros: None) -> Iterator[CompensatedOutput]:
     node = rclpy.create_node("cost", namespace="/test_cost")
-    made = CompensatedOutput(node, "ft")
+    made = CompensatedOutput(make_stages(node, "ft"))
     made.plan = Plan(_SOURCE, Compensator(TOOL, inertia=True), BiasRamp(BIAS), needs_gravity=True)
     yield made
     node.destroy_node()

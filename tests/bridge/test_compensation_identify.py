@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, sensed
-from tests.bridge.conftest import Listener, NodeProcess, starter
+from tests.bridge.conftest import Listener, NodeThread, starter
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.shared import listener, server, stream
 from tests.bridge.streaming import Stream
@@ -27,24 +27,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def node(server: ScriptedServer, stream: Stream, listener: Listener, folder: Path) -> Iterator[NodeProcess]:
+def node(server: ScriptedServer, stream: Stream, listener: Listener, folder: Path) -> Iterator[NodeThread]:
     hold(stream, UP, bias=BIAS)
     with starter(listener) as start:
         yield start(server.port, **QUICK, bias_directory=folder / "deeper")
 
 
 @pytest.fixture(scope="module")
-def stages(listener: Listener, node: NodeProcess) -> Stages:
+def stages(listener: Listener, node: NodeThread) -> Stages:
     return Stages(listener)
 
 
 @pytest.fixture(autouse=True)
-def _whole(node: NodeProcess, stages: Stages, stream: Stream) -> Iterator[None]:
+def _whole(node: NodeThread, stages: Stages, stream: Stream) -> Iterator[None]:
     stages.forget()
     assert stages.final.get(timeout=20)
     yield
     stream.forget_once()
-    assert node.process.poll() is None
+    assert node.is_running
     assert "Traceback" not in node.log
 
 
@@ -82,7 +82,7 @@ def test_from_six_poses_to_a_compensated_wrench(
     done, text = started.trigger("identify/solve")
     assert done, text
     for words in (
-        "mass 0.8000 ± ", "centre of gravity (4.0", "Bias Fx 3.0000 Fy -1.5000 Fz 7.2500",
+        "mass 0.8000 ± ", "center of gravity (4.0", "Bias Fx 3.0000 Fy -1.5000 Fz 7.2500",
         "95 % confidence", "Residuals by pose, 1: ", "Condition 1.",
         "One more pose would help most so: turn", "identify/apply",
     ):  # fmt: skip
@@ -97,9 +97,9 @@ def test_from_six_poses_to_a_compensated_wrench(
     done, text = started.trigger("identify/apply")
     assert done
     assert "in force: tool_mass 0.8000 kg" in text
-    (mass, centre, bias) = started.parameters("tool_mass", "tool_center_of_gravity", "bias")
+    (mass, center, bias) = started.parameters("tool_mass", "tool_center_of_gravity", "bias")
     assert mass == pytest.approx(TOOL.mass, abs=1e-4)
-    assert list(centre) == pytest.approx(TOOL.centre, abs=1e-5)
+    assert list(center) == pytest.approx(TOOL.center, abs=1e-5)
     assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)
     hold(stream, (1, -2, 1.5), bias=BIAS, force_z=-5.0)
     stages.settle([0.0, 0.0, -5.0, 0.0, 0.0, 0.0], within=2e-3)
@@ -116,7 +116,7 @@ def test_the_file_is_one_that_the_node_starts_with(started: Listener, take: Take
     assert started.set_parameter("identify.file", "auto") == (True, "")
     other = Listener()
     try:
-        node = NodeProcess("--ros-args", "-r", f"__ns:=/{other.tag}", "--params-file", str(path))
+        node = NodeThread("--ros-args", "-r", f"__ns:=/{other.tag}", "--params-file", str(path))
         try:
             mass, bias = other.parameters("tool_mass", "bias")
             assert mass == pytest.approx(TOOL.mass, abs=1e-4)
@@ -150,11 +150,11 @@ def test_poses_that_do_not_suffice_are_refused_with_what_is_missing(started: Lis
 
 def test_a_pose_that_is_no_good_is_not_taken(started: Listener, take: Take, stream: Stream) -> None:
     take(UP)
-    for place in range(1000):  # for longer than the call may take
-        stream.once(process_data=sensed(UP, force_x=9.0 * (place % 2)))
+    for position in range(1000):  # for longer than the call may take
+        stream.once(process_data=sensed(UP, force_x=9.0 * (position % 2)))
     done, text = started.trigger("identify/add_pose")
     assert not done
-    assert "the sensor is not at rest: force x moved by" in text
+    assert "the sensor is not stationary: force x moved by" in text
     stream.forget_once()
     assert "pose 2 taken" in take(SIDE)
     done, text = started.trigger("identify/drop_pose")

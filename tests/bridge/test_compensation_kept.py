@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,10 +14,10 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 from std_srvs.srv import Trigger
 
-from bridge.compensation.quantities import Payload, Wrench
-from bridge.compensation.store import CompensationStore
+from ft_compensation.quantities import Payload, Wrench
+from ft_compensation.store import CompensationStore
 from tests.bridge.compensating import QUICK, UP, ZERO6, Stages, hold, six, stamp_ns
-from tests.bridge.conftest import Listener, NodeProcess, Start, wait_until
+from tests.bridge.conftest import Listener, NodeThread, Start, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.streaming import Diagnostics, Stream, streaming, streaming_description
 from tests.compensation.making import BIAS
@@ -43,7 +42,7 @@ class Bench:
         self.stages = Stages(listener)
         self.store = CompensationStore(folder)
 
-    def start(self, **parameters: Any) -> NodeProcess:
+    def start(self, **parameters: Any) -> NodeThread:
         self._began_ns = time.time_ns()
         node = self._start(
             self.server.port, **{**QUICK, "bias_keep": True, "bias_directory": self.folder, **parameters}
@@ -51,7 +50,7 @@ class Bench:
         wait_until(self._fresh, "wrench_compensated")
         return node
 
-    def stop(self, node: NodeProcess) -> None:
+    def stop(self, node: NodeThread) -> None:
         node.close()
         time.sleep(0.1)
 
@@ -224,7 +223,7 @@ def test_the_node_ends_while_a_tare_waits(bench: Bench, stream: Stream) -> None:
     assert bench.stages.final.get(timeout=20)
     time.sleep(1.0)
     began = time.monotonic()
-    node.send_signal(signal.SIGINT)
+    node.finish()
     assert node.ends() == 0
     assert time.monotonic() - began < 10  # not the 30 s
     assert "Traceback" not in node.log

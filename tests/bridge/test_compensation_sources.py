@@ -15,18 +15,25 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 import rclpy
-from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped, TransformStamped, WrenchStamped
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
-from bridge.compensation.quantities import length
-from bridge.compensation_parameters import CompensationParameters, OrientationParameters
-from bridge.gravity_sources import ListenerSource, SensorSource
-from bridge.orientation_listener import OrientationListener
-from bridge.orientation_messages import Oriented, Tf, UnusableError, check_tf, look_up, multiply, unit
-from bridge.parameters import ParameterError
-from protocol.json_text import JsonObject
+from bridge.compensating.gravity_sources import ListenerSource, Oriented, SensorSource
+from bridge.compensating.orientation_listener import OrientationListener
+from bridge.compensating.orientation_messages import (
+    Tf,
+    UnusableError,
+    check_tf,
+    look_up,
+    multiply,
+    unit,
+)
+from bridge.parameters.compensation import CompensationParameters, OrientationParameters
+from bridge.parameters.row import ParameterError
+from ft_compensation.quantities import length
+from protocol.text.json_text import JsonObject
 from tests.bridge.compensating import (
     OVER,
     QUICK,
@@ -39,7 +46,7 @@ from tests.bridge.compensating import (
     settle,
     weight,
 )
-from tests.bridge.conftest import PATIENCE_S, Listener, NodeProcess, starter, wait_until
+from tests.bridge.conftest import PATIENCE_S, Listener, NodeThread, starter, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.shared import listener, server, stream
 from tests.bridge.streaming import Diagnostics, Stream, values
@@ -106,13 +113,13 @@ class Robot:
 
 
 @pytest.fixture(scope="module")
-def node(server: ScriptedServer, stream: Stream, listener: Listener) -> Iterator[NodeProcess]:
+def node(server: ScriptedServer, stream: Stream, listener: Listener) -> Iterator[NodeThread]:
     hold(stream, UP)
     with starter(listener) as start:
         yield start(
             server.port,
             tool_mass=TOOL.mass,
-            tool_center_of_gravity=[*TOOL.centre],
+            tool_center_of_gravity=[*TOOL.center],
             orientation_source="topic_pose",
             # Patient: this machine may be busy.
             **{**QUICK, "orientation.stale_after": 0.5, "orientation.topic": "arm/pose"},
@@ -120,19 +127,19 @@ def node(server: ScriptedServer, stream: Stream, listener: Listener) -> Iterator
 
 
 @pytest.fixture(scope="module")
-def _robot(listener: Listener, node: NodeProcess) -> Iterator[Robot]:
+def _robot(listener: Listener, node: NodeThread) -> Iterator[Robot]:
     robot = Robot(listener)
     yield robot
     robot.close()
 
 
 @pytest.fixture(scope="module")
-def stages(listener: Listener, node: NodeProcess) -> Stages:
+def stages(listener: Listener, node: NodeThread) -> Stages:
     return Stages(listener)
 
 
 @pytest.fixture(scope="module")
-def _diagnostics(listener: Listener, node: NodeProcess) -> Diagnostics:
+def _diagnostics(listener: Listener, node: NodeThread) -> Diagnostics:
     return Diagnostics(listener)
 
 
@@ -144,13 +151,13 @@ def diagnostics(_diagnostics: Diagnostics) -> Diagnostics:
 
 @pytest.fixture
 def robot(
-    _robot: Robot, stream: Stream, listener: Listener, stages: Stages, node: NodeProcess
+    _robot: Robot, stream: Stream, listener: Listener, stages: Stages, node: NodeThread
 ) -> Iterator[Robot]:
     """The robot says where the sensor is; the sensor's own accelerometer would say something else."""
     _robot.restore()
     hold(stream, UP, acceleration_x=3.0)
     yield _robot
-    assert node.process.poll() is None
+    assert node.is_running
     assert "Traceback" not in node.log
 
 
@@ -180,10 +187,11 @@ def test_each_kind_of_message(
 
 
 def test_a_source_that_falls_silent_and_comes_back(
-    robot: Robot, stages: Stages, diagnostics: Diagnostics, stream: Stream
+    robot: Robot, stages: Stages, diagnostics: Diagnostics, stream: Stream, listener: Listener
 ) -> None:
     stages.settle(ZERO6)
     diagnostics.until(compensation=OK)
+    measured = listener.subscribe(WrenchStamped, "wrench", depth=20)
     robot.sending = False
     diagnostics.until("older than the sample (limit 0.5 s): it has stopped", compensation=ERROR)
     comes_to_rest(stages.final)
@@ -191,6 +199,7 @@ def test_a_source_that_falls_silent_and_comes_back(
         comes_to_rest(others, 0.1)
     robot.quaternion = ROLLED  # it has moved in the meantime
     hold(stream, OVER)
+    settle(measured, weight(OVER))
     robot.sending = True
     message = stages.final.get(timeout=20)
     assert settle(stages.final, ZERO6)
@@ -488,7 +497,7 @@ def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node
     module = types.ModuleType("tf2_ros")
     vars(module).update(names)
     monkeypatch.setitem(sys.modules, "tf2_ros", module)
-    from bridge.orientation_messages import open_tf
+    from bridge.compensating.orientation_messages import open_tf
 
     check_tf()
     tf = open_tf(ros_node)

@@ -10,9 +10,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
-from ethercat_server.virtual_sensor.scene import TOOL_CENTRE, TOOL_MASS
+from ethercat_server.virtual_sensor.measurement.scene import TOOL_CENTRE, TOOL_MASS
 from tests.bridge.compensating import Stages, forget, six
-from tests.bridge.conftest import Listener, Start, wait_until
+from tests.bridge.conftest import Listener, StartProcess, wait_until
 from tests.bridge.streaming import Diagnostics
 from tests.server.running import Server, needs_bus, virtual_sensor
 
@@ -21,12 +21,14 @@ NOISE_N = 0.26
 """Standard deviation of a force at SINC 64: 0.3 N at 51, falling with the length to the power of 0.62."""
 
 
-def test_from_poses_to_the_force_of_the_environment(listener: Listener, start: Start, tmp_path: Any) -> None:
+def test_from_poses_to_the_force_of_the_environment(
+    listener: Listener, start_process: StartProcess, tmp_path: Any
+) -> None:
     """The accelerometer is the only source of orientation."""
     with virtual_sensor("--signal", "poses") as (veth, sensor):
         server = Server(veth.near).wait_streaming()
         try:
-            node = start(server.port, bias_directory=tmp_path)
+            node = start_process(server.port, bias_directory=tmp_path)
             stages, diagnostics = Stages(listener), Diagnostics(listener)
             assert listener.trigger("identify/start")[0]
             taken, deadline = 0, time.monotonic() + 70.0
@@ -37,13 +39,13 @@ def test_from_poses_to_the_force_of_the_environment(listener: Listener, start: S
                     taken += 1
                     time.sleep(3.0)  # until it has begun to turn to the next
                 else:  # it turns; or this machine is too busy
-                    assert any(words in text for words in ("rest", "turns", "samples came")), text
+                    assert any(words in text for words in ("stationary", "turns", "samples came")), text
             done, text = listener.trigger("identify/solve")
             assert done, text
             assert listener.trigger("identify/apply")[0]
-            mass, centre = listener.parameters("tool_mass", "tool_center_of_gravity")
+            mass, center = listener.parameters("tool_mass", "tool_center_of_gravity")
             assert mass == pytest.approx(TOOL_MASS, rel=0.01)
-            assert list(centre) == pytest.approx(TOOL_CENTRE, abs=0.002)
+            assert list(center) == pytest.approx(TOOL_CENTRE, abs=0.002)
             assert sensor.process.stdin is not None
             sensor.process.stdin.write("signal turn\n")
             sensor.process.stdin.flush()
@@ -64,7 +66,7 @@ def test_from_poses_to_the_force_of_the_environment(listener: Listener, start: S
             wait_until(
                 lambda: any(six(message)[2] < -10.0 for message in list(stages.final.queue)), "a contact"
             )
-            assert node.process.poll() is None
+            assert node.is_running
             assert "Traceback" not in node.log
         finally:
             server.close()

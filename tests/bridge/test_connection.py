@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from bridge.connection import Connection, find_sensor
+from bridge.stream.connection import Connection, find_sensor
 from protocol.errors import ConnectionFailedError, UnreachableError
-from protocol.text import printable
+from protocol.text.visible import printable
 from tests.bridge.scripted_server import ScriptedServer, description
 
 

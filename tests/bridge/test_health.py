@@ -8,16 +8,16 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
-from bridge.compensation_state import CompensationState
-from bridge.connection import SensorInfo
-from bridge.health import Level, Status, judge, text_of
-from bridge.parameters import Thresholds
-from bridge.selection import FrameCounts
-from bridge.snapshot import Snapshot
-from bridge.watch import Flags, Watch
+from bridge.diagnostics.compensation_state import CompensationState
+from bridge.diagnostics.health import Level, Status, judge, text_of
+from bridge.diagnostics.snapshot import Snapshot
+from bridge.parameters.table import Thresholds
+from bridge.stream.connection import SensorInfo
+from bridge.stream.frame_selector import FrameCounts
+from bridge.stream.watch import Flags, Watch
 from protocol.framing import DataMessage
 from protocol.pdo import encode
-from protocol.warnings_register import WARNINGS, Severity
+from protocol.sensor.warnings_register import WARNINGS, Severity
 from tests.compensation.making import BIAS, TOOL
 
 pytestmark = pytest.mark.ros
@@ -57,7 +57,7 @@ def test_good_is_good() -> None:
         (
             "link",
             Level.ERROR,
-            "not connected to localhost:1: it has no sensor 3 (the node goes on trying)",
+            "not connected to localhost:1: it has no sensor 3 (the node keeps trying)",
             {"connected": False, "problem": "it has no sensor 3"},
         ),
         ("stream", Level.STALE, "see link", {"connected": False}),
@@ -75,14 +75,14 @@ def test_good_is_good() -> None:
         ("stream", Level.ERROR, "stopped or overloaded", {"silent_s": 2.0, "answer_s": 1.5}),
         ("stream", Level.ERROR, "in state SAFEOP", {"silent_s": 2.0, "info": SAFEOP}),
         ("stream", Level.ERROR, "again and again", {"silent_s": 2.0, "new": FrameCounts(repeated=1)}),
-        ("stream", Level.ERROR, "take part", {"silent_s": 2.0, "new": FrameCounts(invalid=1)}),
+        ("stream", Level.ERROR, "does not answer the bus", {"silent_s": 2.0, "new": FrameCounts(invalid=1)}),
         ("stream", Level.WARN, "700 samples a second instead of 800", {"rate_hz": 700.0}),
         ("stream", Level.OK, "798", {"rate_hz": 798.0}),
         ("stream", Level.WARN, "12.0 ms old", {"age_us": (1.0, 12_000.0)}),
         ("stream", Level.ERROR, "120.0 ms old", {"age_us": (1.0, 120_000.0)}),
         ("stream", Level.WARN, "3 samples lost", {"new": FrameCounts(lost=3)}),
         ("stream", Level.WARN, "4 samples lost", {"new_server_lost": 4}),
-        ("stream", Level.WARN, "5 old samples skipped", {"new": FrameCounts(skipped=5)}),
+        ("stream", Level.WARN, "5 old samples skipped", {"new": FrameCounts(stale=5)}),
         ("stream", Level.WARN, "not finite", {"new_not_finite": 1}),
         ("sensor", Level.ERROR, "no power; check its cable", {"lost": "no power"}),
         ("sensor", Level.STALE, "see stream", {"silent_s": 2.0}),

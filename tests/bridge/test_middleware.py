@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 from bridge.middleware import PROFILES, use_own_profiles
-from tests.bridge.conftest import Listener, Start
+from tests.bridge.conftest import StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 
 pytestmark = pytest.mark.ros
@@ -37,13 +37,14 @@ def test_nothing_is_repeated_later_for_it() -> None:
 
 
 def test_fast_dds_understands_it(
-    server: ScriptedServer, listener: Listener, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: ScriptedServer, start_process: StartProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """In processes: the middleware reads its profiles once."""
     monkeypatch.delenv(NAME, raising=False)
-    node = start(server.port)
+    node = start_process(server.port)
     node.says("connected to")
     assert "XMLPARSER" not in node.log
     wrong = tmp_path / "wrong.xml"
     wrong.write_text(PROFILES.read_text().replace("nackSupressionDuration", "nackDuration"))
     monkeypatch.setenv(NAME, str(wrong))
-    start(server.port).says("XMLPARSER")  # this is how it would have said so
+    start_process(server.port).says("XMLPARSER")  # this is how it would have said so

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from tests.bridge.conftest import Listener, NodeProcess, Start, establish, wait_until
+from tests.bridge.conftest import Listener, NodeProcess, Start, StartProcess, establish, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("_ros")]
@@ -22,9 +22,10 @@ def free_port() -> int:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_with_exit_code_0(
-    server: ScriptedServer, start: Start, number: signal.Signals
+    server: ScriptedServer, start_process: StartProcess, number: signal.Signals
 ) -> None:
-    node = start(server.port)
+    """In a process: signals are a process's."""
+    node = start_process(server.port)
     node.says("connected to")
     node.send_signal(number)
     assert node.ends() == 0
@@ -46,7 +47,7 @@ def test_waits_for_the_server_and_finds_it_again(listener: Listener, start: Star
     time.sleep(0.5)
     assert node.log.count("no server at") == 1, "said once, not at every attempt"
     assert node.log.count("connected again") == 1
-    node.send_signal(signal.SIGINT)
+    node.finish()
     assert node.ends() == 0
 
 
@@ -112,12 +113,13 @@ def test_a_limit_and_the_notes_parameter_names(listener: Listener, start: Start)
         assert numbers == sorted(numbers)
         assert len(numbers) <= 24
         assert listener.parameters("server_port", "SERVER_PORT") == [server.port, server.port]
-        node.send_signal(signal.SIGTERM)
+        node.finish()
         assert node.ends() == 0
 
 
-def test_a_wrong_parameter_is_one_sentence(start: Start) -> None:
-    node = start(70000)
+def test_a_wrong_parameter_is_one_sentence(start_process: StartProcess) -> None:
+    """In a process: exit code and output are the user's view of every sentence below."""
+    node = start_process(70000)
     assert node.ends() == 2
     (line,) = node.log.splitlines()
     assert line == "bridge-client: parameter server_port is 70000: it must be a whole number from 1 to 65535"
@@ -155,6 +157,7 @@ def test_a_wrong_setting_at_start_is_one_sentence(start: Start) -> None:
 
 
 def test_arguments_that_are_not_understood() -> None:
+    """In processes: it is about the command line."""
     for arguments, code in ((("dance",), 2), (("--ros-args", "-p"), 2), (("--help",), 0)):
         node = NodeProcess(*arguments)
         assert node.ends() == code
@@ -162,8 +165,11 @@ def test_arguments_that_are_not_understood() -> None:
         node.close()
 
 
-def test_a_signal_while_it_starts_is_no_traceback(server: ScriptedServer, start: Start) -> None:
-    node = start(server.port)
+def test_a_signal_while_it_starts_is_no_traceback(
+    server: ScriptedServer, start_process: StartProcess
+) -> None:
+    """In a process: signals are a process's."""
+    node = start_process(server.port)
 
     def signals_blocked() -> bool:
         with open(f"/proc/{node.process.pid}/status") as status:  # noqa: PTH123

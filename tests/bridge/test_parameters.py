@@ -11,9 +11,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
-from bridge.compensation_parameters import ROWS as COMPENSATION_ROWS
-from bridge.compensation_parameters import gather
-from bridge.parameters import PARAMETERS, ParameterError
+from bridge.parameters.compensation import ROWS as COMPENSATION_ROWS
+from bridge.parameters.compensation import gather
+from bridge.parameters.declare import descriptor
+from bridge.parameters.row import ParameterError
+from bridge.parameters.table import PARAMETERS
 
 pytestmark = pytest.mark.ros
 ROWS = {row.name: row for row in PARAMETERS}
@@ -114,8 +116,8 @@ def test_a_covariance_is_three_or_nine_numbers(value: Any) -> None:
 
 def test_every_parameter_describes_itself() -> None:
     for row in PARAMETERS:
-        descriptor = row.descriptor()
-        assert descriptor.description
-        assert descriptor.read_only is not row.live
+        described = descriptor(row)
+        assert described.description
+        assert described.read_only is not row.live
         if isinstance(row.default, int | float) and not isinstance(row.default, bool):
-            assert descriptor.integer_range or descriptor.floating_point_range, row.name
+            assert described.integer_range or described.floating_point_range, row.name

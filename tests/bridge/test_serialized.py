@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Float64MultiArray
 
-from bridge.serialized import SerializedMessage, axes
+from bridge.publishing.serialized import SerializedMessage, axes
 
 
 @pytest.mark.parametrize("frame_id", ["", "a", "ft", "fts", "arm", "ft_sensor", "ü" * 37])
@@ -57,6 +57,6 @@ def test_a_number_that_cannot_be_found_is_refused() -> None:
 
 def test_too_few_numbers_are_an_error_not_an_old_number() -> None:
     message = Float64MultiArray(data=[0.0] * 12)
-    places: list[Any] = [(message.data, place) for place in range(12)]
+    positions: list[Any] = [(message.data, position) for position in range(12)]
     with pytest.raises(struct.error):
-        SerializedMessage(message, [places]).fill(0, [1.0] * 11)
+        SerializedMessage(message, [positions]).fill(0, [1.0] * 11)

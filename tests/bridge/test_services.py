@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -14,11 +13,11 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 from std_srvs.srv import Trigger
 
-from bridge.requests import CONFIGURE_TIMEOUT_S
+from bridge.stream.requests import CONFIGURE_TIMEOUT_S
 from protocol.control import ErrorCode, Event, event
-from protocol.json_text import JsonObject
 from protocol.settings import SETTINGS as TABLE
-from tests.bridge.conftest import PATIENCE_S, Listener, NodeProcess, starter, wait_until
+from protocol.text.json_text import JsonObject
+from tests.bridge.conftest import PATIENCE_S, Listener, NodeThread, starter, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.shared import listener, server, stream
 from tests.bridge.streaming import SETTINGS, Stream
@@ -29,16 +28,16 @@ NAMES = ("settings.sinc_length", "settings.fir", "settings.acceleration_range_g"
 
 
 @pytest.fixture(scope="module")
-def _node(server: ScriptedServer, stream: Stream, listener: Listener) -> Iterator[NodeProcess]:
+def _node(server: ScriptedServer, stream: Stream, listener: Listener) -> Iterator[NodeThread]:
     with starter(listener) as start:
         yield start(server.port, **{"settings.sinc_length": 64})
 
 
 @pytest.fixture(autouse=True)
-def node(_node: NodeProcess, listener: Listener) -> Iterator[NodeProcess]:
+def node(_node: NodeThread, listener: Listener) -> Iterator[NodeThread]:
     wait_until(lambda: listener.parameters(*NAMES) == [512, False, 2, None], "the server's settings")
     yield _node
-    assert _node.process.poll() is None
+    assert _node.is_running
     assert "Traceback" not in _node.log
 
 
@@ -46,7 +45,7 @@ def refuse(message: str, code: str = ErrorCode.SENSOR) -> JsonObject:
     return {"ok": False, "error": {"code": str(code), "message": message}}
 
 
-def test_settings_given_at_start_are_not_taken_in_silence(node: NodeProcess, server: ScriptedServer) -> None:
+def test_settings_given_at_start_are_not_taken_in_silence(node: NodeThread, server: ScriptedServer) -> None:
     assert "settings given at start: sinc_length; call ~/apply_settings" in node.log
     assert not [r for r in server.requests if r["action"] == "configure"]
 
@@ -67,7 +66,7 @@ def configures(server: ScriptedServer) -> list[Any]:
 
 
 def test_settings_given_at_start_or_set_since_are_applied_together(
-    node: NodeProcess, server: ScriptedServer, listener: Listener
+    node: NodeThread, server: ScriptedServer, listener: Listener
 ) -> None:
     asked = configures(server)
     done, text = listener.trigger("apply_settings")
@@ -169,7 +168,7 @@ def test_a_value_that_cannot_be(listener: Listener, name: str, value: Any, words
 def test_a_change_that_did_not_take(server: ScriptedServer, listener: Listener) -> None:
     server.answers["configure"] = lambda _: {"ok": True, "settings": SETTINGS}
     done, reason = listener.set_parameter("settings.fir", True)
-    assert (done, reason) == (False, "fir is still False, says the server: it did not take True")
+    assert (done, reason) == (False, "fir is still False: the server did not apply True")
 
 
 def test_the_parameters_follow_what_others_change(server: ScriptedServer, listener: Listener) -> None:
@@ -241,7 +240,7 @@ def test_the_node_ends_while_a_service_waits(
             other.ask(Trigger, "sensor_tare")
             wait_until(lambda: any(r["action"] == "tare" for r in mute.requests), "the request")
             began = time.monotonic()
-            node.send_signal(signal.SIGTERM)
+            node.finish()
             assert node.ends() == 0
             assert time.monotonic() - began < CONFIGURE_TIMEOUT_S  # it did not wait for the reply
             assert "Traceback" not in node.log

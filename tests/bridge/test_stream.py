@@ -12,7 +12,7 @@ import pytest
 
 from protocol.framing import DataFlag
 from protocol.pdo import encode
-from tests.bridge.conftest import Listener, NodeProcess, establish, starter
+from tests.bridge.conftest import Listener, NodeProcess, NodeThread, establish, process_starter, starter
 from tests.bridge.scripted_server import ScriptedServer, description, process_data
 from tests.bridge.shared import listener, server
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.ros
 
 
 @pytest.fixture(scope="module")
-def node(server: ScriptedServer, listener: Listener) -> Iterator[NodeProcess]:
+def node(server: ScriptedServer, listener: Listener) -> Iterator[NodeThread]:
     with starter(listener) as start:
         yield start(server.port)
 
@@ -30,7 +30,7 @@ def node(server: ScriptedServer, listener: Listener) -> Iterator[NodeProcess]:
 def _streaming(node: NodeProcess, server: ScriptedServer, listener: Listener) -> Iterator[None]:
     establish(server, listener)
     yield
-    assert node.process.poll() is None
+    assert node.is_running
     assert "Traceback" not in node.log
 
 
@@ -75,7 +75,7 @@ def test_both_sizes_of_process_data(server: ScriptedServer, listener: Listener) 
 
 
 def test_what_is_no_news_is_not_published(
-    server: ScriptedServer, listener: Listener, node: NodeProcess
+    server: ScriptedServer, listener: Listener, node: NodeThread
 ) -> None:
     server.send_sample(1.0, DataFlag.REPEATED)
     server.send_sample(2.0, DataFlag.INVALID)
@@ -90,7 +90,7 @@ def test_what_is_no_news_is_not_published(
     assert node.log.count("not finite") == 1
 
 
-def test_events_are_said(server: ScriptedServer, listener: Listener, node: NodeProcess) -> None:
+def test_events_are_said(server: ScriptedServer, listener: Listener, node: NodeThread) -> None:
     server.send_json({"event": "sensor_lost", "sensor": 0})
     server.send_json({"event": "sensor_back", "sensor": 0})
     server.send_json({"event": "some\x1b[2Jthing", "detail": "{0}"})
@@ -102,39 +102,8 @@ def test_events_are_said(server: ScriptedServer, listener: Listener, node: NodeP
         node.says(words)
 
 
-@pytest.mark.parametrize(
-    "garbage",
-    [
-        b"\xff" * 1000,
-        b"\0\0\0\0",
-        b"\0\0\0\x02\x02[",
-        b"\0\0\0\x05\x01abcd",
-        b"\0\0\0\x05\x09abcd",
-    ],
-)
-def test_garbage_ends_the_connection_and_the_next_one_works(
-    server: ScriptedServer, listener: Listener, node: NodeProcess, garbage: bytes
-) -> None:
-    connections = server.connections
-    server.subscribed.clear()
-    server.send_raw(server.frame(1.0) + garbage + server.frame(2.0))
-    node.says("is not this protocol")
-    establish(server, listener)
-    server.send_sample(3.0)
-    assert listener.next_number() == 3.0
-    assert server.connections > connections
-
-
-def test_an_impossible_time_is_garbage(server: ScriptedServer, listener: Listener, node: NodeProcess) -> None:
-    server.subscribed.clear()
-    server.send_sample(1.0, stamp_ns=2**64 - 1)
-    node.says("impossible time")
-    establish(server, listener)
-    assert 1.0 not in listener.numbers()
-
-
 def test_a_sensor_that_goes_and_comes_back(
-    server: ScriptedServer, listener: Listener, node: NodeProcess
+    server: ScriptedServer, listener: Listener, node: NodeThread
 ) -> None:
     server.description = description(sensors=[])
     server.drop()
@@ -145,10 +114,19 @@ def test_a_sensor_that_goes_and_comes_back(
     assert listener.next_number() == 1.0
 
 
-def test_nothing_old_after_the_node_was_stopped(
-    server: ScriptedServer, listener: Listener, node: NodeProcess
-) -> None:
-    server.ahead_ns = 0  # here it is the age that counts
+@pytest.mark.usefixtures("_ros")
+def test_nothing_old_after_the_node_was_stopped() -> None:
+    """In a process: it is stopped."""
+    listener = Listener()
+    with ScriptedServer() as server, process_starter(listener) as start:
+        node = start(server.port)
+        establish(server, listener)
+        server.ahead_ns = 0  # here it is the age that counts
+        _stop_and_go(server, listener, node)
+    listener.close()
+
+
+def _stop_and_go(server: ScriptedServer, listener: Listener, node: NodeProcess) -> None:
     sent = 0
     stop = threading.Event()
 

@@ -17,7 +17,7 @@ from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import Imu, Temperature
 
 from protocol.pdo import encode
-from tests.bridge.conftest import PATIENCE_S, Listener, NodeProcess, establish, starter, wait_until
+from tests.bridge.conftest import PATIENCE_S, Listener, NodeThread, establish, starter, wait_until
 from tests.bridge.scripted_server import ScriptedServer, process_data
 from tests.bridge.shared import listener, server
 
@@ -41,7 +41,7 @@ class Topics:
 
 
 @pytest.fixture(scope="module")
-def node(server: ScriptedServer, listener: Listener) -> Iterator[NodeProcess]:
+def node(server: ScriptedServer, listener: Listener) -> Iterator[NodeThread]:
     with starter(listener) as start:
         yield start(
             server.port,
@@ -55,7 +55,7 @@ def node(server: ScriptedServer, listener: Listener) -> Iterator[NodeProcess]:
 
 
 @pytest.fixture(scope="module")
-def topics(server: ScriptedServer, listener: Listener, node: NodeProcess) -> Topics:
+def topics(server: ScriptedServer, listener: Listener, node: NodeThread) -> Topics:
     subscribed = Topics(listener)
     establish(server, listener)
     wait_until(
@@ -70,7 +70,7 @@ def _sent(server: ScriptedServer) -> bool:
 
 
 @pytest.fixture(autouse=True)
-def _quiet(topics: Topics, server: ScriptedServer, node: NodeProcess) -> Iterator[None]:
+def _quiet(topics: Topics, server: ScriptedServer, node: NodeThread) -> Iterator[None]:
     # What was sent before is on its way for as long as it takes: wait for one that is known.
     number = float(next(_NUMBERS))
     marked = encode(61, {"acceleration.x": number, "temperature": number})
@@ -80,7 +80,7 @@ def _quiet(topics: Topics, server: ScriptedServer, node: NodeProcess) -> Iterato
     while get(topics.imu).linear_acceleration.x != pytest.approx(number * 9.80665):
         pass
     yield
-    assert node.process.poll() is None
+    assert node.is_running
     assert "Traceback" not in node.log
 
 

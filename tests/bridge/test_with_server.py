@@ -1,4 +1,7 @@
-"""The node against the real server and a virtual sensor: all that only shows when both are what they are."""
+"""The node against the real server and a virtual sensor: all that only shows when both are what they are.
+
+Each is a process, as in use.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import Imu
 
-from tests.bridge.conftest import PATIENCE_S, Listener, NodeProcess, starter, wait_until
+from tests.bridge.conftest import PATIENCE_S, Listener, NodeProcess, process_starter, wait_until
 from tests.bridge.shared import listener
 from tests.bridge.streaming import Diagnostics, values
 from tests.server.running import Program, Server, needs_bus, virtual_sensor
@@ -38,7 +41,7 @@ class Bench:
         self.server = Server(ifname, *SLOW).wait_streaming()
         self.port = self.server.port
         self.diagnostics = Diagnostics(listener)
-        self.wrench: queue.Queue[Any] = listener.subscribe(WrenchStamped, "wrench")
+        self.wrench: queue.Queue[Any] = listener.subscribe(WrenchStamped, "wrench", depth=20)
 
     def restart_server(self) -> None:
         self.server.close()
@@ -89,7 +92,7 @@ def _bench(listener: Listener) -> Iterator[Bench]:
 
 @pytest.fixture(scope="module")
 def node(_bench: Bench, listener: Listener) -> Iterator[NodeProcess]:
-    with starter(listener) as start:
+    with process_starter(listener) as start:
         tolerant = {
             "diagnostics.age_warn": 1.0,
             "diagnostics.rate_tolerance": 0.2,
@@ -103,7 +106,7 @@ def bench(_bench: Bench, node: NodeProcess) -> Iterator[Bench]:
     _bench.diagnostics.until(**THERE)
     _bench.forget()
     yield _bench
-    assert node.process.poll() is None
+    assert node.is_running
     assert "Traceback" not in node.log
 
 

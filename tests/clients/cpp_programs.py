@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import atexit
+import fcntl
 import functools
+import hashlib
 import json
 import shutil
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +22,7 @@ from tests.server.running import PATIENCE_S, wait_until
 
 ROOT: Final = Path(__file__).parents[2]
 CLIENT: Final = ROOT / "clients" / "cpp"
+HEADER: Final = CLIENT / "include" / "bota_ethercat.hpp"
 SOURCES: Final = Path(__file__).parent / "cpp"
 GXX: Final = shutil.which("g++")
 needs_gxx: Final = pytest.mark.skipif(GXX is None, reason="no g++ here: sudo apt install g++")
@@ -28,35 +32,65 @@ patient: Final = pytest.mark.timeout(300)
 
 STRICT: Final = ("-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZED: Final = ("-g", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-COUNTING: Final = ("-O0", "-DCOUNT_ALLOCATIONS")
 
 BUILD_TIMEOUT_S: Final = 280.0
+KEPT_S: Final = 7 * 86400.0
+"""Age from which a program that was built for other contents is deleted."""
 Reading = dict[str, Any]
 
 
 @functools.cache
+def _folder() -> Path:
+    """Where programs are built: kept between runs, for all workers, if pytest's cache can be written."""
+    kept = ROOT / ".pytest_cache" / "cpp"
+    try:
+        kept.mkdir(parents=True, exist_ok=True)
+        (kept / "lock").touch()
+    except OSError:
+        made = tempfile.mkdtemp(prefix="ethercat-cpp-")
+        atexit.register(shutil.rmtree, made, ignore_errors=True)
+        return Path(made)
+    return kept
+
+
+@functools.cache
 def build(source: Path, flags: Sequence[str], compiler: str = "g++") -> Path:
-    """The program made of `source`; every warning is an error."""
-    folder = tempfile.mkdtemp(prefix="ethercat-cpp-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    program = Path(folder) / source.stem
-    command = [compiler, *STRICT, *flags, f"-I{CLIENT / 'include'}", str(source), "-o", str(program)]
-    made = subprocess.run(command, check=False, capture_output=True, text=True, timeout=BUILD_TIMEOUT_S)
-    assert made.returncode == 0, f"{' '.join(command)}\n{made.stderr}"
+    """The program made of `source`, built once for its contents; every warning is an error."""
+    digest = hashlib.sha256(repr((compiler, STRICT, flags)).encode())
+    for path in (HEADER, source, *sorted(source.parent.glob("*.hpp"))):
+        digest.update(path.read_bytes())
+    program = _folder() / f"{source.stem}-{digest.hexdigest()[:16]}"
+    with (_folder() / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one of the workers builds it, the others wait
+        if not program.exists():
+            for old in _folder().glob(f"{source.stem}-*"):
+                if old.stat().st_mtime < time.time() - KEPT_S:
+                    old.unlink()
+            unfinished = program.with_suffix(".new")
+            command = [compiler, *STRICT, *flags, f"-I{HEADER.parent}", str(source), "-o", str(unfinished)]
+            made = subprocess.run(
+                command, check=False, capture_output=True, text=True, timeout=BUILD_TIMEOUT_S
+            )
+            assert made.returncode == 0, f"{' '.join(command)}\n{made.stderr}"
+            unfinished.rename(program)
     return program
 
 
-class Driver:
-    """tests/clients/cpp/driver.cpp: a C++ client that does what it is told."""
+def driver_program() -> Path:
+    """tests/clients/cpp/driver.cpp: one program for all tests, because g++ takes seconds."""
+    return build(SOURCES / "driver.cpp", SANITIZED)
 
-    def __init__(self, port: int, flags: Sequence[str] = SANITIZED, /, **options: object) -> None:
-        words = [f"{name}={value}" for name, value in options.items()]
-        self.process = subprocess.Popen(
-            [build(SOURCES / "driver.cpp", tuple(flags)), "host=127.0.0.1", f"port={port}", *words],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+
+_idle: list[subprocess.Popen[str]] = []
+"""Drivers that wait for the next test."""
+
+
+class Driver:
+    """A C++ client that a test commands: tests/clients/cpp/driver.cpp, a process for many tests."""
+
+    def __init__(self, port: int, **options: object) -> None:
+        self.process = _idle.pop() if _idle else start_driver()
+        self.begin("new", "host=127.0.0.1", f"port={port}", *(f"{k}={v}" for k, v in options.items()))
 
     def begin(self, *words: object) -> None:
         """Give a command; `answer` has what comes of it."""
@@ -79,12 +113,12 @@ class Driver:
         assert told["ok"], told
         return self
 
-    def latest(self, place: int = 0) -> Reading:
-        reading: Reading = self.do("latest", place)
+    def latest(self, position: int = 0) -> Reading:
+        reading: Reading = self.do("latest", position)
         return reading
 
-    def info(self, place: int = 0) -> dict[str, Any]:
-        told: dict[str, Any] = self.do("info", place)
+    def info(self, position: int = 0) -> dict[str, Any]:
+        told: dict[str, Any] = self.do("info", position)
         return told
 
     def until(self, condition: Callable[[Reading], bool], what: str) -> Reading:
@@ -99,30 +133,47 @@ class Driver:
         wait_until(so, what)
         return last
 
-    def close(self) -> int:
-        """End it; the exit code, which is not 0 if a sanitizer found something."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.close()
-        try:
-            return self.process.wait(20)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            return self.process.wait()
-        finally:
-            self.process.stdout.close()
+
+def start_driver() -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [driver_program()],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def end_driver(process: subprocess.Popen[str]) -> int:
+    """The exit code, which is not 0 if a sanitizer found something."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.close()
+    try:
+        return process.wait(20)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+    finally:
+        process.stdout.close()
 
 
 @contextmanager
-def driver(port: int, flags: Sequence[str] = SANITIZED, /, **options: object) -> Iterator[Driver]:
-    """A driver that ends with 0, whatever it met."""
-    running = Driver(port, flags, **options)
+def driver(port: int, /, **options: object) -> Iterator[Driver]:
+    """A driver with a new client. A module that uses it ends with `assert_no_faults`."""
+    running = Driver(port, **options)
     try:
         yield running
+        running.do("close")
     except BaseException:
-        running.close()
+        end_driver(running.process)
         raise
-    assert running.close() == 0
+    _idle.append(running.process)
+
+
+def assert_no_faults() -> None:
+    """End the drivers; none had a fault that a sanitizer found."""
+    while _idle:
+        assert end_driver(_idle.pop()) == 0
 
 
 def check(reading: Reading) -> None:

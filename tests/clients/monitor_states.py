@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from clients.monitor.model import Model
-from clients.monitor.state import State
+from clients.monitor.model.server import Model
+from clients.monitor.model.state import State
 from protocol.control import Event
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import encode
@@ -32,9 +32,9 @@ def description(names: Sequence[str] = ("BFT-SENS-ECAT-M8",), **settings: Any) -
         "version": "1.0.0",
         "sensors": [
             {
-                "sensor": place,
+                "sensor": position,
                 "name": name,
-                "serial": 1234 + place,
+                "serial": 1234 + position,
                 "hardware": "RM200V4_6adc",
                 "firmware": "1.3.8",
                 "pdo_size": 77,
@@ -42,7 +42,7 @@ def description(names: Sequence[str] = ("BFT-SENS-ECAT-M8",), **settings: Any) -
                 "state": "OP",
                 "settings": {**start_up_defaults(), **settings},
             }
-            for place, name in enumerate(names)
+            for position, name in enumerate(names)
         ],
     }
 
@@ -60,7 +60,7 @@ def status(sensors: int = 1, mode: str = "locked", sent: int = 0) -> dict[str, A
         "lost_frames": 1,
         "uptime_s": 4567.0,
         "last_10s": {"wake_us": spread, "exchange_us": spread, "age_us": [spread] * sensors},
-        "sensors": [{"sensor": place, **row} for place in range(sensors)],
+        "sensors": [{"sensor": position, **row} for position in range(sensors)],
         "clients": [
             {"peer": "127.0.0.1:51234", "sent": 4 * sent, "withheld": 12},
             {"peer": OWN_PEER, "sent": sent, "withheld": 0},
@@ -86,10 +86,15 @@ def moving(k: int) -> dict[str, float]:
     }  # fmt: skip
 
 
+@functools.cache
+def _moving_data(k: int) -> bytes:
+    return process_data(moving(k))
+
+
 def frame(k: int, values: Values | None = None, *, sensor: int = 0, flags: int = 0) -> DataMessage:
     """Frame number k of a sensor at 800 Hz."""
     monotonic_ns = round(START_S * 1e9) + k * PERIOD_NS + 1300 * (k * k % 7 - 3)
-    data = process_data(moving(k) if values is None else values)
+    data = _moving_data(k) if values is None else process_data(values)
     return DataMessage(k, monotonic_ns, monotonic_ns, sensor, flags, 3, data)
 
 
@@ -105,9 +110,9 @@ def fed(model: Model, sensors: int, frames: Mapping[int, Values] | None = None) 
     for first in range(0, count, 40):
         numbers = range(first, first + 40)
         batch = [
-            frame(k, {**moving(k), **other[k]} if k in other and not place else None, sensor=place)
+            frame(k, {**moving(k), **other[k]} if k in other and not position else None, sensor=position)
             for k in numbers
-            for place in range(sensors)
+            for position in range(sensors)
         ]
         model.take(batch, now(numbers[-1]))
         for last in batch[-sensors:]:

@@ -11,7 +11,7 @@ from clients.recording.ros_messages import RosTopics
 from clients.recording.writer import RecordingWriter
 from protocol import pdo
 from protocol.framing import DataMessage
-from protocol.json_text import JsonObject
+from protocol.text.json_text import JsonObject
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 1_250_000

@@ -18,7 +18,7 @@ from typing import Final
 from PIL import Image, PngImagePlugin
 
 from clients.report.examine import examine
-from clients.report.page import render
+from clients.report.page.page import render
 from tests.clients import chromium
 from tests.clients.simulated import sensor
 
@@ -26,7 +26,7 @@ PICTURE: Final = Path(__file__).resolve().parents[2] / "docs" / "report.png"
 AGAIN: Final = "make it again: python -m tests.clients.report_capture"
 _KEY: Final = "Source"
 _WIDTH, _HEIGHT = 960, 3480
-_COLOURS: Final = 160
+_COLORS: Final = 160
 
 
 def fixed_page() -> str:
@@ -63,7 +63,7 @@ def make(picture: Path) -> None:
         notes.add_text(_KEY, digest(page))
         with Image.open(drawn) as image:
             whole = image.convert("RGB")
-            few = whole.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+            few = whole.quantize(_COLORS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
             few.save(picture, optimize=True, pnginfo=notes)
 
 

@@ -1,26 +1,79 @@
-"""Runs `ethercat-record` and `ethercat-replay` as processes. A replay is a server that needs no bus."""
+"""Runs `ethercat-replay` in a thread, and `ethercat-record` and `ethercat-replay` as processes.
+
+A replay is a server that needs no bus. A thread is enough wherever a test is about what it sends; a process
+is for signals and exit codes.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest import mock
 
-from tests.server.running import Client, Program, free_port, wait_until
+from clients.program import Signals
+from clients.replay import program
+from tests.server.running import PATIENCE_S, Client, Program, free_port, wait_until
 
-__all__ = ["Client", "Program", "Recorder", "Replay", "free_port", "replaying", "wait_until"]
+__all__ = [
+    "Client",
+    "NoSignals",
+    "Program",
+    "Recorder",
+    "Replay",
+    "ReplayProcess",
+    "free_port",
+    "replaying",
+    "wait_until",
+]
 
 
-class Replay(Program):
-    """`ethercat-replay` of a file on a free port."""
+class NoSignals(Signals):
+    """Signals that a test gives."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._stop: Callable[[], None] | None = None
+
+    def give(self) -> None:
+        self.asked = True
+        if self._stop is not None:
+            self._stop()
+
+
+class Replay:
+    """`ethercat-replay` of a file on a free port, in a thread."""
 
     def __init__(self, *arguments: str | Path, port: int = 0) -> None:
         self.port = port or free_port()
-        super().__init__("clients.replay.cli", [*map(str, arguments), str(self.port)])
+        self._argv = [*map(str, arguments), str(self.port)]
+        self._sentences: list[str] = []
+        self._signals = NoSignals()
+        self._codes: list[int] = []
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        wait_until(self._is_listening, "a replay that listens")
 
-    def wait_listening(self) -> Replay:
-        self.wait_for("replaying")
-        return self
+    def said(self) -> str:
+        return "\n".join(self._sentences)
+
+    def wait(self) -> int:
+        self._thread.join(PATIENCE_S)
+        return self._codes[0]
+
+    def close(self) -> None:
+        self._signals.give()
+        self._thread.join(PATIENCE_S)
+        assert not self._thread.is_alive()
+
+    def _run(self) -> None:
+        with mock.patch.object(program, "_say", self._sentences.append):
+            self._codes.append(program.run(self._argv, self._signals))
+
+    def _is_listening(self) -> bool:
+        assert self._thread.is_alive() or "replaying" in self.said(), self.said()
+        return "replaying" in self.said()
 
 
 @contextlib.contextmanager
@@ -28,9 +81,21 @@ def replaying(*arguments: str | Path, port: int = 0) -> Iterator[Replay]:
     """A replay of `arguments`, the last of which is the file, until the end of the block."""
     running = Replay(*arguments, port=port)
     try:
-        yield running.wait_listening()
+        yield running
     finally:
         running.close()
+
+
+class ReplayProcess(Program):
+    """`ethercat-replay` of a file on a free port, as a process."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        self.port = free_port()
+        super().__init__("clients.replay.cli", [*map(str, arguments), str(self.port)])
+
+    def wait_listening(self) -> ReplayProcess:
+        self.wait_for("replaying")
+        return self
 
 
 class Recorder(Program):
@@ -38,7 +103,7 @@ class Recorder(Program):
 
     def __init__(self, path: Path, port: int, *arguments: str) -> None:
         self.path = path
-        super().__init__("clients.recording.cli", [*arguments, str(path), str(port)])
+        super().__init__("clients.record.cli", [*arguments, str(path), str(port)])
 
     def size(self) -> int:
         return self.path.stat().st_size if self.path.exists() else 0

@@ -19,8 +19,8 @@ from clients.identify.program import run
 from clients.identify.stills import find_stills
 from clients.recording.columns import columns
 from clients.recording.reader import open_recording
-from ethercat_server.virtual_sensor import scene
-from ethercat_server.virtual_sensor.motion import MOVE_LENGTH, POSE_LENGTH, POSES
+from ethercat_server.virtual_sensor.measurement import scene
+from ethercat_server.virtual_sensor.measurement.motion import MOVE_LENGTH, POSE_LENGTH, POSES
 from protocol.framing import DataFlag, DataMessage
 from tests.clients.recordings import START_NS, describe, record, writer
 from tests.compensation.making import written_parameters
@@ -93,9 +93,9 @@ def test_a_person_sees_tables(
     shown = capsys.readouterr().out
     for words in (
         "poses",
-        "left over N",
+        "residual N",
         "mass",
-        "centre of gravity z",
+        "center of gravity z",
         "mm",
         "± (95 %)",
         "bias torque x",
@@ -137,7 +137,7 @@ def test_other_frames_and_bad_samples_do_not_matter(
         mixed.append(frame._replace(sensor=1))
     path = tmp_path / "mixed.mcap"
     record(path, mixed, sensors=(0, 1))
-    assert "several sensors (0, 1): say which with --sensor" in refused(capsys, path)
+    assert "several sensors (0, 1): choose one with --sensor" in refused(capsys, path)
     assert "no samples of sensor 7" in refused(capsys, path, "--sensor", 7)
     code, answer, _ = asked(capsys, path, "--sensor", 0)
     assert code == 0
@@ -165,7 +165,7 @@ def test_too_few_poses_are_refused_with_what_to_do_and_the_poses_are_shown(
 def test_a_recording_that_never_rests_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "scene.mcap"
     record(path, frames(process_data("scene", 4.0, sinc=SINC)))
-    assert "nowhere at rest for 1 s" in refused(capsys, path)
+    assert "never stationary for 1 s" in refused(capsys, path)
 
 
 def test_a_gap_or_a_restarted_server_ends_a_rest(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_what_is_no_recording_is_one_sentence(tmp_path: Path, capsys: pytest.Cap
     (tmp_path / "text.mcap").write_text("hello")
     assert "text.mcap" in refused(capsys, tmp_path / "text.mcap")
     record(tmp_path / "empty.mcap", [])
-    assert "holds no samples" in refused(capsys, tmp_path / "empty.mcap")
+    assert "has no samples" in refused(capsys, tmp_path / "empty.mcap")
 
 
 @pytest.mark.parametrize(
@@ -257,4 +257,4 @@ def test_a_sensor_that_was_exchanged_meanwhile_is_refused(
     for frame in POSED[half:]:
         made.frame(frame)
     made.finish({})
-    assert "sensor 0 was exchanged in it (serial numbers 100, 7)" in refused(capsys, path)
+    assert "sensor 0 was replaced during it (serial numbers 100, 7)" in refused(capsys, path)

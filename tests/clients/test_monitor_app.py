@@ -12,9 +12,9 @@ import pytest
 
 from clients.monitor import cli
 from clients.monitor.app import Monitor
-from clients.monitor.glyphs import UNICODE
-from clients.monitor.model import Model
+from clients.monitor.model.server import Model
 from clients.monitor.recorder import Recorder
+from clients.monitor.view.glyphs import UNICODE
 from protocol.address import Address
 from tests.clients import monitor_states as made
 from tests.server.running import free_port, wait_until
@@ -72,7 +72,7 @@ def test_tare_asks_first_and_only_y_does_it() -> None:
         await stage.press("n", "t")
         assert "Tare sensor 1?" in stage.shown()
         await stage.press("y")
-        wait_until(lambda: "Sensor 1 is not tared: no connection to the server" in stage.shown(), "a word")
+        wait_until(lambda: "Sensor 1 was not tared: no connection to the server" in stage.shown(), "a word")
 
     play(scene)
 
@@ -110,9 +110,9 @@ def test_reset_forgets_the_peaks() -> None:
 
 def test_help_comes_and_goes_and_swallows_the_key() -> None:
     async def scene(stage: Stage) -> None:
-        assert "Any key goes back" in await stage.press("question_mark")
+        assert "Press any key to return" in await stage.press("question_mark")
         text = await stage.press("t")
-        assert "Any key goes back" not in text
+        assert "Press any key to return" not in text
         assert "Tare sensor" not in text
 
     play(scene)

@@ -10,9 +10,9 @@ from unittest import mock
 
 import pytest
 
-from clients.monitor.model import Model
+from clients.monitor.model.server import Model
+from clients.monitor.model.state import SensorState
 from clients.monitor.reader import Reader
-from clients.monitor.state import SensorState
 from protocol.address import Address
 from protocol.client import Client
 from protocol.control import Event

@@ -10,19 +10,19 @@ from dataclasses import replace
 import pytest
 from rich.text import Text
 
-from clients.monitor.bars import bar, scale_for, trace
-from clients.monitor.glyphs import ASCII, UNICODE
-from clients.monitor.json_line import json_line
-from clients.monitor.model import Model
-from clients.monitor.screen import KEYS, Look, render
-from clients.monitor.state import Client, Range, State
-from clients.monitor.table import table
-from clients.monitor.words import duration, quantity
+from clients.monitor.model.server import Model
+from clients.monitor.model.state import Client, Range, State
+from clients.monitor.view.bars import bar, scale_for, trace
+from clients.monitor.view.glyphs import ASCII, UNICODE
+from clients.monitor.view.json_line import json_line
+from clients.monitor.view.screen import KEYS, Look, render
+from clients.monitor.view.table import table
+from clients.numbers import duration, quantity
 from protocol.framing import DataMessage
 from tests.clients import monitor_states as made
 from tests.clients.captures import DOCS, captures
 
-STATES = {"healthy": made.healthy(), "troubled": made.troubled(), "gone": made.gone()}
+STATES = {"healthy": made.healthy, "troubled": made.troubled, "gone": made.gone}
 
 
 def plain(state: State, look: Look | None = None, width: int = 80, height: int = 24) -> str:
@@ -32,9 +32,10 @@ def plain(state: State, look: Look | None = None, width: int = 80, height: int =
 @pytest.mark.parametrize("name", STATES)
 @pytest.mark.parametrize("look", [Look(), Look(help=True), Look(glyphs=ASCII), Look(question="x" * 300)])
 def test_every_size_is_filled_and_never_exceeded(name: str, look: Look) -> None:
+    state = STATES[name]()
     for width in (1, 10, 24, 40, 55, 56, 60, 75, 76, 80, 109, 110, 200):
         for height in (1, 5, 8, 12, 15, 23, 24, 36, 44, 90):
-            rows = render(STATES[name], look, width, height)
+            rows = render(state, look, width, height)
             assert len(rows) == height
             assert max(row.cell_len for row in rows) <= width
 
@@ -107,8 +108,8 @@ def test_help_names_every_key() -> None:
         assert f"  {key}  {name.ljust(8)}{what}" in text
 
 
-def test_no_fact_is_told_by_colour_alone() -> None:
-    """Where colour marks something bad, a word or a sign does too."""
+def test_no_fact_is_told_by_color_alone() -> None:
+    """Where color marks something bad, a word or a sign does too."""
     rows = render(made.troubled(), Look(), 80, 24)
     spans = [(row.plain[s.start : s.end].strip(), str(s.style)) for row in rows for s in row.spans]
     assert {text for text, style in spans if "#d55e00" in style} == {"Fz!", "error", "warning"}

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from clients.errors import DiskError
+from clients.record.parts import Parts
 from clients.recording.disk import DiskFile
-from clients.recording.errors import DiskError
-from clients.recording.parts import Parts
 
 
 def parts(

@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 import zstandard
 
-from clients.recording.chunk import MAX_CHUNK
 from clients.recording.columns import columns
-from clients.recording.container import McapFile
+from clients.recording.container import MAX_CHUNK, McapFile
 from clients.recording.file_format import DESCRIPTION_TOPIC, FORMAT_VERSION
 from clients.recording.reader import (
     DamagedError,

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from clients.record import options as record_options
 from clients.recording import file_format, ros_messages
-from clients.recording import options as record_options
 from clients.replay import options as replay_options
 from protocol.framing import DataMessage
 from tests.clients.recordings import frame
@@ -30,7 +30,7 @@ def test_arguments_and_options_may_stand_in_any_order() -> None:
     recording = record_options.parse_options(["a.mcap", "--seconds", "5", "host:1"])
     assert (recording.path, str(recording.address), recording.seconds) == (Path("a.mcap"), "host:1", 5)
     replay = replay_options.parse_options(["a.mcap", "--loop", "b.mcap", "12002"])
-    assert (replay.paths, replay.port, replay.loop) == ((Path("a.mcap"), Path("b.mcap")), 12002, True)
+    assert (replay.paths, replay.port, replay.loop) == ([Path("a.mcap"), Path("b.mcap")], 12002, True)
 
 
 def test_every_topic_and_schema_is_described() -> None:

@@ -1,26 +1,36 @@
-"""`ethercat-replay` as a process: a client cannot tell it from a server, but for its `describe`."""
+"""`ethercat-replay`: a client cannot tell it from a server, except by its `describe`.
+
+It runs in a thread, except where signals, exit codes and imports are what a test is about.
+"""
 
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from bridge.connection import Connection
+from bridge.stream.connection import Connection
+from clients.recording.reader import Event, open_recording
+from clients.replay import program
+from clients.replay.sensors import ReplayedSensors
 from protocol.client import connect
 from protocol.control import ErrorCode
 from protocol.errors import RefusedError
 from protocol.framing import DataMessage
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
-from tests.clients.running import Client, Replay, free_port, replaying
+from tests.clients.running import Client, NoSignals, ReplayProcess, replaying
 
 COUNT = 400
+
+Run = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture
@@ -116,28 +126,6 @@ def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(
     assert played == frames[: len(played)]
 
 
-def test_step_by_step(path: Path, frames: list[DataMessage]) -> None:
-    with (
-        replaying("--step", "--original-stamps", path) as served,
-        connect(served.port, fresh_only=False) as client,
-    ):
-        stdin = served.process.stdin
-        assert stdin is not None
-        assert client.receive(0.2) == []
-        for line, count in (("\n", 1), ("3\n", 3), ("\n\n", 2)):
-            stdin.write(line)
-            stdin.flush()
-            got: list[DataMessage] = []
-            while len(got) < count:
-                got += client.receive(5)
-            assert got == frames[:count]
-            assert client.receive(0.1) == []
-            frames = frames[count:]
-        stdin.close()
-        assert list(client.frames()) == []
-        assert served.wait() == 0
-
-
 # -- what clients may ask
 
 
@@ -225,28 +213,39 @@ def test_what_happened_happens_again(path: Path) -> None:
     made.event(START_NS, {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}})
     made.frame(frame(2))
     made.finish({})
-    with replaying("--step", path) as served, connect(served.port, fresh_only=False) as client:
-        stdin = served.process.stdin
-        assert stdin is not None
-        stdin.write("2\n")
-        stdin.flush()
-        while not client.receive(5) or not client.events:
-            pass
-        assert client.ask("describe")["sensors"][0]["state"] == "lost"
-        stdin.write("\n")
-        stdin.flush()
-        stdin.close()
-        assert len(list(client.frames())) >= 1
+    with replaying(path) as served, connect(served.port, fresh_only=False) as client:
+        assert len(list(client.frames())) == 3
         assert [event["event"] for event in client.events] == ["sensor_lost", "reconfigured", "shutting_down"]
+
+
+def test_describe_follows_the_events(path: Path, frames: list[DataMessage]) -> None:
+    del frames
+    with open_recording(path) as recording:
+        sensors = ReplayedSensors(recording.sensors)
+    for event, state in (("sensor_lost", "lost"), ("sensor_back", "OP")):
+        sensors.take(Event(0, {"event": event, "sensor": 1, "settings": {"sinc_length": 32}}))
+        described = [sensor.describe() for sensor in sensors.sensors]
+        assert [(row["state"], row["settings"]["sinc_length"]) for row in described] == [
+            ("OP", 64),
+            (state, 32),
+        ]
 
 
 # -- arguments and what is not there
 
 
-def run(*arguments: object) -> tuple[int, str]:
-    command = [sys.executable, "-m", "clients.replay.cli", *map(str, arguments)]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=30)
-    return done.returncode, done.stderr
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs the program here; its exit code and what it said."""
+
+    def running(*arguments: object) -> tuple[int, str]:
+        try:
+            code = program.run([*map(str, arguments)], NoSignals())
+        except SystemExit as ended:
+            code = int(str(ended.code))
+        return code, capsys.readouterr().err
+
+    return running
 
 
 @pytest.mark.parametrize(
@@ -256,17 +255,16 @@ def run(*arguments: object) -> tuple[int, str]:
         (("x.mcap", "99999"), "out of range"),
         (("x.mcap", "--speed", "0"), "it must be a number"),
         (("x.mcap", "--speed", "nan"), "it must be a number"),
-        (("x.mcap", "--speed", "2", "--step"), "not allowed with"),
         (("x.mcap", "--host", "nowhere"), "an IP address of this machine"),
     ],
 )
-def test_wrong_arguments_are_exit_code_2(arguments: tuple[str, ...], sentence: str) -> None:
+def test_wrong_arguments_are_exit_code_2(arguments: tuple[str, ...], sentence: str, run: Run) -> None:
     code, said = run(*arguments)
     assert code == 2
     assert sentence in said
 
 
-def test_a_file_that_is_no_recording_is_said(path: Path) -> None:
+def test_a_file_that_is_no_recording_is_said(path: Path, run: Run) -> None:
     code, said = run(path)
     assert (code, "No such file" in said) == (1, True)
     path.write_text("hello")
@@ -274,18 +272,18 @@ def test_a_file_that_is_no_recording_is_said(path: Path) -> None:
     assert (code, "is not an MCAP file" in said) == (1, True)
 
 
-def test_a_port_that_is_taken_is_said(path: Path, frames: list[DataMessage]) -> None:
+def test_a_port_that_is_taken_is_said(path: Path, frames: list[DataMessage], run: Run) -> None:
     del frames
-    with replaying(path) as served:
-        code, said = run(path, served.port)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        code, said = run(path, taken.getsockname()[1])
     assert code == 1
-    assert "is taken by another program" in said
+    assert "is in use by another program" in said
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_before_anybody_came(path: Path, frames: list[DataMessage], number: int) -> None:
     del frames
-    served = Replay(path, port=free_port()).wait_listening()
+    served = ReplayProcess(path).wait_listening()
     try:
         served.signal(number)
         assert served.wait() == 0
@@ -307,5 +305,5 @@ def test_a_damaged_recording_ends_it_with_a_sentence(path: Path, frames: list[Da
 
 
 def test_it_needs_no_bus() -> None:
-    code = "import sys, clients.replay.program, clients.recording.program; sys.exit('pysoem' in sys.modules)"
+    code = "import sys, clients.replay.program, clients.record.program; sys.exit('pysoem' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -90,7 +90,7 @@ def test_a_jump_of_the_numbers_is_kept_when_it_begins_again() -> None:
 def test_across_a_restart_of_the_machine_the_pause_is_that_of_the_stamps() -> None:
     line = timeline()
     line.due(frame(0)._replace(monotonic_ns=900 * 10**9))
-    line.connected_anew()
+    line.reconnected()
     after = frame(0)._replace(monotonic_ns=10**9, stamp_ns=START_NS + 3 * 10**9)
     assert line.due(after).at_ns - NOW_NS == 3 * 10**9
     later = after._replace(monotonic_ns=10**9 + PERIOD_NS, stamp_ns=after.stamp_ns + PERIOD_NS)

@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from bridge.compensation.poses import Pose
-from bridge.compensation.quantities import Payload, Wrench
+from ft_compensation.identification.poses import Pose
+from ft_compensation.quantities import Payload, Wrench
 from protocol.pdo import STANDARD_GRAVITY, Sample, Vector3
 
 TOOL = Payload(0.8, (0.004, -0.006, 0.055))
@@ -33,7 +33,7 @@ def gravity_for(up: Sequence[float]) -> Vector3:
 def load(up: Sequence[float], payload: Payload = TOOL, bias: Wrench = BIAS) -> Wrench:
     """What the sensor measures at rest, from IV.1 to IV.5 turned round."""
     force = [payload.mass * part for part in gravity_for(up)]
-    torque = cross(payload.centre, force)
+    torque = cross(payload.center, force)
     return Wrench.of([a + b for a, b in zip([*force, *torque], bias.values, strict=True)])
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator
 
-from bridge.compensation.session import IdentificationSession
-from bridge.compensation.still import StillMeans, StillWindow
-from ethercat_server.virtual_sensor import scene
-from ethercat_server.virtual_sensor.firmware import Firmware
-from ethercat_server.virtual_sensor.flash import Flash
-from ethercat_server.virtual_sensor.motion import MOVE_LENGTH, POSE_LENGTH, POSES
+from ethercat_server.virtual_sensor.firmware.firmware import Firmware
+from ethercat_server.virtual_sensor.firmware.flash import Flash
+from ethercat_server.virtual_sensor.measurement import scene
+from ethercat_server.virtual_sensor.measurement.motion import MOVE_LENGTH, POSE_LENGTH, POSES
 from ethercat_server.virtual_sensor.options import SensorOptions
+from ft_compensation.identification.session import IdentificationSession
+from ft_compensation.still import StillMeans, StillWindow
 from protocol.pdo import Sample, SampleDecoder
 
 Stream = Iterable[tuple[float, Sample]]
@@ -32,12 +32,13 @@ def process_data(
     options = SensorOptions(signal=signal, seed=seed)
     flash = Flash()
     flash.entries[0x8006, 1] = struct.pack("<H", sinc)
-    firmware = Firmware(options, flash, 0, lambda *_: None)
+    now = 0
+    firmware = Firmware(options, flash, lambda: now, lambda *_: None)
     for number, offset in enumerate(OFFSET, 1):
         firmware.write(0x8000, number, struct.pack("<f", offset))
     for number in range(int(seconds * 51200 / sinc)):
-        firmware.now = firmware.sampler.clock.instant(number)
-        yield firmware.now * 1e-9, number, firmware.inputs()
+        now = firmware.sampler.clock.instant(number)
+        yield now * 1e-9, number, firmware.inputs()
 
 
 def samples(signal: str, seconds: float, seed: int = 0, sinc: int = SINC) -> Iterator[tuple[float, Sample]]:

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bridge.compensation.bias import estimate_bias
-from bridge.compensation.compensator import Compensator
-from bridge.compensation.orientation import AccelerometerGravity
-from bridge.compensation.payload import Identified
-from bridge.compensation.quantities import Payload, Wrench
-from bridge.compensation.still import NotStillError, StillWindow
-from ethercat_server.virtual_sensor import scene
-from ethercat_server.virtual_sensor.motion import TURN_LENGTH
+from ethercat_server.virtual_sensor.measurement import scene
+from ethercat_server.virtual_sensor.measurement.motion import TURN_LENGTH
+from ft_compensation.bias import estimate_bias
+from ft_compensation.compensator import Compensator
+from ft_compensation.identification.payload import Identified
+from ft_compensation.orientation import AccelerometerGravity
+from ft_compensation.quantities import Payload, Wrench
+from ft_compensation.still import NotStillError, StillWindow
 from protocol.client import Client, connect
 from protocol.pdo import Sample
 from tests.compensation.streaming import (
@@ -90,7 +90,7 @@ def identified() -> Identified:
 def check_identified(found: Identified) -> None:
     assert found.coverage.poses >= 6
     assert found.payload.mass == pytest.approx(TOOL.mass, rel=0.01)
-    assert math.dist(found.payload.centre, TOOL.centre) < 0.002
+    assert math.dist(found.payload.center, TOOL.center) < 0.002
 
 
 # At simulated time.
@@ -150,7 +150,7 @@ def test_the_bias_can_be_taken_with_the_tool_on_in_any_pose_and_not_while_it_swa
     for time_s, sample in samples("scene", 2.0):
         if window.add(sample, time_s):
             break
-    with pytest.raises(NotStillError, match=r"not at rest|turns"):
+    with pytest.raises(NotStillError, match=r"not stationary|turns"):
         window.means()
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.compensation import equations
-from bridge.compensation.quantities import DEFAULT_GRAVITY
-from scripts import _compensation_figure as figure
+from ft_compensation.quantities import DEFAULT_GRAVITY
+from tests.compensation import equations, figure
 from tests.compensation.making import BIAS, TOOL
 
 ROOT = Path(__file__).parent.parent.parent
@@ -22,7 +21,7 @@ POSES = ((0.0, 0.0, 0.0, 1.0), (0.5**0.5, 0.0, 0.0, 0.5**0.5), (1.0, 0.0, 0.0, 0
 BASE_R_SENSOR = equations.matrix_from_quaternion(POSES)
 GRAVITY = equations.gravity_in_sensor_from_quaternion(POSES, DEFAULT_GRAVITY)
 WEIGHT = equations.gravity_force(TOOL.mass, GRAVITY)
-WEIGHT_TORQUE = equations.torque_of(TOOL.centre, WEIGHT)
+WEIGHT_TORQUE = equations.torque_of(TOOL.center, WEIGHT)
 TARED = np.array(BIAS.values) + np.hstack([WEIGHT[0], WEIGHT_TORQUE[0]])
 """The bias of a tare with the tool on, upright."""
 
@@ -36,12 +35,12 @@ MISTAKES: dict[str, dict[str, object]] = {
     "gravity with the wrong sign": {"gravity": -GRAVITY},
     "rotation the wrong way round": {"gravity": equations.gravity_in_sensor(BASE_R_SENSOR, DEFAULT_GRAVITY)},
     "frame turned by 90° about z": {"gravity": GRAVITY[:, [1, 0, 2]] * (1, -1, 1)},
-    "centre of gravity wrong": {"centre": (0.0, 0.0, 0.1)},
+    "center of gravity wrong": {"center": (0.0, 0.0, 0.1)},
 }
 
 
 def left_over(mistake: str) -> equations.ArrayStages:
-    known = {"bias": BIAS.values, "mass": TOOL.mass, "centre": TOOL.centre, "gravity": GRAVITY}
+    known = {"bias": BIAS.values, "mass": TOOL.mass, "center": TOOL.center, "gravity": GRAVITY}
     measured = WEIGHT + np.array(BIAS.force), WEIGHT_TORQUE + np.array(BIAS.torque)
     return equations.compensate(*measured, **(known | MISTAKES[mistake]))  # type: ignore[arg-type]
 
@@ -68,7 +67,7 @@ def test_every_mistake_of_the_page_is_tried() -> None:
 
 
 def test_a_wrong_centre_shows_in_the_torque_only() -> None:
-    left = left_over("centre of gravity wrong")
+    left = left_over("center of gravity wrong")
     assert np.abs(left.final_force).max() < 1e-9
     assert np.abs(left.final_torque).max() > 0.1
 

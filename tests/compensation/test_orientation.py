@@ -10,15 +10,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from bridge.compensation import equations
-from bridge.compensation.orientation import AccelerometerGravity, GravitySource, QuaternionGravity
-from bridge.compensation.quantities import DEFAULT_GRAVITY
+from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
+from ft_compensation.quantities import DEFAULT_GRAVITY
 from protocol.pdo import STANDARD_GRAVITY, Vector3
+from tests.compensation import equations
 
 G = STANDARD_GRAVITY
 UPRIGHT = (0.0, 0.0, G)
 STILL = (0.0, 0.0, 0.0)
 RATE = 800
+Source = AccelerometerGravity | QuaternionGravity
 
 
 def angle(a: Vector3, b: Vector3) -> float:
@@ -78,10 +79,8 @@ def test_noise_is_filtered() -> None:
 def test_the_lag_without_the_gyroscope_is_the_time_constant_and_none_with_it() -> None:
     speed = 0.2
     without = AccelerometerGravity(gyroscope=False, time_constant_s=0.3)
-    assert without.lag_s == 0.3
     assert turning(without, speed, 4.0) / speed == pytest.approx(0.3, rel=0.02)
     with_it = AccelerometerGravity(gyroscope=True, time_constant_s=0.3)
-    assert with_it.lag_s == 0.0
     assert turning(with_it, speed, 4.0) == pytest.approx(0.0, abs=1e-6)
     assert turning(AccelerometerGravity(), 3.0, 4.0) == pytest.approx(0.0, abs=1e-4)
 
@@ -226,12 +225,12 @@ def test_an_older_orientation_does_not_replace_a_newer_one() -> None:
     assert source.update((1.0, 0.0, 0.0, 0.0), 0.5), "unless the clock was set back"
 
 
-def feed_accelerometer(source: GravitySource, t: float) -> None:
+def feed_accelerometer(source: Source, t: float) -> None:
     assert isinstance(source, AccelerometerGravity)
     assert source.update(UPRIGHT, STILL, t)
 
 
-def feed_quaternion(source: GravitySource, t: float) -> None:
+def feed_quaternion(source: Source, t: float) -> None:
     assert isinstance(source, QuaternionGravity)
     assert source.update((0.0, 0.0, 0.0, 1.0), t)
 
@@ -244,7 +243,8 @@ def feed_quaternion(source: GravitySource, t: float) -> None:
     ],
 )
 def test_no_source_goes_on_with_an_old_pose(
-    source: GravitySource, feed: Callable[[GravitySource, float], None]
+    source: Source,
+    feed: Callable[[Source, float], None],
 ) -> None:
     answers = []
     feed(source, 10.0)
@@ -254,8 +254,6 @@ def test_no_source_goes_on_with_an_old_pose(
     assert source.age_s(10.2) == pytest.approx(0.2)
     feed(source, 20.0)
     assert source.gravity(20.1) is not None
-    source.reset()  # type: ignore[attr-defined]
-    assert source.gravity(20.1) is None
 
 
 def test_a_short_gap_is_bridged_by_the_gyroscope() -> None:

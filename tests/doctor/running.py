@@ -1,10 +1,22 @@
-"""Runs `ethercat-doctor` as a process."""
+"""Runs `ethercat-doctor`: as a process, in this one, or only its examination of a simulated bus."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-from tests.ended import Result, run
+from ethercat_server.doctor.bus.examination import Request, examine_bus
+from ethercat_server.doctor.cli import main
+from ethercat_server.doctor.finding import Finding, Level
+from ethercat_server.doctor.machine.facts import InterfaceFacts
+from ethercat_server.doctor.report import worst
+from tests.doctor.made_up import FACTS, Files, machine
+from tests.ended import Result, run, run_here
+from tests.server import readable
+from tests.server.as_another_user import NOBODY
+from tests.simulated_links import SimulatedBus
 
 MODULE = "ethercat_server.doctor.cli"
 
@@ -22,14 +34,62 @@ class Examined(Result):
         return {row["check"]: row for row in self.json["findings"] if row["subject"] == subject}
 
 
-def doctor(*arguments: object, module: str = MODULE, under: tuple[str, ...] = ()) -> Examined:
+def doctor(*arguments: object, under: tuple[str, ...] = (), python: str | Path = sys.executable) -> Examined:
     """Run `ethercat-doctor arguments...`."""
     for _ in range(_ATTEMPTS):
-        ended = Examined(*run(module, *arguments, under=under))
+        ended = Examined(*run(MODULE, *arguments, under=under, python=python))
         if _STARVED not in ended.out:
             break
-    assert "fault of the doctor" not in ended.out, ended.out
+    assert "error in ethercat-doctor" not in ended.out, ended.out
     return ended
+
+
+def doctor_here(*arguments: object) -> Examined:
+    """Run `ethercat-doctor arguments...` in this process, with ordinary scheduling."""
+    ended = Examined(*run_here(main, *arguments, "--rt-priority", 0))
+    assert "error in ethercat-doctor" not in ended.out, ended.out
+    return ended
+
+
+class BusFindings(list[Finding]):
+    """What was found on a simulated bus."""
+
+    @property
+    def worst(self) -> Level:
+        """Decides on the exit code."""
+        return worst(self)
+
+    def of(self, subject: str) -> dict[str, Finding]:
+        """The findings of a subject by check; the last one where there are two."""
+        return {finding.check: finding for finding in self if finding.subject == subject}
+
+    def levels(self, subject: str) -> dict[str, str]:
+        """The level of each check."""
+        return {check: finding.level.name.lower() for check, finding in self.of(subject).items()}
+
+
+def examined(
+    bus: SimulatedBus,
+    root: Path,
+    seconds: float = 0.2,
+    *,
+    files: Files | None = None,
+    facts: InterfaceFacts = FACTS,
+    announce: Callable[[str], None] = lambda _: None,
+) -> BusFindings:
+    """The doctor's examination of `bus` on a machine that is good but for `files` and `facts`."""
+    subject = machine(root, files, facts)
+    subject.ifname = bus.near
+    found = BusFindings(examine_bus(subject, Request(seconds, announce=announce)))
+    assert not [finding for finding in found if "error in ethercat-doctor" in finding.found]
+    return found
+
+
+def doctor_of_nobody(*arguments: object) -> Examined:
+    """Run `ethercat-doctor arguments...` as the user `nobody`."""
+    become = ("setpriv", f"--reuid={NOBODY.pw_uid}", f"--regid={NOBODY.pw_gid}", "--clear-groups")
+    readable.need(*become)
+    return doctor(*arguments, under=(*readable.under(), *become), python=readable.PYTHON)
 
 
 def levels(rows: dict[str, dict[str, Any]]) -> dict[str, str]:

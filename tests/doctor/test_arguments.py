@@ -1,4 +1,4 @@
-"""The command line: what is refused and said, and the machine's own checks for real. No bus is needed."""
+"""The command line, and the checks of this very machine; signals and pipes need a process of their own."""
 
 from __future__ import annotations
 
@@ -9,8 +9,12 @@ import sys
 
 import pytest
 
+from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.examination import CHECKS
-from tests.doctor.running import MODULE, doctor
+from ethercat_server.doctor.machine.machine import Machine
+from tests.doctor.running import MODULE, doctor_here
+from tests.ended import run_here
+from tests.server.running import PATIENCE_S
 
 
 @pytest.mark.parametrize(
@@ -25,30 +29,30 @@ from tests.doctor.running import MODULE, doctor
         (["ens5", "--cpu", "x"], "whole number"),
         (["ens5", "--cpu", "4000"], "--cpu 4000: this machine has the processors 0 to"),
         (["ens5", "--rt-priority", "100"], "--rt-priority 100: it must be a whole number from 0 to 99"),
-        (["a-name-that-is-too-long"], "is no name of a network interface"),
-        (["../lo"], "is no name of a network interface"),
-        ([""], "is no name of a network interface"),
+        (["a-name-that-is-too-long"], "is not an interface name"),
+        (["../lo"], "is not an interface name"),
+        ([""], "is not an interface name"),
     ],
 )
 def test_wrong_arguments_are_exit_code_2(arguments: list[str], named: str) -> None:
-    ended = doctor(*arguments)
+    ended = run_here(main, *arguments)
     assert (ended.code, ended.out) == (2, "")
     assert named in ended.err
     assert ended.err.splitlines()[-1].startswith("ethercat-doctor: ")
 
 
 def test_what_failed_is_json_too() -> None:
-    ended = doctor("a/b", "--json")
+    ended = run_here(main, "a/b", "--json")
     assert ended.code == 2
-    assert "no name of a network interface" in ended.json["error"]
+    assert "not an interface name" in ended.json["error"]
 
 
 def test_help_names_the_exit_codes() -> None:
-    assert "3 the worst is a warning" in " ".join(doctor("--help").out.split())
+    assert "3 warnings" in " ".join(run_here(main, "--help").out.split())
 
 
 def test_no_such_interface_is_a_finding_and_the_machine_is_looked_at() -> None:
-    ended = doctor("nosuch0", "--json", "--seconds", 0.05)
+    ended = doctor_here("nosuch0", "--json", "--seconds", 0.05)
     assert ended.code == 4
     assert ended.json["worst"] == "bad"
     assert ended.findings("interface")["link"]["found"] == "no network interface 'nosuch0'"
@@ -60,10 +64,10 @@ def test_no_such_interface_is_a_finding_and_the_machine_is_looked_at() -> None:
 
 
 def test_the_loopback_interface_is_no_place_for_a_sensor() -> None:
-    ended = doctor("lo", "--seconds", 0)
+    ended = doctor_here("lo", "--seconds", 0)
     assert ended.code == 4
     assert "the loopback interface" in ended.out
-    assert "could not look: --seconds 0 asks for no measurement" in ended.out
+    assert "not checked: disabled by --seconds 0" in ended.out
     assert ended.out.splitlines()[-1].startswith("1 bad, ")
     assert "\x1b" not in ended.out
 
@@ -79,28 +83,35 @@ def test_reader_that_has_enough() -> None:
     assert piped.stderr is not None
     piped.stdout.readline()
     piped.stdout.close()
-    assert piped.wait(timeout=20) == 1
+    assert piped.wait(timeout=PATIENCE_S) == 1
     assert piped.stderr.read() == ""
     piped.stderr.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_while_it_measures(number: signal.Signals) -> None:
+def test_stopped_while_it_measures() -> None:
     running = subprocess.Popen(
-        [sys.executable, "-m", MODULE, "nosuch0", "--seconds", "60"],
+        [sys.executable, "-m", MODULE, "nosuch0", "--seconds", "600"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
     assert running.stdout is not None
-    while "no such interface" not in running.stdout.readline():
-        pass
-    running.send_signal(number)
-    _, err = running.communicate(timeout=20)
+    while "no such interface" not in (line := running.stdout.readline()):
+        assert line, running.communicate()
+    running.send_signal(signal.SIGTERM)
+    _, err = running.communicate(timeout=PATIENCE_S)
     assert (running.returncode, err) == (1, "ethercat-doctor: stopped\n")
 
 
 def test_json_says_on_what_and_how_long() -> None:
-    found = json.loads(doctor("nosuch0", "--json", "--seconds", 0).out)
+    found = json.loads(doctor_here("nosuch0", "--json", "--seconds", 0).out)
     assert (found["interface"], found["seconds"]) == ("nosuch0", 0)
     assert isinstance(found["root"], bool)
+
+
+def test_virtual_without_rights_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Machine, "has_capability", lambda *_: False)
+    ended = doctor_here("virtual", "--json", "--seconds", 0)
+    assert ended.code in {0, 3}
+    assert "there is no virtual bus: CAP_NET_RAW" in ended.findings("bus")["slaves"]["found"]
+    assert ended.err == ""

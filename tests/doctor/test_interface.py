@@ -1,4 +1,4 @@
-"""The network interface, its interrupts and who else touches it, on made-up machines."""
+"""The network interface, its interrupts and other software on it, on made-up machines."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from ethercat_server.doctor import nic
 from ethercat_server.doctor.examination import examine_machine
-from ethercat_server.doctor.facts import InterfaceFacts, Routes
 from ethercat_server.doctor.finding import CannotLookError, Level
+from ethercat_server.doctor.machine import nic
+from ethercat_server.doctor.machine.facts import InterfaceFacts, Routes
 from tests.doctor.made_up import CPUS, but, machine, only
 
 NAMED = "ens5"
@@ -24,7 +24,7 @@ def test_nothing_is_wrong_with_a_good_machine(tmp_path: Path) -> None:
         "rights",
         "processors",
         "interface",
-        "who else",
+        "other software",
     }
 
 
@@ -197,7 +197,7 @@ def test_interrupt_threads_come_before_the_server(tmp_path: Path) -> None:
     assert (found.level, found.commands) == (Level.NOTE, ("sudo chrt -f -p 85 77",))
     assert only("interrupt threads", machine(tmp_path / "c", below, rt_priority=40)).level is Level.OK
     not_threaded = machine(tmp_path / "d", {"/proc/77/comm": None})
-    assert "handled at once" in only("interrupt threads", not_threaded).found
+    assert "not threaded" in only("interrupt threads", not_threaded).found
 
 
 @pytest.mark.parametrize(
@@ -301,7 +301,7 @@ def test_names_of_interfaces_are_quoted_in_commands(tmp_path: Path) -> None:
 
 
 def test_the_facts_of_a_real_interface() -> None:
-    from ethercat_server.doctor.facts import Link, collect
+    from ethercat_server.doctor.machine.facts import Link, collect
 
     found = collect("lo")
     assert isinstance(found.link, Link)

@@ -1,313 +1,186 @@
-"""The whole doctor on real frames: a veth pair with the virtual sensor on its far end."""
+"""The doctor's examination of a bus and its measurement, on simulated sensors."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.doctor.running import MODULE, doctor, levels
-from tests.server.commands import command, stats
-from tests.server.running import Program, Veth, needs_bus, server, virtual_sensor, wait_until
+from ethercat_server.doctor.bus import examination
+from ethercat_server.doctor.finding import Level
+from ethercat_server.doctor.machine.facts import Routes
+from ethercat_server.links.holder import Holder
+from tests.doctor.made_up import but
+from tests.doctor.running import examined
+from tests.simulated_links import MESSAGE_NS, SimulatedBus, simulated_bus, simulated_server
 
-pytestmark = [pytest.mark.bus, needs_bus]
-Bench = tuple[Veth, Program]
-QUICK = ("--json", "--seconds", "0.2")
-NEW_BRIDGE = ("link", "add", "{bridge}", "type", "bridge")
-LOOK = ("--json", "--seconds", "0")
+LOOK = 0.0
+"""No measurement."""
 
 
-@pytest.fixture(scope="module")
-def bench() -> Iterator[Bench]:
+@pytest.fixture
+def bench() -> Iterator[SimulatedBus]:
     """Two sensors of different models."""
     models = "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8"
-    with virtual_sensor("--model", models, "--serial", "10,20") as (veth, sensor):
-        yield veth, sensor
+    with simulated_bus("--model", models, "--serial", "10,20") as bus:
+        yield bus
 
 
-def promiscuous(veth: Veth) -> bool:
-    return "promiscuity 0" not in veth.ip("-d", "link", "show", veth.near)
+@pytest.fixture
+def single() -> Iterator[SimulatedBus]:
+    with simulated_bus() as bus:
+        yield bus
 
 
-def test_sensors_are_found_and_left_as_they_are(bench: Bench) -> None:
-    veth, sensor = bench
-    before = [stats(sensor, place) for place in range(2)]
-    ended = doctor(veth.near, *QUICK)
-    found = ended.findings("bus")
-    assert found["slaves"]["values"] == {"slaves": 2}
-    assert [found[f"slave {n}"]["found"].partition(", a ")[0] for n in range(2)] == [
+def test_sensors_are_found_and_left_as_they_are(bench: SimulatedBus, tmp_path: Path) -> None:
+    found = examined(bench, tmp_path)
+    on_bus = found.of("bus")
+    assert on_bus["slaves"].values == {"slaves": 2}
+    assert [on_bus[f"slave {n}"].found.partition(", supp")[0] for n in range(2)] == [
         "BFT-SENS-ECAT-M8, serial 10",
         "BFT-ROKS-ECAT-M8, serial 20",
     ]
-    assert set(levels(found).values()) == {"ok"}
-    for place in range(2):
-        now = stats(sensor, place)
-        assert (now["al_state"], now["al_error"]) == ("INIT", False)
-        assert now["sdo_write_count"] == before[place]["sdo_write_count"] == 0
-    assert not promiscuous(veth)
+    assert set(found.levels("bus").values()) == {"ok"}
+    for position in range(2):
+        now = bench.stats(position)
+        assert (now["al_state"], now["al_error"], now["sdo_write_count"]) == ("INIT", False, 0)
 
 
-def test_what_is_measured(bench: Bench) -> None:
-    veth, _ = bench
-    found = doctor(veth.near, *QUICK).findings("measurement")
+def test_what_is_measured(bench: SimulatedBus, tmp_path: Path) -> None:
+    announced: list[str] = []
+    findings = examined(bench, tmp_path, announce=announced.append)
+    found = findings.of("measurement")
     assert set(found) == {
         "scheduling", "wake-ups", "exchanges", "messages", "age of data", "card meanwhile", "bus meanwhile",
     }  # fmt: skip
-    exchange, message, age = (found[name]["values"] for name in ("exchanges", "messages", "age of data"))
-    assert exchange["exchanges"] == found["wake-ups"]["values"]["wake_ups"] > 50
-    assert 0 < exchange["p50"] <= exchange["p99"] <= exchange["max"]
+    exchange, message, age = (found[name].values for name in ("exchanges", "messages", "age of data"))
+    assert exchange["exchanges"] == found["wake-ups"].values["wake_ups"] == 160
+    assert 40 <= exchange["p50"] <= exchange["p99"] <= exchange["max"]
+    assert message["p50"] == pytest.approx(MESSAGE_NS / 1000, rel=0.05)
     assert age["p50"] > exchange["p50"] / 2 + message["p50"] / 2
-    assert "124 bytes" in found["exchanges"]["found"], "as long as the process data of two"
-    assert found["card meanwhile"]["level"] == found["bus meanwhile"]["level"] == "ok"
+    assert "124 bytes" in found["exchanges"].found, "as long as the process data of two"
+    assert findings.levels("measurement")["bus meanwhile"] == "ok"
+    assert announced == ["measuring for 0.2 s ..."]
 
 
-def test_the_interface_is_told_for_what_it_is(bench: Bench) -> None:
-    veth, _ = bench
-    ended = doctor(veth.near, *LOOK)
-    interface, others = ended.findings("interface"), ended.findings("who else")
-    assert interface["link"]["values"]["kind"] == "veth"
-    assert interface["driver"]["values"]["driver"] == "veth"
-    assert interface["coalescing"]["level"] == "ok"
-    assert others["addresses"]["level"] in {"ok", "note"}, "nothing but a link-local address"
-    assert others["listeners"]["level"] in {"ok", "warning"}
+def test_a_machine_that_stalls_shows_in_the_measurement(single: SimulatedBus, tmp_path: Path) -> None:
+    for n in range(5):
+        single.at(0.2 + 0.05 * n, lambda: single.clock.stall(3e6))
+    wake_ups = examined(single, tmp_path, 0.5).of("measurement")["wake-ups"]
+    assert wake_ups.values["max"] > 2000
+    assert wake_ups.level > Level.OK
 
 
-def test_a_sensor_that_lost_its_master_is_told_and_left_so() -> None:
-    with virtual_sensor() as (veth, sensor):
-        with server(veth.near, "--rt-priority", "0") as running:
-            running.process.kill()
-            running.process.wait()
-        # As its watchdog does, unless the server was just bringing it back when it ended.
-        command(sensor, "safeop 0x1B")
-        for _ in range(2):
-            ended = doctor(veth.near, *QUICK)
-            found = ended.findings("bus")
-            assert found["slave 0"]["level"] == "ok", "its EEPROM belonged to the firmware, and does again"
-            assert found["slave 0 state"]["level"] == "note"
-            assert found["slave 0 state"]["found"].startswith("SAFEOP with AL status 0x001B")
-            now = stats(sensor)
-            assert (now["al_state"], now["al_error"], now["al_status_code"]) == ("SAFEOP", True, 0x1B)
+def test_a_sensor_that_lost_its_master_is_told_and_left_so(single: SimulatedBus, tmp_path: Path) -> None:
+    with simulated_server(single):
+        single.command("safeop 0x1B")
+    for _ in range(2):
+        found = examined(single, tmp_path).of("bus")
+        assert found["slave 0"].level is Level.OK, "its EEPROM belonged to the firmware, and does again"
+        assert found["slave 0 state"].level is Level.NOTE
+        assert found["slave 0 state"].found.startswith("SAFEOP with AL status 0x001B")
+        now = single.stats()
+        assert (now["al_state"], now["al_error"], now["al_status_code"]) == ("SAFEOP", True, 0x1B)
 
 
-def test_damaged_frames_are_told_with_their_cable() -> None:
-    with virtual_sensor("--sensors", "2") as (veth, sensor):
-        command(sensor, "flap @1")
-        lost = doctor(veth.near, *LOOK).findings("bus")
-        assert lost["slave 1 errors"]["found"] == "link lost 1 times between slave 0 and slave 1"
-        assert lost["slave 1 errors"]["level"] == "note"
-        command(sensor, "damage 3 @1")
-        ended = doctor(veth.near, *LOOK)
-        found = ended.findings("bus")
-        assert ended.code >= 3
-        assert found["slaves"]["values"] == {"slaves": 2}, "it tries again"
-        assert found["slave 1 errors"]["level"] == "warning"
-        assert "3 damaged between slave 0 and slave 1" in found["slave 1 errors"]["found"]
-        assert found["slave 0 errors"]["level"] == "note", "damage that others found"
+def test_damaged_frames_are_told_with_their_cable(bench: SimulatedBus, tmp_path: Path) -> None:
+    bench.command("flap @1")
+    lost = examined(bench, tmp_path, LOOK).of("bus")["slave 1 errors"]
+    assert lost.found == "link lost 1 times between slave 0 and slave 1"
+    assert lost.level is Level.NOTE
+    bench.command("damage 3 @1")
+    found = examined(bench, tmp_path, LOOK)
+    assert found.worst is Level.WARNING
+    on_bus = found.of("bus")
+    assert on_bus["slaves"].values == {"slaves": 2}, "it tries again"
+    assert on_bus["slave 1 errors"].level is Level.WARNING
+    assert "3 corrupted between slave 0 and slave 1" in on_bus["slave 1 errors"].found
+    assert on_bus["slave 0 errors"].level is Level.NOTE, "damage that others found"
 
 
-def test_frames_damaged_while_it_measures_are_bad(bench: Bench) -> None:
-    veth, sensor = bench
-    running = subprocess.Popen(
-        [sys.executable, "-m", MODULE, veth.near, "--seconds", "2"], stdout=subprocess.PIPE, text=True
-    )
-    assert running.stdout is not None
-    while "slave 1 errors" not in running.stdout.readline():
-        pass
-    command(sensor, "damage 5 1")
-    out, _ = running.communicate(timeout=30)
-    assert running.returncode == 4
-    line = next(line for line in out.splitlines() if "bus meanwhile" in line)
-    assert line.split()[0] == "bad"
-    assert "5 damaged between slave 0 and slave 1" in " ".join(out.split())
+def test_frames_damaged_while_it_measures_are_bad(bench: SimulatedBus, tmp_path: Path) -> None:
+    bench.at(0.2, "damage 5 1")
+    found = examined(bench, tmp_path).of("measurement")["bus meanwhile"]
+    assert found.level is Level.BAD
+    assert "5 corrupted between slave 0 and slave 1" in found.found
 
 
-def test_devices_that_the_server_would_refuse() -> None:
-    with virtual_sensor() as (veth, sensor):
-        command(sensor, "swap EK1100 5")
-        ended = doctor(veth.near, *LOOK)
-        assert ended.code == 4
-        assert ended.findings("bus")["slave 0"]["level"] == "bad"
-        assert "EK1100, serial 5" in ended.findings("bus")["slave 0"]["found"]
+def test_devices_that_the_server_would_refuse(single: SimulatedBus, tmp_path: Path) -> None:
+    single.command("swap EK1100 5")
+    found = examined(single, tmp_path, LOOK).of("bus")["slave 0"]
+    assert found.level is Level.BAD
+    assert "EK1100, serial 5" in found.found
 
 
-def test_nothing_answers() -> None:
-    with virtual_sensor() as (veth, sensor):
-        command(sensor, "deaf")
-        ended = doctor(veth.near, *QUICK)
-    assert ended.code == 4
-    assert ended.findings("bus")["slaves"]["found"] == "no EtherCAT slave answers"
-    measured = ended.findings("measurement")
-    assert measured["wake-ups"]["values"]["wake_ups"] > 0, "the machine is measured all the same"
-    assert measured["exchanges"]["level"] == measured["age of data"]["level"] == "skipped"
+def test_nothing_answers(single: SimulatedBus, tmp_path: Path) -> None:
+    single.command("deaf")
+    found = examined(single, tmp_path)
+    assert found.worst is Level.BAD
+    assert found.of("bus")["slaves"].found == "no EtherCAT slave answers"
+    measured = found.of("measurement")
+    assert measured["wake-ups"].values["wake_ups"] == 160, "the machine is measured all the same"
+    assert measured["exchanges"].level is measured["age of data"].level is Level.SKIPPED
 
 
-def test_a_sensor_that_goes_away_while_it_measures() -> None:
-    with virtual_sensor() as (veth, sensor):
-        command(sensor, "deaf-after 600")
-        ended = doctor(veth.near, "--json", "--seconds", "1")
-    assert ended.code == 4
-    assert ended.findings("measurement")["exchanges"]["level"] == "bad"
-    assert ended.findings("measurement")["bus meanwhile"]["level"] == "bad"
+def test_a_sensor_that_goes_away_while_it_measures(single: SimulatedBus, tmp_path: Path) -> None:
+    single.command("deaf-after 600")
+    found = examined(single, tmp_path, 1.0).levels("measurement")
+    assert (found["exchanges"], found["bus meanwhile"]) == ("bad", "bad")
 
 
 @pytest.mark.parametrize(
-    ("commands", "link", "why"),
+    ("changes", "why"),
     [
-        ([("link", "set", "{near}", "down")], "bad", "it is down"),
-        ([("link", "set", "{far}", "down")], "bad", "it has no carrier"),
-        ([("address", "add", "192.0.2.77/32", "dev", "{near}")], "ok", "it carries IP"),
-        ([NEW_BRIDGE, ("link", "set", "{near}", "master", "{bridge}")], "ok", "part of a bridge"),
+        ({"link": {"up": False, "carrier": False}}, "it is down"),
+        ({"link": {"carrier": False}}, "it has no carrier"),
+        ({"link": {"loopback": True}}, "it is the loopback interface"),
+        ({"link": {"master": "br0"}}, "part of a bridge"),
+        ({"link": {"upper": ("ens5.7",)}}, "part of a bridge, bond or VLAN"),
+        ({"routes": Routes(addresses=("192.0.2.77/32",))}, "it carries IP"),
+        ({"routes": Routes(default=True)}, "it carries IP"),
+        ({"routes": "Permission denied"}, "its IP configuration is unknown (Permission denied)"),
     ],
-    ids=["down", "no carrier", "with an address", "in a bridge"],
-)  # fmt: skip
-def test_interfaces_where_no_frame_is_sent(commands: list[tuple[str, ...]], link: str, why: str) -> None:
-    with contextlib.ExitStack() as cleanup:
-        veth, sensor = cleanup.enter_context(virtual_sensor())
-        names = {"near": veth.near, "far": veth.far, "bridge": f"eb{os.getpid()}"}
-        bridge = ["ip", "link", "del", names["bridge"]]
-        cleanup.callback(subprocess.run, bridge, check=False, capture_output=True)
-        for words in commands:
-            veth.ip(*(word.format(**names) for word in words))
-        before = stats(sensor)
-        ended = doctor(veth.near, *QUICK)
-        assert ended.code >= 3
-        assert ended.findings("interface")["link"]["level"] == link
-        assert ended.findings("bus")["slaves"]["level"] == "skipped"
-        assert why in ended.findings("bus")["slaves"]["found"]
-        others = levels(ended.findings("who else"))
-        assert others["addresses"] == ("warning" if why == "it carries IP" else others["addresses"])
-        assert others["membership"] == ("bad" if why == "part of a bridge" else "ok")
-        assert ended.findings("measurement")["wake-ups"]["values"]["wake_ups"] > 0
-        if link == "ok":
-            answer = command(sensor, "stats")
-            assert '"frames":0' in answer, answer
-            assert stats(sensor)["al_state"] == before["al_state"]
+)
+def test_interfaces_where_no_frame_is_sent(
+    single: SimulatedBus, tmp_path: Path, changes: dict[str, Any], why: str
+) -> None:
+    found = examined(single, tmp_path, facts=but(**changes))
+    assert found.of("bus")["slaves"].level is Level.SKIPPED
+    assert why in found.of("bus")["slaves"].found
+    assert found.of("measurement")["wake-ups"].values["wake_ups"] > 0
+    assert found.levels("measurement")["exchanges"] == "skipped"
+    assert single.backend.sensors.frames == 0
 
 
-def test_another_master_is_not_disturbed(bench: Bench) -> None:
-    veth, sensor = bench
-    ended = doctor(veth.far, *QUICK)
-    assert ended.code == 4
-    found = ended.findings("bus")["slaves"]
-    assert found["level"] == "bad"
-    assert f"process {sensor.process.pid}" in found["found"]
-    assert found["commands"] == [f"sudo kill {sensor.process.pid}"]
+def test_without_rights_it_says_what_it_skipped(single: SimulatedBus, tmp_path: Path) -> None:
+    status = "Name:\tpython\nCapEff:\t0000000000000000\n"
+    found = examined(single, tmp_path, files={"/proc/self/status": status})
+    skipped = found.of("bus")["slaves"]
+    assert skipped.found == "not checked: CAP_NET_RAW and CAP_NET_ADMIN missing; run with sudo"
+    assert found.of("measurement")["wake-ups"].values["wake_ups"] > 0
+    assert single.backend.sensors.frames == 0
 
 
-def is_running(pid: str) -> bool:
-    """Whether this process is there and no zombie, whose parent need not be quick."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-def test_stopped_while_it_measures_it_leaves_nothing_behind(bench: Bench) -> None:
-    veth, sensor = bench
-    running = subprocess.Popen(
-        [sys.executable, "-m", MODULE, veth.near, "--seconds", "60"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert running.stdout is not None
-    while "slave 1 errors" not in running.stdout.readline():
-        pass
-
-    def children() -> list[str]:
-        return Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
-
-    wait_until(lambda: bool(children()), "the receiver")
-    receivers = children()
-    running.send_signal(signal.SIGINT)
-    _, err = running.communicate(timeout=20)
-    assert (running.returncode, err) == (1, "ethercat-doctor: stopped\n")
-    wait_until(lambda: not any(is_running(pid) for pid in receivers), "the receiver's end")
-    assert stats(sensor)["al_state"] == "INIT"
-    assert not promiscuous(veth)
-
-
-def test_two_doctors_at_once(bench: Bench) -> None:
-    veth, _ = bench
-    # It measures until it is stopped: the second takes its time to start on a busy machine.
-    first = subprocess.Popen(
-        [sys.executable, "-m", MODULE, veth.near, "--seconds", "90"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert first.stdout is not None
-    said = ""
-    while "slave 1 errors" not in said:
-        line = first.stdout.readline()
-        assert line, said
-        said += line
-    second = doctor(veth.near, *LOOK).findings("bus")["slaves"]
-    first.send_signal(signal.SIGINT)
-    _, err = first.communicate(timeout=20)
-    assert f"process {first.pid}" in second["found"]
-    assert "2 slaves answer" in said
-    assert (first.returncode, err) == (1, "ethercat-doctor: stopped\n")
-
-
-def test_without_rights_it_says_what_it_skipped(bench: Bench) -> None:
-    veth, sensor = bench
-    before = command(sensor, "stats")
-    ended = doctor(veth.near, *QUICK, module="tests.doctor.as_nobody")
-    assert not ended.json["root"]
-    assert ended.findings("bus")["slaves"]["found"] == (
-        "could not look: CAP_NET_RAW and CAP_NET_ADMIN missing; run with sudo"
-    )
-    assert ended.findings("rights")["capabilities"]["level"] == "note"
-    assert ended.findings("measurement")["scheduling"]["values"] == {"real_time": False}
-    assert ended.findings("measurement")["wake-ups"]["values"]["wake_ups"] > 0
-    assert ended.findings("interface")["driver"]["values"]["driver"] == "veth", "this needs no rights"
-    assert before.partition("sensors")[0] == command(sensor, "stats").partition("sensors")[0], (
-        "no frame was sent"
-    )
-
-
-def test_root_without_capabilities_is_no_root(bench: Bench) -> None:
-    veth, _ = bench
-    confined = ("setpriv", "--bounding-set=-all", "--inh-caps=-all", "--ambient-caps=-all")
-    ended = doctor(veth.near, *QUICK, under=confined)
-    assert "CAP_NET_RAW and CAP_NET_ADMIN missing" in ended.findings("bus")["slaves"]["found"]
-    virtual = doctor("virtual", *LOOK, under=confined)
-    assert virtual.code in {0, 3}
-    assert "there is no virtual bus: CAP_NET_RAW" in virtual.findings("bus")["slaves"]["found"]
-    assert virtual.err == ""
-
-
-def test_virtual_brings_a_bus_of_its_own_and_takes_it_away() -> None:
-    ended = doctor("virtual", *QUICK)
-    assert ended.findings("bus")["slave 0"]["found"].startswith("BFT-SENS-ECAT-M8, serial 1")
-    assert ended.findings("measurement")["age of data"]["values"]["p50"] > 0
-    assert ended.json["interface"] == "virtual"
-    assert "ecat" not in str([row["commands"] for row in ended.json["findings"]]), (
-        "what is gone needs no mending"
-    )
-
-
-def test_a_terminal_gets_colour(bench: Bench) -> None:
-    veth, _ = bench
-    shown = subprocess.run(
-        ["script", "-qec", f"{sys.executable} -m {MODULE} {veth.near} --seconds 0", "/dev/null"],
-        capture_output=True, text=True, check=False, env={**os.environ, "TERM": "xterm", "NO_COLOR": ""},
-    )  # fmt: skip
-    assert "\x1b[32mok" in shown.stdout
-
-
-def test_a_terminal_is_told_what_takes_a_while(bench: Bench) -> None:
-    veth, _ = bench
-    shown = subprocess.run(
-        ["script", "-qec", f"{sys.executable} -m {MODULE} {veth.near} --seconds 0.1", "/dev/null"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert "measuring for 0.1 s ..." in shown.stdout
-    assert "measuring" not in doctor(veth.near, "--seconds", "0.1").out
+@pytest.mark.parametrize(
+    ("holder", "level", "named", "commands"),
+    [
+        (Holder(77, "codesys", None), Level.BAD, "process 77 (codesys)", ("sudo kill 77",)),
+        (Holder(None, "", None), Level.SKIPPED, "an EtherCAT master of another user has it", ()),
+    ],
+)
+def test_another_master_is_not_disturbed(
+    single: SimulatedBus,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    holder: Holder,
+    level: Level,
+    named: str,
+    commands: tuple[str, ...],
+) -> None:
+    monkeypatch.setattr(examination, "find_holder", lambda _: holder)
+    found = examined(single, tmp_path, LOOK).of("bus")["slaves"]
+    assert (found.level, found.commands) == (level, commands)
+    assert named in found.found
+    assert single.backend.sensors.frames == 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ethercat_server.doctor.finding import CannotLookError, Level
-from ethercat_server.doctor.machine import as_list, processor_list
+from ethercat_server.doctor.machine.machine import as_list, processor_list
 from tests.doctor.made_up import CPUS, Files, looks, machine, only
 
 NO_RIGHTS = {"/proc/self/status": "CapEff:\t0000000000000000\n"}
@@ -99,7 +99,7 @@ def test_isolation(tmp_path: Path) -> None:
     ],
 )
 def test_virtual_machines(tmp_path: Path, files: dict[str, str], named: str) -> None:
-    found = only("virtualisation", machine(tmp_path, files))
+    found = only("virtualization", machine(tmp_path, files))
     assert found.level is Level.WARNING
     assert named in found.found
 
@@ -113,14 +113,14 @@ def test_virtual_machines(tmp_path: Path, files: dict[str, str], named: str) -> 
     ],
 )
 def test_containers(tmp_path: Path, files: dict[str, str], named: str) -> None:
-    found = only("virtualisation", machine(tmp_path, files))
+    found = only("virtualization", machine(tmp_path, files))
     assert (found.level, found.values["container"]) == (Level.NOTE, named)
 
 
 def test_a_container_in_a_virtual_machine_is_both(tmp_path: Path) -> None:
     both = machine(tmp_path, {"/.dockerenv": "", "/proc/cpuinfo": "flags : hypervisor\n"})
-    assert [finding.level for finding in looks("virtualisation", both)] == [Level.NOTE, Level.WARNING]
-    assert only("virtualisation", machine(tmp_path / "own")).level is Level.OK
+    assert [finding.level for finding in looks("virtualization", both)] == [Level.NOTE, Level.WARNING]
+    assert only("virtualization", machine(tmp_path / "own")).level is Level.OK
 
 
 def test_lists_of_processors() -> None:

@@ -8,7 +8,7 @@ import json
 import pytest
 
 from ethercat_server.doctor.finding import Finding, Level, bad, note, ok, skipped, warning
-from ethercat_server.doctor.report import EXIT_CODES, Report, as_json, printable, wants_colour, worst
+from ethercat_server.doctor.report import EXIT_CODES, Report, as_json, printable, wants_color, worst
 
 
 class Terminal(io.StringIO):
@@ -59,8 +59,8 @@ def test_colour_only_on_a_terminal_and_not_against_the_users_will(monkeypatch: p
     assert "\x1b[1;31mbad" in written(named(bad("x", "y")), stream=Terminal())
     monkeypatch.setenv("NO_COLOR", "1")
     assert "\x1b" not in written(named(bad("x", "y")), stream=Terminal())
-    assert not wants_colour(Terminal(), {"TERM": "dumb"})
-    assert wants_colour(Terminal(), {"NO_COLOR": ""}), "empty means not set"
+    assert not wants_color(Terminal(), {"TERM": "dumb"})
+    assert wants_color(Terminal(), {"NO_COLOR": ""}), "empty means not set"
 
 
 def test_what_devices_say_cannot_reach_the_terminal() -> None:

@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ethercat_server.doctor.examination import CHECKS, examine, examine_machine
-from ethercat_server.doctor.facts import InterfaceFacts, Link
 from ethercat_server.doctor.finding import CannotLookError, Finding, Level, ok
-from ethercat_server.doctor.machine import Machine
+from ethercat_server.doctor.machine.facts import InterfaceFacts, Link
+from ethercat_server.doctor.machine.machine import Machine
 from ethercat_server.errors import BusError
 from tests.doctor.made_up import CARD, GOOD, but, machine
 
@@ -46,7 +46,7 @@ def test_no_files_at_all(tmp_path: Path) -> None:
     assert {finding.level for finding in found} <= {Level.OK, Level.SKIPPED}
     skipped = [finding for finding in found if finding.level is Level.SKIPPED]
     assert len(skipped) > len(CHECKS) // 2
-    assert all(finding.found.startswith("could not look: ") for finding in skipped)
+    assert all(finding.found.startswith("not checked: ") for finding in skipped)
     assert any("/proc/interrupts: No such file" in finding.found for finding in skipped)
 
 
@@ -68,10 +68,10 @@ def test_an_endless_file_is_not_read_to_its_end(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("error", "level", "said"),
     [
-        (CannotLookError("why"), Level.SKIPPED, "could not look: why"),
-        (PermissionError(13, "Permission denied"), Level.SKIPPED, "could not look: Permission denied"),
+        (CannotLookError("why"), Level.SKIPPED, "not checked: why"),
+        (PermissionError(13, "Permission denied"), Level.SKIPPED, "not checked: Permission denied"),
         (BusError("slave 0 does not answer"), Level.BAD, "slave 0 does not answer"),
-        (ZeroDivisionError("oh"), Level.SKIPPED, "a fault of the doctor's"),
+        (ZeroDivisionError("oh"), Level.SKIPPED, "an error in ethercat-doctor"),
     ],
 )
 def test_a_check_that_fails_is_one_finding_more(error: Exception, level: Level, said: str) -> None:

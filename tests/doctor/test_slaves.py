@@ -7,17 +7,17 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.al import AlStatus
-from ethercat_server.doctor import bus
+from ethercat_server.doctor.bus import findings
+from ethercat_server.doctor.bus.slaves import ErrorCounters, Slave
 from ethercat_server.doctor.finding import Finding, Level
-from ethercat_server.doctor.slaves import ErrorCounters, Slave
+from ethercat_server.ethercat.slave.al import AlStatus
 
 INIT = AlStatus.of(1, 0)
 
 
 def slave(**changes: Any) -> Slave:
     found: dict[str, Any] = {
-        "place": 0, "al": INIT, "vendor": 0xB07A, "product": 1, "serial": 1234, "name": "BFT-SENS-ECAT-M8",
+        "position": 0, "al": INIT, "vendor": 0xB07A, "product": 1, "serial": 1234, "name": "BFT-SENS-ECAT-M8",
     }  # fmt: skip
     return Slave(**{**found, **changes})
 
@@ -29,15 +29,15 @@ def the(findings: Any) -> Finding:
 
 
 def test_whether_anything_answers() -> None:
-    assert the(bus.answers("ens5", 2)).level is Level.OK
-    nothing = the(bus.answers("ens5", 0))
+    assert the(findings.answers("ens5", 2)).level is Level.OK
+    nothing = the(findings.answers("ens5", 0))
     assert (nothing.level, nothing.values) == (Level.BAD, {"slaves": 0})
 
 
 @pytest.mark.parametrize(
     ("changes", "level", "named"),
     [
-        ({}, Level.OK, "a model the server knows"),
+        ({}, Level.OK, "supported"),
         ({"name": "BFT-ROKS-ECAT-M8"}, Level.OK, "BFT-ROKS"),
         ({"vendor": 2, "name": "EK1100"}, Level.BAD, "vendor 0x00000002"),
         ({"product": 9}, Level.BAD, "product 0x00000009"),
@@ -46,7 +46,7 @@ def test_whether_anything_answers() -> None:
     ],
 )
 def test_who_it_is(changes: dict[str, Any], level: Level, named: str) -> None:
-    found = the(bus.identity(slave(**changes)))
+    found = the(findings.identity(slave(**changes)))
     assert found.level is level
     assert named in found.found
 
@@ -63,7 +63,7 @@ def test_who_it_is(changes: dict[str, Any], level: Level, named: str) -> None:
     ],
 )
 def test_the_state_it_is_in(status: int, code: int, level: Level) -> None:
-    found = the(bus.state(slave(al=AlStatus.of(status, code))))
+    found = the(findings.state(slave(al=AlStatus.of(status, code))))
     assert found.level is level
     if code:
         assert f"0x{code:04X}" in found.found
@@ -84,19 +84,19 @@ def counted(**by_name: Any) -> ErrorCounters:
 
 
 @pytest.mark.parametrize(
-    ("place", "counters", "level", "said"),
+    ("position", "counters", "level", "said"),
     [
         (0, counted(), Level.OK, "none"),
-        (0, counted(invalid=(3, 0, 0, 0)), Level.WARNING, "3 damaged between the interface and slave 0"),
-        (1, counted(physical=(4, 0, 0, 0)), Level.WARNING, "4 damaged between slave 0 and slave 1"),
+        (0, counted(invalid=(3, 0, 0, 0)), Level.WARNING, "3 corrupted between the interface and slave 0"),
+        (1, counted(physical=(4, 0, 0, 0)), Level.WARNING, "4 corrupted between slave 0 and slave 1"),
         (
             0,
             counted(invalid=(0, 255, 0, 0)),
             Level.WARNING,
-            "255 or more damaged between slave 0 and slave 1",
+            "255 or more corrupted between slave 0 and slave 1",
         ),
-        (1, counted(invalid=(0, 1, 0, 0)), Level.WARNING, "1 damaged at port 1 of slave 1"),
-        (1, counted(forwarded=(2, 0, 0, 0)), Level.NOTE, "2 damaged before it came to slave 1, port 0"),
+        (1, counted(invalid=(0, 1, 0, 0)), Level.WARNING, "1 corrupted at port 1 of slave 1"),
+        (1, counted(forwarded=(2, 0, 0, 0)), Level.NOTE, "2 corrupted before reaching slave 1, port 0"),
         (
             0,
             counted(lost_links=(1, 0, 0, 0)),
@@ -106,33 +106,33 @@ def counted(**by_name: Any) -> ErrorCounters:
         (0, counted(processing_unit=1), Level.NOTE, "processing unit 1, PDI 0"),
     ],
 )
-def test_where_errors_arise(place: int, counters: ErrorCounters, level: Level, said: str) -> None:
-    found = the(bus.errors(slave(place=place, counters=counters), 2))
+def test_where_errors_arise(position: int, counters: ErrorCounters, level: Level, said: str) -> None:
+    found = the(findings.errors(slave(position=position, counters=counters), 2))
     assert (found.level, found.found) == (level, said)
 
 
 def test_only_what_is_new_counts_while_measuring() -> None:
     before = {0: counted(invalid=(5, 0, 0, 0)), 1: counted()}
-    assert the(bus.new_errors(before, before, 2)).level is Level.OK
+    assert the(findings.new_errors(before, before, 2)).level is Level.OK
     after = {0: counted(invalid=(6, 0, 0, 0)), 1: counted(forwarded=(1, 0, 0, 0))}
-    found = the(bus.new_errors(before, after, 2))
+    found = the(findings.new_errors(before, after, 2))
     assert found.level is Level.BAD
-    assert found.found.startswith("1 damaged between the interface and slave 0; ")
+    assert found.found.startswith("1 corrupted between the interface and slave 0; ")
     cleared = {0: counted(), 1: counted()}
-    assert the(bus.new_errors(before, cleared, 2)).level is Level.OK, "a server was started meanwhile"
+    assert the(findings.new_errors(before, cleared, 2)).level is Level.OK, "a server was started meanwhile"
 
 
 def test_names_from_the_bus_are_told_in_json() -> None:
-    found = the(bus.identity(slave(al=AlStatus.parse(struct.pack("<HHH", 0x14, 0, 0x1B)))))
+    found = the(findings.identity(slave(al=AlStatus.parse(struct.pack("<HHH", 0x14, 0, 0x1B)))))
     assert found.values["al_state"] == "SAFEOP"
     assert found.values["al_error"] is True
 
 
 def test_something_connected_that_does_not_answer() -> None:
     alone, linked = (True, False, False, False), (True, True, False, False)
-    assert the(bus.line([slave(links=alone)])).level is Level.OK
-    assert the(bus.line([slave(links=linked), slave(place=1, links=alone)])).level is Level.OK
-    found = the(bus.line([slave(links=linked), slave(place=1, links=linked)]))
+    assert the(findings.line([slave(links=alone)])).level is Level.OK
+    assert the(findings.line([slave(links=linked), slave(position=1, links=alone)])).level is Level.OK
+    found = the(findings.line([slave(links=linked), slave(position=1, links=linked)]))
     assert found.level is Level.NOTE
     assert found.found.endswith("port 0 of slave 1, port 1 of slave 1")
-    assert list(bus.line([])) == []
+    assert list(findings.line([])) == []

@@ -1,89 +1,91 @@
-"""The doctor where a server holds the interface: its figures and clients, and not one frame on the bus."""
+"""The doctor where a server uses the interface: its figures and clients, and not one frame of its own."""
 
 from __future__ import annotations
 
-import signal
+import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from tests.doctor.running import doctor, levels
-from tests.server.commands import command, stats
-from tests.server.running import Program, Server, Veth, needs_bus, server, virtual_sensor, wait_until
+from ethercat_server.doctor.bus import examination
+from ethercat_server.doctor.finding import Level
+from ethercat_server.links.holder import Holder
+from protocol.address import Address
+from tests.doctor.running import examined
+from tests.simulated_links import SINC_LENGTH, SimulatedBus, SimulatedServer, simulated_bus, simulated_server
 
-pytestmark = [pytest.mark.bus, needs_bus]
-Bench = tuple[Veth, Program, Server]
-QUICK = ("--json", "--seconds", "0.5")
+Bench = tuple[SimulatedBus, SimulatedServer]
+ADDRESS = Address("127.0.0.1", 12001)
 
 
-@pytest.fixture(scope="module")
-def bench() -> Iterator[Bench]:
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    holder = Holder(os.getpid(), "ethercat-server", ADDRESS)
+    monkeypatch.setattr(examination, "find_holder", lambda _: holder)
     with (
-        virtual_sensor("--sensors", "2", "--serial", "10,20") as (veth, sensor),
-        server(veth.near, "--rt-priority", "0") as running,
+        simulated_bus("--sensors", "2", "--serial", "10,20", "--sinc", SINC_LENGTH) as bus,
+        simulated_server(bus) as server,
     ):
-        yield veth, sensor, running
+        yield bus, server
 
 
-def test_its_figures_and_clients_instead_of_the_bus(bench: Bench) -> None:
-    veth, sensor, running = bench
-    with running.connect() as client:
-        client.ask("subscribe")
-        ended = doctor(veth.near, *QUICK)
-    found = ended.findings("server")
+def test_its_figures_and_clients_instead_of_the_bus(bench: Bench, tmp_path: Path) -> None:
+    bus, server = bench
+    assert server.connect().ask("subscribe")["ok"]
+    findings = examined(bus, tmp_path, 1.0)
+    found = findings.of("server")
     assert set(found) == {"server", "sensors", "wake-ups", "exchanges", "age of data", "clients"}
-    assert f"process {running.process.pid}" in found["server"]["found"]
-    assert found["server"]["values"]["port"] == running.port
-    assert not ended.findings("bus")
-    assert not ended.findings("measurement"), "its loop is the measurement"
-    sensors = [row for row in ended.json["findings"] if row["check"] == "sensors"]
-    assert [row["values"]["serial"] for row in sensors] == [10, 20]
-    assert all(row["values"]["state"] == "OP" for row in sensors)
-    assert found["exchanges"]["values"]["p50"] > 0
-    assert len(found["clients"]["values"]["clients"]) == 2
-    assert "1 beside the doctor" in found["clients"]["found"]
-    assert stats(sensor)["al_state"] == "OP"
+    assert f"process {os.getpid()}" in found["server"].found
+    assert found["server"].values["port"] == ADDRESS.port
+    assert not findings.of("bus")
+    assert not findings.of("measurement"), "its loop is the measurement"
+    sensors = [finding for finding in findings if finding.check == "sensors"]
+    assert [finding.values["serial"] for finding in sensors] == [10, 20]
+    assert all(finding.values["state"] == "OP" for finding in sensors)
+    assert [finding.values["new_fresh"] for finding in sensors] == pytest.approx([100, 100], abs=2)
+    assert 40 < found["exchanges"].values["p50"] < 100
+    assert len(found["clients"].values["clients"]) == 2
+    assert "1 beside the doctor" in found["clients"].found
+    assert bus.stats()["al_state"] == "OP"
 
 
-def test_without_measuring_it_does_not_wait(bench: Bench) -> None:
-    veth, _, _ = bench
-    assert doctor(veth.near, "--json", "--seconds", "0").findings("server")["server"]["level"] == "ok"
+def test_without_measuring_it_does_not_wait(bench: Bench, tmp_path: Path) -> None:
+    bus, _ = bench
+    before_ns = bus.clock.now_ns
+    assert examined(bus, tmp_path, 0).levels("server")["server"] == "ok"
+    assert bus.clock.now_ns - before_ns < 1e9
 
 
-def test_losses_show(bench: Bench) -> None:
-    veth, sensor, running = bench
-    command(sensor, "power cycle 0.2 @1")
-    with running.connect() as client:
-        wait_until(lambda: client.ask("status")["sensors"][1]["recoveries"] >= 1, "the recovery")
-    rows = [row for row in doctor(veth.near, *QUICK).json["findings"] if row["check"] == "sensors"]
-    assert rows[1]["level"] != "ok"
-    assert rows[1]["values"]["recoveries"] >= 1
+def test_losses_show(bench: Bench, tmp_path: Path) -> None:
+    bus, server = bench
+    bus.command("power cycle 0.2 @1")
+    assert server.run_until(lambda: [event["event"] for event in server.events][-1:] == ["sensor_back"])
+    before, after = (finding for finding in examined(bus, tmp_path, 0.5) if finding.check == "sensors")
+    assert after.level > Level.OK
+    assert (before.values["recoveries"], after.values["recoveries"]) == (0, 1)
 
 
-def test_a_lost_sensor_is_bad() -> None:
-    with virtual_sensor() as (veth, sensor), server(veth.near, "--rt-priority", "0"):
-        command(sensor, "power off")
-        wait_until(lambda: not stats(sensor)["powered"], "it")
-        ended = doctor(veth.near, *QUICK)
-        assert ended.code == 4
-        assert ended.findings("server")["sensors"]["level"] == "bad"
+def test_losses_while_it_looks_are_told(bench: Bench, tmp_path: Path) -> None:
+    bus, _ = bench
+    bus.at(0.5, "lose 5")
+    sensor = examined(bus, tmp_path, 1.0).of("server")["sensors"]
+    assert sensor.level is Level.BAD
+    assert sensor.values["new_invalid"] > 0
 
 
-def test_who_may_not_see_which_process_it_is(bench: Bench) -> None:
-    veth, _, _ = bench
-    ended = doctor(veth.near, *QUICK, module="tests.doctor.as_nobody")
-    found = ended.findings("bus")["slaves"]
-    assert found["level"] == "skipped"
-    assert "an EtherCAT master has it, and only root can see which" in found["found"]
-    assert levels(ended.findings("measurement"))["wake-ups"] in {"ok", "note", "warning", "bad"}
+def test_a_lost_sensor_is_bad(bench: Bench, tmp_path: Path) -> None:
+    bus, server = bench
+    bus.command("power off @1")
+    assert server.run_until(lambda: server.events)
+    found = examined(bus, tmp_path, 0.5)
+    assert found.worst is Level.BAD
+    assert found.of("server")["sensors"].level is Level.BAD
 
 
-def test_a_server_that_hangs_is_bad() -> None:
-    with virtual_sensor() as (veth, _), server(veth.near, "--rt-priority", "0") as running:
-        running.signal(signal.SIGSTOP)
-        try:
-            ended = doctor(veth.near, "--json", "--seconds", "0")
-        finally:
-            running.signal(signal.SIGCONT)
-    assert ended.code == 4
-    assert "no reply to describe within 5 s" in ended.findings("server")["server"]["found"]
+def test_a_server_that_hangs_is_bad(bench: Bench, tmp_path: Path) -> None:
+    bus, server = bench
+    server.hangs = True
+    found = examined(bus, tmp_path, 0)
+    assert found.worst is Level.BAD
+    assert "no reply to describe within 5 s" in found.of("server")["server"].found

@@ -7,10 +7,10 @@ import time
 
 import pytest
 
+from ethercat_server.acquisition.sample_clock import AIM_NS
 from ethercat_server.doctor import verdict
+from ethercat_server.doctor.bus.measurement import PERIOD_NS, Measured, measure
 from ethercat_server.doctor.finding import CannotLookError, Finding, Level
-from ethercat_server.doctor.measurement import PERIOD_NS, Measured, measure
-from ethercat_server.sample_clock import AIM_NS
 
 
 def of(late_us: list[int], exchanges_us: list[int] | None = None, message_us: int = 40) -> Measured:
@@ -52,7 +52,7 @@ def test_exchanges_matter_by_their_losses_and_their_time() -> None:
     assert exchange([80] * 900 + [-1] * 100).level is Level.BAD
     late = exchange([80] * 2000 + [1100])
     assert (late.level, late.values["late"]) == (Level.WARNING, 1)
-    assert "1 came too late of 2001" in late.found
+    assert "1 too late of 2001" in late.found
     none = exchange([-1] * 5)
     assert (none.level, none.values["lost"]) == (Level.BAD, 5)
 
@@ -88,7 +88,7 @@ def test_scheduling_that_was_not_granted_is_said() -> None:
     (refused,) = verdict.scheduling(Measured(priority=80))
     assert (refused.level, "not granted" in refused.why) == (Level.NOTE, True)
     (wanted,) = verdict.scheduling(Measured(priority=0))
-    assert "as asked for" in wanted.found
+    assert "as requested" in wanted.found
 
 
 def test_messages_that_did_not_come_through() -> None:

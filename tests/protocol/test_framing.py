@@ -19,7 +19,7 @@ from protocol.framing import (
     encode_data,
     encode_json,
 )
-from protocol.json_text import MAX_JSON_LENGTH
+from protocol.text.json_text import MAX_JSON_LENGTH
 
 SAMPLE = DataMessage(7, 1_700_000_000_000_000_000, 123_456_789, 3, int(DataFlag.GAP), 3, bytes(range(61)))
 WITH_ORIENTATION = SAMPLE._replace(sequence=8, process_data=bytes(range(77)))

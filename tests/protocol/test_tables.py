@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import SettingError
+from protocol.sensor.warnings_register import WARNINGS, Severity, explain
 from protocol.settings import (
     SETTINGS,
     check_combination,
@@ -16,7 +17,6 @@ from protocol.settings import (
     sampling_rate_hz,
     start_up_defaults,
 )
-from protocol.warnings_register import WARNINGS, Severity, explain
 
 
 def test_warnings_are_the_tables() -> None:

@@ -21,7 +21,7 @@ from tests.ros_package.package_files import PACKAGE, ROOT
 from tests.server.running import free_port, needs_bus
 
 PATIENCE_S = 30.0
-SERVER = f"server_command:={sys.executable} -m ethercat_server.cli"
+SERVER = f"server_command:={sys.executable} -m ethercat_server.daemon.cli"
 CLIENT = f"""#!{sys.executable}
 import sys
 sys.path[:0] = ["{ROOT}", "{PACKAGE}"]

@@ -24,13 +24,13 @@ def command(sensor: Program, text: str) -> str:
     return answer
 
 
-def stats(sensor: Program, place: int = 0) -> dict[str, Any]:
+def stats(sensor: Program, position: int = 0) -> dict[str, Any]:
     """What the virtual sensor says of itself."""
     answer = command(sensor, "stats")
-    found: dict[str, Any] = json.loads(answer[answer.index("{") :])["sensors"][place]
+    found: dict[str, Any] = json.loads(answer[answer.index("{") :])["sensors"][position]
     return found
 
 
-def written(sensor: Program, place: int = 0) -> list[tuple[str, int, str]]:
+def written(sensor: Program, position: int = 0) -> list[tuple[str, int, str]]:
     """The SDO writes so far: index, sub-index, data."""
-    return [(row["index"], row["subindex"], row["hex"]) for row in stats(sensor, place)["sdo_writes"]]
+    return [(row["index"], row["subindex"], row["hex"]) for row in stats(sensor, position)["sdo_writes"]]

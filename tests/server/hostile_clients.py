@@ -20,12 +20,12 @@ import sys
 import time
 from collections.abc import Callable
 
-from ethercat_server.connection import MAX_REQUEST_LENGTH
-from protocol.bare_json import encode_bare_json
+from ethercat_server.serving.connection import MAX_REQUEST_LENGTH
 from protocol.control import request
 from protocol.framing import encode_json
+from protocol.text.bare_json import encode_bare_json
 from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, mutate
-from tests.server.as_another_user import become_nobody
+from tests.server.as_another_user import NO_OTHER_USER, become_nobody
 
 MOST_HELD = 8
 """Connections that are left hanging at a time: half of what one user may have."""
@@ -221,7 +221,7 @@ def main() -> None:
         become_nobody()
         crowd(port, count)
         return
-    am_root = os.geteuid() == 0
+    am_root = NO_OTHER_USER is None
     "x".encode("idna")  # what connecting by name loads, while this user can still read it
     rng = random.Random(int(sys.argv[3]))
     done: collections.Counter[str] = collections.Counter()

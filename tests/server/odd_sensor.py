@@ -11,19 +11,20 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from ethercat_server import objects
+from ethercat_server.sensor import dictionary
 from protocol import pdo, settings
 
 if TYPE_CHECKING:
-    from ethercat_server.virtual_sensor.al import AlState
+    from ethercat_server.virtual_sensor.firmware.al import AlState
 
 
 def change_default(address: tuple[int, int], value: int) -> None:
     rows = [
-        dataclasses.replace(row, default=value) if row.address == address else row for row in objects.OBJECTS
+        dataclasses.replace(row, default=value) if row.address == address else row
+        for row in dictionary.OBJECTS
     ]
-    objects.OBJECTS = tuple(rows)  # type: ignore[misc]
-    objects.BY_ADDRESS.update({row.address: row for row in rows})  # type: ignore[attr-defined]
+    dictionary.OBJECTS = tuple(rows)  # type: ignore[misc]
+    dictionary.BY_ADDRESS.update({row.address: row for row in rows})  # type: ignore[attr-defined]
 
 
 def odd_size() -> None:
@@ -40,28 +41,28 @@ def wrong_rate() -> None:
 
 
 def other_vendor() -> None:
-    objects.VENDOR_ID = 0xDEAD  # type: ignore[misc]
+    dictionary.VENDOR_ID = 0xDEAD  # type: ignore[misc]
     change_default((0x1018, 1), 0xDEAD)
 
 
 def other_product() -> None:
-    objects.PRODUCT_CODE = 7  # type: ignore[misc]
+    dictionary.PRODUCT_CODE = 7  # type: ignore[misc]
     change_default((0x1018, 2), 7)
 
 
 def fewer_objects() -> None:
     """No coordinate system and no inertia compensation."""
     missing = {"coordinate_system", "inertia_compensation"}
-    objects.OBJECTS = tuple(row for row in objects.OBJECTS if row.setting not in missing)  # type: ignore[misc]
+    dictionary.OBJECTS = tuple(row for row in dictionary.OBJECTS if row.setting not in missing)  # type: ignore[misc]
     for name in missing:
-        row = objects.BY_SETTING.pop(name)  # type: ignore[attr-defined]
-        objects.BY_ADDRESS.pop(row.address)  # type: ignore[attr-defined]
+        row = dictionary.BY_SETTING.pop(name)  # type: ignore[attr-defined]
+        dictionary.BY_ADDRESS.pop(row.address)  # type: ignore[attr-defined]
 
 
 def refusing() -> None:
     """Refuses the SINC length 128, which is written last, and one offset."""
-    from ethercat_server.virtual_sensor import dictionary
-    from ethercat_server.virtual_sensor.sdo_abort import Abort, SdoAbortError
+    from ethercat_server.ethercat.slave.abort_codes import AbortCode
+    from ethercat_server.virtual_sensor.firmware import dictionary
 
     check = dictionary.Dictionary.check_write
     write = dictionary.Dictionary.write
@@ -70,7 +71,7 @@ def refusing() -> None:
     def refuse(self: dictionary.Dictionary, index: int, subindex: int, data: bytes, state: AlState) -> None:
         check(self, self.entry(index, subindex), len(data), state)
         if refused.get((index, subindex)) == data:
-            raise SdoAbortError(Abort.INVALID_VALUE)
+            raise dictionary.SdoAbortError(AbortCode.INVALID_VALUE)
         write(self, index, subindex, data, state)
 
     dictionary.Dictionary.write = refuse  # type: ignore[method-assign]
@@ -81,22 +82,23 @@ FOREIGN_LACKS = frozenset({0x1009, 0x1018, 0x2000, 0x7000, 0x8000, 0x8001, 0x800
 
 def foreign() -> None:
     """No sensor of Bota's, which has only some of the objects."""
-    from ethercat_server.virtual_sensor import dictionary
-    from ethercat_server.virtual_sensor.sdo_abort import Abort, SdoAbortError
+    from ethercat_server.ethercat.slave.abort_codes import AbortCode
+    from ethercat_server.virtual_sensor.firmware import dictionary
 
     other_vendor()
     read = dictionary.Dictionary.read
 
     def read_some(self: dictionary.Dictionary, index: int, subindex: int) -> bytes:
         if index in FOREIGN_LACKS:
-            raise SdoAbortError(Abort.NO_OBJECT)
+            raise dictionary.SdoAbortError(AbortCode.NO_OBJECT)
         return read(self, index, subindex)
 
     dictionary.Dictionary.read = read_some  # type: ignore[method-assign]
 
 
 def change_eeprom(change: Callable[[bytes], bytes]) -> None:
-    from ethercat_server.virtual_sensor import firmware, sii
+    from ethercat_server.virtual_sensor.esc import sii
+    from ethercat_server.virtual_sensor.firmware import firmware
 
     build = sii.build_image
     firmware.build_image = lambda *values: change(build(*values))  # type: ignore[attr-defined]
@@ -115,40 +117,17 @@ def latin_foreign() -> None:
 
 def no_mailbox() -> None:
     """No mailbox at all, as a simple slave."""
-    from ethercat_server.virtual_sensor import firmware
+    from ethercat_server.virtual_sensor.firmware import firmware
 
     change_eeprom(lambda image: image[:0x30] + bytes(10) + image[0x3A:])
     firmware.Firmware._mailbox_fault = lambda self: 0  # type: ignore[method-assign]
-
-
-_AL_DELAY_NS = 3_000_000
-
-
-def slow_al() -> None:
-    """Looks at AL control a few exchanges after it was written, and finds what was written last."""
-    from ethercat_server.virtual_sensor import firmware
-
-    act, work = firmware.Firmware.al_control, firmware.Firmware.check_watchdog
-    waiting: dict[firmware.Firmware, tuple[int, int]] = {}
-
-    def remember(self: firmware.Firmware, value: int) -> None:
-        due, _ = waiting.get(self, (self.now + _AL_DELAY_NS, 0))
-        waiting[self] = due, value
-
-    def look(self: firmware.Firmware, now: int) -> None:
-        work(self, now)
-        if self in waiting and now >= waiting[self][0]:
-            act(self, waiting.pop(self)[1])
-
-    firmware.Firmware.al_control = remember  # type: ignore[method-assign]
-    firmware.Firmware.check_watchdog = look  # type: ignore[method-assign]
 
 
 def stays_below(state: int) -> Callable[[], None]:
     """Does not go to `state` when it is told to, and says so."""
 
     def change() -> None:
-        from ethercat_server.virtual_sensor.al import AlStateMachine
+        from ethercat_server.virtual_sensor.firmware.al import AlStateMachine
 
         request = AlStateMachine.request
 
@@ -177,7 +156,6 @@ WAYS = {
     "product": other_product,
     "fewer": fewer_objects,
     "refusing": refusing,
-    "slow": slow_al,
 }
 
 if __name__ == "__main__":

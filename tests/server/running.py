@@ -17,11 +17,11 @@ from typing import Any
 
 import pytest
 
-from protocol.connection import FramedConnection
+from protocol.client.connection import FramedConnection
 from protocol.control import request
 from protocol.errors import ConnectionFailedError
 from protocol.framing import DataFlag, DataMessage
-from protocol.json_text import JsonObject
+from protocol.text.json_text import JsonObject
 
 START_TIMEOUT_S = 40.0
 PATIENCE_S = 30.0
@@ -85,13 +85,19 @@ _AWAY_S = 20.0
 class Program:
     """A program of ours running as a process, its standard error in a file."""
 
-    def __init__(self, module: str, arguments: Sequence[str], under: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        module: str,
+        arguments: Sequence[str],
+        under: Sequence[str] = (),
+        python: str | Path = sys.executable,
+    ) -> None:
         """`under` is a command that becomes the program given behind it, such as `setpriv ...`."""
         descriptor, path = tempfile.mkstemp(prefix="ethercat-test-")
         self.log = Path(path)
         with open(descriptor, "w") as log:  # noqa: PTH123
             self.process = subprocess.Popen(
-                [*under, sys.executable, "-m", module, *arguments],
+                [*under, python, "-m", module, *arguments],
                 stdin=subprocess.PIPE,
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -141,10 +147,13 @@ class Server(Program):
         name: str | None = None,
         port: int = 0,
         under: Sequence[str] = (),
+        python: str | Path = sys.executable,
     ) -> None:
         self.port = port or free_port()
         names = [name] if name else []
-        super().__init__("ethercat_server.cli", [ifname, *names, str(self.port), *arguments], under)
+        super().__init__(
+            "ethercat_server.daemon.cli", [ifname, *names, str(self.port), *arguments], under, python
+        )
 
     @property
     def ifname(self) -> str:

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ethercat_server.server_settings import DEFAULT_RT_PRIORITY
-from ethercat_server.virtual_bus import VirtualBus
+from ethercat_server.daemon.server_settings import DEFAULT_RT_PRIORITY
+from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 from tests.server.running import PATIENCE_S, Client, Server, server
 
 
@@ -32,9 +32,9 @@ class SteadySensor:
         assert answer.startswith("ok"), answer
         return answer[3:]
 
-    def stats(self, place: int = 0) -> dict[str, Any]:
+    def stats(self, position: int = 0) -> dict[str, Any]:
         """What a sensor says of itself."""
-        found: dict[str, Any] = json.loads(self.command("stats"))["sensors"][place]
+        found: dict[str, Any] = json.loads(self.command("stats"))["sensors"][position]
         return found
 
     def close(self) -> None:

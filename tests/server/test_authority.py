@@ -14,12 +14,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from ethercat_server.authority import controlling_uids
 from ethercat_server.errors import UsageError
-from ethercat_server.socket_owner import open_diagnostics, peer_uid
+from ethercat_server.serving.permissions import controlling_uids
+from ethercat_server.serving.transport.peer_uid import open_diagnostics, peer_uid
+from tests.server.as_another_user import NO_OTHER_USER
 
 NOBODY = pwd.getpwnam("nobody")
-AS_NOBODY = pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user")
+AS_NOBODY = pytest.mark.skipif(NO_OTHER_USER is not None, reason=NO_OTHER_USER or "")
 
 
 @pytest.fixture

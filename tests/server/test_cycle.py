@@ -1,169 +1,147 @@
-"""The loop against a scripted bus: stalls, lost frames, sockets' turn. The real bus is in test_end_to_end."""
+"""The loop in simulated time: stalls, lost frames, the sockets' turn, a machine that is slow."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from typing import Any, cast
+import itertools
 
 import pytest
 
-from ethercat_server.bus import Bus
-from ethercat_server.cycle import Cycle
-from ethercat_server.hub import Hub
-from ethercat_server.jobs import Jobs
-from ethercat_server.notify import Notifier
-from ethercat_server.recovery import Recovery
-from ethercat_server.stream import SensorStream
-from protocol.framing import DataMessage, FrameDecoder
+from ethercat_server.simulation.machine import Machine
+from ethercat_server.virtual_sensor.measurement.signals import ClockReading, decode_clock
+from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.framing import DataFlag, DataMessage
+from protocol.pdo import LAYOUTS
+from tests.simulation import Simulation
 
-PERIOD_NS = 5_000_000
-"""Long, so that a slow machine keeps up."""
+PERIOD_NS = 1_250_000
+OLD = DataFlag.REPEATED | DataFlag.INVALID
 
 
-class ScriptedBus:
-    """A sensor on the real clock, without a wire."""
-
-    def __init__(self) -> None:
-        self.started_ns = time.monotonic_ns()
-        self.exchanges: list[int] = []
-        self.lose: set[int] = set()
-        self.timeout_s = 0.0
-
-    def send(self) -> None:
-        self.exchanges.append(time.monotonic_ns())
-
-    def receive(self, timeout_s: float) -> int:
-        self.timeout_s = timeout_s
-        return -1 if len(self.exchanges) in self.lose else 3
-
-    def process_data(self, _slave: int) -> bytes:
-        number = (self.exchanges[-1] - self.started_ns) // PERIOD_NS
-        return number.to_bytes(61, "little")
+def simulation(machine: Machine | None = None, **options: object) -> Simulation:
+    sensor = SensorOptions(**{"signal": "clock", "ppm": 150.0, **options})  # type: ignore[arg-type]
+    return Simulation(sensor, machine=machine)
 
 
-class ScriptedHub:
-    """Counts its turns and keeps what is published."""
-
-    def __init__(self, on_serve: Callable[[int], None]) -> None:
-        self.turns = 0
-        self.frames: list[DataMessage] = []
-        self._on_serve = on_serve
-
-    def serve(self, _until_ns: int) -> None:
-        self.turns += 1
-        self._on_serve(self.turns)
-
-    def publish(self, frame: bytes, _place: int, _flags: int, _now_ns: int) -> None:
-        decoder = FrameDecoder()
-        decoder.feed(frame)
-        message = decoder.next_message()
-        assert isinstance(message, DataMessage)
-        self.frames.append(message)
+def reading(frame: DataMessage) -> ClockReading:
+    """The sample's own number and instant."""
+    return decode_clock(LAYOUTS[61].struct.unpack(frame.process_data)[2:8])
 
 
-class NoTrouble:
-    """A recovery that never has anything to do."""
-
-    alive_wkc = 3
-    all_lost = False
-
-    def attend(self, _wkc: int, _now_ns: int) -> None:
-        pass
+def numbers(running: Simulation) -> list[int]:
+    """The sensor's own numbers of the samples that were handed out as new."""
+    return [reading(frame)[0] for frame in running.frames if not frame.flags & OLD]
 
 
-def run(
-    turns: int, on_serve: Callable[[int], None], bus: ScriptedBus, stream: SensorStream | None = None
-) -> tuple[dict[str, Any], ScriptedHub]:
-    def stop_at_the_end(turn: int) -> None:
-        on_serve(turn)
-        if turn == turns:
-            cycle.stop()
-
-    hub = ScriptedHub(stop_at_the_end)
-    stream = stream or SensorStream(0, PERIOD_NS)
-    cycle = Cycle(
-        cast(Bus, bus),
-        [stream],
-        cast(Hub, hub),
-        cast(Recovery, NoTrouble()),
-        Jobs(cast(Bus, bus), []),
-        Notifier(),
-    )
-    cycle.run()
-    return cycle.status(), hub
+def test_every_sample_is_handed_out_once_and_none_is_lost() -> None:
+    running = simulation()
+    running.run(5.0)
+    got = numbers(running)
+    settled = got[800:]
+    assert settled == list(range(settled[0], settled[0] + len(settled)))
+    assert len(settled) > 3100
+    status = running.status()
+    assert status["sensors"][0]["clock"]["mode"] == "locked"
+    assert status["sensors"][0]["clock"]["offset_ppm"] == pytest.approx(150, abs=5)
+    assert status["cycles"] < 1.5 * len(got), "hardly more than one exchange a sample"
 
 
-def numbers(hub: ScriptedHub) -> list[int]:
-    return [int.from_bytes(frame.process_data, "little") for frame in hub.frames if not frame.flags & 3]
+def test_the_stamp_is_the_instant_of_the_sample() -> None:
+    running = simulation()
+    running.run(5.0)
+    for frame in running.frames[800:]:
+        _, instant_ns = reading(frame)
+        assert abs(frame.monotonic_ns - instant_ns) < 60_000
 
 
 def test_a_stall_is_counted_and_followed_by_no_burst() -> None:
-    bus = ScriptedBus()
-    stall_periods = 30
-
-    def stall(turn: int) -> None:
-        if turn == 150:
-            bus.exchanges.clear()
-            time.sleep(stall_periods * PERIOD_NS / 1e9)
-
-    status, hub = run(300, stall, bus)
-    assert status["missed_deadlines"] >= stall_periods - 2
-    # Afterwards the polls come at the sensor's pace: making up for the stall would take 30 at once.
-    right_after = [moment for moment in bus.exchanges if moment < bus.exchanges[0] + 3 * PERIOD_NS]
-    assert len(right_after) < stall_periods / 2
-    assert status["sensors"][0]["lost_samples"] >= stall_periods - 3
-    got = numbers(hub)
+    running, periods = simulation(), 30
+    running.at(2.0, lambda: running.clock.stall(periods * PERIOD_NS))
+    running.run(2.0 + periods * 1.25e-3)
+    cycles = running.status()["cycles"]
+    running.run(3 * 1.25e-3)
+    assert running.status()["cycles"] - cycles < periods / 2, "it does not make up for the stall"
+    running.run(2.0)
+    status = running.status()
+    assert status["missed_deadlines"] >= periods - 2
+    assert status["sensors"][0]["lost_samples"] in range(periods - 3, periods + 2)
+    got = numbers(running)
     assert got == sorted(set(got)), "nothing twice, nothing out of order"
+    after = next(n for n, pair in enumerate(itertools.pairwise(got)) if pair[1] - pair[0] > 5) + 1
+    new = [frame for frame in running.frames if not frame.flags & OLD]
+    assert new[after].flags & DataFlag.GAP
 
 
 def test_lost_frames_cost_no_sample_when_the_next_exchange_comes_in_time() -> None:
-    bus = ScriptedBus()
-    bus.lose = set(range(200, 400, 20))
-    status, hub = run(500, lambda _: None, bus)
-    assert status["lost_frames"] == len(bus.lose)
-    fetched = [(moment - bus.started_ns) // PERIOD_NS for moment in bus.exchanges]
-    lost = {fetched[exchange - 1] for exchange in bus.lose}
-    seen = {number for place, number in enumerate(fetched, 1) if place not in bus.lose}
-    got = numbers(hub)
-    assert got == [number for number in sorted(seen) if number >= got[0]], "all that a frame brought, once"
-    assert got[0] < 200, "it has followed the sensor since before"
-    assert lost & seen, "a lost frame is followed by another, in time for the same sample"
+    running = simulation()
+    running.run(2.0)
+    for n in range(20):
+        running.at(0.05 * n, "lose 1")
+    running.run(2.0)
+    assert running.status()["lost_frames"] >= 20
+    got = numbers(running)[1000:]
+    missing = got[-1] - got[0] + 1 - len(got)
+    assert missing <= 2
+    assert running.events == []
+
+
+def test_what_is_lost_is_flagged_and_counted_on_a_bad_wire() -> None:
+    running = simulation(Machine(seed=7, lost=0.05, stall_every_s=0.5, stall_ns=20e6, wake_ns=40_000))
+    running.run(20.0)
+    new = [frame for frame in running.frames if not frame.flags & OLD][800:]
+    got = [reading(frame)[0] for frame in new]
+    assert got == sorted(set(got))
+    gaps = [b - a - 1 for a, b in itertools.pairwise(got)]
+    unflagged = [
+        gap for gap, frame in zip(gaps, new[1:], strict=True) if gap and not frame.flags & DataFlag.GAP
+    ]
+    assert sum(gaps) > 50
+    assert sum(unflagged) <= 0.02 * sum(gaps)
+    assert running.status()["sensors"][0]["lost_samples"] == pytest.approx(sum(gaps), rel=0.2)
+    assert running.events == [], "single lost frames and stalls are no lost sensor"
 
 
 def test_a_frame_may_take_as_long_as_the_rate_in_force_allows() -> None:
-    bus, stream = ScriptedBus(), SensorStream(0, PERIOD_NS)
-    seen: list[float] = []
+    running = simulation()
+    waits: list[float] = []
+    receive = running.bus.receive
 
-    def change(turn: int) -> None:
-        if turn == 10:
-            seen.append(bus.timeout_s)
-            stream.recover(PERIOD_NS / 4)  # as after a change of settings
-
-    run(6000, change, bus, stream)  # it looks once a second
-    seen.append(bus.timeout_s)
-    assert seen == pytest.approx([0.75e-9 * PERIOD_NS, 0.75e-9 * PERIOD_NS / 4], rel=0.2)
-
-
-def test_the_sockets_have_their_turn_even_if_every_deadline_has_passed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    bus = ScriptedBus()
-    receive = bus.receive
-
-    def receive_slowly(timeout_s: float) -> int:
-        time.sleep(2 * PERIOD_NS / 1e9)
+    def noted(timeout_s: float) -> int:
+        waits.append(timeout_s)
         return receive(timeout_s)
 
-    monkeypatch.setattr(bus, "receive", receive_slowly)
-    _, hub = run(10, lambda _: None, bus)
-    assert hub.turns == 10
+    running.bus.receive = noted  # type: ignore[method-assign]
+    running.run(0.5)
+    running.streams[0].recover(PERIOD_NS / 2)  # as after a change of settings
+    running.run(1.5)
+    assert waits[0] == pytest.approx(0.75e-9 * PERIOD_NS, rel=0.1)
+    assert waits[-1] == pytest.approx(0.75e-9 * PERIOD_NS / 2, rel=0.1)
+
+
+def test_the_sockets_have_their_turn_even_if_every_deadline_has_passed() -> None:
+    turns: list[int] = []
+    running = simulation(Machine(frame_ns=900_000, frame_jitter_ns=0))
+    running.on_serve = turns.append
+    running.run(1.0)
+    assert len(turns) >= 90, "every 10 ms"
 
 
 def test_status_distributions_count_every_cycle() -> None:
-    status, _ = run(60, lambda _: None, ScriptedBus())
-    assert status["cycles"] >= 60
+    running = simulation()
+    running.run(0.5)
+    status = running.status()
+    assert status["cycles"] >= 400
     for name in ("wake_us", "exchange_us"):
         everything, recent = status[name], status["last_10s"][name]
         assert set(everything) == {"p50", "p99", "p999", "max"}
         assert everything == recent, "a short run lies within the last ten seconds"
+
+
+def test_a_run_is_repeated_by_its_seed() -> None:
+    def run(seed: int) -> list[tuple[int, int, int]]:
+        running = simulation(Machine(seed=seed, lost=0.02, stall_every_s=0.3, stall_ns=5e6))
+        running.at(0.7, "power cycle 0.2")
+        running.run(2.0)
+        return [(frame.sequence, frame.stamp_ns, frame.flags) for frame in running.frames]
+
+    assert run(1) == run(1)
+    assert run(1) != run(2)

@@ -6,16 +6,16 @@ from typing import cast
 
 import pytest
 
-from ethercat_server.actions import Actions
-from ethercat_server.connection import Connection
-from ethercat_server.cycle import Cycle
-from ethercat_server.hub import Hub
-from ethercat_server.sensor import Identity, Sensor
-from ethercat_server.sensor_actions import SensorActions
+from ethercat_server.acquisition.cycle import Cycle
+from ethercat_server.sensor.sensor import Identity, Sensor
+from ethercat_server.serving.actions import Actions
+from ethercat_server.serving.connection import Connection
+from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.sensor_actions import SensorActions
 from protocol.framing import encode_json
-from protocol.json_text import MAX_JSON_LENGTH, JsonObject
-from protocol.meaning import value_meaning
+from protocol.sensor.meaning import value_meaning
 from protocol.settings import SETTINGS, SettingValue, start_up_defaults
+from protocol.text.json_text import MAX_JSON_LENGTH, JsonObject
 
 
 def wordiest() -> dict[str, SettingValue]:
@@ -30,7 +30,9 @@ def wordiest() -> dict[str, SettingValue]:
 
 
 def describe(count: int) -> JsonObject:
-    sensors = [Sensor(place, Identity("B" * 20, 2**32 - 1, "H" * 12, "F" * 13), {}) for place in range(count)]
+    sensors = [
+        Sensor(position, Identity("B" * 20, 2**32 - 1, "H" * 12, "F" * 13), {}) for position in range(count)
+    ]
     for sensor in sensors:
         sensor.hold(wordiest())
 

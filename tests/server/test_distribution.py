@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from ethercat_server.distribution import Distribution, RecentDistribution
+from ethercat_server.acquisition.histogram import Distribution, RecentDistribution
 
 
 def test_percentiles_are_exact_to_a_few_percent() -> None:

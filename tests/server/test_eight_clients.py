@@ -1,111 +1,93 @@
-"""Eight clients at 800 Hz, half of them odd: the others lose nothing, the odd are told what they missed."""
+"""Eight clients at 800 Hz, half of them troublesome, in simulated time.
+
+The others lose nothing, and those that miss frames are told.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import signal
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from typing import Any
+import random
+from itertools import pairwise
 
 import pytest
 
-from scripts._odd_clients import EIGHT
-from tests.server.running import Client, Server, needs_bus, server, wait_until
+from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.framing import DataFlag, DataMessage
+from tests.simulation import OLD, Client, Simulation, check_frames, reading
 
-pytestmark = [pytest.mark.bus, needs_bus]
-ALL_FOR_S = 2.0
-"""How long all eight are at work at least."""
-
-
-class OddClient:
-    """One of them, in a process of its own."""
-
-    def __init__(self, manner: str, port: int) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "scripts._odd_clients", manner, str(port)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdout is not None
-        tells = manner not in {"noise", "churn"}
-        self.address = self.process.stdout.readline().strip() if tells else ""
-
-    def finish(self) -> dict[str, Any]:
-        """Let it end; what came to it."""
-        said, _ = self.process.communicate("\n", timeout=30)
-        assert self.process.returncode == 0
-        found: dict[str, Any] = json.loads(said) if self.address else {}
-        return found
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.communicate()
+ALL_FOR_S = 3.0
+SMALL_BUFFER = 4096
+"""Bytes on their way to a client that reads slowly; a kernel holds more."""
 
 
-class Eight:
-    """The clients and the server's view of them."""
+class Troublesome:
+    """One that stops reading, one that reads slowly, one that sends noise, one that comes and goes."""
 
-    def __init__(self, running: Server, control: Client) -> None:
-        self.control = control
-        self.clients = [OddClient(manner, running.port) for manner in EIGHT]
-        self.stopped, self.slow, self.noise, self.churn, *self.honest = self.clients
+    def __init__(self, simulation: Simulation, seed: int) -> None:
+        self._simulation, self._chance = simulation, random.Random(seed)
+        self.stopped, self.slow = (simulation.connect(buffer_size=SMALL_BUFFER) for _ in range(2))
+        for client in (self.stopped, self.slow):
+            client.ask("subscribe")
+        self._noise: list[Client] = []
+        self._churn: list[Client] = []
+        simulation.on_serve = self._act
 
-    def row(self, client: OddClient) -> dict[str, Any] | None:
-        """What `status` says of a client; None once it is closed."""
-        rows = self.control.ask("status")["clients"]
-        return next((row for row in rows if row["peer"] == client.address), None)
+    def _act(self, _until_ns: int) -> None:
+        chance = self._chance
+        self.slow.reads = chance.random() < 0.02
+        if chance.random() < 0.1:
+            self._noise.append(self._simulation.connect())
+            self._noise[-1].stream.send(chance.randbytes(chance.randrange(1, 200)))
+            self._noise[-1].reads = False
+        if chance.random() < 0.1:
+            self._churn.append(self._simulation.connect())
+            self._churn[-1].send("subscribe")
+        for some in (self._noise, self._churn):
+            if len(some) > 4:
+                some.pop(0).close()
 
-    def withheld_or_closed(self, client: OddClient) -> bool:
-        row = self.row(client)
-        return row is None or row["withheld"] > 0
-
-
-@pytest.fixture
-def eight() -> Iterator[Eight]:
-    with (
-        server("virtual", "--virtual", "--signal clock --ppm 150") as running,
-        running.connect() as control,
-        contextlib.ExitStack() as cleanup,
-    ):
-        clients = Eight(running, control)
-        for client in clients.clients:
-            cleanup.callback(client.kill)
-        yield clients
+    def end(self) -> None:
+        self._simulation.on_serve = lambda _: None
+        for client in (*self._noise, *self._churn):
+            client.close()
+        self.stopped.reads = self.slow.reads = True
 
 
-def test_the_honest_lose_nothing_and_the_odd_know_what_they_missed(eight: Eight) -> None:
-    eight.stopped.process.send_signal(signal.SIGSTOP)
-    time.sleep(ALL_FOR_S)
-    for odd in (eight.stopped, eight.slow):
-        wait_until(lambda odd=odd: eight.withheld_or_closed(odd), "frames to be withheld")  # type: ignore[misc]
-    rows = [eight.row(client) for client in (eight.stopped, eight.slow)]
-    eight.stopped.process.send_signal(signal.SIGCONT)
-    if rows[0] is not None:
-        caught_up = rows[0]["sent"] + 600  # the server keeps 256 frames for it, its kernel some more
+def jumps(frames: list[DataMessage]) -> list[tuple[int, bool]]:
+    """How many frames each jump of the sequence skips, and whether the frame after it has GAP."""
+    return [
+        (after.sequence - before.sequence - 1, bool(after.flags & DataFlag.GAP))
+        for before, after in pairwise(frames)
+        if after.sequence != before.sequence + 1 and not (before.flags | after.flags) & OLD
+    ]
 
-        def is_live_again() -> bool:
-            now = eight.row(eight.stopped)
-            return now is not None and now["sent"] > caught_up
 
-        wait_until(is_live_again, "the stopped one to read on")
-    resumed, trickled = eight.stopped.finish(), eight.slow.finish()
-    heard = [client.finish() for client in eight.honest]
-    for client in (eight.noise, eight.churn):
-        client.finish()
+@pytest.mark.parametrize("seed", range(3))
+def test_the_honest_lose_nothing_and_the_others_know_what_they_missed(seed: int) -> None:
+    simulation = Simulation(SensorOptions(signal="clock", ppm=150.0))
+    honest = [simulation.connect() for _ in range(4)]
+    for client in honest:
+        client.ask("subscribe")
+    troublesome = Troublesome(simulation, seed)
+    stopped, slow = troublesome.stopped, troublesome.slow
+    simulation.run(0.1)
+    stopped.reads = False
+    simulation.run(ALL_FOR_S)
 
-    status = eight.control.ask("status")
-    for one in heard:
-        assert one["frames"] > ALL_FOR_S * 800 * 0.8
-        assert one["jumps"] == [], "the server withheld frames from a client that reads"
-        assert one["lost"] <= status["sensors"][0]["lost_samples"], "lost on the way, not by the server"
-        assert one["unflagged"] <= 1 + one["frames"] // 1000, (
-            "a starved sensor process answers at a time that nobody can know"
-        )
-    for one, row in ((resumed, rows[0]), (trickled, rows[1])):
-        assert one["jumps"] or row is None, "frames were withheld and nothing tells of it"
-        assert all(missed > 0 and told for missed, told in one["jumps"]), "the first frame after it has GAP"
+    status = honest[0].ask("status")
+    rows = {row["peer"]: row for row in status["clients"]}
+    for client in (stopped, slow):
+        assert rows[client.stream.other.peer]["withheld"] > 0
+    troublesome.end()
+    simulation.run(0.5)
+    for client in honest:
+        assert len(client.frames) > ALL_FOR_S * 800
+        assert jumps(client.frames) == [], "the server withheld frames from a client that reads"
+        check_frames(client.frames)
+        assert not client.at_end
+    for client in (stopped, slow):
+        missed = jumps(client.frames)
+        assert missed, "frames were withheld and nothing tells of it"
+        assert all(told for _, told in missed), "the first frame after it has GAP"
+        check_frames(client.frames, complete=False)
+        assert reading(client.frames[-1]).number >= reading(honest[0].frames[-1]).number - 1, "live again"
+    assert len(simulation.hub.connections) == 6

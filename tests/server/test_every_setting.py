@@ -1,37 +1,32 @@
-"""Every value of the note's tables takes while the sensor streams; what none of them has is refused."""
+"""Every value of a setting takes effect while the sensor streams; any other is refused. In simulated time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from protocol.filters import FORCE_TORQUE_FILTERS
-from protocol.meaning import value_meaning
+from protocol.sensor.filters import FORCE_TORQUE_FILTERS
+from protocol.sensor.meaning import value_meaning
 from protocol.settings import SETTINGS
-from tests.server.running import needs_bus
-from tests.server.steady import SteadyBench, steady_bench, steady_sensor
-
-pytestmark = [pytest.mark.bus, needs_bus]
+from tests.server.bench import Bench
 
 IMU = ("acceleration_filter", "angular_rate_filter", "acceleration_range_g", "angular_rate_range_dps")
 
 
 @pytest.fixture(scope="module")
-def bench() -> Iterator[SteadyBench]:
-    with steady_sensor() as sensor, steady_bench(sensor) as found:
-        yield found
+def bench() -> Bench:
+    return Bench()
 
 
-def configure(bench: SteadyBench, **settings: object) -> dict[str, Any]:
+def configure(bench: Bench, **settings: object) -> dict[str, Any]:
     reply = bench.asking.ask("configure", settings=settings)
     assert reply["ok"], reply
     return reply
 
 
 @pytest.mark.parametrize("fir", [False, True])
-def test_every_sinc_length_of_the_table_gives_its_rate(bench: SteadyBench, fir: bool) -> None:
+def test_every_sinc_length_of_the_table_gives_its_rate(bench: Bench, fir: bool) -> None:
     for length, row in FORCE_TORQUE_FILTERS.items():
         reply = configure(bench, sinc_length=length, fir=fir)
         assert reply["rate_hz"] == row.rate_hz
@@ -42,7 +37,7 @@ def test_every_sinc_length_of_the_table_gives_its_rate(bench: SteadyBench, fir: 
 
 
 @pytest.mark.parametrize("name", IMU)
-def test_every_filter_and_range_of_the_imu_takes(bench: SteadyBench, name: str) -> None:
+def test_every_filter_and_range_of_the_imu_takes(bench: Bench, name: str) -> None:
     default = SETTINGS[name].default
     for value in SETTINGS[name].choices or ():
         reply = configure(bench, **{name: value})
@@ -67,11 +62,11 @@ def test_every_filter_and_range_of_the_imu_takes(bench: SteadyBench, name: str) 
     ],
 )
 def test_what_cannot_be_is_refused_and_the_sensor_untouched(
-    bench: SteadyBench, settings: dict[str, object], said: str
+    bench: Bench, settings: dict[str, object], said: str
 ) -> None:
-    before = bench.sensor.stats()["sdo_write_count"]
+    before = bench.stats()["sdo_write_count"]
     reply = bench.asking.ask("configure", settings=settings)
     assert reply["ok"] is False
     assert reply["error"]["code"] == "bad_request"
     assert said in reply["error"]["message"]
-    assert bench.sensor.stats()["sdo_write_count"] == before
+    assert bench.stats()["sdo_write_count"] == before

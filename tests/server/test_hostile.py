@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.connection import MAX_REQUEST_LENGTH
-from ethercat_server.door import MOST_OF_A_STRANGER
+from ethercat_server.serving.connection import MAX_REQUEST_LENGTH
+from ethercat_server.serving.permissions import MAX_CLIENTS_PER_USER
 from protocol.control import request
 from protocol.framing import DataFlag, encode_json
 from tests.hostile_bytes import framed
@@ -134,7 +134,7 @@ def test_hostile_connections_harm_nobody() -> None:
 def test_a_crowd_that_asks_without_pause_costs_no_samples() -> None:
     with server("virtual", "--virtual", "--signal clock --ppm 150") as running, running.connect() as client:
         listener = Listener(client)
-        attack(running, listener, MOST_OF_A_STRANGER, "crowd")
+        attack(running, listener, MAX_CLIENTS_PER_USER, "crowd")
         status = client.ask("status")
         listener.check(status)
         print(f"{listener.samples} samples, {listener.lost} lost")

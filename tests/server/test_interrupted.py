@@ -1,17 +1,13 @@
-"""Changes that fail or are cut off half-way leave the former settings in force, and say so."""
+"""Changes that fail or are cut off leave the former settings in force, and say so. In simulated time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from tests.server.running import Client, Server, check_not_lost, needs_bus
-from tests.server.steady import SteadyBench, SteadySensor, steady_bench, steady_sensor
-from tests.server.test_sensor_actions import error
-
-pytestmark = [pytest.mark.bus, needs_bus]
+from tests.server.bench import Bench, error
+from tests.simulation import Client
 
 CONFIGURATION, OFFSET, RATE = 0x8010, 0x8000, 0x8011
 IN_OP = {"temperature_compensation": True, "imu_active": 3}
@@ -20,10 +16,10 @@ ABORT = "0x08000021"
 
 
 @pytest.fixture
-def bench() -> Iterator[tuple[SteadyBench, Client]]:
-    """A sensor at rest, and two clients: one that listens, one that asks."""
-    with steady_sensor() as sensor, steady_bench(sensor) as found:
-        yield found, found.asking
+def bench() -> tuple[Bench, Client]:
+    """A stationary sensor, and two clients: one that listens, one that asks."""
+    found = Bench()
+    return found, found.asking
 
 
 def row(asking: Client) -> dict[str, Any]:
@@ -36,7 +32,7 @@ def held(asking: Client, index: int, subindex: int) -> int:
     return int(asking.ask("sdo_read", index=index, subindex=subindex)["hex"], 16)
 
 
-def check_former(bench: SteadyBench, asking: Client, before: dict[str, Any]) -> None:
+def check_former(bench: Bench, asking: Client, before: dict[str, Any]) -> None:
     """The server says that the former settings are in force, the sensor holds them, and samples come."""
     assert len(bench.client.fresh(50)) == 50
     now = row(asking)
@@ -47,7 +43,7 @@ def check_former(bench: SteadyBench, asking: Client, before: dict[str, Any]) -> 
     assert asking.ask("sdo_read", index=RATE, type="u16")["value"] == 800
 
 
-def test_an_abort_half_way_in_op(bench: tuple[SteadyBench, Client]) -> None:
+def test_an_abort_half_way_in_op(bench: tuple[Bench, Client]) -> None:
     sensor, asking = bench
     before = row(asking)
     sensor.command(f"abort 0x8010 3 {ABORT}")
@@ -59,15 +55,15 @@ def test_an_abort_half_way_in_op(bench: tuple[SteadyBench, Client]) -> None:
     check_former(sensor, asking, before)
 
 
-def test_an_abort_half_way_by_way_of_preop(bench: tuple[SteadyBench, Client]) -> None:
+def test_an_abort_half_way_by_way_of_preop(bench: tuple[Bench, Client]) -> None:
     sensor, asking = bench
-    before, lost_frames = row(asking), asking.ask("status")["lost_frames"]
+    before = row(asking)
     sensor.command(f"abort 0x8006 1 {ABORT}")
     refused = error(asking.ask("configure", settings=BY_PREOP))
     assert (refused["code"], refused["abort_code"]) == ("sensor", int(ABORT, 16))
     assert refused["message"].endswith("; the former settings are in force")
     check_former(sensor, asking, before)
-    check_not_lost(asking, sensor.client.events, lost_frames)
+    assert not [event for event in sensor.client.events if event["event"] != "reconfigured"]
 
 
 @pytest.mark.parametrize(
@@ -80,7 +76,7 @@ def test_an_abort_half_way_by_way_of_preop(bench: tuple[SteadyBench, Client]) ->
     ],
 )
 def test_a_sensor_lost_half_way_comes_back_with_its_former_settings(
-    bench: tuple[SteadyBench, Client], settings: dict[str, Any], when: str, fault: str
+    bench: tuple[Bench, Client], settings: dict[str, Any], when: str, fault: str
 ) -> None:
     sensor, asking = bench
     before = row(asking)
@@ -95,19 +91,19 @@ def test_a_sensor_lost_half_way_comes_back_with_its_former_settings(
     assert asking.ask("configure", settings=settings)["ok"], "the next one takes"
 
 
-def test_whoever_asked_is_told_at_once_that_the_sensor_is_lost(bench: tuple[SteadyBench, Client]) -> None:
+def test_whoever_asked_is_told_at_once_that_the_sensor_is_lost(bench: tuple[Bench, Client]) -> None:
     sensor, asking = bench
     before = row(asking)
     sensor.command("on-write 0x8006 4 power off")
     assert error(asking.ask("configure", settings=BY_PREOP))["code"] == "not_ready"
     assert row(asking)["state"] == "LOST"
-    assert error(asking.ask_once("configure", settings=BY_PREOP))["code"] == "not_ready"
+    assert error(asking.ask("configure", settings=BY_PREOP))["code"] == "not_ready"
     sensor.command("power on")
     sensor.wait_event("sensor_back")
     check_former(sensor, asking, before)
 
 
-def test_putting_back_what_was_in_force_fails_too_in_op(bench: tuple[SteadyBench, Client]) -> None:
+def test_putting_back_what_was_in_force_fails_too_in_op(bench: tuple[Bench, Client]) -> None:
     sensor, asking = bench
     sensor.command(f"abort 0x8010 3 {ABORT}")
     sensor.command("on-write 0x8010 3 abort 0x8010 2 0x08000022")
@@ -124,7 +120,7 @@ def test_putting_back_what_was_in_force_fails_too_in_op(bench: tuple[SteadyBench
     assert (held(asking, CONFIGURATION, 2), held(asking, CONFIGURATION, 3)) == (1, 2)
 
 
-def test_what_could_not_be_put_back_is_when_the_sensor_comes_back(bench: tuple[SteadyBench, Client]) -> None:
+def test_what_could_not_be_put_back_is_when_the_sensor_comes_back(bench: tuple[Bench, Client]) -> None:
     sensor, asking = bench
     before = row(asking)
     sensor.command(f"abort 0x8010 3 {ABORT}")
@@ -135,7 +131,7 @@ def test_what_could_not_be_put_back_is_when_the_sensor_comes_back(bench: tuple[S
     check_former(sensor, asking, before)
 
 
-def test_putting_back_what_was_in_force_fails_too_by_way_of_preop(bench: tuple[SteadyBench, Client]) -> None:
+def test_putting_back_what_was_in_force_fails_too_by_way_of_preop(bench: tuple[Bench, Client]) -> None:
     sensor, asking = bench
     before = row(asking)
     sensor.command(f"abort 0x8006 1 {ABORT}")
@@ -158,7 +154,7 @@ def test_putting_back_what_was_in_force_fails_too_by_way_of_preop(bench: tuple[S
     ],
 )
 def test_a_tare_cut_off_half_way_leaves_the_old_offset(
-    bench: tuple[SteadyBench, Client], fault: str, said: str
+    bench: tuple[Bench, Client], fault: str, said: str
 ) -> None:
     sensor, asking = bench
     first = asking.ask("tare", samples=20, target=[5.0, 0, 0, 0, 0, 0])
@@ -177,7 +173,7 @@ def test_a_tare_cut_off_half_way_leaves_the_old_offset(
 
 
 def test_a_save_that_ends_with_a_status_is_no_success(
-    bench: tuple[SteadyBench, Client],
+    bench: tuple[Bench, Client],
 ) -> None:
     sensor, asking = bench
     sensor.command(f"abort 0x8030 1 {ABORT}")
@@ -194,45 +190,68 @@ def test_a_save_that_ends_with_a_status_is_no_success(
     assert saved["saved"] is True
 
 
-def start_again(sensor: SteadySensor) -> tuple[Server, str]:
-    running = Server(sensor.ifname)
-    running.wait_streaming()
-    return running, running.said()
+def test_a_power_cut_during_save_is_met_by_the_next_start(caplog: pytest.LogCaptureFixture) -> None:
+    """The flash has 0x8000 to 0x8006:3 new, the rest old: a mixture that nobody asked for."""
+    caplog.set_level("INFO")
+    bench = Bench()
+    cut_while_saving(bench)
+    bench.command("power on")
+    caplog.clear()
+    bench = bench.start_again()
+    said = caplog.text
+    assert "sensor 0 held fir = true (wanted: false)" in said, said
+    assert "a sampling rate of 400 Hz (wanted: 800 Hz)" in said
+    assert "chop" not in said, "its turn had not come"
+    assert "sensor 0 has a tare in force (saved or not): Fx offset 3.5 N" in said
+    found = row(bench.asking)
+    assert (found["state"], found["rate_hz"]) == ("OP", 800)
+    assert (found["settings"]["fir"], found["settings"]["chop"]) == (False, False)
+    assert found["settings"]["sinc_length"] == 64
+    assert len(bench.client.fresh(50)) == 50
+    caplog.clear()
+    bench.start_again()
+    assert " held " not in caplog.text, "now it holds what is wanted"
 
 
-def test_a_power_cut_during_save_is_met_by_the_next_start() -> None:
-    with steady_sensor() as sensor:
-        cut_while_saving(sensor)
-        sensor.command("power on")
-        # The flash has 0x8000 to 0x8006:3 new, the rest old: a mixture that nobody asked for.
-        running, said = start_again(sensor)
-        try:
-            assert "sensor 0 held fir = true (wanted: false)" in said, said
-            assert "a sampling rate of 400 Hz (wanted: 800 Hz)" in said
-            assert "chop" not in said, "its turn had not come"
-            assert "sensor 0 has a tare in force (saved or not): Fx offset 3.5 N" in said
-            with running.connect() as asking:
-                found = row(asking)
-                assert (found["state"], found["rate_hz"]) == ("OP", 800)
-                assert (found["settings"]["fir"], found["settings"]["chop"]) == (False, False)
-                assert found["settings"]["sinc_length"] == 64
-                asking.ask("subscribe")
-                assert len(asking.fresh(50)) == 50
-        finally:
-            running.close()
-        running, said = start_again(sensor)
-        running.close()
-        assert " held " not in said, "now it holds what is wanted"
-
-
-def cut_while_saving(sensor: SteadySensor) -> None:
+def cut_while_saving(bench: Bench) -> None:
     """FIR, SINC 128, CHOP and an offset are in force; the power goes after FIR was saved, before CHOP."""
-    with steady_bench(sensor) as bench:
-        tared = bench.asking.ask("tare", samples=20, target=[5.0, 0, 0, 0, 0, 0])
-        assert tared["ok"], tared
-        assert tared["new_offset"][0] == 3.5
-        assert bench.asking.ask("configure", settings={"fir": True, "sinc_length": 128, "chop": True})["ok"]
-        bench.command("cut-save 27")
-        refused = error(bench.asking.ask("configure", settings={"fir": True}, save=True))
-        assert refused["code"] == "not_ready"
-        assert "whether it saved all, some or none of its settings is not known" in refused["message"]
+    tared = bench.asking.ask("tare", samples=20, target=[5.0, 0, 0, 0, 0, 0])
+    assert tared["ok"], tared
+    assert tared["new_offset"][0] == 3.5
+    assert bench.asking.ask("configure", settings={"fir": True, "sinc_length": 128, "chop": True})["ok"]
+    bench.command("cut-save 27")
+    refused = error(bench.asking.ask("configure", settings={"fir": True}, save=True))
+    assert refused["code"] == "not_ready"
+    assert "whether it saved all, some or none of its settings is not known" in refused["message"]
+
+
+@pytest.mark.parametrize("after", range(0, 60, 2))
+def test_a_sensor_lost_at_any_moment_of_a_change_has_its_former_settings_or_the_new_ones(after: int) -> None:
+    """The power goes `after` ms into the change; what the reply says is what is in force."""
+    bench = Bench()
+    asking = bench.asking
+    before = row(asking)["settings"]
+    number = asking.send("configure", settings=BY_PREOP)
+    bench.simulation.at(after * 1e-3, "power cycle 0.2")
+    reply = asking.reply(number)
+    bench.simulation.run(0.5)
+    asking.ask("status")
+    found = row(asking)
+    assert found["state"] == "OP"
+    assert found["settings"] == (reply["settings"] if reply["ok"] else before)
+    assert held(asking, 0x8006, 4) == found["settings"]["chop"]
+    assert len(bench.client.fresh(50)) == 50
+    assert asking.ask("configure", settings=BY_PREOP)["ok"], "the next one takes"
+
+
+@pytest.mark.parametrize("after", range(0, 90, 3))
+def test_a_sensor_lost_at_any_moment_of_a_tare_has_its_old_offset_or_the_new_one(after: int) -> None:
+    """It is deaf `after` ms into the tare; what the reply says is what is in force."""
+    bench = Bench()
+    asking = bench.asking
+    number = asking.send("tare", samples=20, target=[5.0, 0, 0, 0, 0, 0])
+    bench.simulation.at(after * 1e-3, "power cycle 0.2")
+    reply = asking.reply(number)
+    bench.simulation.run(0.5)
+    offset = [asking.ask("sdo_read", index=OFFSET, subindex=n, type="f32")["value"] for n in range(1, 7)]
+    assert offset == pytest.approx(reply["new_offset"] if reply["ok"] else [0.0] * 6)

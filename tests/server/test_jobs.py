@@ -12,15 +12,17 @@ from typing import Any, cast
 
 import pytest
 
-from ethercat_server.bus import Bus
+from ethercat_server.acquisition.jobs import Jobs
+from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError
-from ethercat_server.jobs import Jobs
-from ethercat_server.object_access import write
-from ethercat_server.objects import BY_SETTING
-from ethercat_server.sdo import CyclicSdo, Steps, finish
-from ethercat_server.sensor import Identity, Sensor, read_offset, read_settings, write_offset
-from ethercat_server.stream import SensorStream
-from ethercat_server.tare import tare
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK
+from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, finish
+from ethercat_server.sensor.dictionary import BY_SETTING
+from ethercat_server.sensor.object_access import write
+from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
+from ethercat_server.sensor.set_up import read_offset, read_settings, write_offset
+from ethercat_server.sensor.tare import tare
 from protocol.control import ErrorCode
 from protocol.errors import RequestError
 from protocol.pdo import LAYOUTS
@@ -31,6 +33,8 @@ IMU = BY_SETTING["imu_active"].address
 class NoBus:
     """Whatever is done on it has no time to be in time for."""
 
+    clock = SYSTEM_CLOCK
+
     @contextlib.contextmanager
     def in_time(self, _until_ns: int) -> Iterator[None]:
         yield
@@ -38,6 +42,8 @@ class NoBus:
 
 class ScriptedSdo:
     """A sensor that holds what was written, and else zeros of the right size."""
+
+    clock = SYSTEM_CLOCK
 
     def __init__(self) -> None:
         self.held: dict[tuple[int, int], bytes] = {}
@@ -55,12 +61,14 @@ class ScriptedSdo:
 
 
 def new_sensor() -> Sensor:
-    return Sensor(0, Identity("BFT-SENS-ECAT-M8", 1, "", ""), {"sinc_length": 64}, pdo_size=61)
+    sensor = Sensor(0, Identity("BFT-SENS-ECAT-M8", 1, "", ""), {"sinc_length": 64}, pdo_size=61)
+    sensor.enter(SensorState.STREAMING)
+    return sensor
 
 
 def run_job(steps: Steps[Any]) -> tuple[Any, RequestError | None]:
     """What whoever asked for `steps` is told."""
-    jobs = Jobs(cast(Bus, NoBus()), [SensorStream(0, 1_250_000)])
+    jobs = Jobs(cast(Bus, NoBus()), [new_sensor()])
     told: list[tuple[Any, RequestError | None]] = []
     jobs.start(0, steps, lambda result, error: told.append((result, error)))
     while jobs.waiting:
@@ -133,7 +141,7 @@ def test_a_tare_whose_sum_is_too_large_is_refused_before_it_writes() -> None:
 
 @pytest.mark.parametrize("size", [0, 113])
 def test_what_does_not_fit_the_mailbox_is_not_sent(size: int) -> None:
-    sdo = CyclicSdo(cast(Bus, NoBus()), 0, ((0x1000, 128), (0x1080, 128)))
+    sdo = MailboxSdo(cast(Bus, NoBus()), 0, ((0x1000, 128), (0x1080, 128)))
     with pytest.raises(BusError, match=f"1 to 112 bytes fit its mailbox, not {size}"):
         finish(sdo.write(0x1008, 0, bytes(size)))
 

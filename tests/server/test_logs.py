@@ -10,8 +10,8 @@ from typing import cast
 
 import pytest
 
-from ethercat_server import logs
-from ethercat_server.logs import JournalFormatter, PlainFormatter, Repetitions, goes_to_journal
+from ethercat_server.process import logs
+from ethercat_server.process.logs import JournalFormatter, PlainFormatter, Repetitions, goes_to_journal
 
 
 def record(message: str, *arguments: object, level: int = logging.WARNING) -> logging.LogRecord:
@@ -63,7 +63,7 @@ def test_repetitions_are_counted_and_told_with_the_next(monkeypatch: pytest.Monk
     now += 11
     late = record("denied %d", 20)
     assert repetitions.filter(late)
-    assert late.getMessage() == "denied 20 (and 15 more like it before)"
+    assert late.getMessage() == "denied 20 (15 similar messages suppressed)"
     other = record("denied %d", 99)
     other.kind = "another user"
     assert repetitions.filter(other), "what one user does hides nothing of another"

@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.bus import Bus
+from ethercat_server.acquisition.start_up import bring_up
+from ethercat_server.daemon.options import ServerOptions
 from ethercat_server.errors import BusError, StopRequestedError
-from ethercat_server.interface import claimed
-from ethercat_server.options import ServerOptions
-from ethercat_server.raw_socket import packet_sockets
-from ethercat_server.start_up import bring_up
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.nic import claimed
+from ethercat_server.ethercat.raw_socket import packet_sockets
+from ethercat_server.ethercat.soem import SoemBackend
 from tests.server.running import Veth, needs_bus, server, virtual_sensor
 from tests.tool.running import one_sentence, tool
 
@@ -36,14 +37,17 @@ class Gone:
 def test_an_interface_that_goes_away_while_it_is_opened() -> None:
     with Veth() as veth:
         before = packet_sockets()
-        bus = Bus(veth.near)
-        bus._master = Gone(bus._master, veth)
-        with contextlib.closing(bus), pytest.raises(BusError, match=f"the interface {veth.near} went away"):
-            bus.open()
+        backend = SoemBackend(veth.near)
+        backend._master = Gone(backend._master, veth)
+        with (
+            contextlib.closing(backend),
+            pytest.raises(BusError, match=f"the interface {veth.near} went away"),
+        ):
+            backend.open()
         assert packet_sockets() == before
 
 
-class Asked(Bus):
+class Asked(SoemBackend):
     """A bus that the start is to give up on after a certain transfer."""
 
     def __init__(self, ifname: str, last: str) -> None:
@@ -66,12 +70,12 @@ class Asked(Bus):
 
 @pytest.mark.parametrize("last", ["read", "write"])
 def test_a_start_is_given_up_between_two_transfers(last: str) -> None:
-    with virtual_sensor() as (veth, _), contextlib.closing(Asked(veth.near, last)) as bus:
-        bus.open()
+    with virtual_sensor() as (veth, _), contextlib.closing(Asked(veth.near, last)) as backend:
+        backend.open()
         options = ServerOptions(veth.near, 1, assigned_settings={"fir": True})
         with pytest.raises(StopRequestedError):
-            bring_up(bus, options, bus.check_interrupt)
-        assert bus.transfers.index(last) == len(bus.transfers) - 1, "nothing after it"
+            bring_up(Bus(backend), options, backend.check_interrupt)
+        assert backend.transfers.index(last) == len(backend.transfers) - 1, "nothing after it"
 
 
 def test_whoever_was_first_keeps_all_others_out_before_it_has_opened_the_bus() -> None:

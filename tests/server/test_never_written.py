@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
-from ethercat_server.bus import Bus
 from ethercat_server.errors import ForbiddenWriteError
-from ethercat_server.objects import BY_SETTING, FACTORY_CALIBRATION
-from ethercat_server.sdo import BlockingSdo, CyclicSdo, finish
-from protocol.sdo_types import SDO_TYPE_NAMES
-from tests.server.running import Client, needs_bus
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK
+from ethercat_server.ethercat.slave.coe import finish
+from ethercat_server.sensor.dictionary import BY_SETTING, FACTORY_CALIBRATION
+from ethercat_server.sensor.guard import GuardedSdo
+from protocol.sensor.sdo_types import SDO_TYPE_NAMES
+from tests.server.bench import Bench
+from tests.server.running import needs_bus
 from tests.server.steady import SteadyBench, steady_bench, steady_sensor
+from tests.simulation import Client
 from tests.tool.running import tool
 
 WAYS_TO_SAY_IT: tuple[Any, ...] = (0x2000, "0x2000", "8192", "0X2000", "0x02000", "08192", " 8192 ", "8_192")
@@ -36,9 +40,8 @@ def refused(asking: Client, **keys: object) -> str:
     return code
 
 
-@pytest.mark.bus
-@needs_bus
-def test_the_control_channel_writes_none_of_it(bench: SteadyBench) -> None:
+def test_the_control_channel_writes_none_of_it() -> None:
+    bench = Bench()
     asking = bench.asking
     before = [asking.ask("sdo_read", index=0x2000, subindex=sub)["hex"] for sub in range(58)]
     for subindex in range(256):
@@ -61,6 +64,7 @@ def test_the_control_channel_writes_none_of_it(bench: SteadyBench) -> None:
         reply = asking.ask("configure", settings={name: 1})
         assert reply["error"]["code"] == "bad_request"
     assert before == [asking.ask("sdo_read", index=0x2000, subindex=sub)["hex"] for sub in range(58)]
+    assert bench.stats()["calibration_writes"] == 0
 
 
 @pytest.mark.bus
@@ -81,15 +85,25 @@ def test_no_command_of_the_tool_writes_it(bench: SteadyBench, tmp_path: Path) ->
 
 
 def test_nothing_below_the_tool_and_the_server_writes_it() -> None:
-    class NoBus:
+    class NoSdo:
         """Whoever comes as far as this has failed."""
 
-    sdos = (
-        BlockingSdo(cast(Bus, NoBus()), 0),
-        CyclicSdo(cast(Bus, NoBus()), 0, ((0x1000, 128), (0x1080, 128))),
-    )
-    for sdo in sdos:
-        for subindex in range(256):
-            with pytest.raises(ForbiddenWriteError, match="never written"):
-                finish(sdo.write(FACTORY_CALIBRATION, subindex, b"\0" * 4))
+        clock = SYSTEM_CLOCK
+
+    sdo = GuardedSdo(cast(Any, NoSdo()))
+    for subindex in range(256):
+        with pytest.raises(ForbiddenWriteError, match="never written"):
+            finish(sdo.write(FACTORY_CALIBRATION, subindex, b"\0" * 4))
     assert FACTORY_CALIBRATION not in {row.index for row in BY_SETTING.values()}
+
+
+def test_every_path_to_a_sensor_that_writes_is_guarded() -> None:
+    """Whoever makes an `Sdo` of its own wraps it, or only identifies with it."""
+    root = Path(__file__).parents[2] / "ethercat_server"
+    for path in root.rglob("*.py"):
+        if path.name in ("coe.py", "guard.py") or path.is_relative_to(root / "simulation"):
+            continue
+        for made in re.findall(
+            r"^.*\b(?:MailboxSdo|BlockingSdo|_ServerSdo)\(.*$", path.read_text(), re.MULTILINE
+        ):
+            assert "GuardedSdo(" in made or "identify(" in made, f"{path}: {made}"

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from ethercat_server.known_objects import BY_ADDRESS, KNOWN_OBJECTS
-from ethercat_server.object_names import NOTE_NAMES, find_objects, full_name, similar_names
-from ethercat_server.objects import BY_SETTING, FACTORY_CALIBRATION, OBJECTS, Access, ObjectType
+from ethercat_server.sensor.dictionary import BY_SETTING, FACTORY_CALIBRATION, OBJECTS, Access, ObjectType
+from ethercat_server.sensor.dictionary_search import (
+    BY_ADDRESS,
+    KNOWN_OBJECTS,
+    NOTE_NAMES,
+    find_objects,
+    full_name,
+    similar_names,
+)
 from protocol.settings import SETTINGS
 
 TABLE_III_1 = (

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from ethercat_server.daemon.options import parse_options
+from ethercat_server.daemon.server_settings import SERVER_SETTINGS
 from ethercat_server.errors import UsageError
-from ethercat_server.options import parse_options
-from ethercat_server.server_settings import SERVER_SETTINGS
 
 
 def test_both_forms_of_the_command() -> None:
@@ -43,9 +43,9 @@ def test_defaults_are_the_notes() -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["ens5"], "IFACE"),
-        (["a", "b", "c", "d"], "4 arguments"),
-        (["ens5", "port"], "'port' is no number"),
+        (["ens5"], "PORT is missing: usage is ethercat-server IFACE"),
+        (["a", "b", "c", "d"], "unexpected argument 'd'"),
+        (["ens5", "port"], "'port' is not a number"),
         (["ens5", "0"], "port 0 is out of range"),
         (["ens5", "70000"], "port 70000 is out of range"),
         (["ens5", "1", "--set", "colour=red"], "no setting 'colour'"),
@@ -55,7 +55,7 @@ def test_defaults_are_the_notes() -> None:
         (["ens5", "1", "--set", "acceleration_range_g=3"], "one of 2, 4, 8, 16"),
         (["ens5", "1", "--set", "angular_rate_filter=2"], "from 3 to 9"),
         (["ens5", "1", "--set", "fast=true"], "fast is true but fir is false"),
-        (["ens5", "1", "--virtual", "--pdo 77"], "goes with the interface 'virtual'"),
+        (["ens5", "1", "--virtual", "--pdo 77"], "requires the interface 'virtual'"),
     ],
 )
 def test_wrong_arguments_are_refused_by_name(arguments: list[str], complaint: str) -> None:
@@ -81,8 +81,8 @@ def test_single_sensors_have_tables_by_place_serial_number_and_name(tmp_path: Pa
     )
     options = parse_options(["ens5", "1", "--config", str(file)])
 
-    def asked(place: int, name: str, serial: int) -> tuple[object, object]:
-        found = options.asked_settings(place, name, serial)
+    def asked(position: int, name: str, serial: int) -> tuple[object, object]:
+        found = options.asked_settings(position, name, serial)
         return found["sinc_length"], found.get("imu_active")
 
     assert asked(0, "BFT-SENS-ECAT-M8", 1) == (128, None)
@@ -96,7 +96,7 @@ def test_tables_that_contradict_one_another_for_one_sensor_are_named(tmp_path: P
     file.write_text("[sensor]\nfir = true\n[sensor.BFT-SENS-ECAT-M8]\nfir = false\n[sensor.0]\nfast = true\n")
     options = parse_options(["ens5", "1", "--config", str(file)])
     assert options.wanted_settings(0, "BFT-ROKS-ECAT-M8", 7)["fast"] is True
-    with pytest.raises(UsageError, match=r"sensor 0 .BFT-SENS-ECAT-M8 with serial 7. contradicts") as error:
+    with pytest.raises(UsageError, match=r"sensor 0 .BFT-SENS-ECAT-M8, serial 7. are inconsistent") as error:
         options.wanted_settings(0, "BFT-SENS-ECAT-M8", 7)
     assert str(error.value).endswith("correct one of [sensor], [sensor.BFT-SENS-ECAT-M8], [sensor.0]")
 
@@ -111,11 +111,11 @@ def test_tables_that_contradict_one_another_for_one_sensor_are_named(tmp_path: P
         ("[server]\ncolour = 1\n", "no 'colour'"),
         ("[server]\nrt_priority = 100\n", "from 0 to 99"),
         ("[server]\nrt_priority = true\n", "a number"),
-        ("[server]\ncontrol_users = 'anna'\n", "a list of texts"),
+        ("[server]\ncontrol_users = 'anna'\n", "a list of strings"),
         ("[server]\nhosts = ['localhost']\n", "an IP address"),
         ("[server]\nidle_timeout_s = 0\n", "seconds"),
         ("sensor = 3\n", "unexpected 'sensor'"),
-        ('[sensor."serial:x"]\nfir = true\n', "named by a place"),
+        ('[sensor."serial:x"]\nfir = true\n', "named by a position"),
         ("[sensor.0]\nfast = true\n", "fast is true but fir is false"),
         ("[sensor\n", "not valid TOML"),
     ],

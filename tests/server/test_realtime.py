@@ -12,7 +12,7 @@ import pytest
 
 PROBE = """
 import gc, json, logging, os, sys
-from ethercat_server import realtime
+from ethercat_server.process import realtime
 logging.basicConfig(format="%(message)s", stream=sys.stderr)
 realtime.prepare({priority}, {cpu})
 locked = next(l for l in open("/proc/self/status") if l.startswith("VmLck")).split()[1]
@@ -62,3 +62,27 @@ def test_ordinary_scheduling_is_a_choice() -> None:
     (scheduler, *_), said = probe(0, None)
     assert scheduler == os.SCHED_OTHER
     assert not said
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root to be granted real-time scheduling")
+def test_a_thread_can_leave_what_it_inherits() -> None:
+    script = (
+        PROBE.format(priority=40, cpu=min(os.sched_getaffinity(0)))
+        + """
+import threading
+def other():
+    realtime.leave()
+    found.append([os.sched_getscheduler(0), sorted(os.sched_getaffinity(0))])
+found = []
+thread = threading.Thread(target=other)
+thread.start()
+thread.join()
+print(json.dumps([*found[0], os.sched_getscheduler(0), len(os.sched_getaffinity(0))]))
+"""
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    if done.stderr:
+        pytest.skip(f"this machine does not grant root everything: {done.stderr.strip()}")
+    scheduler, cpus, own_scheduler, own_cpus = json.loads(done.stdout.splitlines()[-1])
+    assert (scheduler, cpus) == (os.SCHED_OTHER, sorted(os.sched_getaffinity(0)))
+    assert (own_scheduler, own_cpus) == (os.SCHED_FIFO, 1), "the loop keeps its own"

@@ -12,10 +12,8 @@ from collections.abc import Iterator
 import pytest
 
 from protocol.errors import ConnectionFailedError
-from tests.server.commands import command
-from tests.server.running import Client, Server, needs_bus, server, virtual_sensor, wait_until
-
-pytestmark = [pytest.mark.bus, needs_bus]
+from tests.server.bench import Bench
+from tests.server.running import Client, Server, needs_bus, virtual_sensor, wait_until
 
 
 class Persistent:
@@ -55,6 +53,8 @@ def ifname(request: pytest.FixtureRequest) -> Iterator[str]:
         yield veth.near
 
 
+@pytest.mark.bus
+@needs_bus
 def test_killed_and_started_again_on_the_same_port(ifname: str) -> None:
     with contextlib.ExitStack() as stack:
         running = Server(ifname)
@@ -80,6 +80,8 @@ def test_killed_and_started_again_on_the_same_port(ifname: str) -> None:
         assert running.wait() == 0
 
 
+@pytest.mark.bus
+@needs_bus
 def test_connections_that_the_killed_one_left_do_not_hold_the_port() -> None:
     with contextlib.ExitStack() as stack:
         running = Server("virtual")
@@ -99,16 +101,17 @@ def test_connections_that_the_killed_one_left_do_not_hold_the_port() -> None:
             assert len(client.ask("status")["clients"]) == 1
 
 
-def test_a_tare_that_was_not_saved_outlives_the_server_and_then_a_power_cut() -> None:
-    with virtual_sensor("--signal", "rest") as (veth, sensor):
-        with server(veth.near) as running, running.connect() as client:
-            client.ask("subscribe")
-            tared = client.ask("tare", samples=20, target=[5.0, 0, 0, 0, 0, 0])
-            assert tared["ok"], tared
-        with server(veth.near) as running, running.connect() as client:
-            assert "sensor 0 has a tare in force (saved or not): Fx offset" in running.said()
-            client.ask("subscribe")
-            command(sensor, "power cycle 0.3")
-            client.wait_event("sensor_back")
-            held = client.ask("sdo_read", index=0x8000, subindex=1, type="f32")["value"]
-            assert held == pytest.approx(tared["new_offset"][0])
+def test_a_tare_that_was_not_saved_outlives_the_server_and_then_a_power_cut(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
+    bench = Bench()
+    tared = bench.asking.ask("tare", samples=20, target=[5.0, 0, 0, 0, 0, 0])
+    assert tared["ok"], tared
+    caplog.clear()
+    bench = bench.start_again()
+    assert "sensor 0 has a tare in force (saved or not): Fx offset" in caplog.text
+    bench.command("power cycle 0.3")
+    bench.wait_event("sensor_back")
+    held = bench.asking.ask("sdo_read", index=0x8000, subindex=1, type="f32")["value"]
+    assert held == pytest.approx(tared["new_offset"][0])

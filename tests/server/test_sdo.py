@@ -7,9 +7,11 @@ from typing import cast
 
 import pytest
 
-from ethercat_server.bus import Bus
 from ethercat_server.errors import SdoAbortError
-from ethercat_server.sdo import SM_READ_STATUS, CyclicSdo, Steps, T, finish
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK
+from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, T, finish
+from ethercat_server.ethercat.slave.registers import MAILBOX_IN_STATUS
 
 MAILBOXES = ((0x1000, 128), (0x1080, 128))
 READ, WRITTEN, ABORTED = 0x43, 0x60, 0x80
@@ -18,12 +20,14 @@ READ, WRITTEN, ABORTED = 0x43, 0x60, 0x80
 class GivenBus:
     """A sensor that puts these answers into its mailbox once it is asked: command, index, data."""
 
+    clock = SYSTEM_CLOCK
+
     def __init__(self, *answers: tuple[int, int, bytes]) -> None:
         self.answers = list(answers)
         self.asked = 0
 
     def read_register(self, slave: int, address: int, size: int) -> bytes:
-        if address == SM_READ_STATUS:
+        if address == MAILBOX_IN_STATUS:
             return bytes([0x08 if self.asked and self.answers else 0])
         command, index, data = self.answers.pop(0)
         service = 2 if command == ABORTED else 3
@@ -42,8 +46,8 @@ def run(bus: GivenBus, steps: Steps[T]) -> T:
     return done
 
 
-def mailbox(bus: GivenBus) -> CyclicSdo:
-    return CyclicSdo(cast(Bus, bus), 0, MAILBOXES)
+def mailbox(bus: GivenBus) -> MailboxSdo:
+    return MailboxSdo(cast(Bus, bus), 0, MAILBOXES)
 
 
 def test_a_read_leaves_the_late_answer_to_a_repeated_write_alone() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 import socket
 import subprocess
@@ -15,15 +14,15 @@ from typing import Any
 
 import pytest
 
-from protocol.bare_json import encode_bare_json
 from protocol.control import ACTIONS, request
-from tests.server.as_another_user import NOBODY
+from protocol.text.bare_json import encode_bare_json
+from tests.server.as_another_user import NO_OTHER_USER, NOBODY
 from tests.server.running import Server, Veth, free_port, needs_bus, server, wait_until
 
 pytestmark = [
     pytest.mark.bus,
     needs_bus,
-    pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user"),
+    pytest.mark.skipif(NO_OTHER_USER is not None, reason=NO_OTHER_USER or ""),
 ]
 
 CONTROL: dict[str, dict[str, Any]] = {

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ethercat_server.notify import Notifier
+from ethercat_server.process.notify import Notifier
 from tests.server.commands import command
 from tests.server.running import Server, needs_bus, server, virtual_sensor, wait_until
 
@@ -98,16 +98,16 @@ def test_sighup_puts_in_force_what_can_be_and_names_the_rest(tmp_path: Path) -> 
     file.write_text("[server]\n")
     with server("virtual", "--config", str(file)) as running, running.connect() as client:
         client.ask("subscribe")
-        reload(running, "configuration read again: [server]: nothing new")
+        reload(running, "configuration reloaded: [server]: no changes")
         file.write_text("[server]\nidle_timeout_s = 0.2\nrt_priority = 3\n[sensor]\nfir = true\n")
         with running.connect() as idle:
             reload(running, "changed idle_timeout_s")
-            assert "a change of [server] rt_priority takes effect at the next start" in running.said()
-            wait_until(lambda: "sensor 0 now has fir = True" in running.said(), "the sensor's setting")
-            wait_until(lambda: "it has asked nothing for 0.2 s" in running.said(), "the idle client closed")
+            assert "a change of [server] rt_priority requires a restart" in running.said()
+            wait_until(lambda: "sensor 0: applied fir = True" in running.said(), "the sensor's setting")
+            wait_until(lambda: "has sent no request for 0.2 s" in running.said(), "the idle client closed")
             idle.receive_all()
         file.write_text("[server]\ncontrol_users = ['no-such-user']\n")
-        reload(running, "the configuration stays as it was")
+        reload(running, "reload failed, the configuration is unchanged")
         assert "no-such-user: there is no such user" in running.said()
         file.write_text("[server\n")
         reload(running, "not valid TOML")
@@ -124,7 +124,7 @@ def test_sighup_refuses_tables_that_contradict_one_another_and_the_stream_goes_o
             "[server]\nidle_timeout_s = 5\n[sensor]\nfir = true\nimu_active = 3\n"
             "[sensor.BFT-SENS-ECAT-M8]\nfir = false\n[sensor.0]\nfast = true\n"
         )
-        reload(running, "the configuration stays as it was: what is asked of sensor 0")
+        reload(running, "reload failed, the configuration is unchanged: the settings for sensor 0")
         assert "Traceback" not in running.said()
         assert len(client.fresh(400)) == 400
         assert client.ask("describe")["sensors"][0]["settings"]["imu_active"] == 1, (
@@ -141,17 +141,17 @@ def test_sighup_tries_again_what_could_not_be_put_in_force(tmp_path: Path) -> No
         command(sensor, "power off")
         running.wait_for("is lost")
         file.write_text("[sensor]\nsinc_length = 128\n")
-        reload(running, "sensor 0 does not have sinc_length = 128, which the next reload tries again")
+        reload(running, "sensor 0: could not apply sinc_length = 128, the next reload tries again")
         file.write_text("[sensor]\nsinc_length = 256\nfir = true\n")
-        reload(running, "sensor 0 does not have sinc_length = 256, fir = True, which")
+        reload(running, "sensor 0: could not apply sinc_length = 256, fir = True, the")
         command(sensor, "power on")
         running.wait_for("is back")
-        reload(running, "sensor 0 now has sinc_length = 256, fir = True")
+        reload(running, "sensor 0: applied sinc_length = 256, fir = True")
         with running.connect() as client:
             found = client.ask("describe")["sensors"][0]
             assert (found["rate_hz"], found["settings"]["fir"]) == (200, True)
         file.write_text("[sensor]\nsinc_length = 256\n")
-        reload(running, "sensor 0 now has fir = False\n")
+        reload(running, "sensor 0: applied fir = False\n")
 
 
 def test_sighup_tells_of_a_table_that_no_sensor_has_and_puts_the_rest_in_force(tmp_path: Path) -> None:
@@ -159,5 +159,5 @@ def test_sighup_tells_of_a_table_that_no_sensor_has_and_puts_the_rest_in_force(t
     file.write_text("[server]\n")
     with server("virtual", "--config", str(file)) as running:
         file.write_text("[sensor]\nimu_active = 3\n[sensor.4]\nfir = true\n[sensor.5]\nfir = true\n")
-        reload(running, "sensor 0 now has imu_active = 3")
+        reload(running, "sensor 0: applied imu_active = 3")
         assert "settings for sensor 4, 5, but the bus has only 0: BFT-SENS-ECAT-M8" in running.said()

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import time
-
-from ethercat_server.stream import DISCARDED_AT_START, GAP, INVALID, REPEATED, SensorStream
+from ethercat_server.acquisition.stream import DISCARDED_AT_START, GAP, INVALID, REPEATED, SensorStream
+from ethercat_server.simulation.machine import Machine, SimulatedClock
 from protocol.framing import DataMessage, FrameDecoder
 
 PERIOD_NS = 1_250_000
-START_NS = time.monotonic_ns() + 3600 * 10**9
-"""Of the simulated clock: after the streams were made, which read the real one."""
 
 
 class Feeder:
     """Feeds a stream exchanges on a simulated clock and decodes what comes out."""
 
     def __init__(self) -> None:
-        self.stream = SensorStream(0, PERIOD_NS)
-        self.now = START_NS
+        clock = SimulatedClock(Machine())
+        self.stream = SensorStream(0, PERIOD_NS, clock)
+        self.now = clock.now_ns
         self.sample = 0
-        self.prepares = True
 
     def exchange(
         self, *, new: bool, valid: bool = True, after_ns: int = PERIOD_NS // 4, took_ns: int = 50_000
@@ -27,8 +24,6 @@ class Feeder:
         self.now += after_ns
         self.sample += new
         data = self.sample.to_bytes(61, "little")
-        if self.prepares:
-            self.stream.prepare(self.now - took_ns, 3)
         made = self.stream.take(data, 3 if valid else -1, valid, self.now - took_ns, self.now)
         self.stream.learn()
         if made is None:
@@ -72,35 +67,6 @@ def test_what_an_exchange_brought_that_was_held_up_is_not_dated_from_its_end() -
         if feeder.stream.clock.locked:
             return
     raise AssertionError("it never locked")
-
-
-def test_a_frame_prepared_on_the_way_is_the_one_that_is_made_afterwards() -> None:
-    prepared, made = Feeder().start(), Feeder().start()
-    made.prepares = False
-    used = 0
-    for turn in range(600):
-        # Some samples are lost, some exchanges are not valid, and now and then the sensor is silent.
-        lost, valid, silent = turn % 97 == 96, turn % 61 < 57, 300 <= turn < 310
-        pair = []
-        for feeder in (prepared, made):
-            feeder.exchange(new=False, valid=valid, after_ns=100_000)
-            feeder.sample += lost
-            pair.append(feeder.exchange(new=not silent, valid=valid, after_ns=PERIOD_NS - 100_000))
-        one, other = pair
-        assert (one is None) == (other is None)
-        if one is not None and other is not None:
-            assert one._replace(stamp_ns=0, monotonic_ns=0) == other._replace(stamp_ns=0, monotonic_ns=0)
-            assert abs(one.monotonic_ns - other.monotonic_ns) <= 2, "rounded"
-            assert abs((one.stamp_ns - one.monotonic_ns) - (other.stamp_ns - other.monotonic_ns)) < 10**9
-        used += prepared.stream.clock.locked and prepared.stream.frame_was_prepared
-        assert not made.stream.frame_was_prepared
-    assert used > 300
-    counted = [
-        {name: stream.status()[name] for name in ("fresh", "repeated", "invalid", "lost_samples")}
-        for stream in (prepared.stream, made.stream)
-    ]
-    assert counted[0] == counted[1]
-    assert all(counted[0].values()), counted[0]
 
 
 def test_silence_shows_as_repeated_frames_once_a_period() -> None:

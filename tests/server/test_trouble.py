@@ -76,7 +76,7 @@ def test_not_allowed_names_the_capabilities() -> None:
 
     with Veth() as veth:
         done = subprocess.run(
-            [sys.executable, "-m", "ethercat_server.cli", veth.near, str(free_port())],
+            [sys.executable, "-m", "ethercat_server.daemon.cli", veth.near, str(free_port())],
             preexec_fn=drop, capture_output=True, text=True, check=False, timeout=60,
         )  # fmt: skip
     assert done.returncode == 1
@@ -86,13 +86,13 @@ def test_not_allowed_names_the_capabilities() -> None:
 
 def test_a_virtual_bus_without_rights_is_a_sentence() -> None:
     done = subprocess.run(
-        ["setpriv", "--bounding-set", "-net_admin,-net_raw", sys.executable, "-m", "ethercat_server.cli",
-         "virtual", str(free_port())],
+        ["setpriv", "--bounding-set", "-net_admin,-net_raw",
+         sys.executable, "-m", "ethercat_server.daemon.cli", "virtual", str(free_port())],
         capture_output=True, text=True, check=False, timeout=60,
     )  # fmt: skip
     assert done.returncode == 1
     first, last = done.stderr.splitlines()
-    assert first.startswith("ethercat-virtual-sensor: a veth pair cannot be made here: ")
+    assert first.startswith("ethercat-virtual-sensor: cannot create a veth pair: ")
     assert last.endswith("it needs root, or CAP_NET_ADMIN and CAP_NET_RAW")
 
 
@@ -107,9 +107,9 @@ def test_another_model_is_refused_by_name() -> None:
         (
             "vendor",
             (),
-            "place 0 of .* is 'BFT-SENS-ECAT-M8' .vendor 0x0000DEAD, .* not a Bota",
+            "position 0 of .* is 'BFT-SENS-ECAT-M8' .vendor 0x0000DEAD, .* not a Bota",
         ),
-        ("latin foreign", (), "place 0 of .* is 'nameless' .vendor 0x0000DEAD"),
+        ("latin foreign", (), "position 0 of .* is 'nameless' .vendor 0x0000DEAD"),
         ("product", (), "vendor 0x0000B07A, product 0x00000007"),
         (
             "size",
@@ -149,7 +149,7 @@ def test_an_eeprom_that_cannot_be_read(how: str) -> None:
     with virtual_sensor() as (veth, sensor):
         command(sensor, f"sii {how}")
         said = fails(veth.near)
-        assert re.search(r"the SII .EEPROM. of the slave at place 0 of .* cannot be read", said)
+        assert re.search(r"the SII .EEPROM. of the slave at position 0 of .* cannot be read", said)
         command(sensor, "sii ok")
         running = Server(veth.near)
         try:
@@ -175,11 +175,11 @@ def test_port_taken() -> None:
         other.listen()
         port = other.getsockname()[1]
         done = subprocess.run(
-            [sys.executable, "-m", "ethercat_server.cli", "virtual", str(port)],
+            [sys.executable, "-m", "ethercat_server.daemon.cli", "virtual", str(port)],
             capture_output=True, text=True, check=False, timeout=60,
         )  # fmt: skip
         assert done.returncode == 1
-        assert f"port {port} on 127.0.0.1 is taken" in done.stderr
+        assert f"port {port} on 127.0.0.1 is in use by another program" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_settings_for_a_sensor_that_is_not_switched_on_yet(tmp_path_factory: pyt
         command(sensor, "power off @1")
         said = fails(veth.near, "--config", str(config), code=1)  # with 2 the service would stay as it is
         assert "settings for sensor 1, but the bus has only 0: BFT-SENS-ECAT-M8" in said
-        assert said.endswith("switch that sensor on, or correct the table's name")
+        assert said.endswith("connect that sensor, or correct the name of the table")
         command(sensor, "power on @1")
         running = Server(veth.near, "--config", str(config))
         try:
@@ -216,7 +216,7 @@ def test_tables_that_contradict_one_another(tmp_path_factory: pytest.TempPathFac
     config.write_text(
         "[sensor]\nfir = true\n[sensor.BFT-SENS-ECAT-M8]\nfir = false\n[sensor.0]\nfast = true\n"
     )
-    assert "contradicts itself: fast is true but fir is false" in fails(
+    assert "are inconsistent: fast is true but fir is false" in fails(
         "virtual", "--config", str(config), code=2
     )
 
@@ -254,7 +254,7 @@ def test_stopped_while_a_sensor_does_not_change_its_state(way: str) -> None:
             sensor.wait_for("ignored")
             running.signal(15)
             assert running.wait() == 0, "it does not wait until the sensor has had its time and is blamed"
-            assert running.said().endswith("stopped before it was up\n")
+            assert running.said().endswith("stopped during start-up\n")
         finally:
             running.close()
 

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import struct
-import time
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from ethercat_server import ladder
-from ethercat_server.al import AL_STATUS, AlState
-from ethercat_server.bus import Bus
+from ethercat_server.acquisition.ladder import Ladder
+from ethercat_server.acquisition.recovery import Recovery
+from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError
-from ethercat_server.ladder import Ladder
-from ethercat_server.recovery import Recovery
-from ethercat_server.sdo import finish
-from ethercat_server.sensor import Sensor
-from ethercat_server.stream import SensorStream
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.slave.coe import finish
+from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
+from ethercat_server.simulation.machine import Machine, SimulatedClock
 
 MS = 1_000_000
 _ERROR_BIT = 0x10
@@ -26,10 +26,13 @@ _ERROR_BIT = 0x10
 class GivenBus:
     """Two sensors in the AL states given; None does not answer."""
 
-    ifname, ifindex = "lo", 1
-    reclaimed = False
+    backend = SimpleNamespace(check_present=lambda: None)
+    stations = (1, 2)
+    fmmus = (b"", b"")
 
     def __init__(self) -> None:
+        self.clock = SimulatedClock(Machine())
+        self.looked_for = False
         self.states: list[AlState | None] = [AlState.OP, AlState.OP]
         self.error = 0
         """AL status code of all, with the error bit if there is one."""
@@ -37,31 +40,40 @@ class GivenBus:
         self.lose = 0
         """So many datagrams more are lost."""
 
-    def read_register(self, place: int, address: int, size: int) -> bytes | None:
-        if address != AL_STATUS:
+    def read_register(self, position: int, address: int, size: int) -> bytes | None:
+        if address != reg.AL_STATUS:
             return bytes(size)
         self.read += 1
         if self.lose:
             self.lose -= 1
             return None
-        state = self.states[place]
+        state = self.states[position]
         if state is None:
             return None
         return struct.pack("<HHH", state | (_ERROR_BIT if self.error else 0), 0, self.error)
 
-    def write_register(self, place: int, address: int, data: bytes) -> bool:
+    def write_register(self, position: int, address: int, data: bytes) -> bool:
         self.written += 1
-        return self.states[place] is not None
+        return self.states[position] is not None
 
-    def working_counter(self, place: int) -> int:
+    def working_counter(self, position: int) -> int:
         return 3
 
-    def reclaim(self, place: int) -> bool:
-        self.reclaimed = True
-        return False
+    def read_surely(self, position: int, address: int, size: int) -> bytes:
+        return b"\2\4" if address == reg.FMMU_AND_SM_COUNT else bytes(size)
+
+    def read_at(self, position: int, address: int, size: int) -> bytes | None:
+        self.looked_for = True
+        return None
 
     def be_patient(self, patient: bool) -> None:
         pass
+
+
+def a_sensor(position: int) -> Sensor:
+    sensor = Sensor(position, Identity("a sensor", position, "", ""), {})
+    sensor.enter(SensorState.STREAMING)
+    return sensor
 
 
 class Watched:
@@ -70,15 +82,14 @@ class Watched:
     def __init__(self) -> None:
         self.bus = GivenBus()
         self.told: list[dict[str, Any]] = []
-        sensors = [SimpleNamespace(place=n, identity="a sensor", state="OP") for n in range(2)]
-        self.streams = [SimpleNamespace(alive=True) for _ in range(2)]
+        self.sensors = [a_sensor(position) for position in range(2)]
         self.recovery = Recovery(
             cast(Bus, self.bus),
-            cast(list[Sensor], sensors),
-            cast(list[SensorStream], self.streams),
+            self.sensors,
+            cast(list[SensorStream], [None, None]),
             self.told.append,
         )
-        self.now = time.monotonic_ns()
+        self.now = self.bus.clock.now_ns
 
     def exchange(self, wkc: int, count: int = 1, after_ms: int = 1) -> None:
         for _ in range(count):
@@ -98,7 +109,7 @@ def test_one_that_dies_while_another_is_out_and_counted_is_lost_too() -> None:
     watched.bus.states[1] = None
     watched.exchange(3, 300)
     assert watched.lost()[1:] == [(1, "it does not answer")]
-    assert not watched.streams[1].alive
+    assert watched.sensors[1].state is SensorState.LOST
 
 
 def test_one_that_leaves_op_while_another_is_out_is_lost_too() -> None:
@@ -130,33 +141,31 @@ def test_at_a_low_rate_too_one_lost_frame_is_no_lost_sensor() -> None:
         watched.exchange(-1, after_ms=80)
     assert watched.lost() == []
     watched.exchange(-1, after_ms=40)
-    assert [place for place, _ in watched.lost()] == [0, 1]
+    assert [position for position, _ in watched.lost()] == [0, 1]
 
 
-def test_a_refused_sensor_is_not_set_up_again_because_of_a_lost_datagram(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(ladder, "_REFUSED_PAUSE_S", 0.001)
+def test_a_refused_sensor_is_not_set_up_again_because_of_a_lost_datagram() -> None:
     bus = GivenBus()
     bus.states[0] = AlState.INIT
-    waiting = Ladder(cast(Bus, bus), cast(Sensor, SimpleNamespace(place=0))).wait_for_removal()
+    waiting = Ladder(cast(Bus, bus), a_sensor(0)).wait_for_removal()
     for reads in range(10, 100, 10):
         bus.lose = 1
         while bus.read < reads:
             next(waiting)
+            bus.clock.sleep(0.001)
     assert not bus.written
     bus.states[0] = None
-    while not bus.reclaimed:
+    while not bus.looked_for:
         next(waiting)
+        bus.clock.sleep(0.001)
 
 
-def test_a_sensor_that_keeps_its_error_is_not_asked_for_op(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(ladder, "_STATE_TIMEOUT_S", 0.01)
+def test_a_sensor_that_keeps_its_error_is_not_asked_for_op() -> None:
     bus = GivenBus()
     bus.states[0], bus.error = AlState.SAFEOP, 0x001B
-    climbing = Ladder(cast(Bus, bus), cast(Sensor, SimpleNamespace(place=0)))._go(AlState.OP)
-    with pytest.raises(BusError, match="sensor 0 keeps its error when that is acknowledged: it is in SAFEOP"):
-        finish(climbing, pause_s=0.001)
+    climbing = Ladder(cast(Bus, bus), a_sensor(0))._go(AlState.OP)
+    with pytest.raises(
+        BusError, match="sensor 0 keeps its error although it was acknowledged: it is in SAFEOP"
+    ):
+        finish(climbing, clock=bus.clock)
     assert bus.written == 1

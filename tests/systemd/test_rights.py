@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 
 from protocol.framing import DataFlag
+from tests.server import readable
 from tests.server.running import Server, needs_bus, virtual_sensor
-from tests.systemd.confined import NOBODY, readable_for_all, with_capabilities
+from tests.systemd.confined import NOBODY, with_capabilities
 from tests.systemd.staging import CAPABILITIES, SERVER_UNIT, values
 
 pytestmark = [pytest.mark.bus, needs_bus]
@@ -19,14 +20,11 @@ pytestmark = [pytest.mark.bus, needs_bus]
 BITS = {"CAP_NET_ADMIN": 12, "CAP_NET_RAW": 13, "CAP_IPC_LOCK": 14, "CAP_SYS_NICE": 23}
 
 
-@pytest.fixture
-def stage(tmp_path: Path) -> Path:
-    """Where directories are mounted; skips where the server cannot be started as another user at all."""
-    command = [*readable_for_all(tmp_path / "try"), *with_capabilities(CAPABILITIES), "true"]
-    tried = subprocess.run(command, check=False, capture_output=True, text=True)
-    if tried.returncode:
-        pytest.skip(f"nothing can be started as another user here: {tried.stderr.strip()}")
-    return tmp_path / "stage"
+def confined(ifname: str, capabilities: Iterable[str]) -> Server:
+    """The server with no more than `capabilities`; skips where it cannot be started like this at all."""
+    readable.need(*with_capabilities(CAPABILITIES))
+    under = [*readable.under(), *with_capabilities(capabilities)]
+    return Server(ifname, under=under, python=readable.PYTHON)
 
 
 def of_process(pid: int) -> dict[str, str]:
@@ -34,13 +32,12 @@ def of_process(pid: int) -> dict[str, str]:
     return {key: value.strip() for key, _, value in (line.partition(":") for line in lines)}
 
 
-def test_the_units_capabilities_are_enough_for_everything(stage: Path) -> None:
+def test_the_units_capabilities_are_enough_for_everything() -> None:
     (ambient,) = values(SERVER_UNIT, "AmbientCapabilities")
     given = ambient.split()
     expected = sum(1 << BITS[name] for name in given)
-    under = [*readable_for_all(stage), *with_capabilities(given)]
     with virtual_sensor() as (veth, _):
-        server = Server(veth.near, under=under)
+        server = confined(veth.near, given)
         try:
             server.wait_streaming()
             process = of_process(server.process.pid)
@@ -72,10 +69,10 @@ def test_the_units_capabilities_are_enough_for_everything(stage: Path) -> None:
         ("CAP_IPC_LOCK", "not granted: locked memory (CAP_IPC_LOCK); ", 0),
     ],
 )
-def test_none_of_them_can_be_done_without(stage: Path, missing: str, complaint: str, exit_code: int) -> None:
+def test_none_of_them_can_be_done_without(missing: str, complaint: str, exit_code: int) -> None:
     rest = [name for name in CAPABILITIES if name != missing]
     with virtual_sensor() as (veth, _):
-        server = Server(veth.near, under=[*readable_for_all(stage), *with_capabilities(rest)])
+        server = confined(veth.near, rest)
         try:
             if exit_code == 0:
                 server.wait_streaming()

@@ -1,7 +1,7 @@
 """The server as a real service of a running systemd, under everything that its unit forbids.
 
-A copy of the unit goes into /run/systemd/system for the time of a test. It starts the server of this checkout
-as nobody. The checkout is shown to it, wherever it is; nothing else is different.
+A copy of the unit goes into /run/systemd/system for the time of a test. It starts a copy of this server as
+nobody. The copy and Python are shown to it, wherever they are; nothing else is different.
 """
 
 from __future__ import annotations
@@ -10,15 +10,14 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.server import readable
 from tests.server.running import Client, Veth, free_port, needs_bus, virtual_sensor, wait_until
-from tests.systemd.confined import needed
-from tests.systemd.staging import ROOT, SERVER_UNIT
+from tests.systemd.staging import SERVER_UNIT
 
 pytestmark = [
     pytest.mark.bus,
@@ -53,17 +52,19 @@ def service(veth: Veth, config: str = "", *, starts: bool = True) -> Iterator[Se
     template = f"ethercat-test-{os.getpid()}"
     running = Service(template, veth.near, free_port())
     text = SERVER_UNIT.read_text()
-    program = f"{sys.executable} -m ethercat_server.cli"
+    program = f"{readable.PYTHON} -m ethercat_server.daemon.cli"
     text = text.replace("/opt/ethercat-server/bin/ethercat-server", program)
     # ProtectHome=yes shows nothing below home directories, not even what is bound there.
     text = text.replace("ProtectHome=yes", "ProtectHome=tmpfs").replace("User=ethercat", f"User={USER}")
     text = text.replace("Group=ethercat\n", "")
     unit, settings = RUNTIME / f"{template}@.service", RUNTIME / f"{template}.toml"
     settings.write_text(config)
-    shown = " ".join(str(path) for path in needed() if not path.is_relative_to("/usr"))
+    shown = " ".join(
+        str(path) for path in (readable.python_prefix(), readable.copy()) if not path.is_relative_to("/usr")
+    )
     drop_in = f"""
 [Service]
-Environment=PORT={running.port} CONFIG={settings} PYTHONPATH={ROOT} PYTHONDONTWRITEBYTECODE=1
+Environment=PORT={running.port} CONFIG={settings} PYTHONPATH={readable.copy()} PYTHONDONTWRITEBYTECODE=1
 BindReadOnlyPaths={shown}
 """
     unit.write_text(text + drop_in)

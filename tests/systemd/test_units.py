@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from ethercat_server.config_file import EMPTY, read_config
-from ethercat_server.options import parse_options
-from ethercat_server.server_settings import SERVER_SETTINGS
+from ethercat_server.daemon.config_file import EMPTY, read_config
+from ethercat_server.daemon.options import parse_options
+from ethercat_server.daemon.server_settings import SERVER_SETTINGS
 from protocol.settings import check_settings, start_up_defaults
 from tests.systemd.staging import (
     BRIDGE_UNIT,

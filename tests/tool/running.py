@@ -1,8 +1,9 @@
-"""Runs `ethercat-sensor` as a process."""
+"""Runs `ethercat-sensor`, in this process or as one of its own."""
 
 from __future__ import annotations
 
-from tests.ended import Result, run
+from ethercat_server.tool.cli import main
+from tests.ended import Result, run, run_here
 
 MODULE = "ethercat_server.tool.cli"
 
@@ -13,11 +14,18 @@ _ATTEMPTS = 3
 
 
 def tool(*arguments: object, code: int | None = 0) -> Result:
-    """Run `ethercat-sensor arguments...`; it must end with `code` (None: any)."""
+    """Run `ethercat-sensor arguments...` as a process; it must end with `code` (None: any)."""
     for _ in range(_ATTEMPTS):
         result = run(MODULE, *arguments)
         if not any(words in result.err for words in _STARVED):
             break
+    assert code is None or result.code == code, result
+    return result
+
+
+def tool_here(*arguments: object, code: int | None = 0) -> Result:
+    """Run `ethercat-sensor arguments...` in this process, where no interface is opened."""
+    result = run_here(main, *arguments)
     assert code is None or result.code == code, result
     return result
 

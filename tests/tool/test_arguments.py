@@ -9,19 +9,23 @@ from pathlib import Path
 import pytest
 
 from ethercat_server.errors import ForbiddenWriteError
-from ethercat_server.objects import FACTORY_CALIBRATION
-from ethercat_server.sdo import Steps, finish
-from ethercat_server.tool.holder import find_holder
-from ethercat_server.tool.link import GuardedSdo, sinc_length_in_force
-from ethercat_server.tool.snapshot_file import RESTORABLE
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK
+from ethercat_server.ethercat.slave.coe import Steps, finish
+from ethercat_server.links.holder import find_holder
+from ethercat_server.links.link import sinc_length_in_force
+from ethercat_server.sensor.dictionary import FACTORY_CALIBRATION
+from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.tool.commands.snapshot_file import RESTORABLE
 from tests.server.running import needs_bus
-from tests.tool.running import one_sentence, tool
+from tests.tool.running import one_sentence, tool_here
 
 ROOT = Path(__file__).parent.parent.parent
 
 
 class Recorder:
     """An `Sdo` that remembers what was written."""
+
+    clock = SYSTEM_CLOCK
 
     def __init__(self) -> None:
         self.written: list[tuple[int, int, bytes]] = []
@@ -48,7 +52,7 @@ def test_the_guard_lets_no_write_of_the_factory_calibration_through() -> None:
 
 
 def test_all_that_can_write_is_behind_the_guard() -> None:
-    unguarded = {"BlockingSdo", "CyclicSdo", "_ServerSdo", "sdo"}
+    unguarded = {"BlockingSdo", "MailboxSdo", "_ServerSdo", "sdo"}
     for path in (ROOT / "ethercat_server" / "tool").glob("*.py"):
         tree = ast.parse(path.read_text())
         inside = {
@@ -95,7 +99,7 @@ def test_the_rate_decides_which_sinc_length_is_in_force(
         (["objects", "ens5", "--server", "localhost:12001"], "either an interface"),
         (["objects", "--server", "localhost:port"], "HOST:PORT"),
         (["objects", "--server", "localhost:0"], "HOST:PORT"),
-        (["plan", "ens5"], "nothing is asked for"),
+        (["plan", "ens5"], "no settings given"),
         (["plan", "ens5", "--set", "sinc_length"], "NAME=VALUE"),
         (["apply", "ens5", "--set", "colour=1"], "no setting 'colour'"),
         (["apply", "ens5", "--set", "sinc_length=0"], "from 32 to 2048"),
@@ -114,7 +118,7 @@ def test_the_rate_decides_which_sinc_length_is_in_force(
     ],
 )
 def test_wrong_arguments_are_one_sentence_and_exit_code_2(arguments: list[str], named: str) -> None:
-    assert named in one_sentence(tool(*arguments, code=2))
+    assert named in one_sentence(tool_here(*arguments, code=2))
 
 
 @pytest.mark.parametrize(
@@ -122,12 +126,14 @@ def test_wrong_arguments_are_one_sentence_and_exit_code_2(arguments: list[str], 
     [[], ["colour"], ["objects", "--colour"], ["watch", "a", "b"], ["watch", "a", "--seconds", "-1"]],
 )
 def test_what_argparse_finds_is_exit_code_2(arguments: list[str]) -> None:
-    assert "usage: ethercat-sensor" in tool(*arguments, code=2).err
-    assert tool(*arguments, "--json", code=2).json["error"] in tool(*arguments, "--json", code=2).err
+    assert "usage: ethercat-sensor" in tool_here(*arguments, code=2).err
+    assert (
+        tool_here(*arguments, "--json", code=2).json["error"] in tool_here(*arguments, "--json", code=2).err
+    )
 
 
 def test_help_names_every_command_and_the_exit_codes() -> None:
-    shown = tool("--help").out
+    shown = tool_here("--help").out
     for name in (
         "adapters",
         "eeprom",
@@ -142,13 +148,13 @@ def test_help_names_every_command_and_the_exit_codes() -> None:
     ):
         assert f"\n  {name} " in shown
     assert "3 plan: there are changes" in shown
-    assert "--set NAME=VALUE" in tool("plan", "--help").out
+    assert "--set NAME=VALUE" in tool_here("plan", "--help").out
 
 
 @needs_bus
 @pytest.mark.parametrize("command", ["eeprom", "watch", "objects", "save", "tare"])
 def test_no_such_interface(command: str) -> None:
-    failed = tool(command, "nosuch0", "--json", code=1)
+    failed = tool_here(command, "nosuch0", "--json", code=1)
     assert "no network interface 'nosuch0'" in one_sentence(failed)
     assert "nosuch0" in json.loads(failed.out)["error"]
 
@@ -157,15 +163,15 @@ def test_no_such_interface(command: str) -> None:
     ("text", "named"),
     [
         ("{", "not valid JSON"),
-        ("[]", "no snapshot"),
-        ('{"format": "ethercat-sensor snapshot", "version": 2}', "no snapshot"),
+        ("[]", "not a snapshot"),
+        ('{"format": "ethercat-sensor snapshot", "version": 2}', "not a snapshot"),
         ('{"format": "ethercat-sensor snapshot", "version": 1}', "damaged"),
     ],
 )
 def test_a_file_that_is_no_snapshot(tmp_path: Path, text: str, named: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(text)
-    assert named in one_sentence(tool("restore", "ens5", path, code=2))
+    assert named in one_sentence(tool_here("restore", "ens5", path, code=2))
 
 
 def test_nobody_holds_an_interface_that_is_not_there() -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ethercat_server.objects import BY_SETTING
+from ethercat_server.sensor.dictionary import BY_SETTING
 from ethercat_server.tool.cli import COMMANDS
-from protocol.filters import FORCE_TORQUE_FILTERS
-from protocol.meaning import value_meaning
+from protocol.sensor.filters import FORCE_TORQUE_FILTERS
+from protocol.sensor.meaning import value_meaning
 from protocol.settings import SETTINGS
 
 DOCS = (Path(__file__).parent.parent.parent / "docs" / "sensor-tool.md").read_text()

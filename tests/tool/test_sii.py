@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ethercat_server.tool.sii import decode, raw_lines, read_image
-from ethercat_server.virtual_sensor.sii import build_image
+from ethercat_server.ethercat.slave.sii_content import decode, raw_lines, read_image
+from ethercat_server.virtual_sensor.esc.sii import build_image
 from protocol.control import MAX_SII_WORDS
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from ethercat_server.virtual_sensor import wire
+from ethercat_server.ethercat import wire
+from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
-from ethercat_server.virtual_sensor.wire import Command
 
 MAILBOX = 128
 INIT, PREOP, BOOT, SAFEOP, OP = 1, 2, 3, 4, 8
@@ -62,76 +62,76 @@ class RawMaster:
         assert answer is not None
         return answer[0]
 
-    def read(self, register: int, length: int, place: int = 0) -> bytes:
-        data, counter = self.one(Command.APRD, -place, register, bytes(length))
+    def read(self, register: int, length: int, position: int = 0) -> bytes:
+        data, counter = self.one(Command.APRD, -position, register, bytes(length))
         assert counter == 1
         return data
 
-    def read16(self, register: int, place: int = 0) -> int:
-        return int.from_bytes(self.read(register, 2, place), "little")
+    def read16(self, register: int, position: int = 0) -> int:
+        return int.from_bytes(self.read(register, 2, position), "little")
 
-    def write(self, register: int, data: bytes, place: int = 0) -> int:
-        return self.one(Command.APWR, -place, register, data)[1]
+    def write(self, register: int, data: bytes, position: int = 0) -> int:
+        return self.one(Command.APWR, -position, register, data)[1]
 
-    def request(self, state: int, place: int = 0) -> tuple[int, int]:
+    def request(self, state: int, position: int = 0) -> tuple[int, int]:
         """Ask for a state; returns AL status and AL status code."""
-        assert self.write(0x0120, struct.pack("<H", state), place) == 1
-        return self.read16(0x0130, place), self.read16(0x0134, place)
+        assert self.write(0x0120, struct.pack("<H", state), position) == 1
+        return self.read16(0x0130, position), self.read16(0x0134, position)
 
-    def set_up_mailbox(self, place: int = 0) -> None:
+    def set_up_mailbox(self, position: int = 0) -> None:
         managers = sync_manager(0x1000, MAILBOX, 0x26) + sync_manager(0x1080, MAILBOX, 0x22)
-        assert self.write(0x0800, managers, place) == 1
+        assert self.write(0x0800, managers, position) == 1
 
-    def set_up_process_data(self, place: int = 0, logical: int = 0) -> None:
+    def set_up_process_data(self, position: int = 0, logical: int = 0) -> None:
         managers = sync_manager(0x1100, 1, 0x64) + sync_manager(0x1180, self.pdo_size, 0x20)
-        assert self.write(0x0810, managers, place) == 1
+        assert self.write(0x0810, managers, position) == 1
         units = fmmu(logical, 1, 0x1100, 2) + fmmu(logical + 1, self.pdo_size, 0x1180, 1)
-        assert self.write(0x0600, units, place) == 1
+        assert self.write(0x0600, units, position) == 1
 
     def go(self, state: int) -> RawMaster:
         """Take every slave to `state`, the ordinary way."""
-        for place in range(self.count):
-            self.set_up_mailbox(place)
+        for position in range(self.count):
+            self.set_up_mailbox(position)
             steps = [s for s in (PREOP, SAFEOP, OP) if s <= state]
             for step in steps:
                 if step == SAFEOP:
-                    self.set_up_process_data(place, place * (self.pdo_size + 1))
-                assert self.request(step, place) == (step, 0)
+                    self.set_up_process_data(position, position * (self.pdo_size + 1))
+                assert self.request(step, position) == (step, 0)
         return self
 
     def cycle(self, output: int = 0) -> tuple[bytes, int]:
         """One LRW over all slaves: all data, working counter."""
         return self.one(Command.LRW, 0, 0, (bytes([output]) + bytes(self.pdo_size)) * self.count)
 
-    def inputs(self, place: int = 0) -> bytes:
+    def inputs(self, position: int = 0) -> bytes:
         data, _ = self.cycle()
-        start = place * (self.pdo_size + 1) + 1
+        start = position * (self.pdo_size + 1) + 1
         return data[start : start + self.pdo_size]
 
     # Mailbox.
 
-    def send_mailbox(self, kind: int, body: bytes, counter: int | None = None, place: int = 0) -> int:
+    def send_mailbox(self, kind: int, body: bytes, counter: int | None = None, position: int = 0) -> int:
         if counter is None:
             self.mailbox_counter = self.mailbox_counter % 7 + 1
             counter = self.mailbox_counter
         message = struct.pack("<HHBB", len(body), 0, 0, kind | counter << 4) + body
-        return self.write(0x1000, message.ljust(MAILBOX, b"\0"), place)
+        return self.write(0x1000, message.ljust(MAILBOX, b"\0"), position)
 
-    def mailbox_full(self, place: int = 0) -> bool:
-        return bool(self.read(0x080D, 1, place)[0] & 8)
+    def mailbox_full(self, position: int = 0) -> bool:
+        return bool(self.read(0x080D, 1, position)[0] & 8)
 
-    def fetch_mailbox(self, place: int = 0) -> tuple[int, bytes] | None:
+    def fetch_mailbox(self, position: int = 0) -> tuple[int, bytes] | None:
         """Type and body of the reply that waits; None if there is none."""
-        data, counter = self.one(Command.APRD, -place, 0x1080, bytes(MAILBOX))
+        data, counter = self.one(Command.APRD, -position, 0x1080, bytes(MAILBOX))
         if counter == 0:
             return None
         length, _, _, kind = struct.unpack_from("<HHBB", data)
         return kind & 0x0F, data[6 : 6 + length]
 
-    def coe(self, request: bytes, service: int = 2, place: int = 0) -> bytes:
+    def coe(self, request: bytes, service: int = 2, position: int = 0) -> bytes:
         """A CoE request and its reply, without the CoE header."""
-        assert self.send_mailbox(3, struct.pack("<H", service << 12) + request, place=place) == 1
-        reply = self.fetch_mailbox(place)
+        assert self.send_mailbox(3, struct.pack("<H", service << 12) + request, position=position) == 1
+        reply = self.fetch_mailbox(position)
         assert reply is not None
         kind, body = reply
         assert kind == 3
@@ -141,8 +141,8 @@ class RawMaster:
         assert body[1] >> 4 == (3 if service == 2 else 8)
         return body[2:]
 
-    def upload(self, index: int, subindex: int, place: int = 0) -> bytes:
-        reply = self.coe(struct.pack("<BHBI", 0x40, index, subindex, 0), place=place)
+    def upload(self, index: int, subindex: int, position: int = 0) -> bytes:
+        reply = self.coe(struct.pack("<BHBI", 0x40, index, subindex, 0), position=position)
         assert struct.unpack_from("<HB", reply, 1) == (index, subindex)
         if reply[0] & 2:
             return reply[4 : 8 - (reply[0] >> 2 & 3)]
@@ -150,13 +150,13 @@ class RawMaster:
         assert len(reply) == 8 + size
         return reply[8:]
 
-    def download(self, index: int, subindex: int, data: bytes, place: int = 0) -> None:
+    def download(self, index: int, subindex: int, data: bytes, position: int = 0) -> None:
         if 0 < len(data) <= 4:
             command = 0x23 | (4 - len(data)) << 2
             request = struct.pack("<BHB", command, index, subindex) + data.ljust(4, b"\0")
         else:
             request = struct.pack("<BHBI", 0x21, index, subindex, len(data)) + data
-        reply = self.coe(request, place=place)
+        reply = self.coe(request, position=position)
         assert reply[0] == 0x60
 
     def information(self, operation: int, body: bytes) -> list[bytes]:

@@ -61,6 +61,12 @@ def test_the_way_down_is_open_without_acknowledge() -> None:
     assert master.request(PREOP) == (PREOP, 0)
 
 
+def test_a_request_for_init_needs_no_acknowledge() -> None:
+    master = RawMaster()
+    assert master.request(SAFEOP) == (INIT | ERROR, 0x0011)
+    assert master.request(INIT) == (INIT, 0)
+
+
 def test_an_error_shows_in_the_working_counter() -> None:
     master = RawMaster().go(OP)
     master.bus.sensors[0].life.fail(SAFEOP, 0x001B)  # type: ignore[union-attr,arg-type]

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ethercat_server.virtual_sensor.faults import COMMANDS, QuitCommand, obey
+from ethercat_server.ethercat.wire import Command
+from ethercat_server.virtual_sensor.faults.table import COMMANDS, QuitCommand, obey
+from ethercat_server.virtual_sensor.measurement.signals import CONSTANT, decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import CONSTANT, decode_clock
-from ethercat_server.virtual_sensor.wire import Command
 from protocol.pdo import STANDARD_GRAVITY, Sample, SampleDecoder
-from protocol.warnings_register import WarningFlag
+from protocol.sensor.warnings_register import WarningFlag
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, Abort, RawMaster, chain
 
 PERIOD = 1_250_000
@@ -214,8 +214,8 @@ def test_swap() -> None:
     assert master.read16(0x0130, 1) == INIT
     master.set_up_mailbox(1)
     master.request(PREOP, 1)
-    assert master.upload(0x1008, 0, place=1).rstrip(b"\0") == b"BFT-MEDS-ECAT-M8"
-    assert master.upload(0x1018, 4, place=1) == struct.pack("<I", 4711)
+    assert master.upload(0x1008, 0, position=1).rstrip(b"\0") == b"BFT-MEDS-ECAT-M8"
+    assert master.upload(0x1018, 4, position=1) == struct.pack("<I", 4711)
     master.write(0x0502, struct.pack("<HI", 0x0100, 0x0E), 1)
     assert master.read(0x0508, 4, 1) == struct.pack("<I", 4711)
 
@@ -388,7 +388,7 @@ def test_bad_commands_are_answered_with_a_sentence(line: str) -> None:
 
 
 def test_the_exact_signal_takes_no_channel_faults() -> None:
-    assert "always exact" in obey(RawMaster(SensorOptions(signal="clock")).bus, "noise force.x 1")
+    assert "no channel faults" in obey(RawMaster(SensorOptions(signal="clock")).bus, "noise force.x 1")
 
 
 def test_commands_to_a_sensor_without_power() -> None:
@@ -408,9 +408,9 @@ def test_any_line_gets_one_line(line: str) -> None:
         assert "\n" not in answer
 
 
-def counters(master: RawMaster, place: int = 0) -> dict[str, tuple[int, int]]:
-    """What the controller at `place` has counted, at port 0 and at port 1."""
-    found = master.read(0x0300, 0x14, place)
+def counters(master: RawMaster, position: int = 0) -> dict[str, tuple[int, int]]:
+    """What the controller at `position` has counted, at port 0 and at port 1."""
+    found = master.read(0x0300, 0x14, position)
     assert not any(found[4:8] + found[10:16] + found[18:20]), "no ports 2 and 3, no other errors"
     return {
         "invalid": (found[0], found[2]),
@@ -437,7 +437,7 @@ def test_a_frame_damaged_on_its_way_back_has_done_its_work() -> None:
     master = RawMaster(*chain(3))
     do(master, "damage 1 1 @1")
     assert master.frame((Command.BWR, 0, 0x0F80, b"!")) is None
-    assert [master.read(0x0F80, 1, place) for place in range(3)] == [b"!"] * 3
+    assert [master.read(0x0F80, 1, position) for position in range(3)] == [b"!"] * 3
     assert counters(master, 0) == {**CLEAN, "forwarded": (0, 1)}
     assert counters(master, 1) == {**CLEAN, "invalid": (0, 1), "physical": (0, 1)}
     assert counters(master, 2) == CLEAN
@@ -447,7 +447,7 @@ def test_a_damaged_frame_reaches_only_those_before_the_damage() -> None:
     master = RawMaster(*chain(3))
     do(master, "damage 1 @1")
     assert master.frame((Command.BWR, 0, 0x0F80, b"!")) is None
-    assert [master.read(0x0F80, 1, place) for place in range(3)] == [b"!", b"\0", b"\0"]
+    assert [master.read(0x0F80, 1, position) for position in range(3)] == [b"!", b"\0", b"\0"]
 
 
 def test_a_link_that_flaps_is_counted_at_both_ends() -> None:

@@ -2,7 +2,7 @@
 
 import struct
 
-from ethercat_server.virtual_sensor.wire import Command
+from ethercat_server.ethercat.wire import Command
 from tests.virtual_sensor.raw_master import INIT, MAILBOX, PREOP, RawMaster
 
 READ_NAME = struct.pack("<HBHBI", 0x2000, 0x40, 0x1008, 0, 0)

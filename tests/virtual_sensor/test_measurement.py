@@ -6,9 +6,9 @@ import struct
 
 import pytest
 
-from ethercat_server.virtual_sensor import scene
-from ethercat_server.virtual_sensor.clock import SampleClock
-from ethercat_server.virtual_sensor.motion import (
+from ethercat_server.virtual_sensor.measurement import scene
+from ethercat_server.virtual_sensor.measurement.clock import SampleClock
+from ethercat_server.virtual_sensor.measurement.motion import (
     MOTIONS,
     MOVE_LENGTH,
     POSE_LENGTH,
@@ -20,10 +20,10 @@ from ethercat_server.virtual_sensor.motion import (
     Turning,
     to_sensor,
 )
+from ethercat_server.virtual_sensor.measurement.signals import CONSTANT, decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import CONSTANT, decode_clock
 from protocol.pdo import STANDARD_GRAVITY, SampleDecoder, encode
-from protocol.warnings_register import WarningFlag
+from protocol.sensor.warnings_register import WarningFlag
 from tests.virtual_sensor.raw_master import OP, PREOP, RawMaster
 
 PERIOD = 1_250_000  # 64 / 51200 s in ns

@@ -1,9 +1,11 @@
-"""Real pysoem over a veth pair takes the virtual sensor for a Bota sensor."""
+"""Real pysoem over a veth pair: SOEM's own start-up, SDO and SDO Information requests, and the raw socket.
+
+What does not depend on SOEM or the kernel is tested in memory, in the other files.
+"""
 
 from __future__ import annotations
 
 import functools
-import json
 import struct
 import subprocess
 import time
@@ -12,9 +14,9 @@ from typing import Any, TypeVar
 
 import pytest
 
-from ethercat_server.objects import Access
-from ethercat_server.virtual_sensor.dictionary import entries_of
-from ethercat_server.virtual_sensor.signals import decode_clock
+from ethercat_server.sensor.dictionary import Access
+from ethercat_server.virtual_sensor.firmware.dictionary import entries_of
+from ethercat_server.virtual_sensor.measurement.signals import decode_clock
 from protocol.pdo import encode
 from tests.virtual_sensor.conftest import SensorProcess
 
@@ -161,24 +163,6 @@ def test_the_whole_dictionary(veth: tuple[str, str], start: Start, open_master: 
     assert all(sizes[address] == bits for address, bits in parts.items())
 
 
-def test_configuration_in_preop(veth: tuple[str, str], start: Start, open_master: Callable[[], Any]) -> None:
-    start(veth[0])
-    master = open_master()
-    find(master, 1)
-
-    def configure(position: int) -> None:
-        slave = master.slaves[position]
-        write(slave, 0x8006, 4, b"\0")
-        write(slave, 0x8006, 1, struct.pack("<H", 128))
-
-    master.slaves[0].config_func = configure
-    patiently(master.config_map)
-    assert read(master.slaves[0], 0x8011, 0) == struct.pack("<H", 400)
-    with pytest.raises(pysoem.SdoError) as caught:
-        read(master.slaves[0], 0x8003, 1)
-    assert caught.value.abort_code == 0x06020000
-
-
 def test_a_chain_of_three(veth: tuple[str, str], start: Start, open_master: Callable[[], Any]) -> None:
     start(veth[0], "--sensors", "3", "--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", "--signal", "constant")
     master = open_master()
@@ -192,54 +176,6 @@ def test_a_chain_of_three(veth: tuple[str, str], start: Start, open_master: Call
     assert serials == [1, 2, 3]
 
 
-def test_a_power_cycle_is_recovered_from(
-    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
-) -> None:
-    sensor = start(veth[0], "--sensors", "2")
-    master = open_master()
-    bring_up(master, 2)
-    assert sensor.command("power off @1") == "ok"
-    assert exchange(master) == 3
-    assert sensor.command("power on @1") == "ok"
-    slave = master.slaves[1]
-    end = time.monotonic() + _PATIENCE
-    while time.monotonic() < end:
-        exchange(master)
-        master.read_state()
-        if slave.state == pysoem.OP_STATE and exchange(master) == 6:
-            break
-        if slave.state == pysoem.SAFEOP_STATE + pysoem.STATE_ERROR:
-            slave.state = pysoem.SAFEOP_STATE + pysoem.STATE_ACK
-            slave.write_state()
-        elif slave.state == pysoem.SAFEOP_STATE:
-            slave.state = pysoem.OP_STATE
-            slave.write_state()
-        elif slave.state > pysoem.NONE_STATE:
-            slave.reconfig(100_000)
-        else:
-            slave.recover(100_000)
-    else:
-        pytest.fail("not recovered")
-
-
-def test_safeop_with_error_is_seen_and_cleared(
-    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
-) -> None:
-    sensor = start(veth[0])
-    master = open_master()
-    bring_up(master)
-    assert sensor.command("safeop 0x8042") == "ok"
-    assert exchange(master) == 1
-    master.read_state()
-    slave = master.slaves[0]
-    assert slave.state == pysoem.SAFEOP_STATE + pysoem.STATE_ERROR
-    assert slave.al_status == 0x8042
-    slave.state = pysoem.SAFEOP_STATE + pysoem.STATE_ACK
-    slave.write_state()
-    reach_op(master)
-    assert exchange(master) == 3
-
-
 def test_an_interface_down_for_a_while(
     veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
 ) -> None:
@@ -249,18 +185,3 @@ def test_an_interface_down_for_a_while(
     master = open_master()
     bring_up(master)
     assert exchange(master) == 3
-
-
-def test_the_wire_is_quiet_when_told(
-    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
-) -> None:
-    sensor = start(veth[0])
-    sensor.command("deaf")
-    master = open_master()
-    assert master.config_init() == -1
-    sensor.command("hear")
-    bring_up(master)
-    answer = json.loads(sensor.command("stats").removeprefix("ok "))
-    assert answer["frames_lost"] > 0
-    assert answer["sensors"][0]["al_state"] == "OP"
-    assert answer["sensors"][0]["calibration_writes"] == 0

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from ethercat_server.virtual_sensor.wire import Command
+from ethercat_server.ethercat.wire import Command
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, RawMaster, chain, fmmu, sync_manager
 
 
@@ -25,11 +25,11 @@ def test_broadcast_counts_slaves_and_ors_data() -> None:
 
 def test_auto_increment_addresses_are_counted_up_by_every_slave() -> None:
     master = RawMaster(*chain(3))
-    for place in range(3):
-        assert master.write(0x0010, struct.pack("<H", 0x1000 + place), place) == 1
-    for place in range(3):
-        data, counter = master.one(Command.FPRD, 0x1000 + place, 0x0010, bytes(2))
-        assert (data, counter) == (struct.pack("<H", 0x1000 + place), 1)
+    for position in range(3):
+        assert master.write(0x0010, struct.pack("<H", 0x1000 + position), position) == 1
+    for position in range(3):
+        data, counter = master.one(Command.FPRD, 0x1000 + position, 0x0010, bytes(2))
+        assert (data, counter) == (struct.pack("<H", 0x1000 + position), 1)
     assert master.one(Command.APRD, -3, 0x0010, bytes(2)) == (bytes(2), 0)
     assert master.one(Command.FPRD, 0x2000, 0x0010, bytes(2)) == (bytes(2), 0)
 
@@ -66,7 +66,7 @@ def test_read_multiple_write() -> None:
     master.write(0x0F80, b"\xaa", 1)
     data, counter = master.one(Command.ARMW, -1, 0x0F80, b"\x11")
     assert (data, counter) == (b"\xaa", 3)
-    assert [master.read(0x0F80, 1, place) for place in range(3)] == [b"\x11", b"\xaa", b"\xaa"]
+    assert [master.read(0x0F80, 1, position) for position in range(3)] == [b"\x11", b"\xaa", b"\xaa"]
 
 
 def test_nop_and_unknown_commands_pass() -> None:

@@ -4,11 +4,11 @@ import struct
 
 import pytest
 
-from ethercat_server.objects import BY_SETTING, OBJECTS, Access
-from ethercat_server.virtual_sensor.coe import CoeServer
-from ethercat_server.virtual_sensor.dictionary import entries_of
+from ethercat_server.sensor.dictionary import BY_SETTING, OBJECTS, Access
+from ethercat_server.virtual_sensor.firmware.coe import CoeServer
+from ethercat_server.virtual_sensor.firmware.dictionary import entries_of
+from ethercat_server.virtual_sensor.firmware.sdo_information import SdoInformation
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.sdo_information import SdoInformation
 from protocol.pdo import LAYOUTS
 from protocol.settings import SETTINGS
 from tests.virtual_sensor.raw_master import OP, PREOP, SAFEOP, Abort, RawMaster

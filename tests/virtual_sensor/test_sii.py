@@ -4,8 +4,9 @@ import struct
 
 import pytest
 
+from ethercat_server.ethercat.slave.sii_content import checksum
+from ethercat_server.virtual_sensor.esc.sii import build_image
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.sii import build_image, checksum
 from protocol.pdo import LAYOUTS
 from tests.virtual_sensor.raw_master import RawMaster
 

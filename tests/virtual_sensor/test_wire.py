@@ -5,8 +5,8 @@ import struct
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ethercat_server.virtual_sensor import wire
-from ethercat_server.virtual_sensor.wire import Command
+from ethercat_server.ethercat import wire
+from ethercat_server.ethercat.wire import Command
 from tests.virtual_sensor.raw_master import OP, RawMaster
 
 HEADERS = st.integers(0, 0xFFFF)

@@ -1,6 +1,6 @@
 // Samples of Bota Systems EtherCAT force/torque sensors from ethercat-server, for controllers in C++17.
 //
-//     bota_ethercat::Client sensor({"localhost", 12001});
+//     bota_ethercat::Client sensor("localhost", 12001);
 //     if (!sensor.connect()) { std::fprintf(stderr, "%s\n", sensor.error()); return 1; }
 //     while (running) {
 //         const bota_ethercat::Reading reading = sensor.latest();   // never blocks, never allocates
@@ -11,17 +11,19 @@
 // One header, Linux, libc only. Protocol version 1 (docs/protocol.md); docs/cpp.md is the manual.
 //
 // Units and frames. Force N, torque Nm, acceleration m/s^2, angular rate rad/s, temperature degrees Celsius; all in
-//   the sensor's own frame, nothing filtered or taken off. A sensor at rest measures +g along the axis that points up.
-// Age. CLOCK_MONOTONIC now minus the instant of the sample as the server states it. Only a frame that is neither
+//   the sensor's own frame, neither filtered nor compensated. A stationary sensor measures +g along the axis that points up.
+// Age. CLOCK_MONOTONIC now minus the sample's, as the server stamps it. Only a frame that is neither
 //   INVALID nor REPEATED brings a sample; the age of an older one grows, whatever else arrives. From another machine,
 //   whose CLOCK_MONOTONIC is not ours, the age counts from the arrival and is only a lower bound.
 // Real time. `latest`, `update`, `peek` and `next` throw nothing, allocate nothing and take no locks. `latest` and
 //   `update` do not block: in the steady state one recv() and two clock_gettime(); never more than 16 and `max_bytes_per_call`.
-//   While the connection is down a call does one non-blocking step towards a new one, at most every
-//   `reconnect_every`. Everything else (constructor, `connect`, `Control`) allocates and waits.
-// Threads. None of its own. An object belongs to one thread at a time; different objects know nothing of each other.
-// What comes over the network is not trusted: lengths, depth and numbers are bounded as in protocol/framing.py, and a
-//   server that breaks the framing is disconnected.
+//   While the connection is down a call makes one non-blocking step of reconnecting, one attempt per `reconnect_every`.
+//   Everything else (constructor, `connect`, `Control`) allocates and waits.
+// Threads. None of its own. An object is used by one thread at a time; objects share nothing.
+// Network input is not trusted: lengths, depth and numbers are limited as in protocol/framing.py, and a server that breaks
+//   the framing is disconnected.
+// Contents. Stream: process data, framing, accounting, `Client`. Control: `Control`, one request per connection. Both use
+//   JSON, descriptions and sockets, between them.
 #ifndef BOTA_ETHERCAT_HPP
 #define BOTA_ETHERCAT_HPP
 
@@ -55,12 +57,12 @@
 #include <vector>
 
 #if !defined(__cpp_lib_to_chars) || __cpp_lib_to_chars < 201611L
-#error "bota_ethercat.hpp needs std::from_chars for double: use g++ 11 or newer, or clang with its library"
+#error "bota_ethercat.hpp needs std::from_chars for double: use g++ 11 or newer, or clang with libstdc++"
 #endif
 
 namespace bota_ethercat {
 
-// ---------------------------------------------------------------------------------------------- small things
+// ---------------------------------------------------------------------------------------------- utilities
 
 using std::chrono::nanoseconds;
 
@@ -79,7 +81,7 @@ inline std::int64_t monotonic_now_ns() noexcept {
     return std::int64_t{now.tv_sec} * 1'000'000'000 + now.tv_nsec;
 }
 
-/// A short text in place, always terminated. What does not fit is cut off between two characters.
+/// A short NUL-terminated text without allocation. What does not fit is cut off between two characters.
 template <std::size_t Size>
 class Text {
 public:
@@ -203,7 +205,7 @@ inline double real(const std::uint8_t* bytes) noexcept {
     return static_cast<double>(value);
 }
 
-/// Offsets in the process data, docs/protocol.md; a test holds them against the table in protocol/pdo.py.
+/// Offsets in the process data, docs/protocol.md; a test compares them with the table in protocol/pdo.py.
 enum PdoOffset : std::size_t {
     kStatusAt = 0,
     kWarningsAt = 1,
@@ -250,435 +252,14 @@ inline bool decode(const std::uint8_t* data, std::size_t size, ImuUnits units, S
     return true;
 }
 
-// ---------------------------------------------------------------------------------------------- JSON
-//
-// Only what is needed to read the server's replies and events: no tree, no allocation, no recursion. A text is first
-// checked whole by `is_object`; after that a `Value` is a piece of it that is known to be sound.
-
-namespace json {
-
-namespace detail {
-
-constexpr bool is_blank(char c) noexcept { return c == ' ' || c == '\t' || c == '\n' || c == '\r'; }
-constexpr bool is_digit(char c) noexcept { return c >= '0' && c <= '9'; }
-constexpr int hex_digit(char c) noexcept {
-    return is_digit(c) ? c - '0' : c >= 'a' && c <= 'f' ? c - 'a' + 10 : c >= 'A' && c <= 'F' ? c - 'A' + 10 : -1;
-}
-
-/// Length of the strict UTF-8 sequence at `p` (no overlong forms, no surrogates), 0 if it is none.
-inline std::size_t utf8_length(const char* p, const char* end) noexcept {
-    const auto at = [&](std::ptrdiff_t i) { return static_cast<unsigned char>(p[i]); };
-    const auto continues = [&](std::ptrdiff_t from, std::ptrdiff_t to) {
-        if (end - p < to) return false;
-        for (std::ptrdiff_t i = from; i < to; ++i)
-            if ((at(i) & 0xC0) != 0x80) return false;
-        return true;
-    };
-    const unsigned lead = at(0);
-    if (lead < 0x80) return 1;
-    if (lead >= 0xC2 && lead <= 0xDF) return continues(1, 2) ? 2 : 0;
-    if (lead >= 0xE0 && lead <= 0xEF) {
-        if (!continues(1, 3)) return 0;
-        return (lead == 0xE0 && at(1) < 0xA0) || (lead == 0xED && at(1) >= 0xA0) ? 0 : 3;
-    }
-    if (lead >= 0xF0 && lead <= 0xF4) {
-        if (!continues(1, 4)) return 0;
-        return (lead == 0xF0 && at(1) < 0x90) || (lead == 0xF4 && at(1) >= 0x90) ? 0 : 4;
-    }
-    return 0;
-}
-
-/// Checks a text against the grammar and the bounds; `p` is where it stands.
-class Checker {
-public:
-    explicit Checker(std::string_view text) noexcept : p_(text.data()), end_(text.data() + text.size()) {}
-
-    bool object() noexcept {
-        blanks();
-        if (p_ == end_ || *p_ != '{') return false;
-        if (!containers()) return false;
-        blanks();
-        return p_ == end_;
-    }
-
-private:
-    void blanks() noexcept {
-        while (p_ != end_ && is_blank(*p_)) ++p_;
-    }
-    bool take(char c) noexcept {
-        blanks();
-        if (p_ == end_ || *p_ != c) return false;
-        ++p_;
-        return true;
-    }
-
-    bool containers() noexcept {
-        std::array<bool, static_cast<std::size_t>(kMaxJsonDepth)> is_object_at{};
-        std::size_t depth = 0;
-        for (;;) {  // at the beginning of a value
-            blanks();
-            if (p_ == end_) return false;
-            bool opened = false;
-            if (*p_ == '{' || *p_ == '[') {
-                if (depth == is_object_at.size()) return false;
-                opened = true;
-                is_object_at[depth++] = *p_++ == '{';
-            } else if (!scalar()) {
-                return false;
-            }
-            for (;;) {  // behind a value, or just inside a container
-                if (depth == 0) return true;
-                const bool in_object = is_object_at[depth - 1];
-                if (take(in_object ? '}' : ']')) {
-                    --depth;
-                    opened = false;
-                    continue;
-                }
-                if (!opened && !take(',')) return false;
-                if (in_object) {
-                    blanks();
-                    if (!string() || !take(':')) return false;
-                }
-                break;
-            }
-        }
-    }
-
-    bool scalar() noexcept {
-        switch (*p_) {
-            case '"': return string();
-            case 't': return word("true");
-            case 'f': return word("false");
-            case 'n': return word("null");
-            default: return number();
-        }
-    }
-
-    bool word(std::string_view expected) noexcept {
-        if (std::string_view(p_, static_cast<std::size_t>(end_ - p_)).substr(0, expected.size()) != expected) return false;
-        p_ += expected.size();
-        return true;
-    }
-
-    bool string() noexcept {
-        if (p_ == end_ || *p_ != '"') return false;
-        for (++p_; p_ != end_;) {
-            if (*p_ == '"') return ++p_, true;
-            if (*p_ == '\\') {
-                if (!escape()) return false;
-                continue;
-            }
-            if (static_cast<unsigned char>(*p_) < 0x20) return false;
-            const std::size_t length = utf8_length(p_, end_);
-            if (length == 0) return false;
-            p_ += length;
-        }
-        return false;
-    }
-
-    bool escape() noexcept {
-        if (++p_ == end_) return false;
-        const char kind = *p_++;
-        if (kind != 'u') return std::string_view("\"\\/bfnrt").find(kind) != std::string_view::npos;
-        for (int i = 0; i < 4; ++i, ++p_)
-            if (p_ == end_ || hex_digit(*p_) < 0) return false;
-        return true;
-    }
-
-    std::size_t digits() noexcept {
-        const char* const from = p_;
-        while (p_ != end_ && is_digit(*p_)) ++p_;
-        return static_cast<std::size_t>(p_ - from);
-    }
-
-    bool number() noexcept {
-        const char* const from = p_;
-        if (*p_ == '-') ++p_;
-        if (p_ == end_) return false;
-        const bool zero = *p_ == '0';
-        const std::size_t whole = digits();
-        if (whole == 0 || (zero && whole > 1)) return false;
-        bool is_float = false;
-        if (p_ != end_ && *p_ == '.') {
-            ++p_;
-            if (digits() == 0) return false;
-            is_float = true;
-        }
-        if (p_ != end_ && (*p_ == 'e' || *p_ == 'E')) {
-            ++p_;
-            if (p_ != end_ && (*p_ == '+' || *p_ == '-')) ++p_;
-            if (digits() == 0) return false;
-            is_float = true;
-        }
-        return is_float ? !overflows(from, p_) : whole <= kMaxJsonDigits;
-    }
-
-    /// Whether a floating point literal is too large for a double.
-    static bool overflows(const char* from, const char* to) noexcept {
-        double value = 0.0;
-        if (std::from_chars(from, to, value).ec != std::errc::result_out_of_range) return !std::isfinite(value);
-        // Out of range is too large or too small: the decimal place of the first digit that is not 0 tells which.
-        std::int64_t place = 0, exponent = 0;
-        bool found = false, behind_point = false;
-        const char* p = *from == '-' ? from + 1 : from;
-        for (; p != to && *p != 'e' && *p != 'E'; ++p) {
-            if (*p == '.') {
-                behind_point = true;
-            } else if (!found) {
-                found = *p != '0';
-                if (behind_point) --place;
-            } else if (!behind_point) {
-                ++place;
-            }
-        }
-        if (p != to) {
-            const bool negative = *++p == '-';
-            if (*p == '-' || *p == '+') ++p;
-            for (; p != to; ++p)
-                if (exponent < 1'000'000'000) exponent = exponent * 10 + (*p - '0');
-            if (negative) exponent = -exponent;
-        }
-        return found && place + exponent > 0;
-    }
-
-    const char* p_;
-    const char* end_;
-};
-
-}  // namespace detail
-
-/// Whether `text` is one JSON object in UTF-8 within the bounds above: what protocol/framing.py accepts.
-inline bool is_object(std::string_view text) noexcept { return detail::Checker(text).object(); }
-
-/// The characters of a string between its quotes, one code point at a time; or of a plain text without escapes.
-class Characters {
-public:
-    explicit Characters(std::string_view inside, bool escaped = true) noexcept
-        : p_(inside.data()), end_(p_ + inside.size()), escaped_(escaped) {}
-
-    /// The next code point; false at the end. A lone surrogate, which JSON can spell, comes as it is.
-    bool next(char32_t& c) noexcept {
-        if (p_ == end_) return false;
-        if (!escaped_ || *p_ != '\\') {
-            const std::size_t length = detail::utf8_length(p_, end_);
-            const auto lead = static_cast<unsigned char>(*p_++);
-            c = length <= 1 ? lead : lead & (0xFFu >> (length + 1));
-            for (std::size_t i = 1; i < length; ++i) c = (c << 6) | (static_cast<unsigned char>(*p_++) & 0x3Fu);
-            return true;
-        }
-        const char kind = p_[1];
-        p_ += 2;
-        switch (kind) {
-            case 'b': c = U'\b'; return true;
-            case 'f': c = U'\f'; return true;
-            case 'n': c = U'\n'; return true;
-            case 'r': c = U'\r'; return true;
-            case 't': c = U'\t'; return true;
-            case 'u': break;
-            default: c = static_cast<unsigned char>(kind); return true;
-        }
-        c = four_digits();
-        const bool high = c >= 0xD800 && c < 0xDC00;
-        if (high && end_ - p_ >= 6 && p_[0] == '\\' && p_[1] == 'u') {
-            const char* const before = p_;
-            p_ += 2;
-            const char32_t low = four_digits();
-            if (low >= 0xDC00 && low < 0xE000)
-                c = 0x10000 + ((c - 0xD800) << 10) + (low - 0xDC00);
-            else
-                p_ = before;
-        }
-        return true;
-    }
-
-private:
-    char32_t four_digits() noexcept {
-        char32_t value = 0;
-        for (int i = 0; i < 4; ++i) value = value << 4 | static_cast<char32_t>(detail::hex_digit(*p_++));
-        return value;
-    }
-
-    const char* p_;
-    const char* end_;
-    bool escaped_;
-};
-
-/// A piece of a text that `is_object` accepted, which must live as long as this does. Default: nothing there.
-class Value {
-public:
-    Value() = default;
-    /// `text` must be exactly one value of a checked text, or the whole of it.
-    explicit Value(std::string_view text) noexcept : text_(text) {
-        while (!text_.empty() && detail::is_blank(text_.front())) text_.remove_prefix(1);
-        while (!text_.empty() && detail::is_blank(text_.back())) text_.remove_suffix(1);
-    }
-
-    std::string_view text() const noexcept { return text_; }
-    explicit operator bool() const noexcept { return !text_.empty(); }
-    bool is_object() const noexcept { return first() == '{'; }
-    bool is_array() const noexcept { return first() == '['; }
-    bool is_string() const noexcept { return first() == '"'; }
-    bool is_number() const noexcept { return first() == '-' || detail::is_digit(first()); }
-
-    bool get(bool& value) const noexcept {
-        if (text_ != "true" && text_ != "false") return false;
-        value = text_ == "true";
-        return true;
-    }
-
-    bool get(double& value) const noexcept {
-        if (!is_number()) return false;
-        double found = 0.0;
-        const auto done = std::from_chars(text_.data(), text_.data() + text_.size(), found);
-        // Out of range here is a whole number larger than any double, or something next to nothing.
-        if (done.ec == std::errc::result_out_of_range && text_.find_first_of(".eE") == std::string_view::npos) return false;
-        value = done.ec == std::errc() ? found : 0.0;
-        return true;
-    }
-
-    /// A whole number that fits; anything else is false and leaves `value` as it was.
-    template <typename Integer, typename = std::enable_if_t<std::is_integral_v<Integer> && !std::is_same_v<Integer, bool>>>
-    bool get(Integer& value) const noexcept {
-        if (!is_number()) return false;
-        Integer found = 0;
-        const auto done = std::from_chars(text_.data(), text_.data() + text_.size(), found);
-        if (done.ec != std::errc() || done.ptr != text_.data() + text_.size()) return false;
-        value = found;
-        return true;
-    }
-
-    template <std::size_t Size>
-    bool get(Text<Size>& value) const noexcept {
-        if (!is_string()) return false;
-        value.clear();
-        Characters characters(inside());
-        for (char32_t c = 0; characters.next(c);) add(value, c);
-        return true;
-    }
-
-    /// Whether it is this string.
-    bool is(std::string_view wanted) const noexcept {
-        if (!is_string()) return false;
-        Characters mine(inside()), others(wanted, false);
-        char32_t a = 0, b = 0;
-        for (;;) {
-            const bool more = mine.next(a);
-            if (more != others.next(b)) return false;
-            if (!more) return true;
-            if (a != b) return false;
-        }
-    }
-
-    /// What stands between the quotes of a string.
-    std::string_view inside() const noexcept { return is_string() ? text_.substr(1, text_.size() - 2) : std::string_view(); }
-
-    /// The member of this name, the last one if there are several; nothing if there is none.
-    Value operator[](std::string_view name) const noexcept;
-
-private:
-    char first() const noexcept { return text_.empty() ? '\0' : text_.front(); }
-
-    template <std::size_t Size>
-    static void add(Text<Size>& text, char32_t c) noexcept {
-        if (c >= 0xD800 && c < 0xE000) c = 0xFFFD;
-        std::array<char, 4> bytes{};
-        std::size_t n = 0;
-        const auto put = [&](char32_t byte) { bytes[n++] = static_cast<char>(byte); };
-        if (c < 0x80) {
-            put(c);
-        } else if (c < 0x800) {
-            put(0xC0 | c >> 6), put(0x80 | (c & 0x3F));
-        } else if (c < 0x10000) {
-            put(0xE0 | c >> 12), put(0x80 | (c >> 6 & 0x3F)), put(0x80 | (c & 0x3F));
-        } else {
-            put(0xF0 | c >> 18), put(0x80 | (c >> 12 & 0x3F)), put(0x80 | (c >> 6 & 0x3F)), put(0x80 | (c & 0x3F));
-        }
-        text.add({bytes.data(), n});
-    }
-
-    std::string_view text_;
-};
-
-/// The members of an object, or the items of an array, in order. Nothing for any other value.
-class Items {
-public:
-    explicit Items(Value of) noexcept {
-        if (!of.is_object() && !of.is_array()) return;
-        in_object_ = of.is_object();
-        rest_ = of.text().substr(1, of.text().size() - 2);
-    }
-
-    bool next(Value& value) noexcept {
-        Value name;
-        return next(name, value);
-    }
-
-    /// `name` is the member's name, a string; nothing for an array.
-    bool next(Value& name, Value& value) noexcept {
-        skip_blanks();
-        if (rest_.empty()) return false;
-        if (in_object_) {
-            name = take();
-            skip_blanks();
-            rest_.remove_prefix(1);  // the colon
-            skip_blanks();
-        }
-        value = take();
-        skip_blanks();
-        if (!rest_.empty()) rest_.remove_prefix(1);  // the comma
-        return true;
-    }
-
-private:
-    void skip_blanks() noexcept {
-        while (!rest_.empty() && detail::is_blank(rest_.front())) rest_.remove_prefix(1);
-    }
-
-    Value take() noexcept {
-        std::size_t at = 0, depth = 0;
-        bool in_string = false;
-        for (; at < rest_.size(); ++at) {
-            const char c = rest_[at];
-            if (in_string) {
-                if (c == '\\') ++at;
-                if (c == '"') in_string = false;
-            } else if (c == '"') {
-                in_string = true;
-            } else if (c == '{' || c == '[') {
-                ++depth;
-            } else if (c == '}' || c == ']') {
-                --depth;
-            } else if (depth == 0 && (c == ',' || c == ':' || detail::is_blank(c))) {
-                break;
-            }
-        }
-        const Value found(rest_.substr(0, at));
-        rest_.remove_prefix(at < rest_.size() ? at : rest_.size());
-        return found;
-    }
-
-    std::string_view rest_;
-    bool in_object_ = false;
-};
-
-inline Value Value::operator[](std::string_view name) const noexcept {
-    Value found, key, value;
-    if (!is_object()) return found;
-    for (Items items(*this); items.next(key, value);)
-        if (key.is(name)) found = value;
-    return found;
-}
-
-}  // namespace json
-
 // ---------------------------------------------------------------------------------------------- framing
 
-/// One DATA message; `process_data` points into the decoder and holds until its next call.
+/// One DATA message; `process_data` points into the decoder and is valid until its next call.
 struct Frame {
     std::uint64_t sequence = 0;      ///< counts this sensor's frames at the server
     std::uint64_t stamp_ns = 0;      ///< CLOCK_REALTIME of the sample
     std::uint64_t monotonic_ns = 0;  ///< CLOCK_MONOTONIC of the same moment, on the server's machine
-    std::uint8_t sensor = 0;         ///< place on the bus
+    std::uint8_t sensor = 0;         ///< position on the bus
     std::uint8_t flags = 0;          ///< kRepeated, kInvalid, kGap
     std::uint16_t wkc = 0;           ///< working counter
     const std::uint8_t* process_data = nullptr;
@@ -803,11 +384,376 @@ inline std::string encode_json(std::string_view text) {
     return message;
 }
 
-// ---------------------------------------------------------------------------------------------- descriptions
+// ------------------------------------------------------------------------------------------------ accounting
+
+/// What a frame is. The words here and in `StreamCounts` are those of docs/protocol.md.
+enum class FrameKind : std::uint8_t { sample, repeated, invalid, old };
+
+/// Counts of one sensor's frames and samples: `protocol.accounting` in C++.
+struct StreamCounts {
+    std::uint64_t samples = 0;   ///< new and valid ones: `new`, which is taken in C++
+    std::uint64_t repeated = 0;  ///< the sensor has nothing new
+    std::uint64_t invalid = 0;   ///< the working counter was short
+    std::uint64_t old = 0;       ///< duplicates and frames out of order; ignored
+    std::uint64_t restarts = 0;  ///< the server's numbering began again
+    std::uint64_t gaps = 0;      ///< frames with GAP
+    std::uint64_t withheld = 0;  ///< sequence numbers of frames that this client did not read in time
+    std::uint64_t lost = 0;      ///< samples that the server never had; an estimate
+    std::uint64_t skipped = 0;   ///< sequence numbers that `every` and `fresh_only` left out
+
+    std::uint64_t frames() const noexcept { return samples + repeated + invalid + old; }
+};
+
+/// Classifies and counts the frames of one sensor.
+class StreamAccounting {
+public:
+    StreamCounts counts;
+    double rate_hz = 0.0;  ///< the sensor's sampling rate, at most 1e6; 0 if it is unknown
+
+    /// What was subscribed.
+    void configure(std::uint32_t every, bool fresh_only) noexcept { every_ = every, fresh_only_ = fresh_only; }
+
+    /// A new subscription begins: nothing before its first frame counts as missing, unless it has GAP.
+    void begin() noexcept { begun_ = has_new_ = false; }
+    /// Whether a frame has come since.
+    bool begun() const noexcept { return begun_; }
+
+    FrameKind take(std::uint64_t sequence, std::uint64_t monotonic_ns, std::uint8_t flags) noexcept {
+        std::uint64_t jump = 0;
+        if (begun_ && sequence <= sequence_) {
+            if (monotonic_ns <= monotonic_ns_) return ++counts.old, FrameKind::old;
+            ++counts.restarts;
+        } else if (begun_) {
+            jump = sequence - sequence_ - 1;
+        }
+        if (jump > 0 || (flags & kGap) != 0) count_missing(jump, monotonic_ns, (flags & kGap) != 0);
+        sequence_ = sequence;
+        monotonic_ns_ = monotonic_ns;
+        begun_ = true;
+        if ((flags & kInvalid) != 0) return ++counts.invalid, FrameKind::invalid;
+        if ((flags & kRepeated) != 0) return ++counts.repeated, FrameKind::repeated;
+        new_ns_ = monotonic_ns;
+        has_new_ = true;
+        return ++counts.samples, FrameKind::sample;
+    }
+
+private:
+    void count_missing(std::uint64_t jump, std::uint64_t monotonic_ns, bool gap) noexcept {
+        const std::uint64_t between = every_ > 0 ? every_ - 1 : 0;
+        const std::uint64_t skipped = (fresh_only_ && !gap) || jump < between ? jump : between;
+        counts.skipped += skipped;
+        counts.withheld += jump - skipped;
+        if (!gap) return;
+        ++counts.gaps;
+        std::uint64_t lost = jump > skipped ? 0 : 1;
+        if (has_new_ && rate_hz > 0.0 && monotonic_ns > new_ns_) {
+            const double periods = std::nearbyint(static_cast<double>(monotonic_ns - new_ns_) * rate_hz / 1e9);
+            const std::uint64_t room = periods < 1.0 ? 0 : static_cast<std::uint64_t>(periods) - 1;
+            if (room > jump && room - jump > lost) lost = room - jump;
+        }
+        counts.lost += lost;
+    }
+
+    std::uint64_t sequence_ = 0, monotonic_ns_ = 0, new_ns_ = 0;
+    std::uint32_t every_ = 1;
+    bool fresh_only_ = true, begun_ = false, has_new_ = false;
+};
+
+// ------------------------------------------------------------------------------------------------------ JSON
+//
+// A reader for the server's replies and events: no tree, no allocation, no recursion. `is_object` checks a text whole,
+// as strictly as protocol/text/json_text.py; after that a `Value` is a piece of it that is known to be well-formed.
+
+namespace json {
+
+namespace detail {
+
+constexpr bool is_blank(char c) noexcept { return c == ' ' || c == '\t' || c == '\n' || c == '\r'; }
+constexpr bool is_digit(char c) noexcept { return c >= '0' && c <= '9'; }
+constexpr int hex_digit(char c) noexcept {
+    return is_digit(c) ? c - '0' : c >= 'a' && c <= 'f' ? c - 'a' + 10 : c >= 'A' && c <= 'F' ? c - 'A' + 10 : -1;
+}
+
+/// Decode the strict UTF-8 sequence at `p` and move behind it; false if there is none (overlong, a surrogate, cut off).
+inline bool take_utf8(const char*& p, const char* end, char32_t& c) noexcept {
+    if (p == end) return false;
+    const auto lead = static_cast<unsigned char>(*p);
+    const int more = lead < 0x80 ? 0 : lead >> 5 == 6 ? 1 : lead >> 4 == 14 ? 2 : lead >> 3 == 30 ? 3 : -1;
+    if (more < 0 || end - p <= more) return false;
+    c = more == 0 ? lead : lead & (0x3Fu >> more);
+    for (int i = 1; i <= more; ++i) {
+        const auto next = static_cast<unsigned char>(p[i]);
+        if (next >> 6 != 2) return false;
+        c = c << 6 | (next & 0x3Fu);
+    }
+    constexpr char32_t kLeast[] = {0, 0x80, 0x800, 0x10000};
+    if (c < kLeast[more] || c > 0x10FFFF || (c >= 0xD800 && c < 0xE000)) return false;
+    p += more + 1;
+    return true;
+}
+
+/// Moves over a text and checks it on the way. Every method moves behind what it names, or returns false.
+class Scanner {
+public:
+    explicit Scanner(std::string_view text) noexcept : p_(text.data()), end_(text.data() + text.size()) {}
+
+    const char* position() const noexcept { return p_; }
+    bool at_end() noexcept { return blanks(), p_ == end_; }
+    void blanks() noexcept {
+        while (p_ != end_ && is_blank(*p_)) ++p_;
+    }
+
+    /// Blanks and this character.
+    bool take(char c) noexcept { return !at_end() && *p_ == c && (++p_, true); }
+
+    bool value() noexcept {
+        std::array<char, kMaxJsonDepth> closing{};
+        for (std::size_t depth = 0;;) {
+            if (at_end()) return false;
+            bool opened = *p_ == '{' || *p_ == '[';
+            if (opened) {
+                if (depth == kMaxJsonDepth) return false;
+                closing[depth++] = *p_++ == '{' ? '}' : ']';
+            } else if (!scalar()) {
+                return false;
+            }
+            while (depth > 0 && take(closing[depth - 1])) --depth, opened = false;
+            if (depth == 0) return true;
+            if (!opened && !take(',')) return false;
+            if (closing[depth - 1] == '}' && !(blanks(), string() && take(':'))) return false;
+        }
+    }
+
+    bool string() noexcept {
+        if (p_ == end_ || *p_++ != '"') return false;
+        while (p_ != end_ && *p_ != '"') {
+            char32_t c = 0;
+            if (!(*p_ == '\\' ? escape() : take_utf8(p_, end_, c) && c >= 0x20)) return false;
+        }
+        return p_ != end_ && (++p_, true);
+    }
+
+private:
+    bool scalar() noexcept {
+        if (*p_ == '"') return string();
+        return word("true") || word("false") || word("null") || number();
+    }
+
+    bool word(std::string_view expected) noexcept {
+        if (std::string_view(p_, static_cast<std::size_t>(end_ - p_)).substr(0, expected.size()) != expected) return false;
+        p_ += expected.size();
+        return true;
+    }
+
+    bool escape() noexcept {
+        if (++p_ == end_) return false;
+        const char kind = *p_++;
+        if (kind != 'u') return std::string_view("\"\\/bfnrt").find(kind) != std::string_view::npos;
+        for (int i = 0; i < 4; ++i, ++p_)
+            if (p_ == end_ || hex_digit(*p_) < 0) return false;
+        return true;
+    }
+
+    std::size_t digits() noexcept {
+        const char* const from = p_;
+        while (p_ != end_ && is_digit(*p_)) ++p_;
+        return static_cast<std::size_t>(p_ - from);
+    }
+    bool one_of(char a, char b) noexcept { return p_ != end_ && (*p_ == a || *p_ == b) && (++p_, true); }
+
+    bool number() noexcept {
+        const char* const from = p_;
+        one_of('-', '-');
+        const bool zero = p_ != end_ && *p_ == '0';
+        const std::size_t whole = digits();
+        if (whole == 0 || (zero && whole > 1)) return false;
+        const bool fraction = one_of('.', '.');
+        if (fraction && digits() == 0) return false;
+        const bool exponent = one_of('e', 'E');
+        const bool small = exponent ? one_of('-', '-') : zero;
+        if (exponent && !small) one_of('+', '+');
+        if (exponent && digits() == 0) return false;
+        if (!fraction && !exponent) return whole <= kMaxJsonDigits;
+        double value = 0.0;  // out of range is too large, as JSON for infinity, or next to nothing, which is fine
+        return std::from_chars(from, p_, value).ec != std::errc::result_out_of_range || small;
+    }
+
+    const char* p_;
+    const char* end_;
+};
+
+}  // namespace detail
+
+/// Whether `text` is one JSON object in UTF-8 within the limits above.
+inline bool is_object(std::string_view text) noexcept {
+    detail::Scanner scanner(text);
+    scanner.blanks();
+    const char* const begin = scanner.position();
+    return begin != text.data() + text.size() && *begin == '{' && scanner.value() && scanner.at_end();
+}
+
+/// The characters of a string, given what is between its quotes, one code point at a time.
+class Characters {
+public:
+    explicit Characters(std::string_view inside) noexcept : p_(inside.data()), end_(p_ + inside.size()) {}
+
+    /// The next code point; false at the end. A lone surrogate, which JSON can spell, comes as it is.
+    bool next(char32_t& c) noexcept {
+        if (p_ == end_ || *p_ != '\\') return detail::take_utf8(p_, end_, c);
+        constexpr std::string_view kKinds = "bfnrt", kMeanings = "\b\f\n\r\t";
+        const char kind = p_[1];
+        p_ += 2;
+        if (kind != 'u') {
+            const std::size_t found = kKinds.find(kind);
+            c = static_cast<unsigned char>(found == std::string_view::npos ? kind : kMeanings[found]);
+            return true;
+        }
+        c = four_digits(p_);
+        if (c >= 0xD800 && c < 0xDC00 && end_ - p_ >= 6 && p_[0] == '\\' && p_[1] == 'u') {
+            const char* after = p_ + 2;
+            const char32_t low = four_digits(after);
+            if (low >= 0xDC00 && low < 0xE000) c = 0x10000 + ((c - 0xD800) << 10) + (low - 0xDC00), p_ = after;
+        }
+        return true;
+    }
+
+private:
+    static char32_t four_digits(const char*& p) noexcept {
+        char32_t value = 0;
+        for (int i = 0; i < 4; ++i) value = value << 4 | static_cast<char32_t>(detail::hex_digit(*p++));
+        return value;
+    }
+
+    const char* p_;
+    const char* end_;
+};
+
+/// A piece of a text that `is_object` accepted, which must outlive it. Default: no value.
+class Value {
+public:
+    Value() = default;
+    /// `text` must be exactly one value of a checked text, or the whole of it.
+    explicit Value(std::string_view text) noexcept : text_(text) {
+        while (!text_.empty() && detail::is_blank(text_.front())) text_.remove_prefix(1);
+        while (!text_.empty() && detail::is_blank(text_.back())) text_.remove_suffix(1);
+    }
+
+    std::string_view text() const noexcept { return text_; }
+    explicit operator bool() const noexcept { return !text_.empty(); }
+    bool is_object() const noexcept { return first() == '{'; }
+    bool is_array() const noexcept { return first() == '['; }
+    bool is_string() const noexcept { return first() == '"'; }
+    bool is_number() const noexcept { return first() == '-' || detail::is_digit(first()); }
+
+    bool get(bool& value) const noexcept {
+        if (text_ != "true" && text_ != "false") return false;
+        value = text_ == "true";
+        return true;
+    }
+
+    /// A number as double, or a whole number that fits; anything else is false and leaves `value` as it was.
+    template <typename Number, typename = std::enable_if_t<std::is_arithmetic_v<Number>>>
+    bool get(Number& value) const noexcept {
+        if (!is_number()) return false;
+        Number found = 0;
+        const char* const end = text_.data() + text_.size();
+        const auto done = std::from_chars(text_.data(), end, found);
+        // A double that is out of range and was accepted with a fraction or exponent is next to nothing.
+        const bool tiny = std::is_floating_point_v<Number> && text_.find_first_of(".eE") != std::string_view::npos;
+        if (done.ec != std::errc() && !tiny) return false;
+        if (done.ptr != end) return false;
+        value = done.ec == std::errc() ? found : Number{0};
+        return true;
+    }
+
+    /// A string, cut off where it does not fit.
+    template <std::size_t Size>
+    bool get(Text<Size>& value) const noexcept {
+        if (!is_string()) return false;
+        value.clear();
+        Characters characters(inside());
+        for (char32_t c = 0; characters.next(c);) add(value, c >= 0xD800 && c < 0xE000 ? 0xFFFD : c);
+        return true;
+    }
+
+    /// Whether it is this string, spelled without escapes, as the server spells names.
+    bool is(std::string_view wanted) const noexcept { return is_string() && inside() == wanted; }
+
+    /// The text between the quotes of a string.
+    std::string_view inside() const noexcept { return is_string() ? text_.substr(1, text_.size() - 2) : std::string_view(); }
+
+    /// The member of this name, the last one if there are several; no value if there is none.
+    Value operator[](std::string_view name) const noexcept;
+
+private:
+    char first() const noexcept { return text_.empty() ? '\0' : text_.front(); }
+
+    template <std::size_t Size>
+    static void add(Text<Size>& text, char32_t c) noexcept {
+        const std::size_t more = c < 0x80 ? 0 : c < 0x800 ? 1 : c < 0x10000 ? 2 : 3;
+        constexpr char32_t kLead[] = {0, 0xC0, 0xE0, 0xF0};
+        std::array<char, 4> bytes{static_cast<char>(kLead[more] | c >> (6 * more))};
+        for (std::size_t i = 1; i <= more; ++i) bytes[i] = static_cast<char>(0x80 | (c >> (6 * (more - i)) & 0x3F));
+        text.add({bytes.data(), more + 1});
+    }
+
+    std::string_view text_;
+};
+
+/// The members of an object or the items of an array, in order. None for any other value.
+class Items {
+public:
+    explicit Items(Value of) noexcept : scanner_(inside(of)), in_object_(of.is_object()) {}
+
+    bool next(Value& value) noexcept {
+        Value name;
+        return next(name, value);
+    }
+
+    /// `name` is the member's name, a string; no value for an array.
+    bool next(Value& name, Value& value) noexcept {
+        if (scanner_.at_end()) return false;
+        const char* from = scanner_.position();
+        if (in_object_) {
+            (void)scanner_.string();
+            name = piece(from);
+            (void)scanner_.take(':');
+            scanner_.blanks();
+            from = scanner_.position();
+        }
+        (void)scanner_.value();
+        value = piece(from);
+        (void)scanner_.take(',');
+        return true;
+    }
+
+private:
+    static std::string_view inside(Value of) noexcept {
+        return of.is_object() || of.is_array() ? of.text().substr(1, of.text().size() - 2) : std::string_view();
+    }
+    Value piece(const char* from) const noexcept {
+        return Value(std::string_view(from, static_cast<std::size_t>(scanner_.position() - from)));
+    }
+
+    detail::Scanner scanner_;
+    bool in_object_;
+};
+
+inline Value Value::operator[](std::string_view name) const noexcept {
+    Value found, key, value;
+    if (!is_object()) return found;
+    for (Items items(*this); items.next(key, value);)
+        if (key.is(name)) found = value;
+    return found;
+}
+
+}  // namespace json
+
+// --------------------------------------------------------------------------------------------- descriptions
 
 /// A sensor as the server describes it.
 struct SensorInfo {
-    std::uint8_t sensor = 0;  ///< place on the bus
+    std::uint8_t sensor = 0;  ///< position on the bus
     std::uint64_t serial = 0;
     std::uint32_t pdo_size = 0;  ///< bytes of process data
     double rate_hz = 0.0;
@@ -819,29 +765,6 @@ struct Description {
     Text<32> version;               ///< the server's
     std::size_t sensor_count = 0;   ///< of these in `sensors`
     std::array<SensorInfo, kMaxSensors> sensors;
-};
-
-/// Counters of one sensor, from `status`.
-struct SensorStatus {
-    std::uint8_t sensor = 0;
-    std::uint64_t fresh = 0, repeated = 0, invalid = 0, lost_samples = 0, recoveries = 0;
-    bool locked = false;     ///< the server follows the sensor's clock
-    double period_us = 0.0;  ///< of the sensor's samples
-};
-
-/// Counters of the server, from `status`.
-struct Status {
-    std::uint64_t cycles = 0, missed_deadlines = 0, lost_frames = 0;
-    double uptime_s = 0.0;
-    std::size_t sensor_count = 0;
-    std::array<SensorStatus, kMaxSensors> sensors;
-};
-
-/// What `tare` did: force in N, then torque in Nm.
-struct TareResult {
-    std::array<double, 6> old_offset{}, new_offset{};
-    std::array<double, 6> residual{};   ///< mean minus target afterwards
-    std::array<double, 6> deviation{};  ///< standard deviation of a sample meanwhile
 };
 
 namespace detail {
@@ -867,37 +790,11 @@ inline bool read(json::Value reply, Description& into) noexcept {
     return true;
 }
 
-inline bool read(json::Value reply, Status& into) noexcept {
-    if (!reply["sensors"].is_array()) return false;
-    into = Status();
-    reply["cycles"].get(into.cycles);
-    reply["missed_deadlines"].get(into.missed_deadlines);
-    reply["lost_frames"].get(into.lost_frames);
-    reply["uptime_s"].get(into.uptime_s);
-    json::Value each;
-    for (json::Items items(reply["sensors"]); into.sensor_count < kMaxSensors && items.next(each);) {
-        SensorStatus& status = into.sensors[into.sensor_count++];
-        each["sensor"].get(status.sensor);
-        each["fresh"].get(status.fresh);
-        each["repeated"].get(status.repeated);
-        each["invalid"].get(status.invalid);
-        each["lost_samples"].get(status.lost_samples);
-        each["recoveries"].get(status.recoveries);
-        status.locked = each["clock"]["mode"].is("locked");
-        each["clock"]["period_us"].get(status.period_us);
-    }
-    return true;
-}
+}  // namespace detail
 
-inline bool read(json::Value six, std::array<double, 6>& into) noexcept {
-    std::size_t count = 0;
-    json::Value each;
-    for (json::Items items(six); items.next(each); ++count)
-        if (count == into.size() || !each.get(into[count])) return false;
-    return count == into.size();
-}
+// --------------------------------------------------------------------------------------------------- sockets
 
-// ------------------------------------------------------------------------------------------ sockets
+namespace detail {
 
 using Message = Text<320>;
 
@@ -907,7 +804,7 @@ inline void describe_errno(Message& text, int number) noexcept {
         case ECONNREFUSED: text.add("nobody listens there: start ethercat-server, or name its port"); break;
         case ECONNRESET: case EPIPE: text.add("the server reset the connection"); break;
         case ETIMEDOUT: text.add("no answer"); break;
-        case EHOSTUNREACH: case ENETUNREACH: text.add("no way to that host"); break;
+        case EHOSTUNREACH: case ENETUNREACH: text.add("no route to that host"); break;
         case EMFILE: case ENFILE: text.add("too many open files"); break;
         default: text.add("error ").add(std::int64_t{number});
     }
@@ -1045,7 +942,7 @@ inline std::int64_t after(std::int64_t now_ns, nanoseconds duration) noexcept {
 
 }  // namespace detail
 
-// ---------------------------------------------------------------------------------------------- the stream
+// ------------------------------------------------------------------------------------------------ the stream
 
 /// Whether the newest sample may be used, and if not, why there is no newer one.
 enum class Condition : std::uint8_t {
@@ -1083,7 +980,7 @@ enum class AgeFrom : std::uint8_t {
 struct Options {
     std::string host = "localhost";
     std::uint16_t port = 12001;
-    std::vector<std::uint8_t> sensors{};  ///< places on the bus; empty = all
+    std::vector<std::uint8_t> sensors{};  ///< positions on the bus; empty = all
     std::uint32_t every = 1;              ///< one frame in so many
     bool fresh_only = true;               ///< REPEATED frames only every 10 ms, to show that the sensor is silent
     ImuUnits imu_units = ImuUnits::g_dps;
@@ -1102,7 +999,7 @@ struct Reading {
     bool is_new = false;      ///< no call before returned this sample
     Condition condition = Condition::silent;
 
-    std::uint8_t sensor = 0;         ///< place on the bus
+    std::uint8_t sensor = 0;         ///< position on the bus
     std::uint8_t flags = 0;          ///< of the newest frame, which may be REPEATED or INVALID and bring no sample
     std::uint16_t wkc = 0;           ///< of the newest frame
     std::uint64_t sequence = 0;      ///< of the sample
@@ -1114,7 +1011,8 @@ struct Reading {
 
     // Since the reading of this sensor before this one:
     bool gap = false;                   ///< samples were lost or withheld, or the connection was made anew
-    std::uint64_t missed = 0;           ///< frames that the server numbered and this client did not get, at gaps
+    std::uint64_t withheld = 0;         ///< frames that the server had and this client did not read in time
+    std::uint64_t lost = 0;             ///< samples that the server never had; an estimate, at least one a gap
     std::uint64_t passed_over = 0;      ///< samples that came and that `latest` left out for a newer one
     std::uint32_t warnings_seen = 0;    ///< warnings of all samples, those passed over too: one can last one sample
 
@@ -1125,13 +1023,8 @@ struct Reading {
     bool fresh() const noexcept { return condition == Condition::fresh; }
 };
 
-/// What came of one sensor since the client was made.
-struct Counters {
-    std::uint64_t frames = 0;       ///< all DATA messages
-    std::uint64_t samples = 0;      ///< new and valid ones
-    std::uint64_t repeated = 0, invalid = 0;
-    std::uint64_t gaps = 0;         ///< frames with GAP, or with a sequence that did not rise
-    std::uint64_t missed = 0;       ///< frames that the server numbered and this client did not get, at gaps
+/// Counts of one sensor since the client was made.
+struct Counters : StreamCounts {
     std::uint64_t passed_over = 0;  ///< samples that `latest` left out for a newer one
 };
 
@@ -1214,7 +1107,7 @@ public:
         return frames;
     }
 
-    /// The newest that there is of the sensor at `place`, after reading everything that has arrived.
+    /// The newest sample of the sensor at position `place`, after reading everything that has arrived.
     Reading latest(std::uint8_t place = 0) noexcept {
         update();
         return read(place);
@@ -1226,7 +1119,7 @@ public:
         return read(place);
     }
 
-    /// The next sample of any sensor, in order, none passed over; waits for it at most `timeout`.
+    /// The next sample of any sensor, in order, none left out; waits at most `timeout`.
     ///
     /// Without one the reading is what `latest` of the first wanted sensor would be: `is_new` is false, `condition`
     /// says why. Returns early when the connection is lost and when a signal handler ran.
@@ -1238,7 +1131,10 @@ public:
     bool connected() const noexcept { return link_ == Link::up; }
     /// The server's sensors, as it described them when the subscription was made.
     const Description& description() const noexcept { return description_; }
-    Counters counters(std::uint8_t place = 0) const noexcept { return sensors_ ? sensors_[place].counters : Counters(); }
+    Counters counters(std::uint8_t place = 0) const noexcept {
+        if (!sensors_) return {};
+        return {sensors_[place].accounting.counts, sensors_[place].all_passed_over};
+    }
     /// Connections made so far.
     std::uint32_t connections() const noexcept { return connections_; }
     /// How often a sensor was reconfigured while connected: ranges, filters or rate may be others now.
@@ -1249,7 +1145,8 @@ public:
     int fd() const noexcept { return socket_.fd(); }
 
 private:
-    static constexpr std::size_t kPlaces = 256;  // every value that the sensor's byte can have
+    static constexpr std::size_t kPlaces = 256;  // every value of the `sensor` byte
+    static constexpr double kHighestRateHz = 1e6;
     static constexpr int kMostReads = 16;                // in one call of `update`
     static constexpr ssize_t kBacklog = 2048;            // received at once: more than any steady stream
     static constexpr std::int64_t kAttemptNs = 2'000'000'000;
@@ -1261,11 +1158,12 @@ private:
         Frame sampled;  // the newest that brought a sample
         std::array<std::uint8_t, kPdoSizeWithOrientation> process_data{};
         std::int64_t newest_received_ns = 0, sampled_received_ns = 0;
-        bool seen = false, seen_here = false;  // any frame; any on this connection
+        bool seen = false;  // any frame, on any connection
         bool has_sample = false, unread = false, gap = false, lost = false;
-        std::uint64_t missed = 0, passed_over = 0;
+        std::uint64_t passed_over = 0, all_passed_over = 0;
         std::uint32_t warnings = 0;
-        Counters counters;
+        StreamAccounting accounting;
+        StreamCounts read;  // when the last reading was taken
     };
 
     static Options options_for(std::string host, std::uint16_t port) {
@@ -1407,32 +1305,20 @@ private:
 
     void take(const Frame& frame) noexcept {
         SensorState& state = sensors_[frame.sensor];
-        Counters& counters = state.counters;
-        ++counters.frames;
-        const bool anew = state.seen && !state.seen_here;  // what was lost meanwhile nobody can know
-        const bool back = state.seen_here && frame.sequence <= state.newest.sequence;
-        if (anew || back || (frame.flags & kGap) != 0) {
-            state.gap = true;
-            if (back || (frame.flags & kGap) != 0) ++counters.gaps;
-            if (state.seen_here && !back) {
-                const std::uint64_t jump = frame.sequence - state.newest.sequence;
-                const std::uint64_t missed = jump > options_.every ? jump - options_.every : 0;
-                state.missed += missed;
-                counters.missed += missed;
-            }
-        }
+        StreamAccounting& accounting = state.accounting;
+        const bool reconnected = state.seen && !accounting.begun();  // nobody knows what was lost meanwhile
+        const std::uint64_t restarts = accounting.counts.restarts;
+        const FrameKind kind = accounting.take(frame.sequence, frame.monotonic_ns, frame.flags);
+        if (kind == FrameKind::old) return;
+        if (reconnected || accounting.counts.restarts > restarts || (frame.flags & kGap) != 0) state.gap = true;
         state.newest = frame;
         state.newest.process_data = nullptr;
         state.newest_received_ns = received_ns_;
-        state.seen = state.seen_here = true;
-        if ((frame.flags & (kRepeated | kInvalid)) != 0) {
-            ++((frame.flags & kInvalid) != 0 ? counters.invalid : counters.repeated);
-            return;
-        }
-        ++counters.samples;
+        state.seen = true;
+        if (kind != FrameKind::sample) return;
         if (state.unread) {
             ++state.passed_over;
-            ++counters.passed_over;
+            ++state.all_passed_over;
         }
         state.sampled = state.newest;
         std::memcpy(state.process_data.data(), frame.process_data, frame.size);
@@ -1458,6 +1344,7 @@ private:
                 sensors_[place].lost = false;
             } else if (event.is("reconfigured")) {
                 ++reconfigurations_;
+                if (of_a_sensor) sensors_[place].accounting.rate_hz = 0.0;  // it may be another one now
             } else if (event.is("shutting_down")) {
                 shutting_down_ = true;
             }
@@ -1484,7 +1371,17 @@ private:
             link_ = Link::up;
             error_.clear();
             ++connections_;
-            for (std::size_t i = 0; i < kPlaces; ++i) sensors_[i].seen_here = sensors_[i].lost = false;
+            for (std::size_t i = 0; i < kPlaces; ++i) {
+                sensors_[i].accounting.begin();
+                sensors_[i].accounting.configure(options_.every, options_.fresh_only);
+                sensors_[i].accounting.rate_hz = 0.0;
+                sensors_[i].lost = false;
+            }
+            for (std::size_t i = 0; i < description_.sensor_count; ++i) {
+                const double rate_hz = description_.sensors[i].rate_hz;
+                if (rate_hz > 0.0 && rate_hz <= kHighestRateHz)
+                    sensors_[description_.sensors[i].sensor].accounting.rate_hz = rate_hz;
+            }
         }
     }
 
@@ -1493,7 +1390,7 @@ private:
         value.get(error_);
     }
 
-    // -- what is told
+    // -- readings
 
     Reading read(std::uint8_t place) noexcept {
         Reading reading;
@@ -1508,11 +1405,14 @@ private:
         reading.has_sample = state.has_sample;
         reading.is_new = state.unread;
         reading.gap = state.gap;
-        reading.missed = state.missed;
+        const StreamCounts& counts = state.accounting.counts;
+        reading.withheld = counts.withheld - state.read.withheld;
+        reading.lost = counts.lost - state.read.lost;
+        state.read = counts;
         reading.passed_over = state.passed_over;
         reading.warnings_seen = state.warnings;
         state.unread = state.gap = false;
-        state.missed = state.passed_over = 0;
+        state.passed_over = 0;
         state.warnings = 0;
         bool ahead = false;
         if (state.has_sample) {
@@ -1538,7 +1438,7 @@ private:
         if (state.lost) return Condition::sensor_lost;
         const std::int64_t twice = detail::after(max_age, options_.max_age);
         const std::int64_t silence = twice > kLeastSilenceNs ? twice : kLeastSilenceNs;
-        if (!state.seen_here || now_ns_ - state.newest_received_ns > silence) return Condition::silent;
+        if (!state.accounting.begun() || now_ns_ - state.newest_received_ns > silence) return Condition::silent;
         if ((state.newest.flags & kInvalid) != 0) return Condition::invalid;
         if ((state.newest.flags & kRepeated) != 0) return Condition::repeated;
         return ahead ? Condition::bad_clock : Condition::late;
@@ -1592,11 +1492,67 @@ inline Reading Client::next(nanoseconds timeout) noexcept {
     return read(first);
 }
 
-// ---------------------------------------------------------------------------------------------- requests
+// ------------------------------------------------------------------------------------- control: one request each
 
-/// Asks a server something, on a connection of its own for each request: a stream that is being read is not disturbed,
-/// and a tare, which takes half a second, can be asked for from another thread. Waits and allocates: not for a
-/// control loop. Who may ask for what is the server's decision (docs/protocol.md).
+/// Counters of one sensor, from `status`.
+struct SensorStatus {
+    std::uint8_t sensor = 0;
+    std::uint64_t fresh = 0, repeated = 0, invalid = 0, lost_samples = 0, recoveries = 0;
+    bool locked = false;     ///< the server follows the sensor's clock
+    double period_us = 0.0;  ///< of the sensor's samples
+};
+
+/// Counters of the server, from `status`.
+struct Status {
+    std::uint64_t cycles = 0, missed_deadlines = 0, lost_frames = 0;
+    double uptime_s = 0.0;
+    std::size_t sensor_count = 0;
+    std::array<SensorStatus, kMaxSensors> sensors;
+};
+
+/// What `tare` did: force in N, then torque in Nm.
+struct TareResult {
+    std::array<double, 6> old_offset{}, new_offset{};
+    std::array<double, 6> residual{};   ///< mean minus target afterwards
+    std::array<double, 6> deviation{};  ///< standard deviation of a sample meanwhile
+};
+
+namespace detail {
+
+inline bool read(json::Value reply, Status& into) noexcept {
+    if (!reply["sensors"].is_array()) return false;
+    into = Status();
+    reply["cycles"].get(into.cycles);
+    reply["missed_deadlines"].get(into.missed_deadlines);
+    reply["lost_frames"].get(into.lost_frames);
+    reply["uptime_s"].get(into.uptime_s);
+    json::Value each;
+    for (json::Items items(reply["sensors"]); into.sensor_count < kMaxSensors && items.next(each);) {
+        SensorStatus& status = into.sensors[into.sensor_count++];
+        each["sensor"].get(status.sensor);
+        each["fresh"].get(status.fresh);
+        each["repeated"].get(status.repeated);
+        each["invalid"].get(status.invalid);
+        each["lost_samples"].get(status.lost_samples);
+        each["recoveries"].get(status.recoveries);
+        status.locked = each["clock"]["mode"].is("locked");
+        each["clock"]["period_us"].get(status.period_us);
+    }
+    return true;
+}
+
+inline bool read(json::Value six, std::array<double, 6>& into) noexcept {
+    std::size_t count = 0;
+    json::Value each;
+    for (json::Items items(six); items.next(each); ++count)
+        if (count == into.size() || !each.get(into[count])) return false;
+    return count == into.size();
+}
+
+}  // namespace detail
+
+/// Requests to a server, each on a connection of its own, so that no stream is disturbed and another thread may ask (a tare
+/// takes half a second). Waits and allocates: not for a control loop. Who may do what: docs/protocol.md.
 class Control {
 public:
     explicit Control(std::string host = "localhost", std::uint16_t port = 12001) : host_(std::move(host)), port_(port) {}
@@ -1631,7 +1587,7 @@ public:
     }
 
     /// Set the sensor's own offset so that the mean of `samples` samples becomes `target` (N, Nm). The sensor must be
-    /// at rest; it takes `samples` sample periods and some more.
+    /// stationary; it takes `samples` sample periods and some more.
     bool tare(TareResult& into, std::uint8_t place = 0, unsigned samples = 400, const std::array<double, 6>& target = {},
               nanoseconds timeout = std::chrono::seconds(60)) {
         std::string request = "{\"action\":\"tare\",\"sensor\":" + std::to_string(place) +
@@ -1652,7 +1608,7 @@ public:
                fail("the reply to tare lacks six numbers");
     }
 
-    /// The reply that granted or refused the last request; holds until the next one.
+    /// The reply that granted or refused the last request; valid until the next one.
     json::Value reply() const noexcept { return json::Value(reply_); }
     /// Why the last request failed. A sentence, for a person; empty if it did not.
     const char* error() const noexcept { return error_.c_str(); }

@@ -1,29 +1,24 @@
-// Does with the C++ client what it is told, for tests: `driver [OPTION=VALUE ...]`, then a command a line on standard
-// input, and for each a line of JSON on standard output.
+// Runs the C++ client for tests: a command per line on standard input, and for each a line of JSON on standard output.
 //
-//   connect MS | close | latest [PLACE] | peek [PLACE] | next MS | collect COUNT MS | follow COUNT HZ [PLACE]
-//   info [PLACE] | ask REQUEST | describe | status | tare SAMPLES FX FY FZ MX MY MZ
+//   new [OPTION=VALUE ...]    another client; the one before is gone
+//   connect MS | close | latest [POSITION] | peek [POSITION] | next MS | collect COUNT MS | follow COUNT HZ [POSITION]
+//   info [POSITION] | ask REQUEST | describe | status | tare SAMPLES FX FY FZ MX MY MZ
 //
-// Built with COUNT_ALLOCATIONS it counts what `latest` and `next` allocate (not under ASan, which has its own malloc).
+// Built with ASan, whose hook counts what `latest` and `next` allocate.
 #include <bota_ethercat.hpp>
 
 #include <cinttypes>
 #include <cstdlib>
 #include <iostream>
+#include <optional>
 #include <sstream>
+
+#include "decode.hpp"
 
 static std::size_t allocations = 0;
 
-#ifdef COUNT_ALLOCATIONS
-extern "C" {
-void* __libc_malloc(std::size_t size);
-void* __libc_calloc(std::size_t count, std::size_t size);
-void* __libc_realloc(void* old, std::size_t size);
-void* malloc(std::size_t size) { return ++allocations, __libc_malloc(size); }
-void* calloc(std::size_t count, std::size_t size) { return ++allocations, __libc_calloc(count, size); }
-void* realloc(void* old, std::size_t size) { return ++allocations, __libc_realloc(old, size); }
-}
-#endif
+// Of ASan's runtime; g++ does not always come with <sanitizer/allocator_interface.h>.
+extern "C" int __sanitizer_install_malloc_and_free_hooks(void (*)(const volatile void*, std::size_t), void (*)(const volatile void*));
 
 namespace {
 
@@ -69,17 +64,17 @@ void print(const Reading& r) {
     std::printf(",\"sequence\":%" PRIu64 ",\"stamp_ns\":%" PRIu64 ",\"monotonic_ns\":%" PRIu64 ",\"received_ns\":%" PRId64
                 ",\"age_ns\":%" PRId64 ",\"age_is_lower_bound\":%s",
                 r.sequence, r.stamp_ns, r.monotonic_ns, r.received_ns, r.age_ns, yes(r.age_is_lower_bound));
-    std::printf(",\"gap\":%s,\"missed\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"warnings_seen\":%" PRIu32
+    std::printf(",\"gap\":%s,\"withheld\":%" PRIu64 ",\"lost\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"warnings_seen\":%" PRIu32
                 ",\"connection\":%" PRIu32 ",\"more_waits\":%s",
-                yes(r.gap), r.missed, r.passed_over, r.warnings_seen, r.connection, yes(r.more_waits));
+                yes(r.gap), r.withheld, r.lost, r.passed_over, r.warnings_seen, r.connection, yes(r.more_waits));
     print("array", r.sample.array());
     std::printf(",\"temperature\":%.17g}", r.sample.temperature);
 }
 
-Options options_from(int argc, char** argv) {
+Options options_from(std::istringstream& words) {
     Options options;
-    for (int i = 1; i < argc; ++i) {
-        const std::string word = argv[i], key = word.substr(0, word.find('=')), value = word.substr(word.find('=') + 1);
+    for (std::string word; words >> word;) {
+        const std::string key = word.substr(0, word.find('=')), value = word.substr(word.find('=') + 1);
         const auto number = [&] { return std::stoll(value); };
         if (key == "host") options.host = value;
         else if (key == "port") options.port = static_cast<std::uint16_t>(number());
@@ -116,7 +111,7 @@ void collect(Client& client, long count, long ms) {
 
 /// `latest` at a steady pace; what a controller would have seen.
 void follow(Client& client, long count, double hz, std::uint8_t place) {
-    std::uint64_t fresh = 0, too_young = 0, is_new = 0, not_rising = 0, passed_over = 0, missed = 0, gaps = 0, last = 0;
+    std::uint64_t fresh = 0, too_young = 0, is_new = 0, not_rising = 0, passed_over = 0, withheld = 0, gaps = 0, last = 0;
     std::int64_t due = monotonic_now_ns();
     for (long i = 0; i < count; ++i) {
         due += static_cast<std::int64_t>(1e9 / hz);
@@ -130,24 +125,24 @@ void follow(Client& client, long count, double hz, std::uint8_t place) {
         not_rising += r.is_new && r.monotonic_ns <= last;
         if (r.is_new) last = r.monotonic_ns;
         passed_over += r.passed_over;
-        missed += r.missed;
+        withheld += r.withheld;
         gaps += r.gap;
     }
     std::printf("{\"calls\":%ld,\"fresh\":%" PRIu64 ",\"too_young\":%" PRIu64 ",\"new\":%" PRIu64 ",\"not_rising\":%" PRIu64
-                ",\"passed_over\":%" PRIu64 ",\"missed\":%" PRIu64 ",\"gaps\":%" PRIu64 "}",
-                count, fresh, too_young, is_new, not_rising, passed_over, missed, gaps);
+                ",\"passed_over\":%" PRIu64 ",\"withheld\":%" PRIu64 ",\"gaps\":%" PRIu64 "}",
+                count, fresh, too_young, is_new, not_rising, passed_over, withheld, gaps);
 }
 
 void info(const Client& client, std::uint8_t place) {
     const Counters c = client.counters(place);
     constexpr const char* kLinks[] = {"down", "connecting", "subscribing", "up"};
     std::printf("{\"link\":\"%s\",\"error\":%s,\"connections\":%u,\"reconfigurations\":%u,\"bad_messages\":%" PRIu64
-                ",\"allocated\":%zu,\"fd\":%d",
+                ",\"allocated\":%zu,\"allocates\":%s,\"fd\":%d",
                 kLinks[static_cast<int>(client.link())], quoted(client.error()).c_str(), client.connections(),
-                client.reconfigurations(), client.bad_messages(), allocated, client.fd());
+                client.reconfigurations(), client.bad_messages(), allocated, yes(allocations > 0), client.fd());
     std::printf(",\"frames\":%" PRIu64 ",\"samples\":%" PRIu64 ",\"repeated\":%" PRIu64 ",\"invalid\":%" PRIu64 ",\"gaps\":%" PRIu64
-                ",\"missed\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"names\":[",
-                c.frames, c.samples, c.repeated, c.invalid, c.gaps, c.missed, c.passed_over);
+                ",\"withheld\":%" PRIu64 ",\"skipped\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"names\":[",
+                c.frames(), c.samples, c.repeated, c.invalid, c.gaps, c.withheld, c.skipped, c.passed_over);
     for (std::size_t i = 0; i < client.description().sensor_count; ++i)
         std::printf("%s%s", i ? "," : "", quoted(client.description().sensors[i].name.view()).c_str());
     std::printf("]}");
@@ -161,12 +156,23 @@ void print(const Control& control, bool ok) {
 }  // namespace
 
 int main(int argc, char** argv) {
-    const Options options = options_from(argc, argv);
-    Client client(options);
-    Control control(options.host, options.port);
+    if (argc > 1 && std::string_view(argv[1]) == "decode") return decode(argc > 2 && std::string_view(argv[2]) == "accounting");
+    __sanitizer_install_malloc_and_free_hooks([](const volatile void*, std::size_t) { ++allocations; }, [](const volatile void*) {});
+    std::optional<Client> maybe_client;
+    std::optional<Control> maybe_control;
     for (std::string line, command; std::getline(std::cin, line);) {
         std::istringstream words(line);
         words >> command;
+        if (command == "new") {
+            const Options options = options_from(words);
+            maybe_client.emplace(options);
+            maybe_control.emplace(options.host, options.port);
+            allocated = 0;
+            continue;
+        }
+        if (!maybe_client) return 2;
+        Client& client = *maybe_client;
+        Control& control = *maybe_control;
         long number = 0;
         if (command != "ask") words >> number;
         const auto place = static_cast<std::uint8_t>(number);

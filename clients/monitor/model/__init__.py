@@ -1,0 +1,1 @@
+"""The model of the monitor: server, sensors, stream."""

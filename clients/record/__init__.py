@@ -1,0 +1,1 @@
+"""`ethercat-record`: writes every frame of a server into recordings."""

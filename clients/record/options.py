@@ -1,0 +1,87 @@
+"""The command line of `ethercat-record`."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from clients.arguments import add_address, add_imu_units, number, parser, position, seconds
+from protocol.address import Address
+from protocol.pdo import ImuUnits
+
+_UNITS: Final = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}
+_SIZE: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)([kMG]?)B?", re.ASCII)
+_LEAST_SIZE: Final = 100_000
+
+
+class RecordOptions(argparse.Namespace):
+    """What to record, and where."""
+
+    path: Path
+    address: Address
+    sensors: list[int] | None
+    """Positions on the bus, ascending; None for all."""
+    seconds: float | None
+    ros: bool
+    namespaces: list[str] | None
+    imu_units: ImuUnits
+    rotate_size: int | None
+    rotate_seconds: float | None
+    force: bool
+    wait: bool
+    reconnect: bool
+    until_eof: bool
+
+
+def parse_options(argv: Sequence[str] | None) -> RecordOptions:
+    """Read the command line; argparse exits with 2 if it is wrong."""
+    made = parser(
+        "ethercat-record",
+        "Records the unmodified stream of ethercat-server into an MCAP file.",
+        "Ctrl-C ends the recording. SIZE is in bytes, or such as 500k, 100M, 2G.",
+    )
+    add = made.add_argument
+    add("path", type=Path, metavar="OUT.mcap", help="file to write")
+    add_address(made)
+    add("--sensor", type=position, action="append", dest="sensors", metavar="N",
+        help="record only the sensor at this position on the bus; repeatable")  # fmt: skip
+    add("--seconds", type=seconds, metavar="S", help="stop after S seconds")
+    add("--ros", action="store_true",
+        help="also write what the ROS 2 node would publish: WrenchStamped, Imu, Temperature")  # fmt: skip
+    add("--ros-namespace", type=_namespace, action="append", dest="namespaces", metavar="NAME",
+        help="namespace of these topics, one for each sensor in order (default: none for one sensor, "
+        "sensor_0, sensor_1, ... for several)")  # fmt: skip
+    add_imu_units(made, "--ros")
+    add("--rotate-size", type=_size, metavar="SIZE", help="start a new file when one reaches this size")
+    add("--rotate-seconds", type=number(1, 1e9, "at least 1 s"), metavar="S",
+        help="start a new file every S seconds")  # fmt: skip
+    add("--force", action="store_true", help="overwrite existing files")
+    add("--wait", action="store_true", help="wait for the server to start")
+    add("--no-reconnect", action="store_false", dest="reconnect",
+        help="stop when the connection ends, instead of reconnecting")  # fmt: skip
+    add("--until-eof", action="store_true",
+        help="stop at the end of standard input, when the program at its other end exits")  # fmt: skip
+    options = made.parse_intermixed_args(argv, RecordOptions())
+    if options.namespaces is not None and not options.ros:
+        made.error("--ros-namespace requires --ros")
+    if options.sensors is not None:
+        options.sensors = sorted(set(options.sensors))
+    return options
+
+
+def _size(text: str) -> int:
+    match = _SIZE.fullmatch(text)
+    size = int(float(match[1]) * _UNITS[match[2]]) if match else 0
+    if size >= _LEAST_SIZE:
+        return size
+    raise argparse.ArgumentTypeError(f"{text!r}: it must be a size such as 100M, at least 100k")
+
+
+def _namespace(text: str) -> str:
+    name = text.strip("/")
+    if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", name, re.ASCII):
+        return name
+    raise argparse.ArgumentTypeError(f"{text!r}: it must be a ROS namespace, such as left_arm")

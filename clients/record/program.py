@@ -1,0 +1,171 @@
+"""What `ethercat-record` does: connects, records until it is stopped, reports what it recorded and lost."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from functools import partial
+
+from clients.errors import RecordingError
+from clients.numbers import count, data_size, duration
+from clients.program import VERSION, Signals, say
+from clients.record.options import RecordOptions, parse_options
+from clients.record.parts import Parts
+from clients.record.progress import Progress
+from clients.record.recorder import Recorder
+from clients.record.source import Batch, Source
+from clients.recording.file_format import FORMAT_VERSION
+from clients.recording.reader import Event
+from clients.recording.ros_messages import RosTopics
+from protocol.errors import ConnectionFailedError, ProtocolError
+from protocol.text.untrusted import rows
+from protocol.text.visible import printable
+
+_WAIT_S = 0.2
+_say = partial(say, "ethercat-record")
+
+
+def run(argv: Sequence[str] | None, signals: Signals) -> int:
+    """Record; returns the exit code."""
+    options = parse_options(argv)
+    parts = Parts(
+        options.path, size=options.rotate_size, seconds=options.rotate_seconds, overwrite=options.force
+    )
+    source = Source(options.address, options.sensors)
+    try:
+        with contextlib.closing(source):
+            return _run(source, parts, options, signals)
+    except ConnectionFailedError as error:
+        _say(f"no server at {options.address}: {error}; start ethercat-server, or use --wait")
+    except (RecordingError, ProtocolError) as error:
+        _say(str(error))
+    return 1
+
+
+def _run(source: Source, parts: Parts, options: RecordOptions, signals: Signals) -> int:
+    parts.check()
+    first = _connect(source, options, signals)
+    if first is None:
+        _say("stopped before the server started; nothing was recorded")
+        return 0
+    recorder = Recorder(parts, f"ethercat-record {VERSION}", _notes(options, source), _ros(options, source))
+    return _record(source, recorder, first, options, parts, signals)
+
+
+def _connect(source: Source, options: RecordOptions, signals: Signals) -> Batch | None:
+    """The first batch; None if it was stopped before."""
+    waiting = False
+    while True:
+        try:
+            return source.connect()
+        except ConnectionFailedError:
+            if not options.wait:
+                raise
+        if not waiting:
+            _say(f"waiting for a server at {options.address}")
+            waiting = True
+        if _asked(options, signals):
+            return None
+        time.sleep(_WAIT_S)
+
+
+def _record(
+    source: Source, recorder: Recorder, batch: Batch, options: RecordOptions, parts: Parts, signals: Signals
+) -> int:
+    began, reason, code, refused = time.monotonic(), "asked to stop", 0, ""
+    with Progress(options.path.name) as progress:
+        progress.say(f"recording {options.address} to {parts.made[0]}; Ctrl-C ends it")
+        try:
+            while True:
+                recorder.put(batch)
+                _report(batch, progress)
+                if recorder.failed:
+                    code = 1
+                    break
+                if _asked(options, signals):
+                    break
+                if options.seconds is not None and time.monotonic() - began >= options.seconds:
+                    reason = "time is up"
+                    break
+                if not (source.connected or options.reconnect):
+                    reason = "the server ended"
+                    break
+                progress.show(recorder, connected=source.connected)
+                batch = source.receive()
+        except ProtocolError as error:
+            reason, code = f"the server refused: {error}", 1
+            refused = reason
+        seconds = time.monotonic() - began
+        source.close()
+        recorder.stop(reason)
+    if refused:
+        _say(refused)
+        if not recorder.saved and recorder.error is None:
+            # An empty file would block the next attempt.
+            parts.remove()
+            return code
+    if recorder.error is not None:
+        _say(f"{recorder.error}; what was written before is intact")
+        code = 1
+    _say(_summary(recorder, parts, seconds))
+    return code
+
+
+def _asked(options: RecordOptions, signals: Signals) -> bool:
+    """Whether it was asked to stop."""
+    if options.until_eof and not signals.asked and select.select([0], [], [], 0)[0]:
+        signals.asked = not os.read(0, 4096)
+    return signals.asked
+
+
+def _report(batch: Batch, progress: Progress) -> None:
+    for item in batch:
+        if isinstance(item, Event):
+            row = item.event
+            words = row.get("message") or row.get("reason") or ""
+            position = f" {row['sensor']}" if "sensor" in row else ""
+            if item.name != "connected":
+                progress.say(printable(f"{item.name}{position}{': ' if words else ''}{words}", 300))
+
+
+def _summary(recorder: Recorder, parts: Parts, seconds: float) -> str:
+    files = str(parts.made[0]) if len(parts.made) == 1 else f"{parts.made[0]} to {parts.made[-1].name}"
+    frames = f"{recorder.saved} frames of {count(len(recorder.tally.sensors), 'sensor')}"
+    losses = ", ".join(recorder.tally.losses()) or "nothing was lost"
+    return f"{files}: {duration(seconds)}, {frames}, {data_size(recorder.bytes_written)}; {losses}"
+
+
+def _notes(options: RecordOptions, source: Source) -> dict[str, str]:
+    assert source.description is not None
+    return {
+        "format": FORMAT_VERSION,
+        "recorder": f"ethercat-record {VERSION}",
+        "server": str(options.address),
+        "server_version": printable(source.description.get("version"), 40),
+        "host": socket.gethostname(),
+        "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        **({"sensors": " ".join(map(str, options.sensors))} if options.sensors else {}),
+    }
+
+
+def _ros(options: RecordOptions, source: Source) -> dict[int, RosTopics]:
+    if not options.ros:
+        return {}
+    assert source.description is not None
+    described = [row.get("sensor") for row in rows(source.description.get("sensors"))]
+    positions = options.sensors or sorted({position for position in described if isinstance(position, int)})
+    names = options.namespaces or (
+        [""] if len(positions) == 1 else [f"sensor_{position}" for position in positions]
+    )
+    if len(names) != len(positions):
+        raise RecordingError(
+            f"--ros-namespace is given {len(names)} times for {len(positions)} sensors: give one each"
+        )
+    return {
+        position: RosTopics(name, options.imu_units) for position, name in zip(positions, names, strict=True)
+    }

@@ -1,8 +1,0 @@
-"""This package's version."""
-
-from importlib.metadata import PackageNotFoundError, version
-
-try:
-    VERSION = version("bota-ethercat-bridge")
-except PackageNotFoundError:  # run from a checkout that was never installed
-    VERSION = "0+unknown"

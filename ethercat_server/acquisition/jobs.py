@@ -1,0 +1,130 @@
+"""Work on the sensors that clients asked for, in steps between two exchanges, so that no sample waits for it.
+
+A step is one or two datagrams. It is taken when there is time for it before the next exchange is due. Each
+sensor does one job at a time, in the order asked.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
+
+from ethercat_server.errors import BusError, CutOffError, SdoAbortError
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.slave.coe import Steps
+from ethercat_server.sensor.sensor import Sensor
+from protocol.control import ErrorCode
+from protocol.errors import RequestError
+
+_STEP_NS: Final = 300_000
+"""A step is begun only with this much time left: an exchange and a margin."""
+_AT_LEAST_EVERY_NS: Final = 20_000_000
+"""A step is taken at least this often, even on a bus that leaves no time."""
+_MOST_WAITING: Final = 32
+_AWAY: Final = "is lost, or was taken out of OP to be set up"
+
+log = logging.getLogger(__name__)
+
+Done = Callable[[Any, RequestError | None], None]
+"""Called with the job's result, or with why there is none."""
+
+
+class _Job(NamedTuple):
+    """What is to be done on a sensor; whether it changes how the sensor is set or tared."""
+
+    steps: Steps[Any]
+    done: Done
+    changes: bool
+
+
+class Jobs:
+    """The jobs of all sensors of the bus."""
+
+    def __init__(self, bus: Bus, sensors: Sequence[Sensor]) -> None:
+        self._bus = bus
+        self._sensors = sensors
+        self._queues: list[deque[_Job]] = [deque() for _ in sensors]
+        self._turn = 0
+        self._stepped_ns = 0
+        self.waiting = 0
+        """Jobs that are not done."""
+
+    def start(
+        self,
+        position: int,
+        steps: Steps[Any],
+        done: Done,
+        *,
+        changes: bool = False,
+        most: int = _MOST_WAITING,
+    ) -> None:
+        """Have `steps` done on the sensor at `position`; `changes` is for `is_changing`.
+
+        If the sensor is lost meanwhile, CutOffError is raised in `steps`: nothing more can be done on it.
+        RequestError if it is lost already, or if `most` jobs wait for it.
+        """
+        self.check_present(position)
+        if len(self._queues[position]) >= most:
+            raise RequestError(
+                ErrorCode.BUSY, f"sensor {position} has {most} requests to do already: ask again later"
+            )
+        self._queues[position].append(_Job(steps, done, changes))
+        self.waiting += 1
+
+    def is_changing(self, position: int) -> bool:
+        """Whether a job that changes the sensor at `position` is under way or waits."""
+        return any(job.changes for job in self._queues[position])
+
+    def check_present(self, position: int) -> None:
+        """RequestError if the sensor at `position` cannot be talked to."""
+        if not self._sensors[position].streams:
+            raise RequestError(ErrorCode.NOT_READY, f"sensor {position} {_AWAY}: ask again when it is back")
+
+    def step(self, until_ns: int) -> None:
+        """Take a step if there is time for one before `until_ns`. To be called only while jobs wait."""
+        now = self._bus.clock.monotonic_ns()
+        if until_ns - now < _STEP_NS and now - self._stepped_ns < _AT_LEAST_EVERY_NS:
+            return
+        self._stepped_ns = now
+        for _ in self._queues:
+            self._turn = (self._turn + 1) % len(self._queues)
+            if self._queues[self._turn]:
+                self._step(self._turn, until_ns)
+                return
+
+    def _step(self, position: int, until_ns: int) -> None:
+        steps, done, _ = self._queues[position][0]
+        result: Any = None
+        error: RequestError | None = None
+        try:
+            if self._sensors[position].streams:
+                with self._bus.in_time(until_ns):
+                    next(steps)
+                return
+            steps.throw(CutOffError(f"sensor {position} {_AWAY}"))
+            raise CutOffError(f"sensor {position} {_AWAY}")
+        except StopIteration as stop:
+            result = stop.value
+        except RequestError as refused:
+            # A new one: in a variable of this frame, the one that was raised would keep itself alive.
+            error = RequestError(refused.code, str(refused), **refused.extra)
+        except BusError as failed:
+            error = refusal(failed)
+        except Exception:  # a defect in one request must not stop the acquisition
+            log.exception("a request to sensor %d failed", position)
+            error = RequestError(
+                ErrorCode.INTERNAL, "the request failed by a fault of this program: see its log"
+            )
+        steps.close()
+        self._queues[position].popleft()
+        self.waiting -= 1
+        done(result, error)
+
+
+def refusal(error: BusError) -> RequestError:
+    """The error reply for a job that failed."""
+    if isinstance(error, SdoAbortError):
+        return RequestError(ErrorCode.SENSOR, str(error), abort_code=error.abort_code)
+    return RequestError(ErrorCode.NOT_READY, str(error))

@@ -1,0 +1,156 @@
+"""One sensor's stream: which exchanges brought a new sample, and the DATA frame for it.
+
+A frame exists for every new sample. While the sensor is silent there is one REPEATED (or INVALID)
+frame for each sample period that passes, so that its silence is visible; the polls in between samples, which
+find the same data again only because the bus is read more often than the sensor samples, make none.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Final
+
+from ethercat_server.acquisition.histogram import RecentDistribution
+from ethercat_server.acquisition.sample_clock import PLAUSIBLE_PULL, SampleClock
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
+from protocol.framing import DataFlag, encode_data
+
+DISCARDED_AT_START: Final = 3
+"""Bota's own driver discards the first three frames after entering OP."""
+_DEVIATING_SECONDS: Final = 10
+"""Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment."""
+_IDLE_PERIODS: Final = 3.0
+"""Periods without a new sample after which a sensor counts as silent, not just late."""
+
+log = logging.getLogger(__name__)
+
+REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))
+
+
+class SensorStream:
+    """Numbers, stamps and marks the frames of the sensor at `position`, which samples every `period_ns`."""
+
+    def __init__(self, position: int, period_ns: float, clock: Clock = SYSTEM_CLOCK) -> None:
+        self.position = position
+        self._monotonic_ns, self._time_ns = clock.monotonic_ns, clock.time_ns
+        self.clock = SampleClock(period_ns, clock.monotonic_ns())
+        self.process_data = b""
+        """The newest valid process data."""
+        self._handed_out = b""
+        """What the last frame carried: a REPEATED or INVALID one carries it again."""
+        self.sequence = 0
+        self.fresh = 0
+        self.repeated = 0
+        self.invalid = 0
+        self.lost_samples = 0
+        self.recoveries = 0
+        self.age = RecentDistribution()
+        """From the estimated instant of a sample to its hand-out, while locked."""
+        self._discard = DISCARDED_AT_START
+        self._gap = False
+        self._seen = (0, 0, False, False)
+        """The last exchange, as `learn` needs it: sent, back, valid, fresh."""
+        self._rate_reported = False
+        self._deviating_seconds = 0
+        self._valid_ns = 0
+        self._idle_at_ns = 0.0
+
+    def take(
+        self, data: bytes, wkc: int, valid: bool, sent_ns: int, back_ns: int
+    ) -> tuple[bytes, int] | None:
+        """The frame that an exchange gives, and its flags; None if it gives none. `learn` must follow.
+
+        `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the exchange.
+        """
+        clock = self.clock
+        moment_ns = back_ns
+        fresh = valid and data != self.process_data
+        self._seen = sent_ns, back_ns, valid, fresh
+        if valid:
+            self._valid_ns = back_ns
+        if fresh:
+            self.process_data = data
+            if self._discard:
+                self._discard -= 1
+                self._idle_at_ns = back_ns + _IDLE_PERIODS * clock.period_ns
+                return None
+            self._handed_out = data
+            clock.predict(sent_ns, back_ns)
+            flags = self._new_sample(back_ns)
+            # After a stall in the exchange its end says nothing of when the sample came to be.
+            moment_ns = int(clock.instant_ns if clock.locked else min(back_ns, sent_ns + clock.period_ns))
+        elif back_ns >= self._idle_at_ns and self.process_data:
+            self._discard = 0  # a sensor that is stuck from the start is to be seen too
+            self._handed_out = self._handed_out or self.process_data
+            # One lost frame is no news: INVALID is what nothing valid came for in two periods.
+            flags = self._nothing_new(back_ns - self._valid_ns < 2 * clock.period_ns, back_ns)
+        else:
+            return None
+        stamp_ns = self._time_ns() - (self._monotonic_ns() - moment_ns)
+        sequence = self.sequence
+        self.sequence += 1
+        return encode_data(
+            sequence, stamp_ns, moment_ns, self.position, flags, max(wkc, 0), self._handed_out
+        ), flags  # fmt: skip
+
+    def learn(self) -> None:
+        """What the last exchange teaches, which can wait until its frame is on its way."""
+        sent_ns, back_ns, valid, fresh = self._seen
+        if not valid:
+            self.clock.missed(sent_ns)
+            return
+        locked = self.clock.locked
+        self.clock.observe(sent_ns, back_ns, fresh)
+        if fresh and locked:
+            self.age.record(back_ns - int(self.clock.instant_ns))
+
+    def _new_sample(self, now_ns: int) -> int:
+        self._idle_at_ns = now_ns + _IDLE_PERIODS * self.clock.period_ns
+        self.fresh += 1
+        lost = self.clock.steps - 1 if self.sequence else 0
+        # -1 takes back one that was counted after a stall but came after all.
+        self.lost_samples = max(0, self.lost_samples + lost)
+        flags = GAP if lost > 0 or self.clock.uncertain or self._gap else 0
+        self._gap = False
+        return flags
+
+    def _nothing_new(self, valid: bool, now_ns: int) -> int:
+        # The next slot is counted from this one, but a stall makes one frame, not a burst.
+        self._idle_at_ns = max(self._idle_at_ns + self.clock.period_ns, float(now_ns))
+        if valid:
+            self.repeated += 1
+            return REPEATED
+        self.invalid += 1
+        return INVALID
+
+    def check_rate(self) -> None:
+        """To be called once a second: say once if the sensor samples at another rate than it is set to."""
+        pull = self.clock.pull
+        deviates = self.clock.locked and abs(pull) > PLAUSIBLE_PULL
+        self._deviating_seconds = self._deviating_seconds + 1 if deviates else 0
+        if self._deviating_seconds == _DEVIATING_SECONDS and not self._rate_reported:
+            self._rate_reported = True
+            log.warning(
+                "sensor %d samples every %.1f µs, %+.1f %% off what it is set to: check its settings",
+                self.position, self.clock.period_ns / 1000, 100 * pull,
+            )  # fmt: skip
+
+    def recover(self, period_ns: float | None, *, lost: bool = True) -> None:
+        """The sensor is back after it was out; `period_ns` if it entered OP anew, None if it never left."""
+        self.recoveries += lost
+        if period_ns is not None:
+            self.clock = SampleClock(period_ns, self._monotonic_ns())
+            self._discard = DISCARDED_AT_START
+            self._gap = True
+
+    def status(self) -> dict[str, Any]:
+        """The sensor's part of the `status` reply, but for the age."""
+        return {
+            "sensor": self.position,
+            "fresh": self.fresh,
+            "repeated": self.repeated,
+            "invalid": self.invalid,
+            "lost_samples": self.lost_samples,
+            "recoveries": self.recoveries,
+            "clock": self.clock.describe(),
+        }

@@ -1,0 +1,1 @@
+"""`ethercat-server`: command line, configuration, one run. May import everything but the programs."""

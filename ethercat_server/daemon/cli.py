@@ -1,0 +1,34 @@
+"""`ethercat-server`: handles signals from the start, runs the server, turns errors into exit codes."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+
+from ethercat_server.errors import ServerError, StopRequestedError
+from ethercat_server.process.logs import set_up_logging
+from ethercat_server.process.signals import Signals
+
+log = logging.getLogger(__name__)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the server; returns its exit code."""
+    signals = Signals()
+    set_up_logging()
+    # Loading it takes a moment, in which Ctrl-C must work already.
+    from ethercat_server.daemon.server import serve  # noqa: PLC0415
+
+    try:
+        serve(argv, signals)
+    except StopRequestedError:
+        log.info("stopped during start-up")
+    except ServerError as error:
+        log.error("%s", error)
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

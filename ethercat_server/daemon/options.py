@@ -1,0 +1,223 @@
+"""Command line and configuration file, parsed into one checked object."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from ethercat_server import __version__
+from ethercat_server.daemon.config_file import EMPTY, read_config
+from ethercat_server.daemon.server_settings import SERVER_SETTINGS, ServerSetting
+from ethercat_server.errors import UsageError
+from protocol.errors import SettingError
+from protocol.sensor_choice import SensorChoice
+from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
+
+if TYPE_CHECKING:
+    from ethercat_server.sensor.sensor import Identity
+
+VIRTUAL_INTERFACE: Final = "virtual"
+"""Interface name that means a virtual bus with a virtual sensor on it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServerOptions:
+    """Everything the server needs to know to start."""
+
+    ifname: str
+    port: int
+    sensor_name: str | None = None
+    virtual_arguments: str = ""
+    server: Mapping[str, Any] = field(
+        default_factory=lambda: {name: setting.default for name, setting in SERVER_SETTINGS.items()}
+    )
+    """The server's own settings, by the names of SERVER_SETTINGS."""
+    common_settings: dict[str, SettingValue] = field(default_factory=dict)
+    """From the file, for every sensor."""
+    sensor_settings: dict[SensorChoice, dict[str, SettingValue]] = field(default_factory=dict)
+    """From the file, for single sensors; these override the ones above."""
+    assigned_settings: dict[str, SettingValue] = field(default_factory=dict)
+    """From the command line; these override both."""
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether to start a virtual bus."""
+        return self.ifname == VIRTUAL_INTERFACE
+
+    def asked_settings(self, position: int, name: str, serial: int) -> dict[str, SettingValue]:
+        """The settings the user gave for the sensor at `position` with this name and serial number."""
+        asked: dict[str, SettingValue] = {}
+        for _, settings in self._sources(position, name, serial):
+            asked |= settings
+        return asked
+
+    def wanted_settings(self, position: int, name: str, serial: int) -> dict[str, SettingValue]:
+        """The start-up defaults overridden by these; UsageError if the result is inconsistent."""
+        wanted = {**start_up_defaults(), **self.asked_settings(position, name, serial)}
+        try:
+            check_combination(wanted)
+        except SettingError as error:
+            sources = ", ".join(source for source, _ in self._sources(position, name, serial))
+            raise UsageError(
+                f"the settings for sensor {position} ({name}, serial {serial}) are inconsistent: {error}; "
+                f"correct one of {sources}"
+            ) from None
+        return wanted
+
+    def _sources(self, position: int, name: str, serial: int) -> list[tuple[str, dict[str, SettingValue]]]:
+        """Where settings for this sensor come from, and which; later ones override earlier ones."""
+        single = [choice for choice in self.sensor_settings if choice.matches(position, name, serial)]
+        single.sort(key=lambda choice: choice.precedence)
+        sources = [
+            ("[sensor]", self.common_settings),
+            *((f"[sensor.{choice}]", self.sensor_settings[choice]) for choice in single),
+            ("--set", self.assigned_settings),
+        ]
+        return [(source, settings) for source, settings in sources if settings]
+
+    def check_sensors(self, found: Mapping[int, Identity]) -> None:
+        """UsageError if there are settings for a sensor that is not among those `found`, by position."""
+        missing = [
+            str(choice)
+            for choice in self.sensor_settings
+            if not any(choice.matches(position, who.name, who.serial) for position, who in found.items())
+        ]
+        if missing:
+            there = "; ".join(f"{position}: {who}" for position, who in found.items())
+            raise UsageError(
+                f"the configuration has settings for sensor {', '.join(missing)}, but the bus has only "
+                f"{there}: connect that sensor, or correct the name of the table"
+            )
+
+    def check(self) -> None:
+        """SettingError if the settings of any sensor are inconsistent."""
+        for own in ({}, *self.sensor_settings.values()):
+            check_combination(
+                {**start_up_defaults(), **self.common_settings, **own, **self.assigned_settings}
+            )
+
+
+@functools.cache
+def build_parser() -> argparse.ArgumentParser:
+    """The command line of `ethercat-server`."""
+    parser = argparse.ArgumentParser(
+        prog="ethercat-server",
+        usage="%(prog)s [options] IFACE [SENSOR_NAME] PORT",
+        description="EtherCAT master for Bota force/torque sensors: streams their samples over TCP.",
+        epilog="settings: " + "; ".join(f"{row.name} ({row.meaning})" for row in SETTINGS.values()),
+    )
+    parser.add_argument(
+        "arguments", nargs="+", metavar="IFACE [SENSOR_NAME] PORT",
+        help="network interface ('virtual' for a simulated sensor), model of the first sensor, TCP port",
+    )  # fmt: skip
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",
+        help="set a setting of every sensor at start-up; repeatable",
+    )  # fmt: skip
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE.toml",
+        help="configuration file: [server] for the options below, [sensor] or [sensor.0] for settings",
+    )  # fmt: skip
+    parser.add_argument(
+        "--virtual", default="", metavar="ARGUMENTS",
+        help="arguments of the simulated sensor, such as '--pdo 77' (see ethercat-virtual-sensor)",
+    )  # fmt: skip
+    for setting in SERVER_SETTINGS.values():
+        text = setting.meaning + ("; repeatable" if setting.many else "")
+        if not setting.many and setting.default is not None:
+            text += f" (default {setting.default:g})"
+        parser.add_argument(
+            setting.flag, dest=setting.name, metavar=setting.metavar, help=text,
+            type=_parse_with(setting), action="append" if setting.many else "store",
+        )  # fmt: skip
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    return parser
+
+
+def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
+    """Parse the command line and the file it names; UsageError says what is wrong.
+
+    argparse itself exits with code 2 for the errors it finds.
+    """
+    parsed = build_parser().parse_intermixed_args(argv)
+    arguments: list[str] = parsed.arguments
+    if len(arguments) not in {2, 3}:
+        problem = "PORT is missing" if len(arguments) < 2 else f"unexpected argument {arguments[3]!r}"
+        raise UsageError(
+            f"{problem}: usage is ethercat-server IFACE [SENSOR_NAME] PORT, for example "
+            "'ethercat-server ens5 12001'"
+        )
+    config = read_config(parsed.config) if parsed.config else EMPTY
+    assigned = parse_assignments(parsed.assignments)
+    options = ServerOptions(
+        ifname=arguments[0],
+        port=_port(arguments[-1]),
+        sensor_name=arguments[1] if len(arguments) == 3 else None,
+        virtual_arguments=parsed.virtual,
+        server={
+            name: _first_given(getattr(parsed, name), config.server.get(name), setting)
+            for name, setting in SERVER_SETTINGS.items()
+        },
+        common_settings=config.common,
+        sensor_settings=config.by_sensor,
+        assigned_settings=assigned,
+    )
+    try:
+        shlex.split(options.virtual_arguments)
+    except ValueError as error:
+        raise UsageError(f"--virtual {options.virtual_arguments}: {str(error).lower()}") from None
+    if options.virtual_arguments and not options.is_virtual:
+        raise UsageError(f"--virtual requires the interface 'virtual', not {options.ifname}")
+    try:
+        options.check()
+    except SettingError as error:
+        raise UsageError(str(error)) from None
+    return options
+
+
+def parse_assignments(assignments: Sequence[str]) -> dict[str, SettingValue]:
+    """The settings in NAME=VALUE arguments; UsageError names the one that is wrong."""
+    values: dict[str, SettingValue] = {}
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        setting = SETTINGS.get(name.strip())
+        if not equals:
+            raise UsageError(f"--set {assignment}: it must be NAME=VALUE, for example --set sinc_length=64")
+        if setting is None:
+            raise UsageError(f"no setting {name.strip()!r}: available are " + ", ".join(SETTINGS))
+        try:
+            values[setting.name] = setting.parse(text)
+        except SettingError as error:
+            raise UsageError(f"--set {assignment}: {error}") from None
+    return values
+
+
+def _parse_with(setting: ServerSetting) -> Callable[[str], Any]:
+    def parse(text: str) -> Any:
+        try:
+            return setting.parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(f"{text!r} must be {error}") from None
+
+    return parse
+
+
+def _first_given(on_command_line: Any, in_file: Any, setting: ServerSetting) -> Any:
+    if on_command_line is not None:
+        return tuple(on_command_line) if setting.many else on_command_line
+    return setting.default if in_file is None else in_file
+
+
+def _port(text: str) -> int:
+    try:
+        port = int(text)
+    except ValueError:
+        raise UsageError(f"port {text!r} is not a number: it must be from 1 to 65535") from None
+    if not 1 <= port <= 65535:
+        raise UsageError(f"port {port} is out of range: it must be from 1 to 65535")
+    return port

@@ -1,0 +1,75 @@
+"""One run of the server: start-up, acquisition loop, shutdown."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import logging
+from collections.abc import Sequence
+
+from ethercat_server.acquisition.cycle import Cycle
+from ethercat_server.acquisition.jobs import Jobs
+from ethercat_server.acquisition.recovery import Recovery
+from ethercat_server.acquisition.start_up import bring_up
+from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.daemon.options import parse_options
+from ethercat_server.daemon.service import Policy, Service
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.nic import claimed
+from ethercat_server.ethercat.soem import SoemBackend
+from ethercat_server.process import realtime
+from ethercat_server.process.notify import Notifier
+from ethercat_server.process.signals import Signals
+from ethercat_server.serving.actions import Actions
+from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.sensor_actions import SensorActions
+from ethercat_server.serving.transport.sockets import SocketTransport
+from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
+from protocol.control import Event, event
+
+log = logging.getLogger(__name__)
+
+
+def serve(argv: Sequence[str] | None, signals: Signals) -> None:
+    """Start up, stream until asked to stop, shut down; ServerError says what failed."""
+    options = parse_options(argv)
+    policy, notifier = Policy(options), Notifier()
+    with contextlib.ExitStack() as cleanup:
+        hub = Hub(SocketTransport(options.server["hosts"], options.port))
+        cleanup.callback(hub.close)
+        policy.apply(hub)
+        ifname, priority = options.ifname, options.server["rt_priority"]
+        if options.is_virtual:
+            ifname = cleanup.enter_context(VirtualBus(options.virtual_arguments, priority)).ifname
+        cleanup.enter_context(claimed(ifname))
+        backend = SoemBackend(ifname)
+        cleanup.callback(backend.close)
+        backend.open()
+        bus = Bus(backend)
+        sensors = bring_up(bus, options, signals.check)
+        realtime.prepare(priority, options.server["cpu"])
+        streams = [SensorStream(sensor.position, sensor.period_ns) for sensor in sensors]
+        recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast), Jobs(bus, sensors)
+        cycle = Cycle(bus, sensors, streams, hub, recovery, jobs, notifier)
+        on_sensors = SensorActions(bus, hub, recovery, jobs, sensors, streams)
+        service = Service(argv, policy, hub, on_sensors, notifier)
+        cycle.every_second = service.every_second
+        signals.call(cycle.stop, service.reload)
+        hub.start(Actions(hub, cycle, on_sensors).handle)
+        for sensor in sensors:
+            log.info(
+                "sensor %d: %s, serial %d, firmware %s, %d bytes at %d Hz",
+                sensor.position, sensor.identity.name, sensor.identity.serial, sensor.identity.firmware,
+                sensor.pdo_size, sensor.rate_hz,
+            )  # fmt: skip
+        for host in options.server["hosts"]:
+            if not ipaddress.ip_address(host).is_loopback:
+                log.warning("listening on %s: every machine that can reach it may read the sensors", host)
+        log.info("streaming %s on port %d", ifname, options.port)
+        service.ready()
+        try:
+            cycle.run()
+        finally:
+            notifier.stopping()
+            hub.broadcast(event(Event.SHUTTING_DOWN))
+        log.info("shutting down: the bus goes to INIT")

@@ -1,0 +1,160 @@
+"""What a service needs besides its loop: readiness, a status line, reload.
+
+SIGHUP reads command line and file again in a thread, because looking up user names can require a directory
+server; the loop applies the result within a second.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Sequence
+from typing import Final
+
+from ethercat_server.daemon.options import ServerOptions, parse_options
+from ethercat_server.daemon.server_settings import SERVER_SETTINGS
+from ethercat_server.errors import UsageError
+from ethercat_server.process import realtime
+from ethercat_server.process.notify import Notifier
+from ethercat_server.sensor.sensor import Sensor
+from ethercat_server.serving.connection import Limits
+from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.permissions import controlling_uids
+from ethercat_server.serving.sensor_actions import SensorActions
+from protocol.errors import RequestError
+from protocol.settings import SettingValue
+
+log = logging.getLogger(__name__)
+
+_NANO: Final = 1e9
+
+
+class Policy:
+    """The options that a reload applies, with user names looked up; UsageError if there is no such name."""
+
+    def __init__(self, options: ServerOptions) -> None:
+        server = options.server
+        self.options = options
+        self.control_uids = controlling_uids(server["control_users"], server["control_groups"])
+        self.limits = Limits(server["stall_timeout_s"] * _NANO, server["idle_timeout_s"] * _NANO)
+
+    def apply(self, hub: Hub) -> None:
+        """Apply it."""
+        hub.permissions.control_uids = self.control_uids
+        hub.limits = self.limits
+
+
+class Service:
+    """The running server as systemd and its administrator see it."""
+
+    def __init__(
+        self,
+        argv: Sequence[str] | None,
+        policy: Policy,
+        hub: Hub,
+        on_sensors: SensorActions,
+        notifier: Notifier,
+    ) -> None:
+        self._argv = argv
+        self._policy = policy
+        self._hub = hub
+        self._on_sensors = on_sensors
+        self._notifier = notifier
+        self._fresh: Policy | UsageError | None = None
+        self._reading: threading.Thread | None = None
+        self._again = False
+        self._pending: list[dict[str, SettingValue]] = [{} for _ in on_sensors.sensors]
+        """By position: settings that a reload could not apply; the next one tries again."""
+
+    def ready(self) -> None:
+        """The server streams."""
+        self._notifier.ready()
+        self._update_status()
+
+    def reload(self) -> None:
+        """SIGHUP: read the configuration again."""
+        self._again = True
+
+    def every_second(self) -> None:
+        """Apply a configuration that has been read; update the status line."""
+        if self._again and self._reading is None:
+            self._again = False
+            self._reading = threading.Thread(target=self._read, daemon=True)
+            self._reading.start()
+        elif self._reading is not None and not self._reading.is_alive():
+            self._reading = None
+            self._take_over()
+        self._update_status()
+
+    def _read(self) -> None:
+        realtime.leave()
+        try:
+            self._fresh = Policy(parse_options(self._argv))
+        except UsageError as error:
+            self._fresh = error
+
+    def _take_over(self) -> None:
+        fresh, self._fresh = self._fresh, None
+        try:
+            if not isinstance(fresh, Policy):
+                raise fresh or UsageError("it cannot be read")
+            changes = [self._changes(sensor, fresh.options) for sensor in self._on_sensors.sensors]
+        except UsageError as error:
+            log.error("reload failed, the configuration is unchanged: %s", error)
+            return
+        was, now = self._policy.options, fresh.options
+        fresh.apply(self._hub)
+        self._policy = fresh
+        changed = [name for name in SERVER_SETTINGS if was.server[name] != now.server[name]]
+        later = [f"[server] {name}" for name in changed if not SERVER_SETTINGS[name].at_once]
+        at_once = [name for name in changed if SERVER_SETTINGS[name].at_once]
+        log.info(
+            "configuration reloaded: [server]: %s",
+            f"changed {', '.join(at_once)}" if at_once else "no changes",
+        )
+        if later:
+            log.warning("a change of %s requires a restart", ", ".join(later))
+        try:
+            now.check_sensors({sensor.position: sensor.identity for sensor in self._on_sensors.sensors})
+        except UsageError as error:
+            log.warning("%s", error)  # the other sensors get their settings all the same
+        for position, settings in enumerate(changes):
+            self._configure(position, settings)
+
+    def _changes(self, sensor: Sensor, now: ServerOptions) -> dict[str, SettingValue]:
+        """The settings of this sensor that change; UsageError if `now` is inconsistent."""
+        who = (sensor.position, sensor.identity.name, sensor.identity.serial)
+        before, pending = self._policy.options.wanted_settings(*who), self._pending[sensor.position]
+        wanted = now.wanted_settings(*who)
+        return {n: value for n, value in wanted.items() if n in pending or before.get(n) != value}
+
+    def _configure(self, position: int, changed: dict[str, SettingValue]) -> None:
+        if not changed:
+            return
+        names = ", ".join(f"{name} = {value}" for name, value in changed.items())
+        pending = self._pending[position]
+        pending.update(changed)
+
+        def done(_: object, error: RequestError | None) -> None:
+            if error is not None:
+                log.error(
+                    "sensor %d: could not apply %s, the next reload tries again: %s", position, names, error
+                )
+                return
+            log.info("sensor %d: applied %s", position, names)
+            for name, value in changed.items():
+                if pending.get(name) == value:  # unless a later reload asked for another value meanwhile
+                    del pending[name]
+
+        try:
+            self._on_sensors.configure(position, changed, save_too=False, done=done)
+        except RequestError as error:
+            done(None, error)
+
+    def _update_status(self) -> None:
+        sensors = self._on_sensors.sensors
+        lost = [sensor.position for sensor in sensors if not sensor.streams]
+        text = f"streaming {len(sensors) - len(lost)} of {len(sensors)} sensors"
+        if lost:
+            text += f", lost: {', '.join(map(str, lost))}"
+        self._notifier.status(f"{text}; {len(self._hub.connections)} clients")

@@ -1,0 +1,1 @@
+"""Checks of the bus and its slaves, and the measurement."""

@@ -1,0 +1,135 @@
+"""Identity, state and error counters of the slaves, read without changing them.
+
+Without a scan, which would take them to INIT and clear their counters as every start of a master does.
+Registers are addressed by position. Source: ETG.1000.4.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Any, Final
+
+from ethercat_server.errors import BusError
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.slave import sii_content
+from ethercat_server.ethercat.slave.al import AlStatus
+from ethercat_server.ethercat.slave.coe import finish
+from ethercat_server.ethercat.slave.registers import (
+    AL_STATUS,
+    AL_STATUS_SIZE,
+    DL_STATUS,
+    ERROR_COUNTERS_SIZE,
+    RX_ERRORS,
+    SII_OWNER,
+    WATCHDOG_COUNTER,
+)
+from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
+
+MOST_PORTS: Final = 4
+_ATTEMPTS: Final = 10
+_FIND_ATTEMPTS: Final = 5
+_FIND_TIMEOUT_S: Final = 0.05
+_PROBE_SIZE: Final = 2
+
+
+@dataclass(frozen=True)
+class ErrorCounters:
+    """Error counters of an ESC; each saturates at 255."""
+
+    invalid: tuple[int, ...] = (0,) * MOST_PORTS
+    """By port: corrupted frames received."""
+    physical: tuple[int, ...] = (0,) * MOST_PORTS
+    """By port: errors that the physical layer reported."""
+    forwarded: tuple[int, ...] = (0,) * MOST_PORTS
+    """By port: frames that another slave had found corrupted."""
+    processing_unit: int = 0
+    pdi: int = 0
+    lost_links: tuple[int, ...] = (0,) * MOST_PORTS
+
+    @classmethod
+    def parse(cls, data: bytes) -> ErrorCounters:
+        """From the registers 0x0300 to 0x0313."""
+        return cls(
+            tuple(data[0:8:2]), tuple(data[1:8:2]), tuple(data[8:12]), data[12], data[13], tuple(data[16:20])
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Its JSON form."""
+        return {
+            name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()
+        }
+
+
+@dataclass(frozen=True)
+class Slave:
+    """One slave."""
+
+    position: int
+    al: AlStatus
+    counters: ErrorCounters = ErrorCounters()
+    links: tuple[bool, ...] = (True, False, False, False)
+    """Which ports have a link."""
+    watchdogs: int = 0
+    """Number of expired process data watchdogs."""
+    vendor: int = 0
+    product: int = 0
+    serial: int = 0
+    name: str = ""
+    sii_problem: str = ""
+    """Why its SII, and so its identity, could not be read."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Its JSON form."""
+        return {"sensor": self.position, "name": self.name, "serial": self.serial, "vendor": self.vendor,
+                "product": self.product, "al_state": self.al.state.name, "al_error": self.al.error,
+                "al_status_code": self.al.code}  # fmt: skip
+
+
+def count(bus: Bus) -> int:
+    """Number of slaves that answer."""
+    return max(0, *(bus.count_slaves(_PROBE_SIZE, _FIND_TIMEOUT_S) for _ in range(_FIND_ATTEMPTS)))
+
+
+def look(bus: Bus, position: int) -> Slave:
+    """The slave at `position`; BusError if it does not answer."""
+    al = AlStatus.parse(_read(bus, position, AL_STATUS, AL_STATUS_SIZE))
+    (links,) = struct.unpack("<H", _read(bus, position, DL_STATUS, 2))
+    counters = read_counters(bus, position)
+    watchdogs = _read(bus, position, WATCHDOG_COUNTER, 1)[0]
+    found: dict[str, Any] = {
+        "position": position, "al": al, "counters": counters, "watchdogs": watchdogs,
+        "links": tuple(bool(links >> (4 + port) & 1) for port in range(MOST_PORTS)),
+    }  # fmt: skip
+    try:
+        image = sii_content.decode(_read_sii(bus, position))
+    except BusError as error:
+        return Slave(**found, sii_problem=str(error))
+    names = ("vendor", "product", "serial", "name")
+    return Slave(**found, **{name: image[name] for name in names})
+
+
+def read_counters(bus: Bus, position: int) -> ErrorCounters:
+    """The error counters of the slave at `position`; BusError if it does not answer."""
+    return ErrorCounters.parse(_read(bus, position, RX_ERRORS, ERROR_COUNTERS_SIZE))
+
+
+def _read(bus: Bus, position: int, address: int, size: int) -> bytes:
+    for _ in range(_ATTEMPTS):
+        data = bus.read_at(position, address, size)
+        if data is not None:
+            return data
+    raise BusError(
+        f"slave {position} does not answer reading register 0x{address:04X}: check cable and power"
+    )
+
+
+def _read_sii(bus: Bus, position: int) -> bytes:
+    """Access to the SII returns to its owner afterwards."""
+    owner = _read(bus, position, SII_OWNER, 1)
+    registers = ByPosition(bus)
+
+    def read(word: int, words: int) -> bytes:
+        return finish(read_sii(registers, position, word, words, owner), pause_s=0, clock=bus.clock)
+
+    return sii_content.read_image(read)

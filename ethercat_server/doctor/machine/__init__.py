@@ -1,0 +1,1 @@
+"""Checks of the machine: kernel, processors, network interface, other software on it."""

@@ -1,0 +1,257 @@
+"""Properties of a network interface, from the kernel by netlink and ethtool requests. Needs no rights.
+
+Not from /sys, which shows the network namespace that it was mounted in.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import socket
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from ethercat_server.doctor.finding import cannot_look
+
+_IFF_UP, _IFF_LOOPBACK, _IFF_PROMISC = 0x1, 0x8, 0x100
+_MAIN_TABLE: Final = 254
+_MADE_BY_KERNEL: Final = 2
+_LINK_LOCAL_SCOPE: Final = 253
+_NO_SUPPORT: Final = "the driver does not support it"
+_UNKNOWN_SPEEDS: Final = frozenset({0, 0xFFFF, 0xFFFFFFFF})
+_DUPLEX: Final = {0: "half", 1: "full"}
+# Requests that pyroute2 lacks, from linux/ethtool.h.
+_GET_DRIVER: Final = 0x03, struct.Struct("=4x32s32x32x32s64x")
+"""Driver, bus."""
+_GET_EEE: Final = 0x44, struct.Struct("=16xII16x")
+"""Active, enabled."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """The interface itself."""
+
+    index: int
+    kind: str = ""
+    """Of a virtual one, such as veth or bridge; empty for a network card."""
+    up: bool = True
+    carrier: bool = True
+    loopback: bool = False
+    master: str = ""
+    """Bridge or bond that it is a part of."""
+    upper: tuple[str, ...] = ()
+    """Interfaces that stand on it, such as VLANs."""
+    parent: str = ""
+    """Device behind it, by the kernel's name, such as 0000:00:1f.6 or virtio2."""
+    counters: dict[str, int] = field(default_factory=dict)
+    carrier_changes: int | None = None
+
+
+@dataclass(frozen=True)
+class Routes:
+    """Addresses and routes on it."""
+
+    addresses: tuple[str, ...] = ()
+    """With the length of their prefix; link-local ones of IPv6 are not among them."""
+    link_local: tuple[str, ...] = ()
+    default: bool = False
+    """The machine's default route goes here."""
+    others: tuple[str, ...] = ()
+    """Destinations of the routes that somebody made."""
+
+
+@dataclass(frozen=True)
+class InterfaceFacts:
+    """What is known; each part is a sentence instead where it could not be asked for."""
+
+    link: Link | str | None = None
+    """None: there is no such interface."""
+    names: tuple[str, ...] = ()
+    """The interfaces that there are."""
+    routes: Routes | str = "not asked"
+    settings: tuple[int | None, str | None] | str = "not asked"
+    """Speed in Mbit/s and duplex."""
+    driver: tuple[str, str] | str = "not asked"
+    """Its name, and the bus the card is on."""
+    coalescing: dict[str, int] | str = "not asked"
+    offloads: dict[str, bool] | str = "not asked"
+    eee: tuple[bool, bool] | str = "not asked"
+    """Whether it is switched on, and in use."""
+
+    @property
+    def there(self) -> Link:
+        """The interface; CannotLookError if there is none."""
+        if self.link is None:
+            cannot_look("there is no such interface")
+        there: Link = known(self.link)
+        return there
+
+
+def known(part: Any) -> Any:
+    """A part of the facts; CannotLookError with its sentence if it is not known."""
+    return cannot_look(part) if isinstance(part, str) else part
+
+
+def collect(ifname: str) -> InterfaceFacts:
+    """Everything about `ifname`; never an exception."""
+    names = tuple(name for _, name in socket.if_nameindex())
+    if ifname not in names:
+        return InterfaceFacts(names=names)
+    return InterfaceFacts(
+        link=_asked(_link, ifname),
+        names=names,
+        routes=_asked(_routes, ifname),
+        settings=_asked(_settings, ifname),
+        driver=_asked(_driver, ifname),
+        coalescing=_asked(_coalescing, ifname),
+        offloads=_asked(_offloads, ifname),
+        eee=_asked(_eee, ifname),
+    )
+
+
+def _asked(ask: Callable[[str], Any], ifname: str) -> Any:
+    try:
+        return ask(ifname)
+    except OSError as error:
+        return _NO_SUPPORT if error.errno == errno.EOPNOTSUPP else error.strerror or str(error)
+    except Exception as error:  # noqa: BLE001 - pyroute2's errors share no base, and no part spoils the others
+        name = type(error).__name__
+        return _NO_SUPPORT if name == "NotSupportedError" else f"{name}: {error}".replace("\0", "").strip()
+
+
+@contextlib.contextmanager
+def _ethtool(ifname: str) -> Iterator[Any]:
+    from pyroute2.ethtool.ioctl import IoctlEthtool  # noqa: PLC0415 - takes a moment
+
+    with contextlib.closing(IoctlEthtool(ifname)) as asked:
+        yield asked
+
+
+def _settings(ifname: str) -> tuple[int | None, str | None]:
+    with _ethtool(ifname) as asked:
+        found = asked.get_link_settings()
+    return None if found.speed in _UNKNOWN_SPEEDS else int(found.speed), _DUPLEX.get(found.duplex)
+
+
+def _coalescing(ifname: str) -> dict[str, int]:
+    with _ethtool(ifname) as asked:
+        return {name: int(value) for name, value in asked.get_coalesce().items() if name != "cmd"}
+
+
+def _offloads(ifname: str) -> dict[str, bool]:
+    with _ethtool(ifname) as asked:
+        found: dict[str, bool] = asked.get_offload_flags()
+    return found
+
+
+def _driver(ifname: str) -> tuple[str, str]:
+    texts = _request(ifname, *_GET_DRIVER)
+    driver, bus = (text.split(b"\0")[0].decode("ascii", errors="replace") for text in texts)
+    return driver, bus
+
+
+def _eee(ifname: str) -> tuple[bool, bool]:
+    active, enabled = _request(ifname, *_GET_EEE)
+    return bool(enabled), bool(active)
+
+
+def _request(ifname: str, command: int, layout: struct.Struct) -> tuple[Any, ...]:
+    buffer = ctypes.create_string_buffer(struct.pack("=I", command), layout.size)
+    with _ethtool(ifname) as asked:
+        asked.ifreq.gstats = ctypes.cast(buffer, ctypes.c_void_p)
+        asked.ioctl()
+    return layout.unpack(buffer.raw)
+
+
+def _links() -> dict[int, Any]:
+    from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
+
+    with IPRoute() as route:
+        return {row["index"]: row for row in route.get_links()}
+
+
+def _link(ifname: str) -> Link:
+    everyone, index = _links(), socket.if_nametoindex(ifname)
+    own = everyone[index]
+    upper = [r for r in everyone.values() if r.get_attr("IFLA_LINK") == index and _is_local(r)]
+    master = everyone.get(own.get_attr("IFLA_MASTER"))
+    up = bool(own["flags"] & _IFF_UP)
+    stats = own.get_attr("IFLA_STATS64") or own.get_attr("IFLA_STATS") or {}
+    return Link(
+        index=index,
+        kind=_kind(own),
+        up=up,
+        carrier=up and own.get_attr("IFLA_CARRIER") == 1,
+        loopback=bool(own["flags"] & _IFF_LOOPBACK),
+        master=master.get_attr("IFLA_IFNAME") if master else "",
+        upper=tuple(row.get_attr("IFLA_IFNAME") for row in upper if row["index"] != index),
+        parent=own.get_attr("IFLA_PARENT_DEV_NAME") or "",
+        counters={name: int(stats[name]) for name in stats.keys() if isinstance(stats[name], int)},  # noqa: SIM118
+        carrier_changes=own.get_attr("IFLA_CARRIER_CHANGES"),
+    )
+
+
+def _kind(row: Any) -> str:
+    info = row.get_attr("IFLA_LINKINFO")
+    return (info.get_attr("IFLA_INFO_KIND") if info else None) or ""
+
+
+def _is_local(row: Any) -> bool:
+    """Whether it may depend on an interface of this namespace: a veth's other end does not."""
+    return row.get_attr("IFLA_LINK_NETNSID") is None and _kind(row) != "veth"
+
+
+def read_counters(ifname: str) -> dict[str, int]:
+    """The present counters of `ifname`; empty if they cannot be read."""
+    link = _asked(_link, ifname)
+    return dict(link.counters) if isinstance(link, Link) else {}
+
+
+@contextlib.contextmanager
+def promiscuity_kept(ifname: str) -> Iterator[None]:
+    """Restore promiscuous mode to off afterwards if it was off before: SOEM switches it on and leaves it."""
+    from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
+    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - likewise
+
+    def is_promiscuous() -> bool | None:
+        flags = {row.get_attr("IFLA_IFNAME"): row["flags"] for row in _links().values()}.get(ifname)
+        return None if flags is None else bool(flags & _IFF_PROMISC)
+
+    before = is_promiscuous()
+    try:
+        yield
+    finally:
+        if before is False and is_promiscuous():
+            with IPRoute() as route, contextlib.suppress(NetlinkError, OSError):
+                route.link("set", index=socket.if_nametoindex(ifname), flags=0, change=_IFF_PROMISC)
+
+
+def _routes(ifname: str) -> Routes:
+    from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
+
+    index = socket.if_nametoindex(ifname)
+    with IPRoute() as route:
+        addresses = [row for row in route.get_addr(index=index) if row["index"] == index]
+        routes = [
+            row
+            for family in (socket.AF_INET, socket.AF_INET6)
+            for row in route.get_routes(oif=index, family=family)
+            if row.get_attr("RTA_OIF") == index and row.get_attr("RTA_TABLE") == _MAIN_TABLE
+        ]
+    texts = [
+        (f"{row.get_attr('IFA_LOCAL') or row.get_attr('IFA_ADDRESS')}/{row['prefixlen']}", row)
+        for row in addresses
+    ]
+    local = {
+        text for text, row in texts if row["family"] == socket.AF_INET6 and row["scope"] == _LINK_LOCAL_SCOPE
+    }
+    made = [row for row in routes if row["proto"] != _MADE_BY_KERNEL and row["dst_len"]]
+    return Routes(
+        addresses=tuple(text for text, _ in texts if text not in local),
+        link_local=tuple(sorted(local)),
+        default=any(row["dst_len"] == 0 for row in routes),
+        others=tuple(f"{row.get_attr('RTA_DST')}/{row['dst_len']}" for row in made),
+    )

@@ -1,0 +1,1 @@
+"""An EtherCAT bus and its slaves; nothing of Bota. Imports only `ethercat_server.errors`."""

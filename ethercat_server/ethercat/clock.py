@@ -1,0 +1,53 @@
+"""Time as everything above the bus sees it, so that a test can let it pass as it likes."""
+
+from __future__ import annotations
+
+import time
+from typing import Final, Protocol
+
+_NS: Final = 1_000_000_000
+
+
+class Clock(Protocol):
+    """CLOCK_MONOTONIC for what is measured, CLOCK_REALTIME for stamps, and waiting."""
+
+    def monotonic_ns(self) -> int:
+        """CLOCK_MONOTONIC, ns."""
+        ...
+
+    def time_ns(self) -> int:
+        """CLOCK_REALTIME, ns."""
+        ...
+
+    def sleep(self, seconds: float, /) -> None:
+        """Return `seconds` later, or a little after."""
+        ...
+
+
+class SystemClock:
+    """The kernel's clocks."""
+
+    monotonic_ns = staticmethod(time.monotonic_ns)
+    time_ns = staticmethod(time.time_ns)
+    sleep = staticmethod(time.sleep)
+
+
+SYSTEM_CLOCK: Final = SystemClock()
+
+
+class Deadline:
+    """An instant some `seconds` after now."""
+
+    def __init__(self, clock: Clock, seconds: float) -> None:
+        self._clock = clock
+        self._at_ns = clock.monotonic_ns() + int(seconds * _NS)
+
+    @property
+    def passed(self) -> bool:
+        """Whether it is in the past."""
+        return self._clock.monotonic_ns() > self._at_ns
+
+    @property
+    def left_s(self) -> float:
+        """Seconds until then; negative once it has passed."""
+        return (self._at_ns - self._clock.monotonic_ns()) / _NS

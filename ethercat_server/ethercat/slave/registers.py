@@ -1,0 +1,60 @@
+"""Registers of an EtherCAT slave controller (ESC): one table of addresses. Source: ETG.1000.4.
+
+The master reads and writes them by these names, and the virtual sensor has them at these addresses.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+DL_INFORMATION: Final = 0x0000
+FMMU_AND_SM_COUNT: Final = 0x0004
+"""Two bytes: the number of FMMUs, the number of sync managers."""
+STATION_ADDRESS: Final = 0x0010
+STATION_ALIAS: Final = 0x0012
+DL_CONTROL: Final = 0x0100
+DL_STATUS: Final = 0x0110
+AL_CONTROL: Final = 0x0120
+AL_STATUS: Final = 0x0130
+AL_STATUS_SIZE: Final = 6
+"""AL status, two reserved bytes, AL status code."""
+AL_STATUS_CODE: Final = 0x0134
+PDI_CONTROL: Final = 0x0140
+EVENT_MASK: Final = 0x0200
+EVENT_REQUEST: Final = 0x0210
+AL_EVENT_REQUEST: Final = 0x0220
+RX_ERRORS: Final = 0x0300
+"""Two bytes a port: invalid frames, physical layer errors."""
+FORWARDED_ERRORS: Final = 0x0308
+"""A byte a port: frames that another slave had found invalid."""
+PROCESSING_UNIT_ERRORS: Final = 0x030C
+PDI_ERRORS: Final = 0x030D
+LOST_LINKS: Final = 0x0310
+"""A byte a port."""
+PORT_COUNT: Final = 4
+ERROR_COUNTERS_SIZE: Final = LOST_LINKS + PORT_COUNT - RX_ERRORS
+WATCHDOG_DIVIDER: Final = 0x0400
+WATCHDOG_TIME_PDI: Final = 0x0410
+WATCHDOG_TIME: Final = 0x0420
+WATCHDOG_STATUS: Final = 0x0440
+WATCHDOG_COUNTER: Final = 0x0442
+SII_OWNER: Final = 0x0500
+"""Who may access the SII: bit 0 set, the slave's own firmware (PDI); bit 1 takes it from the firmware."""
+SII_CONTROL: Final = 0x0502
+SII_ADDRESS: Final = 0x0504
+SII_DATA: Final = 0x0508
+FMMU: Final = 0x0600
+FMMU_SIZE: Final = 16
+SYNC_MANAGER: Final = 0x0800
+SYNC_MANAGER_SIZE: Final = 8
+SM_STATUS: Final = 5
+"""Offset within a sync manager."""
+SM_ACTIVATE: Final = 6
+SM_PDI_CONTROL: Final = 7
+MAILBOX_FULL: Final = 0x08
+"""Bit of a mailbox sync manager's status."""
+MAILBOX_IN_STATUS: Final = SYNC_MANAGER + SYNC_MANAGER_SIZE + SM_STATUS
+"""Status of sync manager 1, the mailbox from the slave."""
+USER_RAM: Final = 0x0F80
+REGISTERS_END: Final = 0x1000
+"""Process data memory begins here."""

@@ -1,0 +1,262 @@
+"""The link on the interface itself: this process is the EtherCAT master, with the server's privileges."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, TypeVar
+
+from ethercat_server.acquisition.cycle import Cycle
+from ethercat_server.acquisition.jobs import Jobs
+from ethercat_server.acquisition.recovery import Recovery
+from ethercat_server.acquisition.start_up import AsFound, check_sii, enter_op, find_sensors
+from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.errors import BusError, ServerError, UsageError
+from ethercat_server.ethercat.backend import SlaveIdentity
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.nic import claimed
+from ethercat_server.ethercat.slave.coe import BlockingSdo, Sdo, Steps, finish
+from ethercat_server.ethercat.slave.sii import has_coe
+from ethercat_server.ethercat.soem import SoemBackend
+from ethercat_server.links.link import Found, Link, OnFrame, failed_change, signals_call, signals_held_back
+from ethercat_server.process import realtime
+from ethercat_server.process.notify import Notifier
+from ethercat_server.sensor.configuration import Change, save
+from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.sensor.sensor import Identity, Sensor
+from ethercat_server.sensor.set_up import identify, set_up
+from ethercat_server.sensor.tare import LATER, tare
+from ethercat_server.virtual_sensor.virtual_bus import VIRTUAL_INTERFACE, VirtualBus
+from protocol.control import ErrorCode
+from protocol.errors import RequestError, SettingError
+from protocol.framing import DataMessage, FrameDecoder
+from protocol.settings import SettingValue
+
+T = TypeVar("T")
+
+_BACK_S: Final = 10.0
+"""Timeout for a sensor lost during a tare to come back for its old offset."""
+
+
+def open_bus(ifname: str, cleanup: contextlib.ExitStack) -> Bus:
+    """The open bus on `ifname`, or on a virtual bus for `virtual`; `cleanup` closes it."""
+    if ifname == VIRTUAL_INTERFACE:
+        ifname = cleanup.enter_context(VirtualBus()).ifname
+    cleanup.enter_context(claimed(ifname))
+    backend = SoemBackend(ifname)
+    cleanup.callback(backend.close)
+    backend.open()
+    return Bus(backend)
+
+
+def scan_only(ifname: str, cleanup: contextlib.ExitStack) -> tuple[Bus, list[SlaveIdentity]]:
+    """The bus and all its slaves, of any vendor."""
+    bus = open_bus(ifname, cleanup)
+    return bus, bus.scan(_no_check)
+
+
+class DirectLink(Link):
+    """All sensors in PREOP; `watch` and `tare` take them to OP with their present settings."""
+
+    def __init__(self, ifname: str, *, any_slave: bool = False) -> None:
+        with contextlib.ExitStack() as cleanup:
+            self._bus = open_bus(ifname, cleanup)
+            self.clock = self._bus.clock
+            if any_slave:
+                self.sensors = _identify_all(self._bus)
+            else:
+                found = find_sensors(self._bus, AsFound(), _no_check)
+                self.sensors = [Found(sensor.position, sensor.identity) for sensor in found]
+            self._cleanup = cleanup.pop_all()
+        self.used = f"the interface {ifname}"
+
+    def close(self) -> None:
+        """Take the bus to INIT and release the interface."""
+        self._cleanup.close()
+
+    def sdo(self, position: int) -> GuardedSdo:
+        """See `Link`."""
+        return GuardedSdo(BlockingSdo(self._bus, position))
+
+    def configure(self, position: int, settings: Mapping[str, SettingValue], save: bool) -> None:
+        """See `Link`."""
+        sdo, sensor = self.sdo(position), self.in_force(self.sensors[position])
+        _check_rate_known(sensor)
+        try:
+            change = Change(sensor, settings)
+        except SettingError as error:
+            raise UsageError(str(error)) from None
+        with signals_held_back():
+            finish(_change(sdo, sensor, change, save), clock=self.clock)
+
+    def tare(self, position: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
+        """See `Link`."""
+        running = _Running(self._bus, self._operational(), lambda _: True)
+        sdo = running.recovery.sdo(position)
+        return running.do(
+            position, tare(sdo, running.sensors[position], running.streams[position], samples, target)
+        )
+
+    def watch(self, positions: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
+        """See `Link`."""
+
+        def wanted(frame: DataMessage) -> bool:
+            return frame.sensor not in positions or on_frame(frame)
+
+        running = _Running(self._bus, self._operational(), wanted)
+        running.on_idle = on_idle
+        running.run()
+
+    def _operational(self) -> list[Sensor]:
+        sensors = [self.in_force(found) for found in self.sensors]
+        for sensor in sensors:
+            _check_rate_known(sensor)
+        enter_op(self._bus, sensors, _no_check)
+        return sensors
+
+
+class _Running:
+    """The server's loop in this process, with the tool instead of clients (an `Outlet`)."""
+
+    def __init__(self, bus: Bus, sensors: list[Sensor], on_frame: OnFrame) -> None:
+        realtime.prepare(realtime.DEFAULT_PRIORITY, None)
+        self.sensors = sensors
+        self._clock = bus.clock
+        self.streams = [SensorStream(sensor.position, sensor.period_ns, bus.clock) for sensor in sensors]
+        self.recovery = Recovery(bus, sensors, self.streams, lambda _: None)
+        self.on_idle: Callable[[], bool] = lambda: True
+        self._jobs = Jobs(bus, sensors)
+        self._cycle = Cycle(bus, sensors, self.streams, self, self.recovery, self._jobs, Notifier())
+        self._on_frame = on_frame
+        self._decoder = FrameDecoder()
+        self._stopped = False
+
+    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:  # noqa: ARG002
+        """See `Outlet`."""
+        self._decoder.feed(frame)
+        for message in self._decoder:
+            if isinstance(message, DataMessage) and not self._on_frame(message):
+                self._cycle.stop()
+
+    def serve(self, until_ns: int) -> None:  # noqa: ARG002
+        """See `Outlet`."""
+        if not self.on_idle():
+            self._cycle.stop()
+
+    def run(self) -> None:
+        """Run until stopped; KeyboardInterrupt if by a signal."""
+        with signals_call(self._stop):
+            self._cycle.run()
+        if self._stopped:
+            raise KeyboardInterrupt
+
+    def do(self, position: int, steps: Steps[T]) -> T:
+        """Run until `steps` are done; returns their result. After a signal they undo what is half done."""
+        results: list[T] = []
+        errors: list[RequestError] = []
+
+        def done(result: T, error: RequestError | None) -> None:
+            if error is None:
+                results.append(result)
+            else:
+                errors.append(error)
+            self._cycle.stop()
+
+        self._jobs.start(position, self._stoppable(steps), done)
+        with signals_call(self._note_signal):
+            self._cycle.run()
+        if errors:
+            kind = UsageError if errors[0].code == ErrorCode.BAD_REQUEST else BusError
+            text = str(errors[0])
+            if self.sensors[position].unsettled:
+                text = text.removesuffix(LATER) + self._put_back(position)
+            raise kind(text)
+        return results[0]
+
+    def _stoppable(self, steps: Steps[T]) -> Steps[T]:
+        informed = False
+        raised: BusError | None = None
+        while True:
+            if self._stopped and not informed and raised is None:
+                informed, raised = True, BusError("stopped before it was done")
+            try:
+                if raised is None:
+                    next(steps)
+                else:
+                    steps.throw(raised)
+            except StopIteration as stop:
+                result: T = stop.value
+                return result
+            raised = None
+            try:
+                yield
+            except BusError as error:  # the sensor is lost: the steps may handle that
+                raised = error
+
+    def _put_back(self, position: int) -> str:
+        """Give a sensor that was lost in a tare the time to come back; returns what became of its offset."""
+        sensor, deadline = self.sensors[position], Deadline(self._clock, _BACK_S)
+        self.on_idle = lambda: not sensor.streams and not deadline.passed
+        self._cycle.stopping = False
+        with signals_call(self._note_signal), contextlib.suppress(ServerError):
+            self._cycle.run()
+        if not sensor.unsettled:
+            return "; it is back with its old offset"
+        old = " ".join(f"{value:g}" for value in sensor.offset or ())
+        return f"; its offset may be half written (it was {old}): tare it again"
+
+    def _note_signal(self) -> None:
+        self._stopped = True
+
+    def _stop(self) -> None:
+        self._stopped = True
+        self._cycle.stop()
+
+
+def _change(sdo: Sdo, sensor: Sensor, change: Change, and_save: bool) -> Steps[None]:
+    """Change settings in PREOP; BusError if one fails, with the former settings restored."""
+    before = dict(sensor.settings)
+    try:
+        if change.names:
+            sensor.wanted, sensor.asked = change.wanted, frozenset(change.names)
+            yield from set_up(sdo, sensor)
+    except BusError as error:
+        sensor.wanted, sensor.asked = before, frozenset()
+        try:
+            yield from set_up(sdo, sensor)
+        except BusError as again:
+            raise BusError(
+                f"{error}; the former settings could not be restored ({again}): power it off and on"
+            ) from None
+        raise failed_change(error) from None
+    if and_save:
+        yield from save(sdo, sensor)
+
+
+def _identify_all(bus: Bus) -> list[Found]:
+    """All slaves of any vendor, with what they say of themselves."""
+    found = []
+    slaves = bus.scan(_no_check)
+    for position, slave in enumerate(slaves):
+        check_sii(bus.ifname, position, slave)
+    bus.backend.check_preop(_no_check)
+    for position, slave in enumerate(slaves):
+        try:
+            identity = finish(identify(GuardedSdo(BlockingSdo(bus, position)), slave.name), clock=bus.clock)
+        except BusError:
+            if finish(has_coe(bus, position), clock=bus.clock):
+                raise
+            found.append(Found(position, Identity(slave.name or "nameless", 0, "", ""), has_objects=False))
+        else:
+            found.append(Found(position, identity))
+    return found
+
+
+def _check_rate_known(sensor: Sensor) -> None:
+    if "sinc_length" not in sensor.wanted:
+        raise BusError(f"sensor {sensor.position} does not report its sampling rate: power it off and on")
+
+
+def _no_check() -> None:
+    """Ctrl-C is an exception here: no check is needed."""

@@ -1,0 +1,180 @@
+"""The interface of the two links to sensors, and the guard on all their writes."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+from ethercat_server.errors import BusError, SdoAbortError, UsageError
+from ethercat_server.ethercat.clock import Clock
+from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
+from ethercat_server.sensor.dictionary import BY_SETTING, SAMPLING_RATE
+from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.sensor.sensor import Identity, Sensor
+from ethercat_server.sensor.set_up import read_settings
+from protocol.framing import DataMessage
+from protocol.sensor.filters import FORCE_TORQUE_FILTERS
+from protocol.sensor_choice import SensorChoice
+from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue
+
+
+class Found(NamedTuple):
+    """A sensor reached through a link."""
+
+    position: int
+    identity: Identity
+    has_objects: bool = True
+    """False for a slave without a CoE mailbox."""
+
+    def __str__(self) -> str:
+        """Its description in messages."""
+        return f"sensor {self.position}: {self.identity.name}, serial {self.identity.serial}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Its JSON form."""
+        return {"sensor": self.position, **self.identity._asdict()}
+
+
+OnFrame = Callable[[DataMessage], bool]
+"""Receives a DATA message; returns whether to continue."""
+
+
+class Link(ABC):
+    """Access to the sensors of one bus. Errors are ServerErrors."""
+
+    used: str
+    """Description of the interface or server."""
+    sensors: list[Found]
+    clock: Clock
+    """The time that passes on the bus, and waiting."""
+
+    @abstractmethod
+    def sdo(self, position: int) -> GuardedSdo:
+        """The object dictionary of the sensor at `position`."""
+
+    @abstractmethod
+    def configure(self, position: int, settings: Mapping[str, SettingValue], save: bool) -> None:
+        """Change `settings` and verify them; on failure the former ones are restored."""
+
+    @abstractmethod
+    def tare(self, position: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
+        """Set the force/torque offset; returns the reply of the action `tare`. The last call on a link."""
+
+    @abstractmethod
+    def watch(self, positions: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
+        """Stream until `on_frame` or the periodic `on_idle` returns False. The last call on a link."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the link."""
+
+    def choose(self, wanted: str | None) -> Found:
+        """The sensor selected by `--sensor`; UsageError if it is not unique."""
+        return choose(self.sensors, wanted)
+
+    def chosen(self, wanted: str | None) -> list[Found]:
+        """The same for read-only commands: all sensors if None."""
+        return self.sensors if wanted is None else [self.choose(wanted)]
+
+    def in_force(self, found: Found) -> Sensor:
+        """The sensor with its present settings, which are also the wanted ones."""
+        sensor = Sensor(found.position, found.identity, {})
+        finish(read_in_force(self.sdo(found.position), sensor), clock=self.clock)
+        return sensor
+
+
+def choose(sensors: Sequence[Found], wanted: str | None) -> Found:
+    """The sensor that `wanted` selects, the only one if None; UsageError if it is not unique.
+
+    A number that is no position on the bus is taken as a serial number.
+    """
+    if wanted is None and len(sensors) == 1:
+        return sensors[0]
+    there = "; ".join(map(str, sensors))
+    if wanted is None:
+        raise UsageError(f"there are {len(sensors)} sensors: choose one with --sensor ({there})")
+    try:
+        choice = SensorChoice.parse(wanted)
+    except ValueError as error:
+        if not wanted.isdecimal():
+            raise UsageError(f"--sensor {wanted}: it must be {error}") from None
+        choice = SensorChoice(serial=int(wanted))
+    if choice.position is not None and choice.position >= len(sensors):
+        choice = SensorChoice(serial=choice.position)
+    found = [s for s in sensors if choice.matches(s.position, s.identity.name, s.identity.serial)]
+    if len(found) != 1:
+        many = "more than one sensor" if found else "no sensor"
+        raise UsageError(f"--sensor {wanted}: {many} matches (available: {there})")
+    return found[0]
+
+
+def read_in_force(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+    """Read settings and rate, and take them as wanted."""
+    rate = yield from _number(sdo, SAMPLING_RATE)
+    length = yield from _number(sdo, _SINC)
+    sensor.rate_hz = rate or 0
+    held = sinc_length_in_force(length, rate)
+    sensor.wanted = {"sinc_length": held or 0}
+    yield from read_settings(sdo, sensor)
+    if not held:
+        sensor.hold({name: value for name, value in sensor.settings.items() if name != "sinc_length"})
+    sensor.wanted = dict(sensor.settings)
+
+
+_SINC: Final = BY_SETTING["sinc_length"].address
+
+
+def sinc_length_in_force(read: int | None, rate_hz: int | None) -> int | None:
+    """The SINC length, from what object 0x8006:1 and the sampling rate read.
+
+    The rate decides: a real device read back 2048 while it sampled with 341.
+    """
+    if not rate_hz:
+        return read
+    if read and abs(rate_hz - BASE_SAMPLING_RATE_HZ / read) <= 1.0:
+        return read
+    published = [length for length, row in FORCE_TORQUE_FILTERS.items() if row.rate_hz == rate_hz]
+    return published[0] if published else round(BASE_SAMPLING_RATE_HZ / rate_hz)
+
+
+def _number(sdo: Sdo, address: tuple[int, int]) -> Steps[int | None]:
+    try:
+        return int.from_bytes((yield from sdo.read(*address)), "little")
+    except SdoAbortError:
+        return None
+
+
+def note(text: str) -> None:
+    """One line for people on standard error."""
+    sys.stderr.write(f"ethercat-sensor: {text}\n")
+
+
+@contextlib.contextmanager
+def signals_held_back() -> Iterator[None]:
+    """Defer SIGINT and SIGTERM during a change."""
+    signals = {signal.SIGINT, signal.SIGTERM}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def signals_call(hear: Callable[[], None]) -> Iterator[None]:
+    """SIGINT and SIGTERM only call `hear`."""
+    before = {number: signal.signal(number, lambda *_: hear()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def failed_change(error: BusError) -> BusError:
+    """The same, with the addition that nothing has changed."""
+    return BusError(f"{error}; the former settings are in force")

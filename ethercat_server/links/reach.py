@@ -1,0 +1,48 @@
+"""Opens the link for an interface or a server given on the command line."""
+
+from __future__ import annotations
+
+from ethercat_server.errors import InterfaceError, UsageError
+from ethercat_server.links.direct import DirectLink
+from ethercat_server.links.holder import find_holder
+from ethercat_server.links.link import Link, note
+from ethercat_server.links.remote import ServerLink
+from protocol.address import Address
+
+
+def open_link(ifname: str | None, server: str | None, *, any_slave: bool = False) -> Link:
+    """The link to the sensors on `ifname`, or behind `server`; UsageError unless exactly one is given.
+
+    If a server uses the interface, the link goes through that server, with a note. With `any_slave`, slaves
+    that are not sensors are included, for read-only commands.
+    """
+    link = find_server(ifname, server)
+    if link is not None:
+        return link
+    assert ifname is not None
+    return DirectLink(ifname, any_slave=any_slave)
+
+
+def find_server(ifname: str | None, server: str | None) -> ServerLink | None:
+    """The named server, or the one that uses the interface; None if the interface is not in use."""
+    if (ifname is None) == (server is None):
+        raise UsageError("name either an interface, such as ens5, or a server with --server HOST:PORT")
+    if server is not None:
+        try:
+            address = Address.parse(server)
+        except ValueError as error:
+            raise UsageError(f"--server {error}") from None
+        return ServerLink(address)
+    assert ifname is not None
+    holder = find_holder(ifname)
+    if holder is None:
+        return None
+    if holder.address is None:
+        if holder.pid is None:
+            hint = "run as root, or name its server with --server HOST:PORT"
+        else:
+            hint = "it serves no TCP port, so stop it first"
+        raise InterfaceError(f"{ifname} is in use by {holder}: {hint}")
+    used = f"the server at {holder.address}, {holder}, which uses {ifname}"
+    note(f"going through {used}")
+    return ServerLink(holder.address, used)

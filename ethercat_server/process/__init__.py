@@ -1,0 +1,1 @@
+"""The process itself: signals, scheduling, log, systemd. Imports only `ethercat_server.errors`."""

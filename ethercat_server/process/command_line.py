@@ -1,0 +1,57 @@
+"""Start and end of the command-line programs besides the server: signals, messages, exit codes."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable
+from types import FrameType
+from typing import Final
+
+from ethercat_server.errors import ServerError
+from ethercat_server.process.logs import PlainFormatter
+from protocol.errors import ProtocolError
+
+FAILED: Final = 1
+
+
+def begin(program: str) -> None:
+    """SIGINT and SIGTERM raise KeyboardInterrupt; what is logged appears as `PROGRAM: message`."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, _interrupt)
+    formatter = PlainFormatter()
+    formatter.prefix = f"{program}: "
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(formatter)
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+
+
+def run(program: str, work: Callable[[], int], *, as_json: bool) -> int:
+    """The exit code: what `work` returns, or that of the error it raises, which is printed as one sentence.
+
+    With `as_json` the sentence is on standard output too, as {"error": ...}.
+    """
+    try:
+        return work()
+    except (ServerError, ProtocolError) as error:
+        text, exit_code = str(error), getattr(error, "exit_code", FAILED)
+    except BrokenPipeError:
+        # The reader of the output has closed it; Python would report that again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except OSError as error:
+        text = f"{error.filename or 'the operating system'}: {error.strerror or error}"
+        exit_code = FAILED
+    except KeyboardInterrupt:
+        text, exit_code = "stopped", FAILED
+    if as_json:
+        sys.stdout.write(json.dumps({"error": text}) + "\n")
+    sys.stderr.write(f"{program}: {text}\n")
+    return exit_code
+
+
+def _interrupt(_number: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

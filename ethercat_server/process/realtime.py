@@ -1,0 +1,73 @@
+"""Real-time settings of the acquisition loop: SCHED_FIFO, locked memory, CPU affinity, timer slack.
+
+Each is used if permitted; what is not is logged in one line and the server runs without it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Final
+
+DEFAULT_PRIORITY: Final = 80
+"""SCHED_FIFO priority of the acquisition loop."""
+_MLOCK: Final = 1 | 2 | 4
+"""MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT: pages stay in memory once they have been used."""
+_TIMER_SLACK_NS: Final = "1000"
+_SWITCH_S: Final = 0.0002
+"""Longest time the loop waits for another thread of this process; Python's default of 5 ms loses samples."""
+
+_ALL_CPUS: Final = frozenset(os.sched_getaffinity(0))
+"""The CPUs that this process may use, as of its start."""
+
+log = logging.getLogger(__name__)
+
+
+def prepare(priority: int, cpu: int | None) -> None:
+    """Prepare this thread and process for the acquisition loop; threads started later inherit its scheduling.
+
+    `priority` is that of SCHED_FIFO, 1 to 99, or 0 for ordinary scheduling; `cpu` is the CPU to pin it to.
+    """
+    refused = []
+    if cpu is not None:
+        try:
+            os.sched_setaffinity(0, {cpu})
+        except OSError:
+            refused.append(f"CPU {cpu}")
+    try:
+        if priority:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        refused.append(f"real-time priority {priority} (CAP_SYS_NICE)")
+        _fine_timer()
+    if not priority:
+        _fine_timer()
+    if priority and ctypes.CDLL(None).mlockall(_MLOCK) != 0:
+        refused.append("locked memory (CAP_IPC_LOCK)")
+    if refused:
+        log.warning("not granted: %s; expect more jitter", ", ".join(refused))
+    sys.setswitchinterval(_SWITCH_S)
+    # The loop makes no reference cycles, so it needs no collector, which would pause it.
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+
+def leave() -> None:
+    """Give the calling thread ordinary scheduling on all CPUs: what it does must not delay the loop."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setaffinity(0, _ALL_CPUS)
+
+
+def _fine_timer() -> None:
+    """Timer slack of 1 µs: by default an ordinary thread's sleep may end 50 µs late, a FIFO thread's not."""
+    try:
+        Path("/proc/self/timerslack_ns").write_text(_TIMER_SLACK_NS, encoding="ascii")
+    except OSError:
+        log.debug("timer slack cannot be set")

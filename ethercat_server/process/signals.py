@@ -1,0 +1,37 @@
+"""SIGINT and SIGTERM stop the server, SIGHUP reloads its configuration."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from types import FrameType
+
+from ethercat_server.errors import StopRequestedError
+
+
+class Signals:
+    """Checked between the steps of start-up; passed on to the loop once it runs."""
+
+    def __init__(self) -> None:
+        self._stop: Callable[[], None] | None = None
+        self._received = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_stop)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until there is something to reload
+
+    def check(self) -> None:
+        """StopRequestedError if a signal has arrived."""
+        if self._received:
+            raise StopRequestedError("stopped during start-up")
+
+    def call(self, stop: Callable[[], None], reload: Callable[[], None]) -> None:
+        """From now on a signal calls `stop` or `reload`."""
+        self._stop = stop
+        signal.signal(signal.SIGHUP, lambda *_: reload())
+        if self._received:
+            stop()
+
+    def _on_stop(self, _number: int, _frame: FrameType | None) -> None:
+        self._received = True
+        if self._stop is not None:
+            self._stop()

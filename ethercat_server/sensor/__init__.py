@@ -1,0 +1,1 @@
+"""A Bota sensor: its objects, settings, offset. May import `ethercat` and `protocol`."""

@@ -1,0 +1,243 @@
+"""The sensor's object dictionary: one row per object entry.
+
+Sources: Table III.1 and Listing III.6 of the design note, and the dump of a real Rokubi. The server
+configures the sensor by it and the virtual sensor answers by it; nothing else knows an index.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from protocol.pdo import INPUT_OBJECT, PDO_FIELDS, PdoType
+from protocol.sensor.meaning import value_meaning
+from protocol.settings import SETTINGS, SettingValue
+
+VENDOR_ID: Final = 0x0000B07A
+PRODUCT_CODE: Final = 1
+"""All Gen-0 EtherCAT models have product code 1; the name identifies the model."""
+REVISION: Final = 3
+
+MODELS: Final = (
+    "BFT-SENS-ECAT-M8",
+    "BFT-ROKS-ECAT-M8",
+    "BFT-ROKA-ECAT-M8",
+    "BFT-MEDS-ECAT-M8",
+    "BFT-MEDA-ECAT-M8",
+    "BFT-LAXS-ECAT-M8",
+    "BFT-MEGS-ECAT-M8",
+)
+"""Names of the Gen-0 models, as in SII and in object 0x1008."""
+
+
+class ObjectType(Enum):
+    """CoE base data type: its number in the SDO Information service, and its struct format."""
+
+    U8 = (0x0005, "<B")
+    U16 = (0x0006, "<H")
+    U32 = (0x0007, "<I")
+    REAL32 = (0x0008, "<f")
+    STRING = (0x0009, "")
+    OCTETS = (0x000A, "")
+    """Bytes whose meaning is not known; the value is their hexadecimal digits."""
+
+    def __init__(self, coe_code: int, struct_format: str) -> None:
+        self.coe_code = coe_code
+        self.format = struct_format
+
+    @property
+    def size(self) -> int:
+        """Bytes on the wire; 0 for strings and octets, whose length varies."""
+        return struct.calcsize(self.format) if self.format else 0
+
+    def pack(self, value: float | str) -> bytes:
+        """Wire bytes of `value`; struct.error if it does not fit."""
+        if isinstance(value, str):
+            return bytes.fromhex(value) if self is ObjectType.OCTETS else value.encode("ascii")
+        return struct.pack(self.format, value)
+
+    def unpack(self, data: bytes) -> float | int | str:
+        """The value in `data`; struct.error if the length is wrong."""
+        if self is ObjectType.STRING:
+            return data.rstrip(b"\0").decode("ascii", errors="replace")
+        if self is ObjectType.OCTETS:
+            return data.hex()
+        value: float | int = struct.unpack(self.format, data)[0]
+        return value
+
+
+class Access(Enum):
+    """Who may write an object entry, and in which AL state."""
+
+    RO = "ro"
+    RW = "rw"
+    RW_PREOP = "rw in PREOP only"
+
+    @property
+    def write_states(self) -> tuple[str, ...]:
+        """The AL states in which it may be written."""
+        if self is Access.RO:
+            return ()
+        return ("PREOP",) if self is Access.RW_PREOP else ("PREOP", "SAFEOP", "OP")
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectEntry:
+    """One entry of the object dictionary."""
+
+    index: int
+    subindex: int
+    name: str
+    type: ObjectType
+    access: Access
+    default: float | str = 0
+    """Factory default."""
+    unit: str = ""
+    setting: str | None = None
+    """Name of the setting in `protocol.settings`."""
+    codes: Mapping[SettingValue, int] | None = None
+    """Wire value of each setting value, where they differ."""
+    values: Mapping[int, str] | None = None
+    """Wire values that mean something, for what is no setting."""
+
+    @property
+    def address(self) -> tuple[int, int]:
+        """Index and sub-index."""
+        return self.index, self.subindex
+
+    @property
+    def allowed(self) -> Mapping[int, str] | range | None:
+        """Wire values that it may have with their meaning; a range of many; None if any value may be."""
+        if self.setting is None:
+            return self.values
+        setting = SETTINGS[self.setting]
+        if isinstance(setting.choices, range) and len(setting.choices) > 16:
+            return setting.choices
+        choices: tuple[SettingValue, ...] = (False, True) if setting.is_bool else tuple(setting.choices or ())
+        meanings = {
+            self.codes[value] if self.codes else int(value): value_meaning(self.setting, value)
+            for value in choices
+        }
+        return dict(sorted(meanings.items()))
+
+    def encode_setting(self, value: SettingValue) -> bytes:
+        """Wire bytes of a checked setting value."""
+        return self.type.pack(self.codes[value] if self.codes else int(value))
+
+    def decode_setting(self, data: bytes, is_bool: bool) -> SettingValue:
+        """The setting value in `data`; ValueError if it is none that the setting can have."""
+        try:
+            raw = self.type.unpack(data)
+        except struct.error:
+            raise ValueError(
+                f"object 0x{self.index:04X}:{self.subindex} holds {data.hex() or 'nothing'}, which is no "
+                f"{self.type.name}"
+            ) from None
+        if self.codes:
+            for value, code in self.codes.items():
+                if code == raw:
+                    return value
+            raise ValueError(f"object 0x{self.index:04X}:{self.subindex} holds {raw}, which means nothing")
+        return bool(raw) if is_bool else int(raw)
+
+
+U8, U16, U32, REAL32, STRING, OCTETS = ObjectType
+RO, RW, RW_PREOP = Access
+
+_PDO_TYPES = {PdoType.USINT: U8, PdoType.UINT: U16, PdoType.UDINT: U32, PdoType.REAL: REAL32}
+_AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+_INVERTED: Mapping[SettingValue, int] = {True: 0, False: 1}
+
+FACTORY_CALIBRATION: Final = 0x2000
+"""Writable on the device in every state. Never write it: the calibration is lost."""
+FACTORY_CALIBRATION_ENTRIES: Final = 57
+
+DEVICE_NAME: Final = (0x1008, 0)
+HARDWARE_VERSION: Final = (0x1009, 0)
+FIRMWARE_VERSION: Final = (0x100A, 0)
+SERIAL_NUMBER: Final = (0x1018, 4)
+FORCE_TORQUE_OFFSET: Final = 0x8000
+SAMPLING_RATE: Final = (0x8011, 0)
+CONTROL_COMMAND: Final = (0x8030, 1)
+CONTROL_STATUS: Final = (0x8030, 2)
+SAVE_PARAMETERS: Final = 1
+
+OBJECTS: Final[tuple[ObjectEntry, ...]] = (
+    ObjectEntry(0x1000, 0, "Device type", U32, RO, 0),
+    ObjectEntry(0x1008, 0, "Device name", STRING, RO, MODELS[0]),
+    ObjectEntry(0x1009, 0, "Hardware version", STRING, RO, "RM200V4_6adc"),
+    ObjectEntry(0x100A, 0, "Firmware version", STRING, RO, "1.3.8"),
+    ObjectEntry(0x1018, 1, "Vendor ID", U32, RO, VENDOR_ID),
+    ObjectEntry(0x1018, 2, "Product code", U32, RO, PRODUCT_CODE),
+    ObjectEntry(0x1018, 3, "Revision", U32, RO, REVISION),
+    ObjectEntry(0x1018, 4, "Serial number", U32, RO, 1),
+    *(
+        ObjectEntry(FACTORY_CALIBRATION, sub, f"Calibration {sub}", REAL32, RW)
+        for sub in range(1, FACTORY_CALIBRATION_ENTRIES + 1)
+    ),
+    *(
+        ObjectEntry(INPUT_OBJECT, field.subindex, field.title, _PDO_TYPES[field.type], RO, 0, field.unit)
+        for field in PDO_FIELDS
+    ),
+    ObjectEntry(0x7000, 0, "Digital output", U8, RW),
+    *(
+        ObjectEntry(FORCE_TORQUE_OFFSET, sub, f"{axis} offset", REAL32, RW, 0, "N" if sub <= 3 else "Nm")
+        for sub, axis in enumerate(_AXES, 1)
+    ),
+    *(
+        ObjectEntry(0x8001, sub, f"Acceleration offset {sub}", REAL32, RW, 0, "g" if sub <= 3 else "")
+        for sub in range(1, 7)
+    ),
+    *(
+        ObjectEntry(0x8002, sub, f"Angular rate offset {sub}", REAL32, RW, 0, "deg/s" if sub <= 3 else "")
+        for sub in range(1, 7)
+    ),
+    ObjectEntry(
+        0x8004, 0, "Acceleration range", U8, RW_PREOP, 0, "g",
+        "acceleration_range_g", {2: 0, 4: 1, 8: 2, 16: 3},
+    ),
+    ObjectEntry(
+        0x8005, 0, "Angular rate range", U8, RW_PREOP, 0, "deg/s",
+        "angular_rate_range_dps", {250: 0, 500: 1, 1000: 2, 2000: 3},
+    ),
+    ObjectEntry(0x8006, 1, "SINC length", U16, RW_PREOP, 64, "", "sinc_length"),
+    ObjectEntry(0x8006, 2, "FIR disable", U8, RW_PREOP, 1, "", "fir", _INVERTED),
+    ObjectEntry(0x8006, 3, "FAST enable", U8, RW_PREOP, 0, "", "fast"),
+    ObjectEntry(0x8006, 4, "CHOP enable", U8, RW_PREOP, 0, "", "chop"),
+    ObjectEntry(0x8007, 0, "Acceleration filter", U8, RW_PREOP, 1, "", "acceleration_filter"),
+    ObjectEntry(0x8008, 0, "Angular rate filter", U8, RW_PREOP, 3, "", "angular_rate_filter"),
+    ObjectEntry(0x8010, 1, "Calibration matrix active", U8, RW, 1, "", "calibration_matrix"),
+    ObjectEntry(0x8010, 2, "Temperature compensation", U8, RW, 0, "", "temperature_compensation"),
+    ObjectEntry(0x8010, 3, "IMU active", U8, RW, 1, "", "imu_active"),
+    ObjectEntry(0x8010, 4, "Coordinate system active", U8, RW, 0, "", "coordinate_system"),
+    ObjectEntry(0x8010, 5, "Inertia and gravity compensation", U8, RW, 0, "", "inertia_compensation"),
+    ObjectEntry(0x8010, 6, "Orientation estimation", U8, RW, 0, "", "orientation_estimation"),
+    ObjectEntry(0x8011, 0, "Sampling rate", U16, RO, 800, "Hz"),
+    ObjectEntry(0x8030, 1, "Command", U8, RW, values={SAVE_PARAMETERS: "save the parameters"}),
+    ObjectEntry(0x8030, 2, "Status", U8, RO, values={0: "success"}),
+)  # fmt: skip
+"""Those that the firmware seen has."""
+
+BY_ADDRESS: Final[Mapping[tuple[int, int], ObjectEntry]] = {row.address: row for row in OBJECTS}
+BY_SETTING: Final[Mapping[str, ObjectEntry]] = {row.setting: row for row in OBJECTS if row.setting}
+
+# The device works out the valid SINC range from the other filters, so SINC goes last.
+SETTING_WRITE_ORDER: Final[tuple[str, ...]] = (
+    "calibration_matrix",
+    "temperature_compensation",
+    "imu_active",
+    "coordinate_system",
+    "inertia_compensation",
+    "orientation_estimation",
+    "acceleration_range_g",
+    "angular_rate_range_dps",
+    "acceleration_filter",
+    "angular_rate_filter",
+    "chop",
+    "fast",
+    "fir",
+    "sinc_length",
+)

@@ -1,0 +1,132 @@
+"""One sensor: who it is, what it is set to, and what it is doing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import Any, Final, NamedTuple
+
+from protocol.sensor.meaning import value_meaning
+from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue
+
+_MODEL_NAME: Final = re.compile(r"BFT-[A-Z]{4}-ECAT-M8")
+
+
+class Identity(NamedTuple):
+    """What the sensor says of itself over SDO."""
+
+    name: str
+    serial: int
+    hardware: str
+    firmware: str
+
+    def __str__(self) -> str:
+        """As a person names it."""
+        return f"{self.name} with serial {self.serial}"
+
+
+class SensorState(Enum):
+    """What a sensor is doing. It is in exactly one of these; `Sensor.enter` goes to another."""
+
+    SETTING_UP = auto()
+    STREAMING = auto()
+    CHANGING = auto()
+    """Out of OP to have its settings changed."""
+    REVERTING = auto()
+    """The change failed: it gets its former settings back."""
+    LOST = auto()
+    REFUSED = auto()
+    """Another sensor is connected in its position."""
+
+    @property
+    def reported(self) -> str:
+        """What `describe` says."""
+        return _REPORTED[self]
+
+
+_REPORTED: Final = {
+    SensorState.SETTING_UP: "PREOP",
+    SensorState.STREAMING: "OP",
+    SensorState.CHANGING: "PREOP",
+    SensorState.REVERTING: "PREOP",
+    SensorState.LOST: "LOST",
+    SensorState.REFUSED: "REFUSED",
+}
+_TRANSITIONS: Final = {
+    SensorState.SETTING_UP: {SensorState.STREAMING},
+    SensorState.STREAMING: {SensorState.CHANGING, SensorState.LOST},
+    SensorState.CHANGING: {
+        SensorState.STREAMING,
+        SensorState.REVERTING,
+        SensorState.LOST,
+        SensorState.REFUSED,
+    },
+    SensorState.REVERTING: {SensorState.STREAMING, SensorState.LOST, SensorState.REFUSED},
+    SensorState.LOST: {SensorState.STREAMING, SensorState.REFUSED},
+    SensorState.REFUSED: {SensorState.STREAMING, SensorState.REFUSED},
+}
+
+
+@dataclass(slots=True)
+class Sensor:
+    """One sensor on the bus, as found and set up."""
+
+    position: int
+    identity: Identity
+    wanted: dict[str, SettingValue]
+    """The settings to be in force; written again when the sensor has lost them."""
+    asked: frozenset[str] = frozenset()
+    """Those among them that a person asked for: these must exist."""
+    pdo_size: int = 0
+    rate_hz: int = 0
+    state: SensorState = SensorState.SETTING_UP
+    settings: dict[str, SettingValue] = field(default_factory=dict)
+    """The settings in force; `hold` changes them."""
+    meaning: dict[str, str] = field(default_factory=dict)
+    """What each of them means. Kept, so that telling it takes no time from the samples."""
+    offset: tuple[float, ...] | None = None
+    """The force/torque offset that was set while streaming; written again when the sensor has lost it."""
+    unsettled: bool = False
+    """A change was interrupted: neither the former settings nor the wanted ones are in force for certain."""
+
+    @property
+    def streams(self) -> bool:
+        """Whether its process data is its own: it is in OP and answers."""
+        return self.state is SensorState.STREAMING
+
+    def enter(self, state: SensorState) -> None:
+        """Go to another state; AssertionError for a transition that cannot be."""
+        assert state in _TRANSITIONS[self.state], f"{self.state.name} -> {state.name}"
+        self.state = state
+
+    @property
+    def period_ns(self) -> float:
+        """Nominal sample period; 0x8011 rounds the rate to whole Hz, so it follows from the SINC length."""
+        return 1e9 * self.wanted["sinc_length"] / BASE_SAMPLING_RATE_HZ
+
+    def hold(self, settings: Mapping[str, SettingValue]) -> None:
+        """These settings are in force now."""
+        self.settings = dict(settings)
+        self.meaning = {name: value_meaning(name, value) for name, value in settings.items()}
+
+    def describe(self) -> dict[str, Any]:
+        """The sensor's part of the `describe` reply."""
+        return {
+            "sensor": self.position,
+            "name": self.identity.name,
+            "serial": self.identity.serial,
+            "hardware": self.identity.hardware,
+            "firmware": self.identity.firmware,
+            "pdo_size": self.pdo_size,
+            "rate_hz": self.rate_hz,
+            "state": self.state.reported,
+            "settings": self.settings,
+            "meaning": self.meaning,
+        }
+
+
+def is_known_model(name: str) -> bool:
+    """Whether `name` is that of a Gen-0 EtherCAT model."""
+    return _MODEL_NAME.fullmatch(name) is not None

@@ -1,0 +1,202 @@
+"""The steps that identify a sensor and set it up.
+
+They are generators over an `Sdo` (see `ethercat.slave.coe`): the same code runs at start-up and, between two
+exchanges, when a sensor comes back.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+from collections.abc import Sequence
+from typing import Final
+
+from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError
+from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.slave.coe import Sdo, Steps
+from ethercat_server.sensor import dictionary
+from ethercat_server.sensor.sensor import Identity, Sensor
+from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue
+from protocol.text.visible import visible
+
+_SETTLE_S: Final = 0.5
+"""How long Bota's own driver waits for new filter settings to take effect."""
+
+_LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]
+"""sinc_length."""
+_OFFSETS: Final = tuple((dictionary.FORCE_TORQUE_OFFSET, sub) for sub in range(1, 7))
+
+log = logging.getLogger(__name__)
+
+
+def identify(sdo: Sdo, sii_name: str) -> Steps[Identity]:
+    """Ask the sensor who it is; what its firmware has no object for is left empty."""
+    name = yield from _read_text(sdo, dictionary.DEVICE_NAME)
+    hardware = yield from _read_text(sdo, dictionary.HARDWARE_VERSION)
+    firmware = yield from _read_text(sdo, dictionary.FIRMWARE_VERSION)
+    serial = yield from _read(sdo, dictionary.SERIAL_NUMBER)
+    return Identity(name or sii_name, int.from_bytes(serial or b"", "little"), hardware, firmware)
+
+
+def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+    """Write the wanted settings that are not in force yet, in the device's order, and verify them.
+
+    The sensor must be in PREOP. Afterwards `settings` and `rate_hz` are what is in force. BusError says which
+    setting did not take.
+    """
+    held: dict[str, str] = {}
+    written = False
+    for name in dictionary.SETTING_WRITE_ORDER:
+        if name not in sensor.wanted or name == _LAST:
+            continue
+        entry = dictionary.BY_SETTING[name]
+        found = yield from _read(sdo, entry.address)
+        if found != entry.encode_setting(sensor.wanted[name]):
+            yield from write_setting(sdo, sensor, name)
+            written = True
+            if found is not None:
+                held[name] = _setting_text(name, found)
+    # The valid SINC range depends on the filters before it, and only the sampling rate shows what it is.
+    right = yield from _rate_is_right(sdo, sensor)
+    rate_hz = sensor.rate_hz
+    if written or not right:
+        yield from write_setting(sdo, sensor, _LAST)
+        yield from _check_rate(sdo, sensor)
+    texts = [f"{name} = {text} (wanted: {_text(sensor.wanted[name])})" for name, text in held.items()]
+    if not right:
+        texts.append(f"a sampling rate of {rate_hz} Hz (wanted: {sensor.rate_hz} Hz)")
+    if texts:
+        log.info(
+            "sensor %d held %s: what is wanted was written and verified", sensor.position, ", ".join(texts)
+        )
+    yield from read_settings(sdo, sensor)
+    if sensor.offset is not None:
+        yield from write_offset(sdo, sensor.offset)
+    sensor.unsettled = False
+
+
+def put_right(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+    """After a change that was cut off in OP: write what is wanted, as far as OP takes it; see `set_up`."""
+    for name in dictionary.SETTING_WRITE_ORDER:
+        if name not in sensor.wanted or SETTINGS[name].preop_only:
+            continue
+        entry = dictionary.BY_SETTING[name]
+        if (yield from _read(sdo, entry.address)) != entry.encode_setting(sensor.wanted[name]):
+            yield from write_setting(sdo, sensor, name)
+    if sensor.offset is not None:
+        yield from write_offset(sdo, sensor.offset)
+    yield from read_settings(sdo, sensor)
+    sensor.unsettled = False
+
+
+def write_setting(sdo: Sdo, sensor: Sensor, name: str, value: SettingValue | None = None) -> Steps[None]:
+    """Write one setting, to what is wanted if no value is given; BusError if it did not take."""
+    entry, value = dictionary.BY_SETTING[name], sensor.wanted[name] if value is None else value
+    data = entry.encode_setting(value)
+    try:
+        yield from sdo.write(*entry.address, data)
+        # SINC is proved by the sampling rate: a real device read back 2048 at 341.
+        held = data if name == "sinc_length" else (yield from sdo.read(*entry.address))
+    except SdoAbortError as error:
+        if error.abort_code in OBJECT_MISSING and name not in sensor.asked:
+            log.warning(
+                "sensor %d (%s) has no setting %s; left out", sensor.position, sensor.identity.name, name
+            )
+            return
+        raise SdoAbortError(f"the setting {name} = {value} did not take: {error}", error.abort_code) from None
+    if held != data:
+        raise BusError(
+            f"the setting {name} = {value} did not take: sensor {sensor.position} holds {held.hex()} after "
+            f"{data.hex()} was written; power it off and on, then start again"
+        )
+
+
+def _setting_text(name: str, data: bytes) -> str:
+    """For people: the setting in what was read of its object."""
+    try:
+        return _text(dictionary.BY_SETTING[name].decode_setting(data, SETTINGS[name].is_bool))
+    except ValueError:
+        return f"0x{data.hex()}"
+
+
+def _text(value: SettingValue) -> str:
+    return str(value).lower()
+
+
+def read_offset(sdo: Sdo) -> Steps[tuple[float, ...]]:
+    """The six force/torque offsets in force."""
+    found = []
+    for address in _OFFSETS:
+        entry, data = dictionary.BY_ADDRESS[address], (yield from sdo.read(*address))
+        try:
+            found.append(float(entry.type.unpack(data)))
+        except struct.error:
+            raise BusError(
+                f"the offset {entry.name} is {data.hex() or 'nothing'}, which is no {entry.type.name}"
+            ) from None
+    return tuple(found)
+
+
+def pack_offset(offset: Sequence[float]) -> list[bytes]:
+    """The six offsets as REAL32; ValueError if one is too large."""
+    try:
+        return [
+            dictionary.BY_ADDRESS[address].type.pack(v) for address, v in zip(_OFFSETS, offset, strict=True)
+        ]
+    except OverflowError:
+        raise ValueError(f"{max(offset, key=abs):g} is larger than a REAL32 can be") from None
+
+
+def write_offset(sdo: Sdo, offset: Sequence[float]) -> Steps[None]:
+    """Write the six offsets and verify them; BusError if one does not take."""
+    for address, value, data in zip(_OFFSETS, offset, pack_offset(offset), strict=True):
+        yield from sdo.write(*address, data)
+        if (yield from sdo.read(*address)) != data:
+            raise BusError(f"the offset {dictionary.BY_ADDRESS[address].name} = {value:g} did not take")
+
+
+def _rate_is_right(sdo: Sdo, sensor: Sensor) -> Steps[bool]:
+    sensor.rate_hz = int.from_bytes((yield from sdo.read(*dictionary.SAMPLING_RATE)), "little")
+    # Table III.4 rounds some rates up and some down.
+    return abs(sensor.rate_hz - BASE_SAMPLING_RATE_HZ / sensor.wanted[_LAST]) <= 1.0
+
+
+def _check_rate(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+    deadline = Deadline(sdo.clock, _SETTLE_S)
+    while not (yield from _rate_is_right(sdo, sensor)):
+        if deadline.passed:
+            length = sensor.wanted[_LAST]
+            raise BusError(
+                f"sensor {sensor.position} samples at {sensor.rate_hz} Hz, but sinc_length {length} implies "
+                f"{BASE_SAMPLING_RATE_HZ / length:.0f} Hz: power it off and on, or choose another sinc_length"
+            )
+        yield
+
+
+def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+    """Find out what is in force."""
+    held: dict[str, SettingValue] = {}
+    for name, setting in SETTINGS.items():
+        data = yield from _read(sdo, dictionary.BY_SETTING[name].address)
+        if data is None:
+            continue
+        try:
+            held[name] = dictionary.BY_SETTING[name].decode_setting(data, setting.is_bool)
+        except ValueError as error:
+            log.warning("sensor %d: %s", sensor.position, error)
+    held["sinc_length"] = sensor.wanted["sinc_length"]
+    sensor.hold(held)
+
+
+def _read(sdo: Sdo, address: tuple[int, int]) -> Steps[bytes | None]:
+    try:
+        return (yield from sdo.read(*address))
+    except SdoAbortError:
+        return None
+
+
+def _read_text(sdo: Sdo, address: tuple[int, int]) -> Steps[str]:
+    data = yield from _read(sdo, address)
+    # Up to the first NUL: strings come padded, and from the wire, so only what can be printed is kept.
+    text = (data or b"").split(b"\0")[0].decode("ascii", errors="replace").strip()
+    return visible(text)

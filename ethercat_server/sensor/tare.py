@@ -1,0 +1,215 @@
+"""Tare: sets the sensor's own force/torque offset so that the mean reading becomes a given wrench.
+
+The sensor adds its offset to what it measures, so new = target - mean + current.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, NamedTuple, Protocol
+
+from ethercat_server.errors import BusError, CutOffError, extended
+from ethercat_server.ethercat.clock import Clock, Deadline
+from ethercat_server.ethercat.slave.coe import Sdo, Steps
+from ethercat_server.sensor.sensor import Sensor
+from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
+from protocol.control import ErrorCode
+from protocol.errors import RequestError
+from protocol.pdo import layout_for
+
+LATER: Final = "; it gets its old offset when it is back"
+_NAMES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz", "Rx", "Ry", "Rz")
+_CHANNELS: Final = len(_NAMES)
+_LOAD: Final = slice(2, 8)
+_RATE: Final = slice(13, 16)
+"""Fields of the process data with force and torque, and with the angular rate."""
+LEAST_SAMPLES: Final = 20
+"""Fewer would not show whether the sensor is stationary."""
+_REST_FORCE_N: Final = 1.0
+_REST_TORQUE_NM: Final = 0.05
+_REST_RATE_DPS: Final = 3.0
+"""Limits of the standard deviation for a stationary sensor, above Bota's own limits for a healthy one."""
+_REST_TURN_DPS: Final = math.degrees(0.5)
+"""Length of the mean angular rate: beyond it a robot is plainly moving. The residual tells what a slower turn
+costs."""
+_BY_CHANCE: Final = 5.0
+"""Standard errors by which two means must differ to differ significantly."""
+_SETTLING: Final = 8
+"""Samples after which a new offset is in effect."""
+_PATIENCE: Final = 4.0
+"""Timeout for samples, in multiples of their nominal duration."""
+
+
+class Samples(Protocol):
+    """The samples as they come in: the stream of the sensor."""
+
+    @property
+    def fresh(self) -> int:
+        """How many there have been."""
+
+    @property
+    def process_data(self) -> bytes:
+        """The newest."""
+
+
+def tare(
+    sdo: Sdo, sensor: Sensor, stream: Samples, samples: int, target: Sequence[float]
+) -> Steps[dict[str, Any]]:
+    """Steps of the action `tare`; returns what its reply carries. RequestError if the sensor is not at rest,
+    or cannot hold the offset.
+
+    If it fails half-way the old offset is put back.
+    """
+    _check_fits(target, "the key 'target'")
+    samples = max(samples, LEAST_SAMPLES)
+    before = yield from _average(sdo.clock, sensor, stream, samples)
+    _check_rest(sensor, before)
+    old = yield from read_offset(sdo)
+    new = tuple(t - m + o for t, m, o in zip(target, before.mean[:6], old, strict=True))
+    _check_fits(new, "the offset that the key 'target' asks for")
+    try:
+        yield from write_offset(sdo, new)
+        yield from _wait(sdo.clock, sensor, stream, _SETTLING)
+        after = yield from _average(sdo.clock, sensor, stream, samples)
+    except (BusError, RequestError) as error:
+        raise (yield from _take_back(sdo, sensor, old, error)) from None
+    sensor.offset = new
+    return {
+        "old_offset": list(old),
+        "new_offset": list(new),
+        "residual": [m - t for m, t in zip(after.mean[:6], target, strict=True)],
+        "deviation": before.deviation[:6],
+    }
+
+
+def _check_fits(offset: Sequence[float], what: str) -> None:
+    try:
+        pack_offset(offset)
+    except ValueError as error:
+        raise RequestError(ErrorCode.BAD_REQUEST, f"{what} cannot be: {error}") from None
+
+
+def _take_back(
+    sdo: Sdo, sensor: Sensor, old: tuple[float, ...], error: BusError | RequestError
+) -> Steps[BusError | RequestError]:
+    """Write the old offset again; returns `error` with what came of that."""
+    addition = "; the old offset is in force"
+    if isinstance(error, CutOffError):
+        sensor.offset, sensor.unsettled = old, True
+        addition = LATER
+    else:
+        try:
+            yield from write_offset(sdo, old)
+        except BusError as worse:
+            sensor.offset, sensor.unsettled = old, True
+            addition = f"; putting back the old offset failed too: {worse}; tare it again"
+    if isinstance(error, RequestError):
+        return RequestError(error.code, f"{error}{addition}", **error.extra)
+    return extended(error, addition)
+
+
+class _Window(NamedTuple):
+    """Force, torque and angular rate (deg/s) over some samples."""
+
+    mean: list[float]
+    deviation: list[float]
+    change: list[float]
+    """From the mean of the first half to that of the second."""
+    by_chance: list[float]
+    """What noise explains of that."""
+
+
+class _Block:
+    """Sums over some samples."""
+
+    def __init__(self, channels: int) -> None:
+        self.taken = 0
+        self.sums = [0.0] * channels
+        self.squares = [0.0] * channels
+
+    def add(self, row: Sequence[float]) -> None:
+        self.taken += 1
+        for position, value in enumerate(row):
+            self.sums[position] += value
+            self.squares[position] += value * value
+
+    def statistics(self) -> Iterator[tuple[float, float]]:
+        """Mean and variance of each channel."""
+        for total, squares in zip(self.sums, self.squares, strict=True):
+            mean = total / self.taken
+            yield mean, max(0.0, squares / self.taken - mean * mean)
+
+
+def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[_Window]:
+    """Over the next samples."""
+    unpack = layout_for(sensor.pdo_size).struct.unpack
+    deadline = _patience(clock, sensor, samples)
+    seen = stream.fresh
+    whole, halves = _Block(_CHANNELS), (_Block(_CHANNELS), _Block(_CHANNELS))
+    first: list[float] = []
+    while whole.taken < samples:
+        yield
+        if deadline.passed:
+            raise RequestError(
+                ErrorCode.NOT_READY, f"sensor {sensor.position} gives too few samples to tare it"
+            )
+        if stream.fresh == seen:
+            continue
+        seen = stream.fresh
+        values = unpack(stream.process_data)
+        row = [*values[_LOAD], *values[_RATE]]
+        if not all(map(math.isfinite, row)):
+            raise RequestError(
+                ErrorCode.NOT_READY, f"sensor {sensor.position} is overloaded: it gives no finite numbers"
+            )
+        first = first or row
+        # From the first on, so that a large load does not drown its small changes.
+        row = [value - start for value, start in zip(row, first, strict=True)]
+        halves[2 * whole.taken >= samples].add(row)
+        whole.add(row)
+    found = list(whole.statistics())
+    mean = [m + start for (m, _), start in zip(found, first, strict=True)]
+    change, by_chance = [], []
+    for (one, noise), (other, more_noise) in zip(*(half.statistics() for half in halves), strict=True):
+        change.append(abs(other - one))
+        by_chance.append(_BY_CHANCE * math.sqrt((noise + more_noise) / halves[0].taken))
+    return _Window(mean, [math.sqrt(variance) for _, variance in found], change, by_chance)
+
+
+def _wait(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[None]:
+    """Wait for `samples` samples, or the timeout."""
+    target = stream.fresh + samples
+    deadline = _patience(clock, sensor, samples)
+    while stream.fresh < target and not deadline.passed:
+        yield
+
+
+def _patience(clock: Clock, sensor: Sensor, samples: int) -> Deadline:
+    """Timeout for `samples` samples."""
+    return Deadline(clock, 1.0 + _PATIENCE * samples * sensor.period_ns * 1e-9)
+
+
+def _check_rest(sensor: Sensor, found: _Window) -> None:
+    turn = math.hypot(*found.mean[6:])
+    if turn > _REST_TURN_DPS:
+        raise _not_at_rest(sensor, f"it turns by {turn:.3g} deg/s (mean; at most {_REST_TURN_DPS:.3g})")
+    limits = (_REST_FORCE_N,) * 3 + (_REST_TORQUE_NM,) * 3 + (_REST_RATE_DPS,) * 3
+    units = ("N",) * 3 + ("Nm",) * 3 + ("deg/s",) * 3
+    for name, deviation, limit, unit in zip(_NAMES, found.deviation, limits, units, strict=True):
+        if deviation > limit:
+            raise _not_at_rest(
+                sensor, f"{name} varies by {deviation:.3g} {unit} (standard deviation; at most {limit:g})"
+            )
+    # The means of the two halves may lie as far apart as single samples, and what noise explains.
+    changes = zip(_NAMES[:6], found.change[:6], found.by_chance[:6], limits[:6], units[:6], strict=True)
+    for name, change, by_chance, limit, unit in changes:
+        if change > limit + by_chance:
+            text = f"{name} changes by {change:.3g} {unit} (mean; at most {limit + by_chance:.3g})"
+            raise _not_at_rest(sensor, text)
+
+
+def _not_at_rest(sensor: Sensor, why: str) -> RequestError:
+    return RequestError(
+        ErrorCode.NOT_READY, f"sensor {sensor.position} is not at rest: {why}: hold it still and tare again"
+    )

@@ -1,0 +1,1 @@
+"""Clients over TCP. May import `acquisition` and below; loads no pysoem."""

@@ -1,0 +1,149 @@
+"""The actions of the control channel: what the server does for each request.
+
+What produces the frames and what acts on the sensors are known here as protocols only: a replay, which has
+no bus, is served by the same code.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Container, Mapping, Sequence
+from typing import Any, Final, Protocol
+
+from ethercat_server import __version__
+from ethercat_server.serving.connection import Connection, Subscription
+from ethercat_server.serving.hub import Hub
+from protocol.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
+from protocol.errors import RequestError
+from protocol.text.json_text import JsonObject
+
+_MOST_EXPLAINED: Final = 32
+"""With more sensors `describe` omits the meaning of their settings: a reply has at most 65536 bytes."""
+
+log = logging.getLogger(__name__)
+
+
+class Producer(Protocol):
+    """What produces the frames: the server's `Cycle`."""
+
+    def status(self) -> dict[str, Any]:
+        """Its part of the `status` reply."""
+        ...
+
+    def stop(self) -> None:
+        """End soon."""
+        ...
+
+
+class Described(Protocol):
+    """A sensor."""
+
+    def describe(self) -> dict[str, Any]:
+        """Its part of the `describe` reply."""
+        ...
+
+
+class OnSensors(Protocol):
+    """What acts on the sensors: the server's `SensorActions`."""
+
+    @property
+    def sensors(self) -> Sequence[Described]:
+        """All of them, by position."""
+        ...
+
+    @property
+    def handlers(self) -> Container[str]:
+        """The actions it handles."""
+        ...
+
+    def handle(self, connection: Connection, request: Request) -> None:
+        """Start one and answer later through the hub; RequestError refuses it."""
+        ...
+
+
+class Actions:
+    """Answers requests: one method for each action."""
+
+    def __init__(
+        self, hub: Hub, cycle: Producer, on_sensors: OnSensors, extra: Mapping[str, Any] | None = None
+    ) -> None:
+        """`extra` is added to the reply of `describe`."""
+        self._hub = hub
+        self._cycle = cycle
+        self._extra = extra or {}
+        self._on_sensors = on_sensors
+        self._sensors = on_sensors.sensors
+        self._handlers: dict[str, Callable[[Connection, Request], JsonObject]] = {
+            "describe": self._describe,
+            "subscribe": self._subscribe,
+            "unsubscribe": self._unsubscribe,
+            "status": self._status,
+            "shutdown": self._shutdown,
+        }
+
+    def handle(self, connection: Connection, message: JsonObject) -> JsonObject | None:
+        """The reply to `message`, None if it comes later; RequestError refuses it."""
+        request = parse_request(message)
+        action = ACTIONS[request.action]
+        if action.framed_only and connection.framed is None:
+            raise RequestError(
+                ErrorCode.BAD_REQUEST,
+                f"{request.action} needs a framed connection: a bare JSON connection carries no DATA",
+            )
+        if action.controls and not self._hub.permissions.may_control(connection):
+            kind = f"{connection.uid} {request.action}"
+            log.warning("%s: %s denied", connection, request.action, extra={"kind": kind})
+            raise RequestError(ErrorCode.DENIED, _denial(request.action, connection.uid))
+        if request.action in self._on_sensors.handlers:
+            self._on_sensors.handle(connection, request)
+            return None
+        return self._handlers[request.action](connection, request)
+
+    def _describe(self, _: Connection, request: Request) -> JsonObject:
+        rows = [sensor.describe() for sensor in self._sensors]
+        if len(rows) > _MOST_EXPLAINED:
+            rows = [{key: value for key, value in row.items() if key != "meaning"} for row in rows]
+        return reply(request, protocol=PROTOCOL_VERSION, version=__version__, sensors=rows, **self._extra)
+
+    def _subscribe(self, connection: Connection, request: Request) -> JsonObject:
+        positions = request.values["sensors"]
+        absent = [position for position in positions or () if position >= len(self._sensors)]
+        if absent:
+            raise RequestError(
+                ErrorCode.BAD_REQUEST,
+                f"the key 'sensors' names sensor {absent[0]}, but the bus has {len(self._sensors)}, "
+                "counted from 0",
+            )
+        connection.subscription = Subscription(
+            len(self._sensors), positions, request.values["every"], request.values["fresh_only"]
+        )
+        self._hub.subscriptions_changed()
+        return self._describe(connection, request)
+
+    def _unsubscribe(self, connection: Connection, request: Request) -> JsonObject:
+        connection.subscription = None
+        self._hub.subscriptions_changed()
+        return reply(request)
+
+    def _status(self, _: Connection, request: Request) -> JsonObject:
+        clients = [
+            {"peer": c.peer, "sent": c.outbox.sent, "withheld": c.outbox.withheld}
+            for c in self._hub.connections.values()
+        ]
+        return reply(request, **self._cycle.status(), clients=clients)
+
+    def _shutdown(self, _: Connection, request: Request) -> JsonObject:
+        self._cycle.stop()
+        return reply(request)
+
+
+def _denial(action: str, uid: int | None) -> str:
+    if uid is None:
+        return (
+            f"{action} is denied because your user is not known: connect from this machine and keep the "
+            "connection open until the reply has arrived"
+        )
+    return (
+        f"{action} is denied to uid {uid}: only root, the server's own user, the user who ran sudo and those "
+        "named with --control-user or --control-group may do that"
+    )

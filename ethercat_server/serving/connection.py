@@ -1,0 +1,251 @@
+"""One client's connection: its state, what it has sent so far, which DATA it wants. It never blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from ethercat_server.serving.outbox import Outbox, with_gap
+from ethercat_server.serving.state import TRANSITIONS, State
+from ethercat_server.serving.transport.base import Stream
+from protocol.errors import BadMessageError, RemoteProtocolError
+from protocol.framing import DataFlag, FrameDecoder, encode_json
+from protocol.text.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
+from protocol.text.json_text import JsonObject
+
+MAX_REQUEST_LENGTH: Final = 4096
+_IDLE_FRAME_NS: Final = 10_000_000
+"""A `fresh_only` client gets a REPEATED frame only if it has received nothing for this long."""
+_REPEATED: Final = int(DataFlag.REPEATED)
+_GAP: Final = int(DataFlag.GAP)
+_UNFINISHED_NS: Final = 10_000_000_000
+"""Timeout for the rest of a message whose first part has arrived."""
+_LAST_REPLY_NS: Final = 1_000_000_000
+"""Timeout for a connection that is being closed."""
+
+
+class Limits(NamedTuple):
+    """Timeouts after which a client is closed."""
+
+    stall_ns: float = 10e9
+    """While something waits to be sent: nothing of it was accepted."""
+    idle_ns: float = 300e9
+    """Without a subscription: no request."""
+
+
+class Unreadable(NamedTuple):
+    """A message that could not be read.
+
+    Not an exception: its traceback would refer to itself, and the garbage collector is off in the loop.
+    """
+
+    reason: str
+
+
+class Subscription:
+    """Which DATA a client wants. Lists are by the sensor's position."""
+
+    __slots__ = ("every", "fresh_only", "gap", "last_ns", "skipped", "wanted")
+
+    def __init__(
+        self, sensor_count: int, sensors: tuple[int, ...] | None, every: int, fresh_only: bool
+    ) -> None:
+        self.wanted = [sensors is None or position in sensors for position in range(sensor_count)]
+        self.every = every
+        self.fresh_only = fresh_only
+        self.skipped = [every - 1] * sensor_count
+        # Nothing was sent yet, which counts as long ago even if the clock starts at zero.
+        self.last_ns = [-_IDLE_FRAME_NS] * sensor_count
+        self.gap = [False] * sensor_count
+
+
+class Connection:
+    """A client's stream and everything that belongs to it."""
+
+    def __init__(self, stream: Stream, uid: int | None, monotonic_ns: Callable[[], int]) -> None:
+        """`uid` is the user who owns the other end, None if that is not known."""
+        self.fd = stream.fileno()
+        self.peer = stream.peer
+        self.uid = uid
+        self.state = State.READING
+        self.framed: FrameDecoder | None = None
+        self.bare: BareJsonDecoder | None = None
+        self.subscription: Subscription | None = None
+        self.outbox = Outbox(stream, monotonic_ns)
+        self._stream = stream
+        self._monotonic_ns = monotonic_ns
+        self._heard_ns = monotonic_ns()
+        self._begun_ns = 0
+        """Since when the rest of an unfinished message is awaited; 0 if there is none."""
+        self._ending_ns = 0
+        """Since when the connection is being closed."""
+
+    def __str__(self) -> str:
+        """For the log. The user by number: looking up a name can require a directory server."""
+        return f"client {self.peer} (uid {'unknown' if self.uid is None else self.uid})"
+
+    def _become(self, state: State) -> None:
+        assert state in TRANSITIONS[self.state], f"{self}: {self.state} -> {state}"
+        self.state = state
+
+    def find_uid(self) -> int | None:
+        """The user who owns the other end; asked again if that was not known."""
+        if self.uid is None:
+            self.uid = self._stream.peer_uid()
+        return self.uid
+
+    # -- receiving
+
+    def receive(self) -> None:
+        """Read what has arrived, at most one request's worth; READY then means to call `next_message`."""
+        try:
+            data = self._stream.recv(MAX_REQUEST_LENGTH)
+        except BlockingIOError:
+            return
+        except OSError:
+            self.fail()
+            return
+        if self.state.ending:
+            # Read and discarded, so that closing does not reset the connection before the last reply is read.
+            if not data:
+                self._become(State.FLUSHING if self.state is State.CLOSING else State.CLOSED)
+        elif data:
+            self._feed(data)
+            self._become(State.READY)
+        elif self.bare is not None and self.bare.pending:
+            self.bare.end_of_input()
+            self._become(State.READY)
+        elif self.subscription is not None:
+            self._become(State.HALF_CLOSED)
+        else:
+            self._end(State.FLUSHING)
+
+    def _feed(self, data: bytes) -> None:
+        decoder = self.framed or self.bare
+        if decoder is None:
+            if data.startswith(BARE_JSON_FIRST_BYTE):
+                decoder = self.bare = BareJsonDecoder(max_json_length=MAX_REQUEST_LENGTH)
+            else:
+                decoder = self.framed = FrameDecoder(max_json_length=MAX_REQUEST_LENGTH, accept_data=False)
+        decoder.feed(data)
+
+    def next_message(self) -> JsonObject | Unreadable | None:
+        """In READY, the next request, or why it cannot be read; None if there is no whole one.
+
+        After it the connection is still READY, or READING if there was none, or CLOSING if nothing after it
+        can be read either.
+        """
+        decoder = self.framed or self.bare
+        assert decoder is not None
+        try:
+            message = decoder.next_message()
+        except BadMessageError as error:
+            self._begun_ns = 0
+            return Unreadable(str(error))
+        except RemoteProtocolError as error:
+            self.finish()
+            return Unreadable(str(error))
+        if isinstance(message, dict):  # this decoder accepts no DATA
+            self._heard_ns, self._begun_ns = self._monotonic_ns(), 0
+            return message
+        self._become(State.READING)
+        if decoder.pending and not self._begun_ns:
+            self._begun_ns = self._monotonic_ns()
+        return None
+
+    def answer_later(self) -> None:
+        """The request that was taken is answered later: `answered` then."""
+        self._become(State.ANSWERING)
+
+    def answered(self) -> None:
+        """Go on with what the client sent after the request."""
+        self._become(State.READY)
+
+    # -- ending
+
+    def complaint(self, now_ns: int, limits: Limits) -> str | None:
+        """Why this client is to be closed, None if it is not."""
+        if self.state.ending:
+            return None
+        if self.outbox.waiting:
+            if now_ns - self.outbox.progress_ns > limits.stall_ns:
+                return f"it has read nothing for {limits.stall_ns / 1e9:g} s"
+        elif self._begun_ns and now_ns - self._begun_ns > _UNFINISHED_NS:
+            return f"its message is still incomplete after {_UNFINISHED_NS / 1e9:g} s"
+        elif (
+            self.subscription is None
+            and self.state is not State.ANSWERING
+            and now_ns - self._heard_ns > limits.idle_ns
+        ):
+            return f"it is not subscribed and has sent no request for {limits.idle_ns / 1e9:g} s"
+        return None
+
+    def finish(self) -> None:
+        """Accept no more requests and close once everything is sent."""
+        if not self.state.ending:
+            self._end(State.FLUSHING if self.state is State.HALF_CLOSED else State.CLOSING)
+
+    def fail(self) -> None:
+        """Close at once: the connection is broken, or the client is beyond a limit."""
+        if self.state is not State.CLOSED:
+            self._become(State.CLOSED)
+            self.subscription = None
+
+    def settle(self, now_ns: int) -> None:
+        """Go on with closing, to be called now and then."""
+        too_long = self.state.ending and now_ns - self._ending_ns > _LAST_REPLY_NS
+        if too_long or self.outbox.broken:
+            self.fail()
+        elif self.state is State.CLOSING and not self.outbox.waiting:
+            self._stream.end_sending()
+            self._become(State.LINGERING)
+        elif self.state is State.FLUSHING and not self.outbox.waiting:
+            self._become(State.CLOSED)
+
+    def close(self) -> None:
+        """Close the stream."""
+        self._stream.close()
+
+    def _end(self, state: State) -> None:
+        self._become(state)
+        self.subscription = None
+        self._ending_ns = self._monotonic_ns()
+
+    # -- sending
+
+    def send_json(self, message: JsonObject) -> None:
+        """Send a reply or an event in this connection's own form."""
+        if self.state is State.LINGERING or self.state is State.CLOSED:
+            return
+        if self.outbox.full:
+            self.fail()
+            return
+        self.outbox.send(encode_bare_json(message) if self.bare is not None else encode_json(message))
+
+    def offer(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
+        """Send a DATA frame if the subscription wants it."""
+        wants = self.subscription
+        if wants is None or not wants.wanted[position]:
+            return
+        if not flags and wants.every == 1 and not wants.gap[position]:
+            withheld = self.outbox.send(frame, position)
+            wants.last_ns[position] = now_ns
+            if withheld >= 0:
+                wants.gap[withheld] = True
+            return
+        if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[position] < _IDLE_FRAME_NS:
+            return
+        if flags & _GAP:
+            wants.gap[position] = True
+        if wants.skipped[position] < wants.every - 1:
+            wants.skipped[position] += 1
+            return
+        wants.skipped[position] = 0
+        wants.last_ns[position] = now_ns
+        if wants.gap[position]:
+            wants.gap[position] = False
+            if not flags & _GAP:
+                frame = with_gap(frame)
+        withheld = self.outbox.send(frame, position)
+        if withheld >= 0:
+            wants.gap[withheld] = True

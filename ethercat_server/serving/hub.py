@@ -1,0 +1,213 @@
+"""All clients: accepts them, hands samples out and answers requests in the time between two exchanges.
+
+It runs in the acquisition loop's thread. No client can delay the bus, because
+
+- nothing here waits for a client,
+- one pass over the clients answers at most one request of each, and begins none shortly before the deadline,
+- a pass is followed by a pause nine times as long, in which replies and samples are sent but nothing is read.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from ethercat_server.serving.connection import Connection, Limits, Unreadable
+from ethercat_server.serving.permissions import Permissions
+from ethercat_server.serving.state import State
+from ethercat_server.serving.transport.base import Transport
+from protocol.control import ErrorCode, error_reply
+from protocol.errors import RequestError
+from protocol.text.json_text import JsonObject
+
+_PAUSE_RATIO: Final = 9
+"""Clients get at most a tenth of this thread's time, however much they ask."""
+_LONGEST_PAUSE_NS: Final = 20_000_000
+"""A pass that took long because this thread was not running must not silence all clients."""
+_REQUEST_NS: Final = 200_000
+"""No request is begun this shortly before a deadline; a usual one takes less."""
+_MAX_ACCEPTS: Final = 2
+"""Clients accepted in one pass."""
+_SWEEP_NS: Final = 50_000_000
+"""How often connections are checked for timeouts and closed."""
+_CLOSE_NS: Final = 1_000_000_000
+_CLOSE_TURN_NS: Final = 20_000_000
+
+log = logging.getLogger(__name__)
+
+Handler = Callable[[Connection, JsonObject], JsonObject | None]
+"""Turns a request into its reply, or None if it comes later through `Hub.answer`; RequestError refuses it."""
+
+
+class Hub:
+    """All client connections. Not thread-safe: one thread does everything."""
+
+    def __init__(self, transport: Transport, monotonic_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self.connections: dict[int, Connection] = {}
+        """By file descriptor."""
+        self.limits = Limits()
+        self.permissions = Permissions()
+        self._transport = transport
+        self._monotonic_ns = monotonic_ns
+        self._handler: Handler | None = None
+        self._subscribers: list[Connection] = []
+        self._ready: deque[Connection] = deque()
+        """Those in State.READY, in the order of their turns."""
+        self._pause_ends_ns = 0
+        self._sweep_at_ns = 0
+
+    def start(self, handler: Handler) -> None:
+        """Begin to accept; until now clients waited in the kernel's queue."""
+        self._handler = handler
+
+    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
+        """Send a DATA frame of the sensor at `position` to every subscriber that wants it."""
+        for connection in self._subscribers:
+            connection.offer(frame, position, flags, now_ns)
+
+    def broadcast(self, message: JsonObject) -> None:
+        """Send an event to every framed connection."""
+        for connection in self.connections.values():
+            if connection.framed is not None and not connection.state.ending:
+                connection.send_json(message)
+
+    def answer(self, connection: Connection, reply: JsonObject) -> None:
+        """Send the reply that a handler left for later, and go on with what the client sent after it."""
+        if self.connections.get(connection.fd) is not connection:
+            return
+        connection.send_json(reply)
+        if connection.state is State.ANSWERING:
+            connection.answered()
+            self._ready.append(connection)
+
+    def subscriptions_changed(self) -> None:
+        """A connection's subscription began or ended."""
+        self._subscribers = [c for c in self.connections.values() if c.subscription is not None]
+
+    def serve(self, until_ns: int) -> None:
+        """Serve the clients until the clock is at `until_ns`; once, without waiting, if that has passed."""
+        now_ns = self._monotonic_ns()
+        last_start_ns = max(until_ns - _REQUEST_NS, now_ns + 1)
+        while True:
+            self._serve_once(now_ns, last_start_ns, until_ns)
+            now_ns = self._monotonic_ns()
+            if now_ns >= until_ns:
+                break
+        if now_ns >= self._sweep_at_ns:
+            self._sweep(now_ns)
+
+    def _serve_once(self, now_ns: int, last_start_ns: int, until_ns: int) -> None:
+        """Wait for something to do and do it."""
+        reads = self._pause_ends_ns <= now_ns < last_start_ns
+        if reads:
+            wake_ns = now_ns if self._ready else min(last_start_ns, until_ns)
+        else:
+            wake_ns = min(self._pause_ends_ns, until_ns) if now_ns < self._pause_ends_ns else until_ns
+        readers: list[int] = []
+        if reads and self._handler is not None:
+            readers = [fd for fd, c in self.connections.items() if c.state.reads]
+            readers += self._transport.listening()
+        writers = [fd for fd, c in self.connections.items() if c.outbox.waiting]
+        readable, writable = self._transport.wait(readers, writers, max(0, wake_ns - now_ns) * 1e-9)
+        for fd in writable:
+            self.connections[fd].outbox.flush()
+        if reads and (readable or self._ready):
+            began_ns = self._monotonic_ns()
+            self._read(readable)
+            self._answer_some(last_start_ns)
+            ended_ns = self._monotonic_ns()
+            self._pause_ends_ns = ended_ns + min(_PAUSE_RATIO * (ended_ns - began_ns), _LONGEST_PAUSE_NS)
+
+    def _read(self, readable: Sequence[int]) -> None:
+        for fd in readable:
+            connection = self.connections.get(fd)
+            if connection is None:
+                self._accept(fd)
+                continue
+            connection.receive()
+            if connection.state is State.READY:
+                self._ready.append(connection)
+            elif connection.state.ending:
+                self._sweep_at_ns = 0
+
+    def _accept(self, fd: int) -> None:
+        for _ in range(_MAX_ACCEPTS):
+            if (stream := self._transport.accept(fd)) is None:
+                return
+            connection = Connection(stream, stream.peer_uid(), self._monotonic_ns)
+            if self.permissions.have_room(connection.uid, self.connections.values()):
+                self.connections[connection.fd] = connection
+            else:
+                log.warning("%s refused: there are %d clients already", connection, len(self.connections))
+                connection.close()
+
+    def _answer_some(self, until_ns: int) -> None:
+        """One request of each that has sent some, until the time is up; the others are first next time."""
+        for _ in range(len(self._ready)):
+            connection = self._ready.popleft()
+            if connection.state is State.READY:
+                self._answer_one(connection)
+            if self._monotonic_ns() >= until_ns:
+                return
+
+    def _answer_one(self, connection: Connection) -> None:
+        message = connection.next_message()
+        if isinstance(message, Unreadable):
+            connection.send_json(error_reply(None, ErrorCode.BAD_REQUEST, message.reason))
+        elif message is not None:
+            answer = self._handle(connection, message)
+            if answer is None:
+                connection.answer_later()
+            else:
+                connection.send_json(answer)
+        if connection.state is State.READY:
+            self._ready.append(connection)
+        elif connection.state.ending:
+            self._sweep_at_ns = 0
+            self.subscriptions_changed()
+
+    def _handle(self, connection: Connection, message: JsonObject) -> JsonObject | None:
+        assert self._handler is not None
+        try:
+            return self._handler(connection, message)
+        except RequestError as error:
+            return error_reply(message, error.code, str(error), **error.extra)
+        except Exception:  # a defect in one action must not stop the acquisition
+            log.exception("internal error in a request: %.200r", message)
+            return error_reply(None, ErrorCode.INTERNAL, "the server failed on this request: see its log")
+
+    def _sweep(self, now_ns: int) -> None:
+        """Close those that are beyond a timeout, have received their last reply, or are broken."""
+        self._sweep_at_ns = now_ns + _SWEEP_NS
+        for connection in self.connections.values():
+            if complaint := connection.complaint(now_ns, self.limits):
+                log.warning("%s closed: %s", connection, complaint)
+                if connection.outbox.waiting:
+                    connection.fail()
+                else:
+                    connection.send_json(error_reply(None, ErrorCode.BAD_REQUEST, complaint))
+                    connection.finish()
+            connection.settle(now_ns)
+        gone = [connection for connection in self.connections.values() if connection.state is State.CLOSED]
+        for connection in gone:
+            del self.connections[connection.fd]
+            connection.close()
+        if gone:
+            self.subscriptions_changed()
+
+    def close(self) -> None:
+        """Send what waits, for a bounded time, then close everything."""
+        self._transport.stop_listening()
+        for connection in self.connections.values():
+            connection.finish()
+        self.subscriptions_changed()
+        deadline_ns = self._monotonic_ns() + _CLOSE_NS
+        while self.connections and (now_ns := self._monotonic_ns()) < deadline_ns:
+            self.serve(now_ns + _CLOSE_TURN_NS)
+        for connection in self.connections.values():
+            connection.close()
+        self.connections.clear()
+        self._transport.close()

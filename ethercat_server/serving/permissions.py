@@ -1,0 +1,77 @@
+"""Who may connect and who may control: root, the server's own user, the user who ran sudo, and those named.
+
+Names are looked up when they are read, never in the loop: a directory service can take seconds.
+"""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+from collections.abc import Collection, Iterable
+from typing import Final
+
+from ethercat_server.errors import UsageError
+from ethercat_server.serving.connection import Connection
+
+MAX_CLIENTS: Final = 64
+RESERVED_FOR_CONTROL: Final = 16
+"""Clients among them that must be of users who may control, so that the others cannot use all of them up."""
+MAX_CLIENTS_PER_USER: Final = 16
+"""Clients of one user who may not control."""
+
+
+class Permissions:
+    """What the server allows whom.
+
+    Attributes:
+        control_uids: users who may configure, tare, write objects and shut the server down.
+    """
+
+    def __init__(self) -> None:
+        self.control_uids: frozenset[int] = frozenset({0})
+
+    def have_room(self, uid: int | None, clients: Collection[Connection]) -> bool:
+        """Whether the user `uid` may connect once more beside these clients."""
+        if uid in self.control_uids:
+            return len(clients) < MAX_CLIENTS
+        of_this_user = sum(client.uid == uid for client in clients)
+        return of_this_user < MAX_CLIENTS_PER_USER and len(clients) < MAX_CLIENTS - RESERVED_FOR_CONTROL
+
+    def may_control(self, client: Connection) -> bool:
+        """Whether the user at the other end may control; an unknown user may not."""
+        return client.find_uid() in self.control_uids
+
+
+def controlling_uids(users: Iterable[str], groups: Iterable[str]) -> frozenset[int]:
+    """The users who may control the server; UsageError names a user or group that does not exist."""
+    found = {0, os.geteuid()}
+    sudo_uid = os.environ.get("SUDO_UID", "")
+    if sudo_uid.isdecimal():
+        found.add(int(sudo_uid))
+    for name in users:
+        found.add(_uid(name, f"--control-user {name}"))
+    for name in groups:
+        found |= _members(name)
+    return frozenset(found)
+
+
+def _uid(name: str, option: str) -> int:
+    try:
+        return int(name) if name.isdecimal() else pwd.getpwnam(name).pw_uid
+    except KeyError:
+        raise UsageError(f"{option}: there is no such user on this machine") from None
+
+
+def _members(name: str) -> set[int]:
+    try:
+        group = grp.getgrgid(int(name)) if name.isdecimal() else grp.getgrnam(name)
+    except KeyError:
+        raise UsageError(f"--control-group {name}: there is no such group on this machine") from None
+    found = {user.pw_uid for user in pwd.getpwall() if user.pw_gid == group.gr_gid}
+    for member in group.gr_mem:
+        try:
+            found.add(pwd.getpwnam(member).pw_uid)
+        except KeyError:
+            continue  # still listed, but deleted
+    return found

@@ -1,0 +1,220 @@
+"""The actions that access a sensor: objects, EEPROM, settings, tare. They reply when it has answered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+from ethercat_server.acquisition.jobs import Done, Jobs, refusal
+from ethercat_server.acquisition.recovery import Recovery
+from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.errors import BusError
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.slave.coe import Steps
+from ethercat_server.ethercat.slave.sii import read_sii
+from ethercat_server.sensor import dictionary
+from ethercat_server.sensor.configuration import Change, apply_in_op, save
+from ethercat_server.sensor.object_access import bytes_to_write, entry_named, read, read_named, write
+from ethercat_server.sensor.sensor import Sensor
+from ethercat_server.sensor.tare import tare
+from ethercat_server.serving.connection import Connection
+from ethercat_server.serving.hub import Hub
+from protocol.control import ErrorCode, Event, Request, error_reply, event, reply
+from protocol.errors import RequestError, SettingError
+from protocol.sensor_choice import SensorChoice
+from protocol.settings import SettingValue
+from protocol.text.json_text import JsonObject
+
+_MOST_READS: Final = 8
+"""Reads that may wait for one sensor: everyone may read, and changes must still get their turn."""
+
+_CHANGES: Final = frozenset({"configure", "tare"})
+"""A sensor does one of these at a time."""
+
+
+class SensorActions:
+    """One method for each action; it starts work between the exchanges, which answers through the hub."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        hub: Hub,
+        recovery: Recovery,
+        jobs: Jobs,
+        sensors: Sequence[Sensor],
+        streams: Sequence[SensorStream],
+    ) -> None:
+        self.sensors = sensors
+        self._bus = bus
+        self._hub = hub
+        self._recovery = recovery
+        self._jobs = jobs
+        self._streams = streams
+        self.handlers: Mapping[str, Callable[[Connection, Request], None]] = {
+            "sdo_read": self._sdo_read,
+            "sdo_write": self._sdo_write,
+            "sii_read": self._sii_read,
+            "configure": self._configure,
+            "tare": self._tare,
+        }
+
+    def handle(self, connection: Connection, request: Request) -> None:
+        """Start `request`; RequestError refuses it."""
+        position = self._position(request.values["sensor"])
+        if request.action in _CHANGES:
+            self._check_unchanging(position)  # the sensor may be out of OP because of a change
+        self._jobs.check_present(position)
+        values = {**request.values, "sensor": position}
+        self.handlers[request.action](connection, request._replace(values=values))
+
+    def _position(self, choice: SensorChoice) -> int:
+        found = [
+            sensor.position
+            for sensor in self.sensors
+            if choice.matches(sensor.position, sensor.identity.name, sensor.identity.serial)
+        ]
+        if len(found) != 1:
+            available = "; ".join(f"{sensor.position}: {sensor.identity}" for sensor in self.sensors)
+            problem = f"{len(found)} sensors match" if found else "no sensor"
+            raise RequestError(ErrorCode.BAD_REQUEST, f"{problem} {choice} (available: {available})")
+        return found[0]
+
+    def _start(self, connection: Connection, request: Request, steps: Steps[Mapping[str, Any]]) -> None:
+        self._jobs.start(request.values["sensor"], steps, self._answering(connection, request))
+
+    def _answering(self, connection: Connection, request: Request) -> Done:
+        def done(values: Mapping[str, Any], error: RequestError | None) -> None:
+            self._hub.answer(connection, _answer(request, values, error))
+
+        return done
+
+    def _start_change(self, position: int, steps: Steps[Mapping[str, Any]], done: Done) -> None:
+        self._check_unchanging(position)
+        self._jobs.start(position, steps, done, changes=True)
+
+    def _check_unchanging(self, position: int) -> None:
+        if self._jobs.is_changing(position) or self._recovery.is_changing(position):
+            raise RequestError(
+                ErrorCode.BUSY, f"sensor {position} is being configured or tared: try again when that is done"
+            )
+
+    def _sdo_read(self, connection: Connection, request: Request) -> None:
+        values = request.values
+        sdo = self._recovery.sdo(values["sensor"])
+        if (values["index"] is None) == (values["name"] is None):
+            raise RequestError(
+                ErrorCode.BAD_REQUEST, "sdo_read needs either the key 'index' or the key 'name'"
+            )
+        if values["name"] is not None and values["subindex"] is not None:
+            raise RequestError(
+                ErrorCode.BAD_REQUEST,
+                "the key 'subindex' requires the key 'index': a name includes it",
+            )
+        if values["name"] is not None:
+            steps = read_named(sdo, entry_named(values["name"]), values["type"])
+        else:
+            steps = read(sdo, values["index"], values["subindex"] or 0, values["type"])
+        self._start_reading(connection, request, steps)
+
+    def _sii_read(self, connection: Connection, request: Request) -> None:
+        word, words = request.values["word"], request.values["words"]
+
+        def steps() -> Steps[Mapping[str, Any]]:
+            data = yield from read_sii(self._bus, request.values["sensor"], word, words)
+            return {"word": word, "words": words, "hex": data.hex()}
+
+        self._start_reading(connection, request, steps())
+
+    def _start_reading(
+        self, connection: Connection, request: Request, steps: Steps[Mapping[str, Any]]
+    ) -> None:
+        done = self._answering(connection, request)
+        self._jobs.start(request.values["sensor"], steps, done, most=_MOST_READS)
+
+    def _sdo_write(self, connection: Connection, request: Request) -> None:
+        values = request.values
+        if values["index"] == dictionary.FACTORY_CALIBRATION:
+            raise RequestError(
+                ErrorCode.DENIED, "object 0x2000 is the factory calibration, which is never written"
+            )
+        sensor = self.sensors[values["sensor"]]
+        sdo = self._recovery.sdo(sensor.position)
+        data = bytes_to_write(values)
+
+        def steps() -> Steps[Mapping[str, Any]]:
+            before = sensor.settings
+            written = yield from write(sdo, sensor, values["index"], values["subindex"], data)
+            if sensor.settings != before:
+                self._announce_change(sensor)
+            return written
+
+        self._start(connection, request, steps())
+
+    def _tare(self, connection: Connection, request: Request) -> None:
+        values = request.values
+        sensor = self.sensors[values["sensor"]]
+        stream, sdo = self._streams[sensor.position], self._recovery.sdo(sensor.position)
+        steps = tare(sdo, sensor, stream, values["samples"], values["target"])
+        self._start_change(sensor.position, steps, self._answering(connection, request))
+
+    def _configure(self, connection: Connection, request: Request) -> None:
+        values, done = request.values, self._answering(connection, request)
+        self.configure(values["sensor"], values["settings"], save_too=values["save"], done=done)
+
+    def configure(
+        self, position: int, settings: Mapping[str, SettingValue], *, save_too: bool, done: Done
+    ) -> None:
+        """Change settings of the sensor at `position`, save them if `save_too`; `done` gets the result.
+
+        RequestError refuses it at once.
+        """
+        self._check_unchanging(position)
+        self._jobs.check_present(position)
+        sensor = self.sensors[position]
+        try:
+            change = Change(sensor, settings)
+        except SettingError as error:
+            raise RequestError(ErrorCode.BAD_REQUEST, f"the key 'settings' is refused: {error}") from None
+        if not change.needs_preop:
+            self._start_change(position, self._change_in_op(sensor, change, save_too), done)
+            return
+
+        def changed(error: BusError | None) -> None:
+            if error is not None:
+                done({}, refusal(error))
+                return
+            try:
+                self._start_change(position, self._finish_change(sensor, save_too), done)
+            except RequestError as refused:
+                done({}, refused)
+
+        self._recovery.reconfigure(position, change, changed)
+
+    def _change_in_op(self, sensor: Sensor, change: Change, save_too: bool) -> Steps[Mapping[str, Any]]:
+        sdo = self._recovery.sdo(sensor.position)
+        yield from apply_in_op(sdo, sensor, change)
+        if change.names:
+            self._announce_change(sensor)
+        return (yield from self._finish_change(sensor, save_too))
+
+    def _announce_change(self, sensor: Sensor) -> None:
+        self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.position, settings=dict(sensor.settings)))
+
+    def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
+        if save_too:
+            yield from save(self._recovery.sdo(sensor.position), sensor)
+        return {
+            "sensor": sensor.position,
+            "settings": dict(sensor.settings),
+            "rate_hz": sensor.rate_hz,
+            "saved": save_too,
+        }
+
+
+def _answer(request: Request, values: Mapping[str, Any], error: RequestError | None) -> JsonObject:
+    if error is None:
+        return reply(request, **values)
+    message: JsonObject = {"action": request.action}
+    if request.has_id:
+        message["id"] = request.id
+    return error_reply(message, error.code, str(error), **error.extra)

@@ -1,0 +1,149 @@
+"""`adapters` and `eeprom`: network adapters, and the EEPROMs (SII) of the slaves."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from ethercat_server.errors import BusError
+from ethercat_server.ethercat.slave import sii_content
+from ethercat_server.ethercat.slave.coe import finish
+from ethercat_server.ethercat.slave.sii import read_sii
+from ethercat_server.links.direct import scan_only
+from ethercat_server.links.holder import find_holder
+from ethercat_server.links.link import Found, choose, note
+from ethercat_server.links.reach import find_server
+from ethercat_server.process.command_line import FAILED
+from ethercat_server.sensor.sensor import Identity
+from ethercat_server.tool.command import DONE, Command, add_link_arguments
+from ethercat_server.tool.show import columns, say, say_json
+
+
+def _no_arguments(_: argparse.ArgumentParser) -> None:
+    """`adapters` has none."""
+
+
+def _adapters(args: argparse.Namespace) -> int:
+    from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment, and only this needs it
+
+    found = []
+    with IPRoute() as route:
+        for interface in route.get_links():
+            info = interface.get_attr("IFLA_LINKINFO")
+            name = interface.get_attr("IFLA_IFNAME")
+            holder = find_holder(name)
+            found.append(
+                {
+                    "name": name,
+                    "kind": (info.get_attr("IFLA_INFO_KIND") if info else None) or "",
+                    "address": interface.get_attr("IFLA_ADDRESS"),
+                    "up": bool(interface["flags"] & 0x1),
+                    "carrier": interface.get_attr("IFLA_CARRIER") == 1 and bool(interface["flags"] & 0x1),
+                    "loopback": bool(interface["flags"] & 0x8),
+                    "held_by": str(holder) if holder else None,
+                }
+            )
+    if args.json:
+        say_json({"adapters": found})
+        return DONE
+    rows = [("adapter", "state", "address", "")]
+    for row in found:
+        state = "down" if not row["up"] else "up" if row["carrier"] else "up, no carrier"
+        what = "loopback" if row["loopback"] else row["kind"]
+        held = f"in use by {row['held_by']}" if row["held_by"] else ""
+        rows.append((row["name"], state, row["address"] or "", ", ".join(filter(None, (what, held)))))
+    say(columns(rows))
+    return DONE
+
+
+def _eeprom_arguments(parser: argparse.ArgumentParser) -> None:
+    add_link_arguments(parser, all_if_none=True)
+
+
+def _images(args: argparse.Namespace) -> dict[int, bytes | BusError]:
+    """The SII of each selected slave by position, or the error of reading it."""
+    with contextlib.ExitStack() as cleanup:
+        link = find_server(args.iface, args.server)
+        if link is not None:
+            cleanup.callback(link.close)
+            return {
+                sensor.position: _image(functools.partial(link.sii, sensor.position))
+                for sensor in link.chosen(args.sensor)
+            }
+        bus, slaves = scan_only(args.iface, cleanup)
+
+        def read(position: int, word: int, words: int) -> bytes:
+            return finish(read_sii(bus, position, word, words), pause_s=0, clock=bus.clock)
+
+        images = {position: _image(functools.partial(read, position)) for position in range(len(slaves))}
+    if args.sensor is None:
+        return images
+    found = [_identified(position, image) for position, image in images.items()]
+    position = choose(found, args.sensor).position
+    return {position: images[position]}
+
+
+def _image(read: Callable[[int, int], bytes]) -> bytes | BusError:
+    try:
+        return sii_content.read_image(read)
+    except BusError as error:
+        return error
+
+
+def _identified(position: int, image: bytes | BusError) -> Found:
+    row: dict[str, Any] = {"name": "", "serial": 0}
+    if isinstance(image, bytes):
+        row = sii_content.decode(image)
+    return Found(position, Identity(row["name"], row["serial"], "", ""))
+
+
+def _eeprom(args: argparse.Namespace) -> int:
+    images = _images(args)
+    read = {n: image for n, image in images.items() if isinstance(image, bytes)}
+    errors = {n: image for n, image in images.items() if isinstance(image, BusError)}
+    if not read:
+        raise next(iter(errors.values()))
+    decoded = {n: sii_content.decode(image) for n, image in read.items()}
+    if args.json:
+        rows = [{"sensor": n, **row, "raw": read[n].hex()} for n, row in decoded.items()]
+        rows += [{"sensor": n, "error": str(error)} for n, error in errors.items()]
+        say_json({"slaves": sorted(rows, key=lambda row: row["sensor"])})
+    else:
+        for n, row in decoded.items():
+            say(f"slave {n}: {row['name'] or 'nameless'}")
+            say("\n".join(sii_content.raw_lines(read[n])))
+            say(columns(_rows(row), indent=2))
+    for error in errors.values():
+        note(str(error))
+    return FAILED if errors else DONE
+
+
+def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:
+    mailboxes, protocols = found["mailboxes"], ", ".join(found["protocols"]) or "none"
+    rows = [
+        ("vendor", f"0x{found['vendor']:08X}"),
+        ("product", str(found["product"])),
+        ("revision", str(found["revision"])),
+        ("serial", str(found["serial"])),
+        ("name", found["name"]),
+        ("group", found["group"]),
+        ("check byte", f"0x{found['check_byte']:02X}, {'correct' if found['check_byte_right'] else 'WRONG'}"),
+        ("mailbox out", f"0x{mailboxes['out'][0]:04X}, {mailboxes['out'][1]} bytes"),
+        ("mailbox in", f"0x{mailboxes['in'][0]:04X}, {mailboxes['in'][1]} bytes"),
+        ("protocols", protocols),
+    ]
+    for n, row in enumerate(found["sync_managers"]):
+        rows.append((f"sync manager {n}", f"0x{row['start']:04X}, {row['size']} bytes, {row['kind']}"))
+    rows.append(
+        ("categories", ", ".join(f"{name} {size} bytes" for name, size in found["categories"].items()))
+    )
+    return rows
+
+
+COMMANDS = (
+    Command("adapters", "list the network adapters of this machine", _no_arguments, _adapters),
+    Command("eeprom", "read the slaves' SII (EEPROM): raw words, and decoded", _eeprom_arguments, _eeprom),
+)

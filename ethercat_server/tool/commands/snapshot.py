@@ -1,0 +1,182 @@
+"""`snapshot` and `restore`: all objects of a sensor to a file, and its configuration back to the sensor."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import datetime
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ethercat_server.errors import BusError, SdoAbortError, ServerError
+from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
+from ethercat_server.links.link import Found, Link, failed_change, note, signals_held_back
+from ethercat_server.sensor.dictionary_search import BY_ADDRESS, KNOWN_OBJECTS
+from ethercat_server.sensor.sensor import Identity, Sensor
+from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
+from ethercat_server.tool.commands.objects import read_object
+from ethercat_server.tool.commands.settings import (
+    add_save,
+    change_lines,
+    changes,
+    save_now,
+    saving_lines,
+    verify,
+)
+from ethercat_server.tool.commands.snapshot_file import RESTORABLE, Snapshot, SnapshotFile, read_snapshot
+from ethercat_server.tool.show import columns, report, value_text
+from protocol.settings import SettingValue
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add_link_arguments(parser)
+    parser.add_argument("file", type=Path, metavar="FILE", help="JSON file")
+
+
+def _restore_arguments(parser: argparse.ArgumentParser) -> None:
+    _arguments(parser)
+    add_save(parser)
+    parser.add_argument("--force", action="store_true", help="accept a file of another sensor")
+
+
+def _snapshot(args: argparse.Namespace) -> int:
+    with contextlib.closing(SnapshotFile(args.file)) as file:
+        return _take(args, file)
+
+
+def _take(args: argparse.Namespace, file: SnapshotFile) -> int:
+    with link(args) as opened:
+        found = opened.choose(args.sensor)
+        sensor, sdo = opened.in_force(found), opened.sdo(found.position)
+        read = [(row, finish(read_object(sdo, row))) for row in KNOWN_OBJECTS]
+    identity = found.identity
+    content = {
+        "taken": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "model": identity.name,
+        "serial": identity.serial,
+        "hardware": identity.hardware,
+        "firmware": identity.firmware,
+        "settings": sensor.settings,
+        "objects": [_as_json(row.address, row.name, values) for row, values in read],
+    }
+    file.write(content)
+    readable = sum("hex" in values for _, values in read)
+    line = f"  {readable} objects written to {args.file}, {len(read) - readable} could not be read"
+    report(args.json, opened, found, {"file": str(args.file), "objects": readable}, line)
+    return DONE
+
+
+def _as_json(address: tuple[int, int], name: str, values: dict[str, Any]) -> dict[str, Any]:
+    return {"index": f"0x{address[0]:04X}", "subindex": address[1], "name": name, **values}
+
+
+def _restore(args: argparse.Namespace) -> int:
+    snapshot = read_snapshot(args.file)
+    with link(args) as opened:
+        found = opened.choose(args.sensor)
+        _check_whose(found.identity, snapshot.identity, args)
+        sensor = opened.in_force(found)
+        lacking = sorted(snapshot.settings.keys() - sensor.settings.keys())
+        settings = {name: value for name, value in snapshot.settings.items() if name not in lacking}
+        changed = changes(sensor, settings)
+        differing, unreadable = finish(_differing(opened.sdo(found.position), snapshot))
+        if changed or differing:
+            with signals_held_back():
+                _put_back(opened, found, sensor, settings, differing)
+        if args.save:
+            save_now(opened, found)
+    missing = [*lacking, *(f"0x{index:04X}:{sub}" for index, sub in unreadable)]
+    written = [
+        _as_json(address, BY_ADDRESS[address].name, {"now": old.hex(), "then": new.hex()})
+        for address, (old, new) in differing.items()
+    ]
+    lines = [change_lines(changed)] if changed else []
+    if differing:
+        lines.append(columns([_object_line(address, *pair) for address, pair in differing.items()], indent=2))
+    if missing:
+        lines.append(f"  skipped, this sensor does not have them: {', '.join(missing)}")
+    if not changed and not differing:
+        lines.append("  nothing to restore: the sensor already matches the file")
+    values = {"changes": changed, "objects": written, "left_alone": missing, "saved": args.save}
+    lines += saving_lines(bool(changed or differing), args.save)
+    report(args.json, opened, found, values, *lines)
+    return DONE
+
+
+def _check_whose(sensor: Identity, file: Identity, args: argparse.Namespace) -> None:
+    if (sensor.name, sensor.serial) != (file.name, file.serial) and not args.force:
+        raise ServerError(
+            f"{args.file} belongs to the {file}, but this is the {sensor}: connect that one, or use --force"
+        )
+    if sensor.firmware != file.firmware:
+        note(f"{args.file} was taken with firmware {file.firmware}, the sensor now has {sensor.firmware}")
+
+
+def _differing(
+    sdo: Sdo, snapshot: Snapshot
+) -> Steps[tuple[dict[tuple[int, int], tuple[bytes, bytes]], list[tuple[int, int]]]]:
+    """Present and saved value of the objects that differ; the objects that the sensor does not have."""
+    differing, unreadable = {}, []
+    for row in RESTORABLE:
+        wanted = snapshot.objects.get(row.address)
+        if wanted is None:
+            continue
+        try:
+            held = yield from sdo.read(*row.address)
+        except SdoAbortError:
+            unreadable.append(row.address)
+            continue
+        if held != wanted:
+            differing[row.address] = held, wanted
+    return differing, unreadable
+
+
+def _put_back(
+    opened: Link,
+    found: Found,
+    sensor: Sensor,
+    settings: Mapping[str, SettingValue],
+    objects: Mapping[tuple[int, int], tuple[bytes, bytes]],
+) -> None:
+    """Write everything and verify it; on failure restore the former values."""
+    sdo, before = opened.sdo(found.position), dict(sensor.settings)
+    if any(before.get(name) != value for name, value in settings.items()):
+        opened.configure(found.position, settings, save=False)
+    written = []
+    try:
+        verify(opened.in_force(found), settings)
+        for address, (_, wanted) in objects.items():
+            written.append(address)
+            finish(_write(sdo, address, wanted))
+    except BusError as error:
+        try:
+            for address in written:
+                finish(_write(sdo, address, objects[address][0]))
+            opened.configure(found.position, before, save=False)
+        except BusError as again:
+            raise BusError(
+                f"{error}; the former values could not be restored ({again}): power the sensor off and on"
+            ) from None
+        raise failed_change(error) from None
+
+
+def _write(sdo: Sdo, address: tuple[int, int], data: bytes) -> Steps[None]:
+    yield from sdo.write(*address, data)
+    held = yield from sdo.read(*address)
+    if held != data:
+        raise BusError(
+            f"object 0x{address[0]:04X}:{address[1]} reads back {held.hex()} after writing {data.hex()}"
+        )
+
+
+def _object_line(address: tuple[int, int], held: bytes, wanted: bytes) -> tuple[str, ...]:
+    row = BY_ADDRESS[address]
+    now, then = (value_text(row.type.unpack(data)) for data in (held, wanted))
+    return f"0x{address[0]:04X}:{address[1]}", row.name, now, then, row.unit
+
+
+COMMANDS = (
+    Command("snapshot", "write all readable objects to a file", _arguments, _snapshot),
+    Command("restore", "write back what differs from a snapshot", _restore_arguments, _restore),
+)

@@ -1,0 +1,1 @@
+"""The slave controller (ESC) of a virtual sensor: registers, memory, frames."""

@@ -1,0 +1,107 @@
+"""What the commands of EtherCAT datagrams do to a slave: addressing, copying, the working counter.
+
+Source: ETG.1000.4. A successful read counts 1, a write 1, and in a read-write command a read 1 and a write 2.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from ethercat_server.ethercat.wire import Command, Datagram
+from ethercat_server.virtual_sensor.esc import registers as reg
+from ethercat_server.virtual_sensor.esc.controller import Esc
+
+_U16 = struct.Struct("<H")
+_LOGICAL = frozenset({Command.LRD, Command.LWR, Command.LRW})
+_READS = frozenset({Command.APRD, Command.FPRD, Command.BRD})
+_WRITES = frozenset({Command.APWR, Command.FPWR, Command.BWR})
+_AUTO_INCREMENT = frozenset({Command.APRD, Command.APWR, Command.APRW, Command.ARMW})
+_BROADCAST = frozenset({Command.BRD, Command.BWR, Command.BRW})
+_READ_MULTIPLE_WRITE = frozenset({Command.ARMW, Command.FRMW})
+_KNOWN = frozenset(Command) - {Command.NOP}
+_PLANS_KEPT: Final = 64
+
+
+def execute(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
+    """Process one datagram in place as it passes this slave."""
+    command = datagram.command
+    if command in _LOGICAL:
+        counted = _logical(esc, frame, datagram)
+    elif command in _KNOWN:
+        counted = _physical(esc, frame, datagram)
+    else:
+        return
+    events = esc.events & _U16.unpack_from(esc.memory, reg.EVENT_MASK)[0]
+    if events:
+        at = datagram.data - 2
+        _U16.pack_into(frame, at, _U16.unpack_from(frame, at)[0] | events)
+    if counted:
+        at = datagram.end
+        _U16.pack_into(frame, at, (_U16.unpack_from(frame, at)[0] + counted) & 0xFFFF)
+
+
+def _physical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
+    command, address = datagram.command, datagram.ado
+    position_or_station = _U16.unpack_from(frame, datagram.header + 2)[0]
+    if command in _AUTO_INCREMENT or command in _BROADCAST:
+        # Every slave counts it up; the one it reaches as 0 is meant.
+        _U16.pack_into(frame, datagram.header + 2, (position_or_station + 1) & 0xFFFF)
+        meant = command in _BROADCAST or position_or_station == 0
+    else:
+        meant = position_or_station == _U16.unpack_from(esc.memory, reg.STATION_ADDRESS)[0]
+    reads, writes = command not in _WRITES, command not in _READS
+    if command in _READ_MULTIPLE_WRITE:
+        reads, writes = meant, not meant
+    elif not meant:
+        return 0
+    start, end = datagram.data, datagram.end
+    incoming = bytes(frame[start:end])
+    counted = 0
+    if reads:
+        read = esc.read(address, incoming)
+        if read is not None:
+            counted = 1
+            if command in _BROADCAST:
+                read = bytes(a | b for a, b in zip(read, incoming, strict=True))
+            frame[start:end] = read
+    if writes and esc.write(address, incoming):
+        counted += 2 if reads else 1
+    return counted
+
+
+def _logical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
+    address = datagram.ado << 16 | datagram.adp
+    key = (address, datagram.length)
+    plan = esc.plans.get(key)
+    if plan is None:
+        plan = [
+            (fmmu, *overlap)
+            for fmmu in esc.fmmus
+            if (overlap := fmmu.overlap(address, datagram.length)) is not None
+        ]
+        if len(esc.plans) >= _PLANS_KEPT:
+            esc.plans.clear()
+        esc.plans[key] = plan
+    read = written = False
+    base = datagram.data
+    incoming = bytes(frame[base : datagram.end]) if datagram.command == Command.LRW else b""
+    for fmmu, offset, length, at in plan:
+        start, end = base + offset, base + offset + length
+        if fmmu.writes and datagram.command != Command.LRD:
+            data = incoming[offset : offset + length] or bytes(frame[start:end])
+            if fmmu.bitwise:
+                data = fmmu.insert(data, bytes(esc.memory[at : at + fmmu.span(length)]))
+            written |= esc.write(at, data)
+        if fmmu.reads and datagram.command != Command.LWR:
+            if fmmu.bitwise:
+                current = esc.read(at, bytes(fmmu.span(length)))
+                if current is not None:
+                    frame[start:end] = fmmu.extract(current, bytes(frame[start:end]))
+                    read = True
+            else:
+                current = esc.read(at, frame[start:end])
+                if current is not None:
+                    frame[start:end] = current
+                    read = True
+    return read + (2 * written if datagram.command == Command.LRW else written)

@@ -1,0 +1,1 @@
+"""Fault injection: one table of commands, a module for each subject."""

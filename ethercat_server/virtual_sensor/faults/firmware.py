@@ -1,0 +1,80 @@
+"""Faults of AL states, SDOs, mailbox, flash and EEPROM."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Final
+
+from ethercat_server.virtual_sensor.esc.sii import SiiInterface
+from ethercat_server.virtual_sensor.faults.command import Call, CommandError, FaultCommand, real, whole
+from ethercat_server.virtual_sensor.firmware.al import AlState
+
+
+def _safeop(call: Call) -> None:
+    code = whole(call.arguments[0], 0, 0xFFFF)
+    call.life.fail(AlState.SAFEOP, code)
+
+
+def _error(call: Call) -> None:
+    code = whole(call.arguments[0], 0, 0xFFFF)
+    call.life.fail(call.life.al.state, code)
+
+
+def _abort(call: Call) -> None:
+    index, subindex = whole(call.arguments[0], 0, 0xFFFF), whole(call.arguments[1], 0, 0xFF)
+    call.life.aborts.arm((index, subindex), whole(call.arguments[2], 0, 0xFFFFFFFF))
+
+
+def _on_write(call: Call) -> None:
+    address = whole(call.arguments[0], 0, 0xFFFF), whole(call.arguments[1], 0, 0xFF)
+    later = call.parse(" ".join(call.arguments[2:]))
+
+    def do() -> None:
+        with contextlib.suppress(CommandError):  # no power by then
+            later()
+
+    call.sensor.on_write(address, do)
+
+
+def _saving(call: Call) -> None:
+    flash = call.sensor.flash
+    flash.seconds = real(call.arguments[0], 0, 1e6)
+    flash.result = whole(call.arguments[1], 0, 0xFE) if len(call.arguments) > 1 else 0
+
+
+def _cut_save(call: Call) -> None:
+    sensor, count = call.sensor, whole(call.arguments[0], 0, 1000)
+    sensor.flash.cut = count, lambda: sensor.due.append(lambda: call.bus.power(sensor, False))
+
+
+def _mute(call: Call) -> None:
+    call.life.mailbox.mute = whole(call.arguments[0], 0, 2**31)
+
+
+def _sii(call: Call) -> None:
+    faults = SiiInterface.FAULTS.get(call.arguments[0])
+    if faults is None:
+        raise CommandError(f"sii takes {', '.join(SiiInterface.FAULTS)}")
+    call.life.esc.sii.fail(faults)
+
+
+COMMANDS: Final[tuple[FaultCommand, ...]] = (
+    FaultCommand("safeop", "safeop CODE [@N]", (1,), "fall to SAFEOP with this AL status code", _safeop),
+    FaultCommand("error", "error CODE [@N]", (1,), "set the error bit and this AL status code", _error),
+    FaultCommand(
+        "abort", "abort INDEX SUBINDEX CODE [@N]", (3,), "abort the next SDO on that entry", _abort
+    ),
+    FaultCommand(
+        "on-write", "on-write INDEX SUBINDEX COMMAND ...", range(3, 7),
+        "execute a command after the next SDO write to that entry", _on_write,
+    ),
+    FaultCommand(
+        "saving", "saving SECONDS [STATUS] [@N]", (1, 2),
+        "duration and final status of the save command (0 = success)", _saving,
+    ),
+    FaultCommand(
+        "cut-save", "cut-save N [@N]", (1,), "lose power in the next save after N entries", _cut_save
+    ),
+    FaultCommand("mute-mailbox", "mute-mailbox N [@N]", (1,), "drop the next N mailbox requests", _mute),
+    FaultCommand("sii", "sii error|busy|ok [@N]", (1,), "result of reading the EEPROM", _sii),
+)  # fmt: skip

@@ -1,0 +1,1 @@
+"""Firmware behind the slave controller: AL states, mailbox, object dictionary."""

@@ -1,0 +1,125 @@
+"""The mailbox: requests out of sync manager 0, replies into sync manager 1, duplicates and lost replies.
+
+Source: ETG.1000.4 and ETG.1000.6. A message is: length u16, address u16, channel and priority u8, type
+(4 bits) and counter (3 bits) u8, then `length` bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Final
+
+from ethercat_server.virtual_sensor.esc.sync_manager import SyncManager
+
+HEADER: Final = struct.Struct("<HHBB")
+_TYPE_MASK = 0x0F
+
+
+class MailboxType(IntEnum):
+    """Protocols, as numbered in the mailbox header."""
+
+    ERROR = 0
+    COE = 3
+    FOE = 4
+
+
+class MailboxError(IntEnum):
+    """Details of a mailbox error reply."""
+
+    UNSUPPORTED_PROTOCOL = 0x02
+    INVALID_HEADER = 0x05
+    TOO_SHORT = 0x06
+    INVALID_SIZE = 0x08
+
+
+class MailboxRequestError(Exception):
+    """The request cannot be answered by its protocol; the reply is a mailbox error."""
+
+    def __init__(self, detail: MailboxError) -> None:
+        super().__init__(detail.name)
+        self.detail = detail
+
+
+_FOE_ERROR = struct.pack("<BBI", 5, 0, 0x8002) + b"Access denied"
+
+
+class Mailbox:
+    """Both directions of one sensor's mailbox.
+
+    `coe` answers a CoE request (what follows the mailbox header) with any number of replies; it may raise
+    MailboxRequestError.
+    """
+
+    def __init__(
+        self, written: SyncManager, read: SyncManager, coe: Callable[[bytes, int], list[bytes]]
+    ) -> None:
+        self._written = written
+        self._read = read
+        self._coe = coe
+        self._replies: deque[bytes] = deque()
+        self._last_reply = b""
+        self._last_counter = 0
+        self._counter = 0
+        self.mute = 0
+        """Number of the next requests to drop: a fault."""
+
+    def reset(self) -> None:
+        """The mailbox was switched off or on."""
+        self._replies.clear()
+        self._last_reply = b""
+        self._last_counter = self._counter = 0
+
+    def work(self) -> None:
+        """Put a pending reply into an empty read mailbox, or process the next request.
+
+        While replies are pending the write mailbox stays full: the master has to read first.
+        """
+        if self._read.full:
+            return
+        if not self._replies and self._written.full:
+            message = self._written.content()
+            self._written.full = False
+            self._request(message)
+        if self._replies:
+            self._last_reply = self._replies.popleft()
+            self._read.load(self._last_reply)
+
+    def repeat(self) -> None:
+        """The master lost the last reply: repeat it."""
+        self._read.acknowledge_repeat()
+        if not self._read.full and self._last_reply:
+            self._read.load(self._last_reply)
+
+    def _request(self, message: bytes) -> None:
+        if len(message) < HEADER.size:
+            return
+        length, address, _, kind = HEADER.unpack_from(message)
+        counter = kind >> 4 & 0x07
+        if counter and counter == self._last_counter:
+            return  # a duplicate
+        self._last_counter = counter
+        if self.mute:
+            self.mute -= 1
+            return
+        body = message[HEADER.size : HEADER.size + length]
+        reply_type = MailboxType.ERROR
+        try:
+            if length > len(message) - HEADER.size:
+                raise MailboxRequestError(MailboxError.INVALID_SIZE)
+            reply_type, replies = self._answer(kind & _TYPE_MASK, body)
+        except MailboxRequestError as fault:
+            replies = [struct.pack("<HH", 1, fault.detail)]
+        for reply in replies:
+            self._counter = self._counter % 7 + 1
+            self._replies.append(HEADER.pack(len(reply), address, 0, reply_type | self._counter << 4) + reply)
+
+    def _answer(self, kind: int, body: bytes) -> tuple[MailboxType, list[bytes]]:
+        if kind == MailboxType.COE:
+            return MailboxType.COE, self._coe(body, self._read.length - HEADER.size)
+        if kind == MailboxType.FOE:
+            # FoE is for firmware updates.
+            return MailboxType.FOE, [_FOE_ERROR]
+        raise MailboxRequestError(MailboxError.UNSUPPORTED_PROTOCOL)

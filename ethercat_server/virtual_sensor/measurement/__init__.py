@@ -1,0 +1,1 @@
+"""What a virtual sensor measures: its clock, signals, and process data."""

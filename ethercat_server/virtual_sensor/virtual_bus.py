@@ -1,0 +1,133 @@
+"""A virtual EtherCAT bus: a veth pair, with a virtual sensor in a process of its own on the far end.
+
+The sensor's process creates the pair in its own network namespace and moves the near end into the server's.
+However the processes end, the kernel removes the namespace and the pair. Without CAP_SYS_ADMIN both ends
+are created in the server's namespace and deleted at the end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import select
+import shlex
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from types import TracebackType
+from typing import Final
+
+from ethercat_server.errors import ServerError
+
+VIRTUAL_INTERFACE: Final = "virtual"
+"""Interface name that requests a virtual bus."""
+_CLONE_NEWNET: Final = 0x40000000
+_START_TIMEOUT_S: Final = 20.0
+_GONE_TIMEOUT_S: Final = 3.0
+_USAGE_EXIT_CODE: Final = 2
+_FAR_END: Final = "sensor"
+
+
+class VirtualBus:
+    """Brings a virtual bus up and down; `ifname` is the end for the master."""
+
+    def __init__(self, arguments: str = "", master_priority: int = 0) -> None:
+        """`arguments` are `ethercat-virtual-sensor`'s own options, as on a command line.
+
+        The sensor gets a real-time priority above `master_priority`: real sensors do not wait for a CPU.
+        """
+        self._priority = min(99, master_priority + 1) if master_priority else 0
+        self.ifname = f"ecat{os.getpid()}"
+        self._arguments = shlex.split(arguments)
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> VirtualBus:
+        """Start the sensor's process and wait until it answers; ServerError if it does not."""
+        command = [sys.executable, "-P", "-m", "ethercat_server.virtual_sensor.virtual_bus"]
+        command += [self.ifname, str(self._priority), *self._arguments]
+        # A session of its own: Ctrl-C is for the server, which then ends the sensor. Its standard input
+        # closes when this process ends, in any way, and ends it too.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
+        assert self._process.stdout is not None
+        ready, _, _ = select.select((self._process.stdout,), (), (), _START_TIMEOUT_S)
+        if not ready or not self._process.stdout.readline():
+            code = self._process.poll()
+            self.__exit__(None, None, None)
+            raise ServerError(
+                "the virtual sensor did not start"
+                + (f" (exit code {code})" if code is not None else "")
+                + ": see its message above"
+                + ("" if code == _USAGE_EXIT_CODE else "; it needs root, or CAP_NET_ADMIN and CAP_NET_RAW")
+            )
+        return self
+
+    def __exit__(
+        self, _type: type[BaseException] | None, _value: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        """End the sensor's process, and with it the bus."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        assert process.stdin is not None
+        assert process.stdout is not None
+        with contextlib.suppress(OSError):
+            process.stdin.close()
+        try:
+            process.wait(timeout=3)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        process.stdout.close()
+        # The kernel removes a namespace a moment after its last process.
+        deadline = time.monotonic() + _GONE_TIMEOUT_S
+        while time.monotonic() < deadline and self.ifname in {name for _, name in socket.if_nameindex()}:
+            time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def veth_pair(near: str) -> Iterator[str]:
+    """Create the pair and bring it up; yields the name of the far end, in this process's namespace."""
+    from pyroute2 import IPRoute  # noqa: PLC0415 - only this process needs it
+
+    with open("/proc/self/ns/net", "rb") as namespace, IPRoute() as outer:  # noqa: PTH123
+        own_namespace = ctypes.CDLL(None, use_errno=True).unshare(_CLONE_NEWNET) == 0
+        far = _FAR_END if own_namespace else f"{near[:14]}s"
+        with IPRoute() as inner:
+            peer = {"ifname": near, "net_ns_fd": namespace.fileno()} if own_namespace else {"ifname": near}
+            inner.link("add", ifname=far, kind="veth", peer=peer)
+            try:
+                for route, name in ((inner, far), (outer, near)):
+                    route.link("set", index=route.link_lookup(ifname=name)[0], state="up")
+                yield far
+            finally:
+                for index in inner.link_lookup(ifname=far):
+                    inner.link("del", index=index)
+
+
+def main(argv: Sequence[str]) -> int:
+    """The sensor's process: `argv` is the near end's name, a priority, the sensor's options."""
+    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - only this process needs it
+
+    from ethercat_server.virtual_sensor import cli  # noqa: PLC0415 - likewise
+
+    near, priority, *arguments = argv
+    with contextlib.ExitStack() as made:
+        try:
+            far = made.enter_context(veth_pair(near))
+        except (OSError, NetlinkError) as error:
+            why = os.strerror(error.code) if isinstance(error, NetlinkError) else error.strerror or error
+            sys.stderr.write(f"ethercat-virtual-sensor: cannot create a veth pair: {why}\n")
+            return 1
+        if int(priority):
+            with contextlib.suppress(PermissionError):
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(priority)))
+        return cli.main([far, "--exit-on-eof", *arguments])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,88 @@
+"""The sensor's warnings register ("Warnings Errors Fatal"): what each bit means and what to do about it.
+
+Source: Table III.3 of the design note.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, IntFlag
+from typing import Final, NamedTuple
+
+
+class Severity(Enum):
+    """How bad a set bit is."""
+
+    WARNING = "warning"
+    ERROR = "error"
+    FATAL = "fatal"
+
+
+class WarningFlag(IntFlag):
+    """The bits of the register that have a meaning; 7 to 31 are reserved."""
+
+    FORCE_TORQUE_SATURATED = 1 << 0
+    ACCELERATION_SATURATED = 1 << 1
+    ANGULAR_RATE_SATURATED = 1 << 2
+    ADC_OUT_OF_SYNC = 1 << 3
+    FORCE_TORQUE_OUT_OF_RANGE = 1 << 4
+    OVERTEMPERATURE = 1 << 5
+    WRONG_SUPPLY_VOLTAGE = 1 << 6
+
+
+class WarningMeaning(NamedTuple):
+    """What one bit means, and what to do about it."""
+
+    flag: int
+    severity: Severity
+    meaning: str
+    remedy: str
+
+
+WARNINGS: Final[tuple[WarningMeaning, ...]] = (
+    WarningMeaning(
+        WarningFlag.FORCE_TORQUE_SATURATED, Severity.ERROR,
+        "Force/torque (ADC) saturated", "Reduce sensor loading",
+    ),
+    WarningMeaning(
+        WarningFlag.ACCELERATION_SATURATED, Severity.ERROR,
+        "Acceleration saturated", "Reduce acceleration or increase acceleration range",
+    ),
+    WarningMeaning(
+        WarningFlag.ANGULAR_RATE_SATURATED, Severity.ERROR,
+        "Angular velocities (gyro) saturated",
+        "Reduce angular velocities or increase angular velocities range",
+    ),
+    WarningMeaning(
+        WarningFlag.ADC_OUT_OF_SYNC, Severity.ERROR,
+        "ADC out of sync", "Contact support (repair required)",
+    ),
+    WarningMeaning(
+        WarningFlag.FORCE_TORQUE_OUT_OF_RANGE, Severity.ERROR,
+        "Force/torque measurement exceeding the range", "Reduce sensor loading",
+    ),
+    WarningMeaning(
+        WarningFlag.OVERTEMPERATURE, Severity.WARNING,
+        "Overtemperature", "Power off the sensor and let it cool down",
+    ),
+    WarningMeaning(
+        WarningFlag.WRONG_SUPPLY_VOLTAGE, Severity.FATAL,
+        "Wrong supply voltage", "Remove sensor from power supply",
+    ),
+)  # fmt: skip
+
+
+def explain(register: int) -> list[WarningMeaning]:
+    """The meaning of every set bit, lowest first; reserved bits are listed too, as warnings."""
+    found = [row for row in WARNINGS if register & row.flag]
+    reserved = register & 0xFFFFFFFF & ~sum(row.flag for row in WARNINGS)
+    for bit in range(32):
+        if reserved >> bit & 1:
+            found.append(
+                WarningMeaning(
+                    1 << bit,
+                    Severity.WARNING,
+                    f"Reserved bit {bit} set",
+                    "Check the firmware's manual: this bit has no published meaning",
+                )
+            )
+    return found

@@ -1,0 +1,129 @@
+"""The bias across restarts: which one each sensor starts with, kept by its serial number.
+
+Used from the executor's thread; any thread may read `serial`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from bridge.parameters.compensation import AUTO, CompensationParameters
+from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
+from ft_compensation.store import CompensationStore, Stored, StoreError, default_directory
+
+FROM_PARAMETER: Final = "parameter"
+
+
+class Beginning(NamedTuple):
+    """The bias to put in force at once."""
+
+    bias: Wrench
+    origin: str
+    """Where it comes from."""
+
+
+class BiasKeeper:
+    """The files, and the sensor that the bias in force is for.
+
+    Attributes:
+        serial: of that sensor; None until there was one.
+        problem: why the bias could not be kept or read, a sentence; empty if it could, or was not to be.
+    """
+
+    def __init__(self, log: Any) -> None:
+        self.serial: str | None = None
+        self.problem = ""
+        self._kept: Wrench | None = None
+        """What the file has."""
+        self._log = log
+
+    def forget(self) -> None:
+        """What the file has is not known any more: keep the bias anew."""
+        self._kept = None
+
+    def keep(self, bias: Wrench, parameters: CompensationParameters) -> None:
+        """Keep `bias` for the sensor that is there, if that is asked for and it is not the kept one."""
+        if not parameters.bias_keep:
+            self.problem = ""
+            return
+        if self.serial is None or bias == self._kept:
+            return
+        try:
+            path = _store(parameters).save(_number(self.serial), bias, parameters.payload)
+        except StoreError as error:
+            self._say_not_kept(str(error))
+            return
+        self._kept, self.problem = bias, ""
+        self._log.info(f"the bias is kept in {path}")
+
+    def take(
+        self, serial: str, bias: Wrench, origin: str, parameters: CompensationParameters
+    ) -> Beginning | None:
+        """Another sensor is there; `bias` from `origin` is in force. None: it stays."""
+        is_first, self.serial = self.serial is None, serial
+        self._kept = None
+        stored = self._look_up(serial, parameters)
+        if stored is None:
+            if is_first or origin == FROM_PARAMETER:
+                return None
+            self._log.warning(
+                f"another sensor is there now, serial number {serial}: the bias was the other's and is "
+                "zero now; tare"
+            )
+            return Beginning(NO_WRENCH, FROM_PARAMETER)
+        if is_first and bias not in (NO_WRENCH, stored.bias):
+            self._log.warning(
+                f"the bias kept of sensor {serial} is not used, because the parameter bias is given; "
+                "it is replaced by it"
+            )
+            return None
+        self._kept = stored.bias
+        self._log.info(f"sensor {serial} has the bias that was kept at {stored.saved}")
+        if stored.payload is not None and stored.payload != parameters.payload:
+            self._log.warning(
+                f"the kept bias was taken with {_payload_text(stored.payload)}, and now there is "
+                f"{_payload_text(parameters.payload)}: tare again"
+            )
+        return Beginning(stored.bias, f"kept since {stored.saved}")
+
+    def _look_up(self, serial: str, parameters: CompensationParameters) -> Stored | None:
+        self.problem = ""
+        if not parameters.bias_keep:
+            return None
+        try:
+            return _store(parameters).load(_number(serial))
+        except StoreError as error:
+            self._say_not_kept(str(error))
+            return None
+
+    def _say_not_kept(self, problem: str) -> None:
+        self.problem = problem
+        self._log.warning(problem)
+
+
+def _payload_text(payload: Payload) -> str:
+    return f"a tool of {payload.mass:.3g} kg" if payload.mass else "no tool_mass"
+
+
+def directory_of(parameter: str) -> Path:
+    """The directory that the parameter `bias_directory` means. StoreError if there is none."""
+    return default_directory() if parameter == AUTO else expand(parameter, "bias_directory")
+
+
+def expand(path: str, parameter: str) -> Path:
+    """A path that may begin with ~. StoreError if there is no home directory."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        raise StoreError(f"there is no home directory for {path}: give {parameter} in full") from None
+
+
+def _store(parameters: CompensationParameters) -> CompensationStore:
+    return CompensationStore(directory_of(parameters.bias_directory))
+
+
+def _number(serial: str) -> int:
+    if not (serial.isascii() and serial.isdigit()):
+        raise StoreError(f"the sensor's serial number is {serial!r}, not a number: its bias cannot be kept")
+    return int(serial)

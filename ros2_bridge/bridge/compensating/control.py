@@ -1,0 +1,257 @@
+"""What the compensation is to do: parameters made into a `Plan`, the bias with its history, the source.
+
+Lives in the executor's thread, but for `link_changed` and `cancel`. The parameter `bias` is the bias: every
+change goes through it, so that it always shows what is in force, or ramped in.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from rclpy.node import Node
+
+from bridge.compensating.bias_keeper import FROM_PARAMETER, BiasKeeper
+from bridge.compensating.gravity_sources import (
+    AccelerometerSource,
+    ListenerSource,
+    NoSource,
+    SensorSource,
+    Source,
+)
+from bridge.compensating.orientation_listener import OrientationListener, check_can_listen
+from bridge.diagnostics.compensation_state import CompensationState, conflict
+from bridge.parameters.compensation import CompensationParameters
+from bridge.parameters.live import LiveParameters
+from bridge.parameters.row import ParameterError
+from bridge.parameters.table import Parameters
+from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
+from bridge.stream.link import Link
+from ft_compensation.bias import BiasRamp
+from ft_compensation.compensator import Compensator
+from ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
+from protocol.pdo import Vector3
+
+_LOOKING_UP: Final = "the bias of this sensor is being looked up"
+
+
+class CompensationControl:
+    """Wires parameters, bias and source to `output`, from `start` to `close`."""
+
+    def __init__(
+        self,
+        node: Node,
+        parameters: Parameters,
+        output: CompensatedOutput,
+        link: Link,
+        count_not_finite: Callable[[], int],
+        on_failure: Callable[[str], object],
+    ) -> None:
+        """ParameterError if the parameters cannot be had here."""
+        self.parameters = parameters.compensation
+        self.output, self.link = output, link
+        self.origin = FROM_PARAMETER
+        """Where the bias in force comes from."""
+        self.sensors = 1
+        """How many have been there: what was measured on one is of no use with another."""
+        self.ending = False
+        self._node, self._log = node, node.get_logger()
+        self._frame, self._on_failure = parameters.frame_id, on_failure
+        self._listener: OrientationListener | None = None
+        self._angular_rate_offset = ZERO
+        self._keeper = BiasKeeper(self._log)
+        self.count_not_finite = count_not_finite
+        """Samples so far that were not finite somewhere."""
+        self._next_origin = FROM_PARAMETER
+        self._check(self.parameters)
+        self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
+        self.source: Source = NoSource()
+        self._live = LiveParameters(node, self._check, self._apply)
+        self._guard = node.create_guard_condition(self._follow_sensor)
+
+    def start(self) -> None:
+        """Open the orientation's source, which may take a thread; before any sample comes.
+
+        ParameterError if it cannot be had.
+        """
+        self.source = self._open_source(self.parameters)
+        self._make_plan()
+
+    def close(self) -> bool:
+        """Stop listening for orientations; False if that does not end in time."""
+        return self._listener is None or self._listener.close()
+
+    def cancel(self) -> None:
+        """Make whoever waits for samples give up; from any thread: the node ends."""
+        self.ending = True
+
+    def link_changed(self) -> None:
+        """There is another connection, or none; for the reader's thread."""
+        if not self._is_same_sensor():
+            # Not one sample of this sensor with what may be another's bias.
+            self.output.hold = _LOOKING_UP
+            self._guard.trigger()
+
+    @property
+    def keeping(self) -> str:
+        """Why the bias could not be kept or read, a sentence; empty if it could, or was not to be."""
+        return self._keeper.problem
+
+    @property
+    def bias(self) -> Wrench:
+        """The one in force, or being ramped in."""
+        return self._ramp.target
+
+    def after_sensor_tare(self) -> str:
+        """What a new offset in the sensor itself means here, a sentence; "" if nothing."""
+        if self.bias == NO_WRENCH:
+            return ""
+        return "The node's own bias was for the old offset: call ~/tare or ~/clear_tare"
+
+    def conflict(self) -> str | None:
+        """What the sensor is set to that does not go with compensation, a sentence."""
+        return conflict(self.link.settings, self.parameters.payload)
+
+    def state(self) -> CompensationState:
+        """How things are, for the diagnostics' thread."""
+        output, source = self.output, self.source
+        payload = self.parameters.payload
+        why = None
+        if output.is_stopped:
+            why = output.hold or source.why_none(output.time_s)
+        return CompensationState(
+            has_subscribers=output.has_subscribers,
+            published=output.published,
+            withheld=output.withheld,
+            why_stopped=why,
+            source=source.describe,
+            age_s=source.age_s(output.time_s),
+            payload=payload,
+            inertia=self.parameters.compensate_inertia,
+            bias=self.bias,
+            origin=self.origin,
+            is_ramping=self.is_ramping,
+            keep=self.parameters.bias_keep,
+            problem=self.conflict() or self.keeping,
+        )
+
+    @property
+    def is_ramping(self) -> bool:
+        """Whether it is on the way to `bias`, as of the latest sample."""
+        return not self._ramp.arrived(self.output.time_s)
+
+    def set_bias(self, bias: Wrench, origin: str) -> None:
+        """Put a bias in force, and keep it if that is asked for."""
+        with self._origin(origin):
+            self._live.put(bias=[*bias.values])
+
+    def undo_bias(self) -> Wrench:
+        """Go back to the bias before, and return it; CompensationError if there is none."""
+        before = self._ramp.undo(self.output.time_s)
+        self.set_bias(before, "undone")
+        self.origin = "undone"
+        return before
+
+    def set_payload(self, payload: Payload, bias: Wrench) -> None:
+        """Put an identified payload and its bias in force, both at once."""
+        with self._origin("identified"):
+            self._live.put(
+                tool_mass=payload.mass, tool_center_of_gravity=[*payload.center], bias=[*bias.values]
+            )
+
+    def note_rest(self, angular_rate: Vector3) -> None:
+        """What the gyroscope read at rest, rad/s: its offset."""
+        self._angular_rate_offset = angular_rate
+        if isinstance(self.source, AccelerometerSource):
+            self.source.set_angular_rate_offset(angular_rate)
+
+    @contextlib.contextmanager
+    def _origin(self, origin: str) -> Iterator[None]:
+        self._next_origin = origin
+        try:
+            yield
+        finally:
+            self._next_origin = FROM_PARAMETER
+
+    def _check(self, wanted: CompensationParameters) -> None:
+        """ParameterError if that cannot be had on this machine."""
+        check_can_listen(self._node, wanted.orientation)
+
+    def _apply(self, wanted: CompensationParameters) -> None:
+        was, self.parameters = self.parameters, wanted
+        if _source_part(wanted) != _source_part(was):
+            try:
+                self.source = self._open_source(wanted)
+            except ParameterError as error:  # too late to refuse the parameter
+                self._log.error(str(error))
+                self.source = NoSource(str(error))
+        self._ramp.seconds = wanted.bias_ramp_time
+        if wanted.bias != self.bias:
+            self._ramp.go(wanted.bias, self.output.time_s)
+            self.origin = self._next_origin
+        self._make_plan()
+        if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
+            self._keeper.forget()
+        self._keeper.keep(self.bias, wanted)
+
+    def _make_plan(self) -> None:
+        wanted = self.parameters
+        compensator = Compensator(
+            wanted.payload, inertia=wanted.compensate_inertia, imu_position=wanted.imu_position
+        )
+        self.output.plan = Plan(self.source, compensator, self._ramp, wanted.payload.mass > 0.0)
+
+    def _open_source(self, wanted: CompensationParameters) -> Source:
+        listener, self._listener = self._listener, None
+        if listener is not None:
+            listener.close()
+        name = wanted.orientation.source
+        if name == "none":
+            return NoSource()
+        if name == "accelerometer":
+            return AccelerometerSource(wanted, self._angular_rate_offset)
+        if name == "sensor":
+            return SensorSource(wanted)
+        self._listener = OrientationListener(self._node, wanted.orientation, self._frame, self._on_failure)
+        return ListenerSource(wanted, self._listener)
+
+    def _is_same_sensor(self) -> bool:
+        info = self.link.info
+        return self.link.connection is None or info is None or info.serial == self._keeper.serial
+
+    def _follow_sensor(self) -> None:
+        """Find the bias of the sensor that is there now."""
+        while not self._is_same_sensor():
+            info = self.link.info
+            if info is None:
+                break
+            is_another = self._keeper.serial is not None
+            begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters)
+            if begin is not None:
+                self._begin_with(*begin)
+            elif is_another:
+                # What was before in its history was the other's too.
+                self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
+                self._make_plan()
+            if is_another:
+                self.note_rest(ZERO)
+                self.sensors += 1
+            if not self.keeping and self.bias != NO_WRENCH:
+                self._keeper.keep(self.bias, self.parameters)
+        self.output.hold = None
+        if not self._is_same_sensor():
+            self.link_changed()
+
+    def _begin_with(self, bias: Wrench, origin: str) -> None:
+        """Put a bias in force at once, with nothing before it."""
+        problem = self.keeping
+        with self._origin(origin):
+            self._ramp = BiasRamp(bias, self.parameters.bias_ramp_time)
+            self._live.put(bias=[*bias.values])
+        self.origin, self._keeper.problem = origin, problem
+        self._make_plan()
+
+
+def _source_part(parameters: CompensationParameters) -> tuple[object, ...]:
+    return parameters.orientation, parameters.accelerometer, parameters.gravity

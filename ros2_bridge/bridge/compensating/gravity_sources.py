@@ -1,0 +1,202 @@
+"""Where gravity points, sample by sample: what the reader asks, around `ft_compensation.orientation`. No ROS.
+
+The reader alone calls `gravity`. `why_none` and `age_s` are for the diagnostics' thread.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, Protocol
+
+from bridge.parameters.compensation import CompensationParameters, Quaternion
+from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
+from ft_compensation.quantities import length
+from protocol.pdo import Sample, Vector3
+
+
+class Oriented(NamedTuple):
+    """An orientation and its time, ns since the Unix epoch."""
+
+    quaternion: Quaternion
+    stamp_ns: int
+
+
+class Source(Protocol):
+    """Gravity in the sensor's frame from one kind of orientation."""
+
+    describe: str
+    """Its name for people."""
+    is_accelerometer: bool
+    """Whether it is: at rest the mean of a window is better then than the filter."""
+
+    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
+        """m/s², for this sample; None if what is known is too old, or nothing is."""
+
+    def why_none(self, time_s: float) -> str:
+        """The reason for None, a sentence."""
+
+    def age_s(self, time_s: float) -> float:
+        """How old the orientation in use is."""
+
+
+class NoSource:
+    """There is none: `orientation_source` is `none`, or what it is set to cannot be had."""
+
+    describe = "none"
+    is_accelerometer = False
+
+    def __init__(self, why: str = "orientation_source is none") -> None:
+        self._why = why
+
+    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:  # noqa: ARG002
+        """None."""
+        return None
+
+    def why_none(self, time_s: float) -> str:  # noqa: ARG002
+        """What to do."""
+        return (
+            f"{self._why}, so where gravity points is not known: set orientation_source to a source, or "
+            "set tool_mass to 0"
+        )
+
+    def age_s(self, time_s: float) -> float:  # noqa: ARG002
+        """Infinite."""
+        return math.inf
+
+
+class AccelerometerSource:
+    """The sensor's own accelerometer, low-pass filtered and turned along by its gyroscope."""
+
+    describe = "accelerometer"
+    is_accelerometer = True
+
+    def __init__(self, parameters: CompensationParameters, angular_rate_offset: Vector3) -> None:
+        """`angular_rate_offset`: what the gyroscope reads at rest, rad/s."""
+        p = parameters.accelerometer
+        self._filter = AccelerometerGravity(
+            length(parameters.gravity),
+            time_constant_s=p.time_constant,
+            gate=p.gate,
+            stale_after_s=p.stale_after,
+            gyroscope=p.gyroscope,
+            angular_rate_offset=angular_rate_offset,
+        )
+        self._imu_is_off = False
+
+    def set_angular_rate_offset(self, offset: Vector3) -> None:
+        """What the gyroscope reads at rest, rad/s, from the next sample on."""
+        self._filter.angular_rate_offset = offset
+
+    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
+        """From this sample and those before it."""
+        acceleration = sample.acceleration
+        if not sample.acceleration_saturated and not sample.angular_rate_saturated:
+            self._filter.update(acceleration, sample.angular_rate, time_s)
+        found = self._filter.gravity(time_s)
+        if found is None:
+            self._imu_is_off = not any(acceleration)
+        return found
+
+    def why_none(self, time_s: float) -> str:
+        """The IMU is off, or the sensor is being accelerated."""
+        if self._imu_is_off:
+            return "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
+        f, age_s = self._filter, self._filter.age_s(time_s)
+        since = "not yet" if math.isinf(age_s) else f"not for {age_s:.2f} s"
+        return (
+            f"the accelerometer has {since} read {f.magnitude:.2f} ± {f.gate:g} m/s²: the sensor is being "
+            "moved hard, or imu_raw_units is wrong; for use in motion take the orientation from the robot "
+            "(orientation_source)"
+        )
+
+    def age_s(self, time_s: float) -> float:
+        """Since the last sample that counted."""
+        return self._filter.age_s(time_s)
+
+
+class SensorSource:
+    """The orientation that the sensor estimates, where it maps one."""
+
+    describe = "the sensor's own estimate"
+    is_accelerometer = False
+
+    def __init__(self, parameters: CompensationParameters) -> None:
+        self._turn = QuaternionGravity(parameters.gravity, stale_after_s=parameters.orientation.stale_after)
+
+    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
+        """From this sample's orientation."""
+        if sample.orientation is not None and not self._turn.update(sample.orientation, time_s):
+            # Time went back: what was known is of no use any more.
+            self._turn.reset()
+            self._turn.update(sample.orientation, time_s)
+        return self._turn.gravity(time_s)
+
+    def why_none(self, time_s: float) -> str:  # noqa: ARG002
+        """It estimates none."""
+        return (
+            "the sensor gives no orientation of its own: switch it on (settings.orientation_estimation), "
+            "which only sensors with 77 bytes of process data have, or take another orientation_source"
+        )
+
+    def age_s(self, time_s: float) -> float:
+        """Since the last estimate."""
+        return self._turn.age_s(time_s)
+
+
+class Listening(Protocol):
+    """What is used of an `OrientationListener`."""
+
+    latest: Oriented | None
+    problem: str
+    describe: str
+
+
+class ListenerSource:
+    """A topic or TF: the latest orientation that has come, if it is of nearly the sample's time."""
+
+    is_accelerometer = False
+
+    def __init__(self, parameters: CompensationParameters, listener: Listening) -> None:
+        self._listener = listener
+        self._limit_s = parameters.orientation.stale_after
+        self._turn = QuaternionGravity(parameters.gravity, stale_after_s=self._limit_s)
+        self._taken: Oriented | None = None
+        self.describe = listener.describe
+
+    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:  # noqa: ARG002
+        """From the latest orientation."""
+        latest = self._listener.latest
+        if latest is not self._taken and latest is not None:
+            self._taken = latest
+            stamp_s = latest.stamp_ns * 1e-9
+            if not self._turn.update(latest.quaternion, stamp_s):
+                # The publisher's clock went back, or it is another publisher: what came last is what counts.
+                self._turn.reset()
+                self._turn.update(latest.quaternion, stamp_s)
+        return self._turn.gravity(time_s)
+
+    def why_none(self, time_s: float) -> str:
+        """Nothing has come, it stopped, it is of no use, or its stamps are of another time."""
+        latest, name = self._listener.latest, self.describe
+        if latest is None:
+            return f"no orientation from {name}: {self._listener.problem}"
+        behind_s = time_s - latest.stamp_ns * 1e-9
+        if behind_s < 0:
+            return (
+                f"the orientation from {name} is stamped {_seconds(-behind_s)} after the sample (limit "
+                f"{self._limit_s:g} s): the clocks of the two computers differ"
+            )
+        problem = self._listener.problem
+        return (
+            f"the latest orientation from {name} is {_seconds(behind_s)} older than the sample (limit "
+            f"{self._limit_s:g} s)"
+            + (f": {problem}" if problem else ": it has stopped, is slow, or has another clock")
+        )
+
+    def age_s(self, time_s: float) -> float:
+        """Between the stamps of sample and orientation."""
+        return self._turn.age_s(time_s)
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.3f} s" if value < 100 else f"{value:.3g} s"

@@ -1,0 +1,1 @@
+"""/diagnostics: `observer` and `server_status` sum up, `health` judges (no ROS), `monitor` publishes."""

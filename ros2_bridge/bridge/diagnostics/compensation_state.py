@@ -1,0 +1,85 @@
+"""How the compensation is at one moment, as the diagnostics tell it. No ROS, no threads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
+
+
+class CompensationState(NamedTuple):
+    """What is known at one moment."""
+
+    has_subscribers: bool = False
+    published: int = 0
+    withheld: int = 0
+    """Samples since the node started that were compensated, and that could not be."""
+    why_stopped: str | None = None
+    """Why the latest sample could not be, a sentence; None if it could."""
+    source: str = "none"
+    age_s: float = math.inf
+    """Of the orientation."""
+    payload: Payload = Payload()
+    inertia: bool = False
+    bias: Wrench = NO_WRENCH
+    origin: str = "parameter"
+    """Where the bias comes from."""
+    is_ramping: bool = False
+    keep: bool = False
+    """Whether the bias is to survive a restart."""
+    problem: str = ""
+    """What is not as it should be, a sentence."""
+
+    @property
+    def good(self) -> str:
+        """What to say when all is well."""
+        parts = ["bias"] if self.bias != NO_WRENCH else []
+        if self.payload.mass:
+            parts += ["gravity", "inertia"] if self.inertia else ["gravity"]
+        if not parts:
+            text = "nothing is subtracted: there is no bias and no tool_mass"
+        elif len(parts) == 1:
+            text = f"{parts[0]} is subtracted"
+        else:
+            text = f"{', '.join(parts[:-1])} and {parts[-1]} are subtracted"
+        return text if self.has_subscribers else f"{text}; nobody has subscribed"
+
+    @property
+    def values(self) -> dict[str, object]:
+        """By name."""
+        uses_source = bool(self.payload.mass) and self.has_subscribers
+        return {
+            "orientation_source": self.source,
+            "orientation_age_s": round(self.age_s, 4) if uses_source and math.isfinite(self.age_s) else "",
+            "tool_mass": round(self.payload.mass, 4),
+            "tool_center_of_gravity": _numbers(self.payload.center),
+            "tared": self.bias != NO_WRENCH,
+            "bias": _numbers(self.bias.values),
+            "bias_from": self.origin,
+            "bias_ramping": self.is_ramping,
+            "bias_keep": self.keep,
+            "subscribed": self.has_subscribers,
+            "compensated": self.published,
+            "withheld": self.withheld,
+        }
+
+
+def conflict(settings: Mapping[str, object], payload: Payload) -> str | None:
+    """What the sensor is set to that does not go with compensation, a sentence."""
+    if settings.get("calibration_matrix") is False:
+        return (
+            "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
+            "switch it on"
+        )
+    if settings.get("inertia_compensation") is True and payload.mass:
+        return (
+            "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
+            "or set tool_mass to 0"
+        )
+    return None
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:.4f}" for value in values)

@@ -1,0 +1,122 @@
+"""Sums up what reader and server know into snapshots, and keeps what "since the last report" means."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from bridge.diagnostics.compensation_state import CompensationState
+from bridge.diagnostics.server_status import ServerStatus
+from bridge.diagnostics.snapshot import Snapshot, server_lost
+from bridge.stream.connection import find_sensor
+from bridge.stream.frame_selector import FrameCounts
+from bridge.stream.reader import Reader
+from bridge.stream.watch import Flags
+from protocol.errors import ConnectionFailedError
+
+_SHORTEST_RATE_S: Final = 0.8
+"""A rate measured over less time than this says little."""
+
+
+class Observer:
+    """Call `look` often; after a regular report call `begin_interval`."""
+
+    def __init__(self, reader: Reader, compensation: Callable[[], CompensationState]) -> None:
+        """`compensation` tells how it is."""
+        self._reader, self._link, self._compensation = reader, reader.link, compensation
+        self._poll = ServerStatus()
+        self._flags = Flags()
+        self._age_us: tuple[float, float] | None = None
+        self._rate_hz: float | None = None
+        self._fresh, self._fresh_s, self._epoch = 0, time.monotonic(), -1
+        """The last number of fresh samples, when it changed, and the link's epoch."""
+        self._rate_fresh, self._rate_s = 0, self._fresh_s
+        """Where the rate is measured from."""
+        self._then, self._then_not_finite = FrameCounts(), 0
+        self._then_connects, self._then_server_lost, self._then_withheld = 0, -1, 0
+
+    def look(self, now_s: float) -> Snapshot:
+        """How things are now."""
+        link, reader = self._link, self._reader
+        connection = link.connection
+        described = self._poll.collect(connection)
+        if described is not None:
+            self._take_description(described)
+        counts = dataclasses.replace(reader.counts)
+        if link.epoch != self._epoch:
+            self._epoch, self._rate_hz = link.epoch, None
+            self._rate_fresh, self._rate_s = counts.new, now_s
+        if counts.new != self._fresh:
+            self._fresh, self._fresh_s = counts.new, now_s
+        self._flags = self._flags.merge(reader.watch.take_flags())
+        lost = server_lost(self._poll.status, link.sensor) if self._poll.status else self._then_server_lost
+        silent_since_s = max(self._fresh_s, link.since_s)
+        sample, compensation = reader.watch.sample, self._compensation()
+        return Snapshot(
+            sensor=link.sensor,
+            address=link.address,
+            connected=connection is not None,
+            problem=link.problem,
+            is_reachable=link.is_reachable,
+            connection_s=now_s - link.since_s,
+            connects=link.connects,
+            new_connects=link.connects - self._then_connects,
+            info=link.info,
+            lost=link.lost,
+            silent_s=max(now_s - silent_since_s, 0.0),
+            rate_hz=self._rate_hz,
+            expected_hz=link.rate_hz,
+            age_us=self._age_us,
+            counts=counts,
+            new=_difference(counts, self._then),
+            not_finite=reader.not_finite,
+            new_not_finite=reader.not_finite - self._then_not_finite,
+            flags=self._flags,
+            temperature=None if sample is None else sample.temperature,
+            server=self._poll.status,
+            new_server_lost=max(lost - self._then_server_lost, 0) if self._then_server_lost >= 0 else 0,
+            answer_s=self._poll.owed_s(now_s),
+            compensation=compensation,
+            new_withheld=compensation.withheld - self._then_withheld,
+        )
+
+    def measure(self, now_s: float) -> None:
+        """Work out rate and ages of the interval that ends; before `look`."""
+        connection = self._link.connection
+        ages = self._reader.watch.take_ages()
+        self._age_us = None
+        if ages and connection is not None and connection.same_machine:
+            self._age_us = ages[len(ages) // 2] / 1e3, ages[min(len(ages) * 99 // 100, len(ages) - 1)] / 1e3
+        if self._link.epoch != self._epoch:
+            return
+        fresh, elapsed_s = self._reader.counts.new, now_s - self._rate_s
+        self._rate_hz = (fresh - self._rate_fresh) / elapsed_s if elapsed_s >= _SHORTEST_RATE_S else None
+        self._rate_fresh, self._rate_s = fresh, now_s
+
+    def begin_interval(self, reported: Snapshot) -> None:
+        """`reported` was a regular report: what is new counts from there on. Asks the server again."""
+        self._flags = Flags()
+        self._then, self._then_not_finite = reported.counts, reported.not_finite
+        self._then_connects, self._then_withheld = reported.connects, reported.compensation.withheld
+        if reported.server:
+            self._then_server_lost = server_lost(reported.server, self._link.sensor)
+        elif not reported.connected:
+            self._then_server_lost = -1  # the next server counts from 0
+        self._poll.ask()
+
+    def _take_description(self, description: Mapping[str, Any]) -> None:
+        try:
+            self._link.described(find_sensor(description, self._link.sensor))
+        except ConnectionFailedError:
+            return  # not there any more: its frames will say so
+
+
+def _difference(now: FrameCounts, then: FrameCounts) -> FrameCounts:
+    return FrameCounts(
+        **{
+            field.name: getattr(now, field.name) - getattr(then, field.name)
+            for field in dataclasses.fields(FrameCounts)
+        }
+    )

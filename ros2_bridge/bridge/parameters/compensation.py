@@ -1,0 +1,145 @@
+"""The parameters of the compensation: their rows, their values, and what must hold between them.
+
+All can be set while the node runs. A wrong value is refused with a sentence and the old one stays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
+
+from bridge.parameters.row import ParameterError, Row
+from ft_compensation.quantities import DEFAULT_GRAVITY, ZERO, Payload, Wrench, length
+from ft_compensation.still import StillLimits
+from protocol.pdo import Vector3
+
+Quaternion = tuple[float, float, float, float]
+AUTO: Final = "auto"
+"""The value of a path that is for the node to choose."""
+TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
+SOURCES: Final = ("none", "accelerometer", "sensor", *TOPIC_SOURCES, "tf")
+_LEAST_GRAVITY: Final = 0.1
+_REST: Final = StillLimits()
+
+_TABLE: Final = (
+    Row("tool_mass", 0.0, "Mass of what hangs on the sensor, kg; 0 = gravity is not compensated", 0, 1000),
+    Row("tool_center_of_gravity", ZERO, "Its center of gravity in frame_id, m", 0, 10, lengths=(3,)),
+    Row("gravity", DEFAULT_GRAVITY,
+        "Gravity, m/s², in the base frame: that of the orientations", 0, 100, lengths=(3,)),
+    Row("bias", (0.0,) * 6,
+        "Subtracted from the wrench: Fx Fy Fz (N) Mx My Mz (Nm); ~/tare sets it", 0, 1e6, lengths=(6,)),
+    Row("bias_ramp_time", 0.5, "Seconds in which a new bias replaces the old one; 0 = at once", 0, 60),
+    Row("bias_keep", False, "Whether the bias is kept across restarts, by the sensor's serial number"),
+    Row("bias_directory", AUTO,
+        "Where it is kept; auto = bota-ethercat-bridge in $XDG_STATE_HOME or ~/.local/state"),
+    Row("compensate_inertia", False, "Whether the inertial force of the tool is subtracted too"),
+    Row("imu_position", ZERO,
+        "Position of the IMU in frame_id, m, for compensate_inertia", 0, 1, lengths=(3,)),
+    Row("orientation_source", "accelerometer",
+        "Source of the sensor's orientation; used only with a tool_mass", choices=SOURCES),
+    Row("orientation.topic", "orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}"),
+    Row("orientation.base_frame", "base_link", "Frame that gravity is given in, for the source tf"),
+    Row("orientation.mounting", (0.0, 0.0, 0.0, 1.0),
+        "Quaternion x y z w: frame_id in the frame of the topic", 0, 1, lengths=(4,)),
+    Row("orientation.stale_after", 0.1,
+        "Largest difference of the stamps of orientation and sample, s", 0.001, 10),
+    Row("accelerometer.stale_after", 0.5,
+        "Seconds that the source may go without a usable sample", 0.001, 10),
+    Row("accelerometer.time_constant", 0.5, "Of the accelerometer's low-pass filter, s", 0.001, 60),
+    Row("accelerometer.gate", 0.5,
+        "A usable sample's acceleration differs from gravity by no more, m/s²", 0.01, 10),
+    Row("accelerometer.gyroscope", True,
+        "Whether the gyroscope rotates the estimate, so that it does not lag"),
+    Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
+    Row("rest.force_spread", _REST.force_spread, "Largest standard deviation when stationary, N", 0, 1e3),
+    Row("rest.torque_spread", _REST.torque_spread, "Largest standard deviation when stationary, Nm", 0, 1e3),
+    Row("rest.force_wander", _REST.force_wander, "Largest drift of the mean when stationary, N", 0, 1e3),
+    Row("rest.torque_wander", _REST.torque_wander, "Largest drift of the mean when stationary, Nm", 0, 1e3),
+    Row("rest.angular_rate", _REST.angular_rate, "Largest mean angular rate when stationary, rad/s", 0, 10),
+    Row("rest.angular_rate_spread", _REST.angular_rate_spread,
+        "Largest standard deviation when stationary, rad/s", 0, 10),
+    Row("rest.acceleration_spread", _REST.acceleration_spread,
+        "Largest standard deviation when stationary, m/s²", 0, 100),
+    Row("rest.acceleration_wander", _REST.acceleration_wander,
+        "Largest drift of the mean when stationary, m/s²", 0, 100),
+    Row("identify.file", AUTO,
+        "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bias_directory"),
+)  # fmt: skip
+ROWS: Final = tuple(row._replace(live=True) for row in _TABLE)
+"""Every one can be set while the node runs."""
+
+
+class OrientationParameters(NamedTuple):
+    """Where the orientation comes from."""
+
+    source: str = "accelerometer"
+    topic: str = "orientation"
+    base_frame: str = "base_link"
+    mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    stale_after: float = 0.1
+
+
+class AccelerometerParameters(NamedTuple):
+    """How the accelerometer is made into an orientation."""
+
+    stale_after: float = 0.5
+    time_constant: float = 0.5
+    gate: float = 0.5
+    gyroscope: bool = True
+
+
+class CompensationParameters(NamedTuple):
+    """The values, checked."""
+
+    payload: Payload = Payload()
+    gravity: Vector3 = DEFAULT_GRAVITY
+    bias: Wrench = Wrench(ZERO, ZERO)
+    bias_ramp_time: float = 0.5
+    bias_keep: bool = False
+    bias_directory: str = AUTO
+    compensate_inertia: bool = False
+    imu_position: Vector3 = ZERO
+    orientation: OrientationParameters = OrientationParameters()
+    accelerometer: AccelerometerParameters = AccelerometerParameters()
+    rest_duration: float = 1.0
+    rest: StillLimits = _REST
+    identify_file: str = AUTO
+
+
+def gather(values: Mapping[str, Any]) -> CompensationParameters:
+    """From checked values by the rows' names; ParameterError if they do not go together."""
+    gravity, mounting = values["gravity"], values["orientation.mounting"]
+    if length(gravity) < _LEAST_GRAVITY:
+        raise ParameterError(
+            f"parameter gravity is {list(gravity)}: it must be at least {_LEAST_GRAVITY} m/s² long; for no "
+            "compensation of gravity set tool_mass to 0"
+        )
+    norm = math.sqrt(sum(part * part for part in mounting))
+    if abs(norm - 1.0) > 0.01:
+        raise ParameterError(
+            f"parameter orientation.mounting is {list(mounting)}: a rotation is a quaternion of length 1, "
+            f"this one's is {norm:g}"
+        )
+
+    def group(prefix: str) -> dict[str, Any]:
+        return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
+
+    rest = group("rest.")
+    duration = rest.pop("duration")
+    orientation = group("orientation.") | {"mounting": tuple(part / norm for part in mounting)}
+    return CompensationParameters(
+        payload=Payload(values["tool_mass"], values["tool_center_of_gravity"]),
+        gravity=gravity,
+        bias=Wrench.of(values["bias"]),
+        bias_ramp_time=values["bias_ramp_time"],
+        bias_keep=values["bias_keep"],
+        bias_directory=values["bias_directory"],
+        compensate_inertia=values["compensate_inertia"],
+        imu_position=values["imu_position"],
+        orientation=OrientationParameters(values["orientation_source"], **orientation),
+        accelerometer=AccelerometerParameters(**group("accelerometer.")),
+        rest_duration=duration,
+        rest=StillLimits(**rest),
+        identify_file=values["identify.file"],
+    )

@@ -1,0 +1,96 @@
+"""The node's parameters: one table, from which they are declared, checked, described and documented. No ROS.
+
+Those of the compensation (`compensation`) can be set while the node runs (`live`), others are read-only. A
+wrong value ends the node at start with one sentence. The sensor's settings are parameters too, but the server
+decides about them: `sensor_settings`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+from bridge.parameters.compensation import ROWS as COMPENSATION_ROWS
+from bridge.parameters.compensation import CompensationParameters, gather
+from bridge.parameters.row import Numbers, ParameterError, Row
+from protocol.pdo import ImuUnits
+
+_UNKNOWN: Final = (0.0, 0.0, 0.0)
+_COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"
+
+SERVER_PORT: Final = Row("server_port", 12001, "TCP port of ethercat-server", 1, 65535)
+PARAMETERS: Final = (
+    Row("server_host", "localhost", "Host that ethercat-server runs on"),
+    SERVER_PORT,
+    Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535),
+    Row("sensor", 0, "The sensor's position on the bus, from 0", 0, 255),
+    Row("publishing_frequency", 0.0, "Most messages a second, always the newest; 0 = every sample", 0, 1e6),
+    Row("array_topic", "/sensone_sensor_data", "Topic of the Float64MultiArray"),
+    Row("frame_id", "ft_sensor", "Frame of the wrench (its origin is the sensor's) and of the temperature"),
+    Row("imu_frame_id", "ft_sensor_imu", "Frame of the IMU's messages"),
+    Row(
+        "imu_raw_units",
+        ImuUnits.G_DPS.value,
+        "What the sensor sends acceleration and angular rate in",
+        choices=tuple(units.value for units in ImuUnits),
+    ),
+    Row("orientation_covariance", _UNKNOWN, f"Of the IMU's orientation, rad²: {_COVARIANCE}", 0, 1e12),
+    Row("angular_velocity_covariance", _UNKNOWN, f"Of the IMU, (rad/s)²: {_COVARIANCE}", 0, 1e12),
+    Row("linear_acceleration_covariance", _UNKNOWN, f"Of the IMU, (m/s²)²: {_COVARIANCE}", 0, 1e12),
+    Row("temperature_variance", 0.0, "Of the temperature, K²; 0 = unknown", 0, 1e6),
+    Row("diagnostics.stale_after", 0.5, "Seconds without a new sample that are an error", 0.05, 60),
+    Row("diagnostics.rate_tolerance", 0.05, "Part by which the rate may differ before it is a warning", 0, 1),
+    Row("diagnostics.age_warn", 0.01, "Age of the samples (p99), s, from which it is a warning", 0, 60),
+    Row("diagnostics.age_error", 0.1, "Age of the samples (p99), s, from which it is an error", 0, 60),
+    Row("diagnostics.lost_warn", 1, "Samples lost or skipped in a second that are a warning", 1, 10**6),
+    Row("diagnostics.temperature_warn", 60.0, "Temperature, °C, from which it is a warning", -40, 200),
+    Row("diagnostics.temperature_error", 80.0, "Temperature, °C, from which it is an error", -40, 200),
+    *COMPENSATION_ROWS,
+)
+
+
+class Thresholds(NamedTuple):
+    """Limits of the diagnostics: the parameters `diagnostics.*`."""
+
+    stale_after: float = 0.5
+    rate_tolerance: float = 0.05
+    age_warn: float = 0.01
+    age_error: float = 0.1
+    lost_warn: int = 1
+    temperature_warn: float = 60.0
+    temperature_error: float = 80.0
+
+
+class Parameters(NamedTuple):
+    """The parameters' values, checked."""
+
+    server_host: str
+    server_port: int
+    sensor: int
+    publishing_frequency: float
+    array_topic: str
+    imu_units: ImuUnits
+    frame_id: str = "ft_sensor"
+    imu_frame_id: str = "ft_sensor_imu"
+    orientation_covariance: Numbers = _UNKNOWN
+    angular_velocity_covariance: Numbers = _UNKNOWN
+    linear_acceleration_covariance: Numbers = _UNKNOWN
+    temperature_variance: float = 0.0
+    thresholds: Thresholds = Thresholds()
+    compensation: CompensationParameters = CompensationParameters()
+    """As they are at start."""
+
+
+def gather_all(values: dict[str, Any]) -> Parameters:
+    """From checked values by the rows' names, which it uses up; ParameterError if they do not go together."""
+    port, alias = values["server_port"], values["SERVER_PORT"]
+    if alias:
+        if port not in (SERVER_PORT.default, alias):
+            raise ParameterError(
+                f"parameters server_port is {port} and SERVER_PORT is {alias}: they are one thing, give one"
+            )
+        values["server_port"] = alias
+    del values["SERVER_PORT"]
+    compensation = gather({row.name: values.pop(row.name) for row in COMPENSATION_ROWS})
+    thresholds = Thresholds(**{name: values.pop(f"diagnostics.{name}") for name in Thresholds._fields})
+    units = ImuUnits(values.pop("imu_raw_units"))
+    return Parameters(**values, imu_units=units, thresholds=thresholds, compensation=compensation)

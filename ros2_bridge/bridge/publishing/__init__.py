@@ -1,0 +1,1 @@
+"""From samples to messages: topics and their serialized messages, and the compensated wrench."""

@@ -1,0 +1,159 @@
+"""`wrench_compensated` and what was subtracted, a topic each: the compensation as the reader runs it. No ROS.
+
+The reader calls `publish` for every selected sample, but only while somebody has subscribed or a window is
+open. What it goes by is a `Plan`, which the executor's thread replaces as a whole: there are no locks.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+from bridge.compensating.gravity_sources import NoSource, Source
+from ft_compensation.bias import BiasRamp
+from ft_compensation.compensator import Compensator
+from ft_compensation.quantities import ZERO, CompensationError
+from ft_compensation.still import StillLimits, StillMeans, StillWindow
+from protocol.pdo import Sample, Vector3
+
+
+class Plan(NamedTuple):
+    """What is done with a sample."""
+
+    source: Source
+    compensator: Compensator
+    ramp: BiasRamp
+    needs_gravity: bool
+    """Whether anything has weight."""
+
+
+class RestWindow:
+    """Samples of some time at rest, and where gravity pointed meanwhile."""
+
+    def __init__(self, seconds: float, limits: StillLimits, source: Source) -> None:
+        self.source = source
+        self.done = threading.Event()
+        self._still = StillWindow(seconds, limits)
+        self._fewest = limits.least_samples
+        self._gravity = ZERO
+        self._count = 0
+        self._blind: str | None = None
+
+    def add(self, sample: Sample, time_s: float, gravity: Vector3 | None) -> bool:
+        """Take a sample, for the reader. True: the window is complete."""
+        if gravity is not None:
+            (x, y, z), (gx, gy, gz) = self._gravity, gravity
+            self._gravity = (x + gx, y + gy, z + gz)
+            self._count += 1
+        elif self._blind is None:
+            self._blind = self.source.why_none(time_s)
+        still = self._still
+        # Too few samples, as of a slow sensor or a busy machine, make it longer.
+        if not still.add(sample, time_s) or not (still.count >= self._fewest or still.spoiled):
+            return False
+        self.done.set()
+        return True
+
+    @property
+    def count(self) -> int:
+        """Samples so far."""
+        return self._still.count
+
+    def means(self) -> StillMeans:
+        """What was read; CompensationError if the sensor did not rest."""
+        return self._still.means()
+
+    def gravity(self) -> Vector3 | None:
+        """Mean gravity in the sensor's frame, m/s²; None: from the means' own acceleration.
+
+        CompensationError if it was not known all the time.
+        """
+        if self.source.is_accelerometer:
+            return None
+        if self._blind is not None:
+            raise CompensationError(f"the orientation is not known: {self._blind}")
+        x, y, z = self._gravity
+        return x / self._count, y / self._count, z / self._count
+
+
+class StageTopic(Protocol):
+    """One stage of the compensation as a topic: `publishing.messages.StageTopic`."""
+
+    index: int
+    """Of the stage in `Stages`."""
+
+    def is_wanted(self) -> bool:
+        """Whether anybody has subscribed."""
+
+    def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+        """Publish a force and a torque."""
+
+
+class CompensatedOutput:
+    """An output of the reader's."""
+
+    fields = ("force", "torque", "acceleration", "angular_rate")
+
+    def __init__(self, topics: Sequence[StageTopic]) -> None:
+        self._all = topics
+        self._wanted: tuple[StageTopic, ...] = ()
+        self.plan = Plan(NoSource(), Compensator(), BiasRamp(), needs_gravity=False)
+        self.window: RestWindow | None = None
+        """The one that is open."""
+        self.hold: str | None = None
+        """Why nothing may be published for now, whatever else is known."""
+        self.published = self.withheld = 0
+        """Samples since the node started that were compensated, and that could not be."""
+        self.is_stopped = False
+        """Whether the latest could not."""
+        self.time_s = 0.0
+        """The latest sample's, seconds since the Unix epoch."""
+
+    def is_wanted(self) -> bool:
+        """Whether anybody has subscribed to any of the topics, or a window is open."""
+        self._wanted = tuple(topic for topic in self._all if topic.is_wanted())
+        if not self._wanted:
+            self.is_stopped = False  # nobody misses anything
+        return bool(self._wanted) or self.window is not None
+
+    @property
+    def has_subscribers(self) -> bool:
+        """Whether anybody has subscribed, as of the last look."""
+        return bool(self._wanted)
+
+    def follow(self, sample: Sample, stamp_ns: int) -> None:
+        """Have the source and the open window take in a sample that is not published."""
+        self.time_s = time_s = stamp_ns * 1e-9
+        self._gravity(self.plan, sample, time_s)
+
+    def _gravity(self, plan: Plan, sample: Sample, time_s: float) -> Vector3 | None:
+        """Gravity as far as it is needed, None if it is not known; the open window takes the sample in."""
+        window = self.window
+        gravity: Vector3 | None = ZERO
+        if plan.needs_gravity or window is not None:
+            gravity = plan.source.gravity(sample, time_s)
+            if window is not None and window.add(sample, time_s, gravity):
+                self.window = None
+            if not plan.needs_gravity:
+                gravity = ZERO
+        return gravity
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Compensate a sample and publish its stages; nothing if gravity is needed and not known."""
+        self.time_s = time_s = stamp_ns * 1e-9
+        plan = self.plan
+        gravity = self._gravity(plan, sample, time_s)
+        if gravity is None or self.hold is not None:
+            self.withheld += 1
+            self.is_stopped = True
+            return
+        self.is_stopped = False
+        compensator = plan.compensator
+        compensator.set_bias(plan.ramp.at(time_s))
+        stages = compensator.compensate(
+            sample.force, sample.torque, gravity, sample.acceleration, sample.angular_rate
+        )
+        for topic in self._wanted:
+            topic.send(*stages[topic.index], stamp_ns)
+        self.published += 1

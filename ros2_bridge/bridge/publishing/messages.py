@@ -1,0 +1,235 @@
+"""The ROS messages: each made and serialised once, then refilled and published.
+
+An output's `publish` runs in the reader's thread, for every selected sample and only while somebody has
+subscribed, so it must not block and should not allocate. To add a topic, add a class here and to `make`.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Callable, Sequence
+from typing import Any, Final, Protocol
+
+from geometry_msgs.msg import WrenchStamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import Imu, Temperature
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension
+
+from bridge.parameters.row import Numbers
+from bridge.parameters.table import Parameters
+from bridge.publishing.serialized import SerializedMessage, axes
+from ft_compensation.compensator import Stages
+from protocol.pdo import Sample, Vector3
+
+ARRAY_LABEL: Final = "Fx Fy Fz Mx My Mz Ax Ay Az Rx Ry Rz"
+"""The label of the array's one dimension: what its values are, in order."""
+ARRAY_SIZE: Final = len(ARRAY_LABEL.split())
+_DEPTH: Final = 10
+"""Short: what a subscriber is too slow for is replaced by newer samples."""
+_NO_ROTATION: Final = (0.0, 0.0, 0.0, 1.0)
+
+
+class Output(Protocol):
+    """A topic, or some that belong together, fed with every selected sample."""
+
+    def is_wanted(self) -> bool:
+        """Whether anybody is there for what `publish` does. Asked now and then, not by the reader."""
+
+    @property
+    def fields(self) -> Sequence[str]:
+        """The fields of `Sample` that it publishes: all of them are finite when `publish` is called."""
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish `sample`; `stamp_ns` is its time, ns since the Unix epoch."""
+
+    def follow(self, sample: Sample, stamp_ns: int) -> None:
+        """Take note of a sample that `publishing_frequency` leaves out."""
+
+
+class Outputs:
+    """All outputs. `wanted` are those that were so at the last `refresh`."""
+
+    def __init__(self, outputs: Sequence[Output]) -> None:
+        self.all = tuple(outputs)
+        self.wanted: tuple[Output, ...] = ()
+
+    def refresh(self) -> None:
+        """Look who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
+        self.wanted = tuple(output for output in self.all if output.is_wanted())
+
+    def publish_finite(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish a sample that is not finite everywhere where it is."""
+        for output in self.wanted:
+            if all(_is_finite(getattr(sample, field)) for field in output.fields):
+                output.publish(sample, stamp_ns)
+
+
+def make(node: Node, parameters: Parameters, *others: Output) -> Outputs:
+    """The node's outputs, `others` last."""
+    return Outputs(
+        [
+            ArrayOutput(node, parameters.array_topic),
+            WrenchOutput(node, "wrench", parameters.frame_id),
+            ImuOutput(node, "imu/data_raw", parameters),
+            TemperatureOutput(node, "temperature", parameters),
+            *others,
+        ]
+    )
+
+
+def create_publisher(node: Node, message_type: Any, topic: str) -> Any:
+    """A reliable publisher, unless parameters override its QoS."""
+    # A profile of its own each: rclpy writes what was overridden into the one it is given.
+    profile = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
+    options = QoSOverridingOptions.with_default_policies()
+    return node.create_publisher(message_type, topic, profile, qos_overriding_options=options)
+
+
+class Topic:
+    """A publisher, and whether anybody has subscribed."""
+
+    def __init__(self, node: Node, message_type: Any, topic: str) -> None:
+        self.publisher = create_publisher(node, message_type, topic)
+        self._publish: Callable[[bytes], None] = self.publisher.publish
+
+    def is_wanted(self) -> bool:
+        """Whether anybody has subscribed."""
+        return bool(self.publisher.get_subscription_count())
+
+    def follow(self, sample: Sample, stamp_ns: int) -> None:
+        """Nothing: each message stands by itself."""
+
+
+class ArrayOutput(Topic):
+    """`std_msgs/Float64MultiArray`: N, Nm, m/s², rad/s, in the order of ARRAY_LABEL."""
+
+    fields = ("force", "torque", "acceleration", "angular_rate")
+
+    def __init__(self, node: Node, topic: str) -> None:
+        super().__init__(node, Float64MultiArray, topic)
+        message = Float64MultiArray()
+        message.layout.dim = [
+            MultiArrayDimension(label=ARRAY_LABEL, size=ARRAY_SIZE, stride=ARRAY_SIZE)
+        ]  # fmt: skip
+        message.data = array("d", bytes(8 * ARRAY_SIZE))
+        self._serialized = SerializedMessage(
+            message, [[(message.data, position) for position in range(ARRAY_SIZE)]]
+        )
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:  # noqa: ARG002 - the message has no header
+        """Publish the twelve values."""
+        self._serialized.fill(0, sample.array)
+        self._publish(self._serialized.message())
+
+
+class WrenchTopic(Topic):
+    """`geometry_msgs/WrenchStamped`: N and Nm, in the sensor's frame."""
+
+    def __init__(self, node: Node, topic: str, frame_id: str) -> None:
+        super().__init__(node, WrenchStamped, topic)
+        message = WrenchStamped()
+        message.header.frame_id = frame_id
+        wrench = message.wrench
+        positions = [[*axes(wrench.force), *axes(wrench.torque)]]
+        self._serialized = SerializedMessage(message, positions, message.header.stamp)
+
+    def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+        """Publish a force and a torque."""
+        self._publish(self._serialized.filled(stamp_ns, force + torque))
+
+
+class WrenchOutput(WrenchTopic):
+    """The wrench as measured."""
+
+    fields = ("force", "torque")
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish force and torque."""
+        self.send(sample.force, sample.torque, stamp_ns)
+
+
+class StageTopic(WrenchTopic):
+    """One stage of the compensation."""
+
+    def __init__(self, node: Node, topic: str, frame_id: str, stage: str) -> None:
+        super().__init__(node, topic, frame_id)
+        self.index = Stages._fields.index(stage)
+
+
+def make_stages(node: Node, frame_id: str) -> list[StageTopic]:
+    """The topics of the compensation."""
+    stages = ("final", "bias", "gravity", "inertia")
+    names = ("wrench_compensated", "compensation/bias", "compensation/gravity", "compensation/inertia")
+    return [StageTopic(node, name, frame_id, stage) for name, stage in zip(names, stages, strict=True)]
+
+
+class ImuOutput(Topic):
+    """`sensor_msgs/Imu`: m/s², rad/s; the sensor's own orientation, if it estimates one."""
+
+    fields = ("acceleration", "angular_rate", "orientation")
+
+    def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
+        super().__init__(node, Imu, topic)
+        self._message = Imu()
+        self._message.header.frame_id = parameters.imu_frame_id
+        self._message.angular_velocity_covariance = _covariance(parameters.angular_velocity_covariance)
+        self._message.linear_acceleration_covariance = _covariance(parameters.linear_acceleration_covariance)
+        self._known = _covariance(parameters.orientation_covariance)
+        self._unknown = [-1.0, *[0.0] * 8]  # REP 145
+        self._message.orientation_covariance = self._unknown
+        self._has_orientation = False
+        self._serialized = self._serialize()
+
+    def _serialize(self) -> SerializedMessage:
+        message = self._message
+        positions = [
+            axes(message.linear_acceleration),
+            axes(message.angular_velocity),
+            axes(message.orientation, "xyzw"),
+        ]
+        return SerializedMessage(message, positions, message.header.stamp)
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish acceleration, angular rate and, where there is one, the orientation."""
+        if (sample.orientation is not None) is not self._has_orientation:
+            self._has_orientation = sample.orientation is not None
+            self._message.orientation_covariance = self._known if self._has_orientation else self._unknown
+            self._serialized = self._serialize()
+        serialized = self._serialized
+        serialized.stamp(stamp_ns)
+        serialized.fill(0, sample.acceleration)
+        serialized.fill(1, sample.angular_rate)
+        serialized.fill(2, sample.orientation or _NO_ROTATION)
+        self._publish(serialized.message())
+
+
+class TemperatureOutput(Topic):
+    """`sensor_msgs/Temperature`: °C, inside the sensor."""
+
+    fields = ("temperature",)
+
+    def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
+        super().__init__(node, Temperature, topic)
+        message = Temperature(variance=parameters.temperature_variance)
+        message.header.frame_id = parameters.frame_id
+        self._serialized = SerializedMessage(message, [[(message, "temperature")]], message.header.stamp)
+
+    def publish(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish the temperature."""
+        self._publish(self._serialized.filled(stamp_ns, (sample.temperature,)))
+
+
+def _covariance(values: Numbers) -> list[float]:
+    """Nine numbers, row by row, from nine or from three variances."""
+    if len(values) == 9:
+        return list(values)
+    return [values[position // 4] if position % 4 == 0 else 0.0 for position in range(9)]
+
+
+def _is_finite(value: float | Sequence[float] | None) -> bool:
+    if value is None:
+        return True
+    return math.isfinite(sum(value) if isinstance(value, Sequence) else value)

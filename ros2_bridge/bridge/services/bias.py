@@ -1,0 +1,61 @@
+"""The services that take, clear and undo the bias: `~/tare`, `~/clear_tare`, `~/undo_tare`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rclpy.node import Node
+
+from bridge.compensating.control import CompensationControl
+from bridge.services.triggers import create_triggers
+from bridge.services.window import take_window
+from ft_compensation.bias import estimate_bias, gravity_of
+from ft_compensation.quantities import NO_WRENCH, CompensationError, Wrench, length
+
+AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+
+
+class BiasServices:
+    """A tare blocks the executor for `rest.duration`, and never the stream."""
+
+    def __init__(self, node: Node, control: CompensationControl) -> None:
+        self._control, self._log = control, node.get_logger()
+        acts = {"tare": self._tare, "clear_tare": self._clear, "undo_tare": self._undo}
+        create_triggers(node, acts, CompensationError)
+
+    def _tare(self) -> str:
+        control = self._control
+        window = take_window(control)
+        means = window.means()
+        payload, gravity = control.parameters.payload, None
+        if payload.mass:
+            gravity = window.gravity() or gravity_of(means.acceleration, length(control.parameters.gravity))
+        control.set_bias(estimate_bias(means, payload, gravity), "tare")
+        control.note_rest(means.angular_rate)
+        weight = (
+            f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
+            if payload.mass
+            else "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds "
+            "in this orientation only"
+        )
+        return self._said(f"bias of {means.samples} samples: {wrench_text(control.bias)}; {weight}")
+
+    def _clear(self) -> str:
+        self._control.set_bias(NO_WRENCH, "cleared")
+        return self._said("the bias is zero")
+
+    def _undo(self) -> str:
+        return self._said(f"back to the bias before: {wrench_text(self._control.undo_bias())}")
+
+    def _said(self, text: str) -> str:
+        control = self._control
+        if control.parameters.bias_keep:
+            text += f"; not kept: {control.keeping}" if control.keeping else "; kept for the next start"
+        self._log.info(text)
+        return text
+
+
+def wrench_text(wrench: Wrench) -> str:
+    """A wrench for people."""
+    numbers = " ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, wrench.values, strict=True))
+    return f"{numbers} (N, Nm)"

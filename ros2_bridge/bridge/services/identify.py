@@ -1,0 +1,141 @@
+"""The services `~/identify/...`: the payload, from a few static poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rclpy.node import Node
+
+from bridge.compensating.bias_keeper import directory_of, expand
+from bridge.compensating.control import CompensationControl
+from bridge.parameters.compensation import AUTO
+from bridge.services.bias import wrench_text
+from bridge.services.triggers import create_triggers
+from bridge.services.window import take_window
+from ft_compensation.identification.parameter_file import write_yaml
+from ft_compensation.identification.payload import Identified
+from ft_compensation.identification.session import IdentificationSession, summary
+from ft_compensation.quantities import CompensationError, length
+
+
+class IdentifyServices:
+    """One identification at a time. A pose blocks the executor for `rest.duration`, and never the stream."""
+
+    def __init__(self, node: Node, control: CompensationControl) -> None:
+        self._control, self._log = control, node.get_logger()
+        self._session: IdentificationSession | None = None
+        self._sensors = control.sensors
+        """As of the session's start."""
+        self._result: Identified | None = None
+        """What was solved last, and fits the poses that there are."""
+        acts = {
+            "identify/start": self._start,
+            "identify/add_pose": self._add_pose,
+            "identify/drop_pose": self._drop_pose,
+            "identify/solve": self._solve,
+            "identify/apply": self._apply,
+            "identify/cancel": self._cancel,
+        }
+        create_triggers(node, acts, CompensationError)
+
+    def _start(self) -> str:
+        if self._control.parameters.orientation.source == "none":
+            raise CompensationError(
+                "orientation_source is none, so a pose says nothing: set it first (accelerometer needs "
+                "nothing but the sensor)"
+            )
+        before = f", the {len(self._session.poses)} poses before are dropped" if self._session else ""
+        self._session = IdentificationSession(length(self._control.parameters.gravity))
+        self._sensors = self._control.sensors
+        self._result = None
+        return self._said(
+            f"identification started{before}; gravity is known by {self._control.source.describe}; "
+            f"{self._session.coverage.next_pose}, hold it still with nothing touching the tool, and call "
+            "identify/add_pose"
+        )
+
+    def _add_pose(self) -> str:
+        session = self._started()
+        window = take_window(self._control)
+        means = window.means()
+        text = session.add(means, window.gravity())
+        self._control.note_rest(means.angular_rate)
+        self._result = None
+        return self._said(text)
+
+    def _drop_pose(self) -> str:
+        text = self._started().drop()
+        self._result = None
+        return self._said(text)
+
+    def _solve(self) -> str:
+        result = self._result = self._started().solve()
+        parts = [summary(result), *details(result)]
+        parts.append(f"{self._write(result, parts)}; identify/apply puts it in force")
+        return self._said(". ".join(parts))
+
+    def _apply(self) -> str:
+        if self._session is not None:
+            self._started()
+        result = self._result
+        if result is None:
+            raise CompensationError("there is no result to apply: call identify/solve first")
+        self._control.set_payload(result.payload, result.bias)
+        not_kept = self._control.keeping
+        return self._said(
+            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias; the "
+            "tool lasts until the node ends, start it with the file to have it again"
+            + (f"; the bias is not kept: {not_kept}" if not_kept else "")
+        )
+
+    def _cancel(self) -> str:
+        session = self._started()
+        self._session = self._result = None
+        return self._said(
+            f"identification cancelled, {len(session.poses)} poses dropped; nothing was changed"
+        )
+
+    def _started(self) -> IdentificationSession:
+        if self._session is not None and self._sensors != self._control.sensors:
+            self._session = self._result = None
+            raise CompensationError(
+                "another sensor is there now, so the poses before were dropped: call identify/start again"
+            )
+        if self._session is None:
+            raise CompensationError("no identification was started: call identify/start first")
+        return self._session
+
+    def _write(self, result: Identified, comment: list[str]) -> str:
+        try:
+            path = self._path()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_yaml(path, result, "\n".join(comment), self._control.parameters.gravity)
+        except (CompensationError, OSError) as error:
+            self._log.warning(f"the result of the identification is not written: {error}")
+            return f"Not written: {error}"
+        return f"Written to {path}"
+
+    def _path(self) -> Path:
+        parameters, info = self._control.parameters, self._control.link.info
+        if parameters.identify_file != AUTO:
+            return expand(parameters.identify_file, "identify.file")
+        serial = info.serial if info is not None and info.serial.isalnum() else "unknown"
+        return directory_of(parameters.bias_directory) / f"sensor-{serial}-payload.yaml"
+
+    def _said(self, text: str) -> str:
+        self._log.info(text)
+        return text
+
+
+def details(result: Identified) -> list[str]:
+    """What `summary` leaves out, a sentence each: bias, residuals by pose, condition, next pose."""
+    left = [
+        f"{position}: {length(residual.force):.2g} N {length(residual.torque):.2g} Nm"
+        for position, residual in enumerate(result.residuals, 1)
+    ]
+    return [
+        f"Bias {wrench_text(result.bias)}, ± {wrench_text(result.bias_interval)}",
+        f"Residuals by pose, {', '.join(left)}",
+        f"Condition {result.condition:.2f} (1.2 is ideal, beyond 10 is bad)",
+        f"One more pose would help most so: {result.coverage.next_pose}",
+    ]

@@ -1,0 +1,50 @@
+"""Takes a window of samples of the stationary sensor, for the services that need one."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from bridge.compensating.control import CompensationControl
+from bridge.publishing.compensated_wrench import RestWindow
+from ft_compensation.quantities import CompensationError
+
+_PATIENCE_S: Final = 2.0
+"""A window may take this much longer than half as long again as it lasts."""
+_LOOK_S: Final = 0.05
+
+
+def take_window(control: CompensationControl) -> RestWindow:
+    """The samples of the next `rest.duration`, whole; blocks the caller and never the stream.
+
+    CompensationError if they do not come or mean nothing.
+    """
+    if (conflict := control.conflict()) is not None:
+        raise CompensationError(conflict)
+    link = control.link
+    if link.connection is None:
+        raise CompensationError(f"{link.absence}, so there are no samples")
+    seconds, limits = control.parameters.rest_duration, control.parameters.rest
+    window = RestWindow(seconds, limits, control.source)
+    patience_s = 1.5 * seconds + _PATIENCE_S
+    deadline_s = time.monotonic() + patience_s
+    sensors, bad = control.sensors, control.count_not_finite()
+    control.output.window = window
+    try:
+        while not window.done.wait(_LOOK_S):
+            if control.ending:
+                raise CompensationError("the node ends")
+            if time.monotonic() > deadline_s:
+                raise CompensationError(
+                    f"only {window.count} samples came in {patience_s:.1f} s: see /diagnostics, stream"
+                )
+    finally:
+        control.output.window = None
+    if control.sensors != sensors:
+        raise CompensationError("the sensor was replaced by another meanwhile: call again")
+    if bad := control.count_not_finite() - bad:
+        raise CompensationError(
+            f"the window is spoiled: {bad} of its samples were not finite; see /diagnostics, stream, and "
+            "call again"
+        )
+    return window

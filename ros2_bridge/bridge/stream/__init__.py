@@ -1,0 +1,1 @@
+"""The stream from the server: connection, reader, frame selection. No ROS; imports only `parameters`."""

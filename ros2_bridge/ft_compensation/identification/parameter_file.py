@@ -1,0 +1,46 @@
+"""Payload and bias as a YAML file in the form of ROS 2 parameters, to start the node with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ft_compensation.identification.payload import Identified
+from ft_compensation.quantities import CompensationError, Payload, Wrench
+from protocol.pdo import Vector3
+
+
+class ParameterFileError(CompensationError):
+    """The file cannot be written; the text is one sentence that names it."""
+
+
+def to_yaml(
+    payload: Payload, bias: Wrench, gravity: Vector3 | None = None, comment: str = "", node: str = "/**"
+) -> str:
+    """The text of a parameter file for `node`; `comment` goes on top of it.
+
+    `gravity` is in the base frame, m/s²; without it the file does not say how the base stands.
+    """
+    rows: list[tuple[str, Sequence[float], str]] = [
+        ("tool_center_of_gravity", payload.center, "m, in the sensor's frame"),
+        ("bias", bias.values, "N, Nm: Fx Fy Fz Mx My Mz, subtracted"),
+    ]
+    if gravity is not None:
+        rows.append(("gravity", gravity, "m/s², in the base frame"))
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    lines += [f"{node}:", "  ros__parameters:", f"    tool_mass: {_number(payload.mass)}  # kg"]
+    lines += [f"    {name}: [{', '.join(map(_number, values))}]  # {unit}" for name, values, unit in rows]
+    return "\n".join(lines) + "\n"
+
+
+def write_yaml(path: Path, result: Identified, comment: str = "", gravity: Vector3 | None = None) -> None:
+    """Write what was identified; `gravity` as for `to_yaml`. ParameterFileError if that fails."""
+    try:
+        path.write_text(to_yaml(result.payload, result.bias, gravity, comment), encoding="utf-8")
+    except OSError as error:
+        raise ParameterFileError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def _number(value: float) -> str:
+    # YAML 1.1 takes 1e-05 for text, and ROS a number without a point for an integer.
+    return f"{value + 0.0:.9f}"

@@ -1,0 +1,180 @@
+"""Static poses for payload identification: what they have seen so far, and which one to take next.
+
+What counts is where gravity points in the sensor's frame. A turn about the vertical changes nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ft_compensation.bias import gravity_of
+from ft_compensation.quantities import ZERO, CompensationError, Wrench, length
+from ft_compensation.still import StillMeans
+from protocol.pdo import STANDARD_GRAVITY, Vector3
+
+LEAST_POSES: Final = 4
+MOST_POSES: Final = 1000
+LEAST_SPREAD: Final = 0.1
+"""Of the directions of gravity, in g: less along an axis counts as not seen."""
+_SAME_POSE: Final = 0.97
+"""Cosine: directions nearer than 14° are the same pose."""
+
+
+class Pose(NamedTuple):
+    """What was measured while the sensor was stationary, with nothing touching the tool."""
+
+    wrench: Wrench
+    """Mean, N and Nm; nothing subtracted."""
+    gravity: Vector3
+    """In the sensor's frame, m/s²."""
+    force_spread: Vector3 = ZERO
+    """Standard deviation of single samples, N."""
+    torque_spread: Vector3 = ZERO
+    """Likewise, Nm."""
+    samples: int = 1
+
+    @property
+    def up(self) -> Vector3:
+        """The direction in the sensor's frame that points up: opposite to gravity, length 1."""
+        x, y, z = self.gravity
+        size = length(self.gravity)
+        return -x / size, -y / size, -z / size
+
+
+def pose_of(means: StillMeans, gravity: Vector3 | None = None, magnitude: float = STANDARD_GRAVITY) -> Pose:
+    """A pose from a stationary window.
+
+    `gravity` (in the sensor's frame, m/s²) is from the window's own accelerometer, with length `magnitude`,
+    unless it is given. CompensationError if the accelerometer reads nothing like g.
+    """
+    if gravity is None:
+        gravity = gravity_of(means.acceleration, magnitude)
+    elif not length(gravity) > 0.0:
+        raise CompensationError("a pose without gravity says nothing about a payload")
+    return Pose(means.wrench, gravity, means.force_spread, means.torque_spread, means.samples)
+
+
+class Coverage(NamedTuple):
+    """How well some poses see a payload."""
+
+    poses: int
+    spread: Vector3
+    """Standard deviation of gravity's direction along three axes, in g, best seen first; 0.58 is ideal."""
+    worst: Vector3
+    """The worst seen direction, in the sensor's frame, length 1."""
+    missing: str | None
+    """Why the poses do not suffice, a sentence; None if they do."""
+    next_pose: str
+    """What to do next, a sentence."""
+
+
+def directions(poses: Sequence[Pose]) -> NDArray[np.float64]:
+    """Where gravity points in the sensor's frame: (n, 3), length 1."""
+    return -np.array([pose.up for pose in poses], dtype=np.float64).reshape(-1, 3)
+
+
+def coverage(poses: Sequence[Pose], *, one_axis: bool = False) -> Coverage:
+    """What `poses` have seen. With `one_axis`, poses about one axis may suffice (see `payload.identify`)."""
+    down = directions(poses)
+    if not poses:
+        return Coverage(
+            0, ZERO, (0.0, 0.0, 1.0), "there is no pose yet", _sentence(np.array((0.0, 0.0, 1.0)))
+        )
+    _, spread, axes = _spread(down)
+    worst = axes[2]
+    return Coverage(
+        len(poses),
+        _triple(spread),
+        _triple(worst * np.sign(worst[np.abs(worst).argmax()])),
+        _missing(len(poses), spread, axes, one_axis),
+        _sentence(_next_up(down)),
+    )
+
+
+def name_direction(direction: NDArray[np.float64]) -> str:
+    """A line in the sensor's frame in words: "the sensor's x axis", or its components."""
+    unit = direction / np.linalg.norm(direction)
+    axis = int(np.abs(unit).argmax())
+    if abs(unit[axis]) > _SAME_POSE:
+        return f"the sensor's {'xyz'[axis]} axis"
+    unit = unit * np.sign(unit[axis])
+    parts = ", ".join(f"{round(float(part), 2) + 0.0:.2f}" for part in unit)
+    return f"the direction ({parts}) of the sensor's frame"
+
+
+def _spread(
+    down: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Mean direction, standard deviations along the principal axes (largest first), the axes as rows."""
+    mean = down.mean(axis=0)
+    values, vectors = np.linalg.eigh(np.atleast_2d((down - mean).T @ (down - mean)) / len(down))
+    return mean, np.sqrt(np.maximum(values[::-1], 0.0)), vectors.T[::-1]
+
+
+def _missing(
+    count: int, spread: NDArray[np.float64], axes: NDArray[np.float64], one_axis: bool
+) -> str | None:
+    if spread[0] < LEAST_SPREAD:
+        same = "the only pose had" if count == 1 else f"all {count} poses had"
+        return (
+            f"{same} gravity in the same direction of the sensor's frame (turning about the vertical does "
+            "not count), so weight and bias cannot be told apart: mass and center of gravity are unseen"
+        )
+    if spread[1] < LEAST_SPREAD:
+        return (
+            f"gravity moved only along {name_direction(axes[0])}, so the center of gravity along it is "
+            "unseen: tilt the sensor about another axis too"
+        )
+    if spread[2] < LEAST_SPREAD and not one_axis:
+        return (
+            "the sensor was turned about one axis only: gravity never changed along "
+            f"{name_direction(axes[2])}, so nothing checks the answer in that direction (standard deviation "
+            f"{spread[2]:.2f} g, at least {LEAST_SPREAD:g} g is needed)"
+        )
+    least = LEAST_POSES - one_axis
+    if count < least:
+        return f"there {'is' if count == 1 else 'are'} {count} of at least {least} poses"
+    return None
+
+
+_CANDIDATES: Final = [
+    np.array(signs, dtype=np.float64)
+    for signs in sorted(
+        (signs for signs in itertools.product((1, 0, -1), repeat=3) if any(signs)),
+        key=lambda signs: (sum(map(abs, signs)), [-sign for sign in signs[::-1]]),
+    )
+]
+"""Directions that may point up: the axes, then between two of them, then between three."""
+
+
+def _next_up(down: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The candidate that, pointing up, helps the worst seen direction most; the simplest one of equals."""
+    best, best_gain = _CANDIDATES[0], -1.0
+    for candidate in _CANDIDATES:
+        up = candidate / np.linalg.norm(candidate)
+        _, spread, _ = _spread(np.vstack([down, -up]))
+        # Where one more pose cannot help the worst direction, it may help the second or the first.
+        gain = float(spread[2] + 0.1 * spread[1] + 0.01 * spread[0])
+        # One that was taken already is the last resort, and so is one that is hard to aim at.
+        gain -= 0.5 * bool((down @ -up).max() > _SAME_POSE) + 0.15 * (np.abs(candidate).sum() - 1)
+        if gain > best_gain + 1e-9:
+            best, best_gain = candidate, gain
+    return best
+
+
+def _sentence(up: NDArray[np.float64]) -> str:
+    axes = [f"{'+' if part > 0 else '-'}{name}" for name, part in zip("xyz", up, strict=True) if part]
+    if len(axes) == 1:
+        return f"turn the sensor so that its {axes[0]} axis points up"
+    named = ", ".join(axes[:-1]) + f" and {axes[-1]}"
+    return f"turn the sensor so that its {named} axes point up equally steeply"
+
+
+def _triple(values: NDArray[np.float64]) -> Vector3:
+    x, y, z = values.tolist()
+    return x, y, z

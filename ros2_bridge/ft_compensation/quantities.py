@@ -1,0 +1,76 @@
+"""What the parts of compensation hand to each other: wrench, payload, and the error with a sentence."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple, Self
+
+from protocol.pdo import STANDARD_GRAVITY, Vector3
+
+ZERO: Final[Vector3] = (0.0, 0.0, 0.0)
+DEFAULT_GRAVITY: Final[Vector3] = (0.0, 0.0, -STANDARD_GRAVITY)
+"""Gravity in the base frame (z up), m/s². The sensor's g is 9.80665 m/s², not 9.81."""
+
+
+class CompensationError(Exception):
+    """Something cannot be estimated, identified or kept; the text is one sentence for people."""
+
+
+class Wrench(NamedTuple):
+    """A load that acts on the sensor, at the sensor's wrench origin and in its frame."""
+
+    force: Vector3
+    """N"""
+    torque: Vector3
+    """Nm, about the wrench origin"""
+
+    @classmethod
+    def of(cls, values: object) -> Self:
+        """From six numbers: Fx Fy Fz (N) Mx My Mz (Nm). ValueError if they are not six finite numbers."""
+        fx, fy, fz, mx, my, mz = _finite(values, 6, "a wrench")
+        return cls((fx, fy, fz), (mx, my, mz))
+
+    @property
+    def values(self) -> tuple[float, float, float, float, float, float]:
+        """Fx Fy Fz (N) Mx My Mz (Nm)."""
+        return *self.force, *self.torque
+
+
+NO_WRENCH: Final = Wrench(ZERO, ZERO)
+
+
+class Payload(NamedTuple):
+    """What hangs on the sensor's tool side, taken for a point mass."""
+
+    mass: float = 0.0
+    """kg"""
+    center: Vector3 = ZERO
+    """Center of gravity in the sensor's frame, m from the wrench origin."""
+
+    @classmethod
+    def of(cls, mass: object, center: object) -> Self:
+        """ValueError, a sentence, if `mass` is not a number >= 0 or `center` not three numbers."""
+        (kilograms,) = _finite((mass,), 1, "a mass")
+        if kilograms < 0.0:
+            raise ValueError(f"a mass cannot be negative: {kilograms:g} kg")
+        x, y, z = _finite(center, 3, "a center of gravity")
+        return cls(kilograms, (x, y, z))
+
+
+NO_PAYLOAD: Final = Payload()
+
+
+def length(a: Vector3) -> float:
+    """The length of a vector."""
+    return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+
+
+def _finite(values: object, count: int, name: str) -> list[float]:
+    try:
+        numbers = [float(value) for value in values]  # type: ignore[attr-defined]
+    except (TypeError, ValueError, OverflowError):
+        numbers = []
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        of = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise ValueError(f"{name} is {of}, not {values!r:.80}")
+    return numbers

@@ -1,0 +1,1 @@
+"""A module for each option of `scripts/benchmark` that measures one part by itself."""

@@ -1,0 +1,104 @@
+"""What compensation costs the node for each sample, besides publishing, beside decoding the same sample."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+import numpy as np
+import rclpy
+from rclpy.context import Context
+from rich.console import Console
+from rich.table import Table
+
+from bridge.compensating.gravity_sources import AccelerometerSource
+from bridge.parameters.compensation import CompensationParameters
+from bridge.publishing.compensated_wrench import CompensatedOutput, Plan, RestWindow
+from bridge.publishing.messages import make_stages
+from ft_compensation.bias import BiasRamp
+from ft_compensation.compensator import Compensator
+from ft_compensation.quantities import ZERO, Payload, Wrench
+from ft_compensation.still import StillLimits
+from protocol.pdo import Sample, SampleDecoder, encode
+from scripts.benchmarks.chain import Setup
+from scripts.demonstration.program import DemoError
+
+SAMPLES: Final = 20_000
+SIZE: Final = 61
+MOST_US: Final = 20.0
+"""What it may cost."""
+_TOOL: Final = Payload(0.8, (0.004, -0.006, 0.055))
+_BIAS: Final = Wrench((3.0, -1.5, 7.25), (0.2, -0.05, 0.125))
+_START_NS: Final = 1_700_000_000_000_000_000
+
+Costs = dict[str, dict[str, float]]
+
+
+def frames() -> Iterator[bytes]:
+    """Process data of a sensor that lies still, upright, with its noise."""
+    noise = random.Random(1)
+    for _ in range(SAMPLES):
+        yield encode(
+            SIZE,
+            {
+                "force.x": noise.gauss(0.0, 0.3), "force.z": -8.0,
+                "acceleration.x": noise.gauss(0.0, 0.002), "acceleration.z": 1.0,
+            },
+        )  # fmt: skip
+
+
+def took(each: Callable[[int], object]) -> dict[str, float]:
+    """Median and p99, in µs, of calling `each` with the numbers from 0 on."""
+    times = []
+    for number in range(SAMPLES):
+        began = time.perf_counter_ns()
+        each(number)
+        times.append(time.perf_counter_ns() - began)
+    return {str(percent): float(np.percentile(times, percent)) / 1000 for percent in (50, 99)}
+
+
+def costs(setup: Setup) -> Costs:
+    """Each case's."""
+    data, decoder = list(frames()), SampleDecoder(SIZE)
+    samples: list[Sample] = [decoder.decode(one) for one in data]
+    step_ns = 1_000_000_000 // setup.rate_hz
+    found = {"decoding": took(lambda number: decoder.decode(data[number]))}
+    context = Context()
+    rclpy.init(args=[], context=context)
+    try:
+        node = rclpy.create_node("compensation_cost", context=context)
+        output = CompensatedOutput(make_stages(node, "ft"))
+
+        def measure(name: str, *, inertia: bool, window: bool) -> None:
+            source = AccelerometerSource(CompensationParameters(payload=_TOOL), ZERO)
+            output.plan = Plan(
+                source, Compensator(_TOOL, inertia=inertia), BiasRamp(_BIAS), needs_gravity=True
+            )
+            output.window = RestWindow(1e9, StillLimits(), source) if window else None
+            before = output.published
+            found[name] = took(lambda number: output.publish(samples[number], _START_NS + number * step_ns))
+            if output.published - before != SAMPLES:
+                raise DemoError(f"{name}: not all samples were compensated")
+
+        measure("bias and gravity", inertia=False, window=False)
+        measure("with inertia", inertia=True, window=False)
+        measure("with inertia, while a tare is taken", inertia=True, window=True)
+    finally:
+        rclpy.try_shutdown(context=context)
+    return found
+
+
+def measure_compensation(setup: Setup, console: Console) -> dict[str, Any]:
+    """Measure and print. DemoError if it costs too much."""
+    found = costs(setup)
+    table = Table("", "median, µs", "p99, µs", "of decoding", title="Compensation of a sample")
+    for name, cost in found.items():
+        ratio = cost["50"] / found["decoding"]["50"]
+        table.add_row(name, f"{cost['50']:.1f}", f"{cost['99']:.1f}", f"{ratio:.1f}")
+    console.print(table)
+    worst = max(found, key=lambda name: found[name]["50"])
+    if found[worst]["50"] > MOST_US:
+        raise DemoError(f"{worst} takes {found[worst]['50']:.1f} µs a sample, more than {MOST_US:g} µs")
+    return found

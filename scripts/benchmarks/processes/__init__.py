@@ -1,0 +1,1 @@
+"""Programs that the benchmark starts, each as a process of its own."""

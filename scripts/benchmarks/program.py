@@ -1,0 +1,266 @@
+"""The benchmark, started by scripts/benchmark in a network namespace of its own: arguments, order, files."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import datetime
+import json
+import os
+import platform
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from rich.console import Console
+
+from ethercat_server.errors import ServerError
+from scripts.benchmarks import chains
+from scripts.benchmarks.chain import OVERSAMPLING_HZ, Setup, virtual_bus
+from scripts.benchmarks.modes.cpp import measure_cpp
+from scripts.benchmarks.modes.node import measure_node
+from scripts.benchmarks.modes.soak import soak
+from scripts.benchmarks.modes.vendor import measure_vendor
+from scripts.benchmarks.plot import Curves, draw
+from scripts.benchmarks.records import may_be_real_time
+from scripts.benchmarks.report import print_configuration
+from scripts.demonstration.program import DemoError, Stopped, ignore_signals, loopback_up, on_signal
+
+MOST_CPUS: Final = 4
+"""CPUs used: each of them runs a canary."""
+_WIDTH: Final = 100
+"""Minimum width of the tables."""
+_SECONDS: Final = 6.0
+_QUICK_SECONDS: Final = 3.0
+_RATES: Final = tuple(OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512))
+
+
+class Mode(NamedTuple):
+    """An option that measures one thing, by itself."""
+
+    measure: Callable[[Setup, Console], dict[str, Any]]
+    help: str
+    seconds: float = _SECONDS
+    """Default duration."""
+
+
+def _compensation(setup: Setup, console: Console) -> dict[str, Any]:
+    if find_spec("rclpy") is None:
+        raise DemoError("no ROS 2 here (rclpy): install the extra 'ros' or source ROS 2")
+    from scripts.benchmarks.modes.compensation import measure_compensation  # noqa: PLC0415 - needs ROS 2
+
+    return measure_compensation(setup, console)
+
+
+MODES: Final[dict[str, Mode]] = {
+    "compensation": Mode(_compensation, "only what compensation costs the node for each sample"),
+    "cpp": Mode(measure_cpp, "only the C++ client, against a bare read"),
+    "node": Mode(
+        measure_node, "only the ROS 2 node: ages beside a TCP client, CPU, first message after a stop", 15.0
+    ),
+    "vendor": Mode(measure_vendor, "only the server and a TCP client, beside Bota's own Python driver", 12.0),
+}
+
+
+@dataclass
+class Progress:
+    """Shows what is being measured."""
+
+    console: Console
+    total: int
+    done: int = 0
+
+    @contextlib.contextmanager
+    def part(self, what: str) -> Iterator[None]:
+        """One chain."""
+        self.done += 1
+        text = f"[{self.done}/{self.total}] {what}"
+        if self.console.is_terminal:
+            with self.console.status(text):
+                yield
+        else:
+            print(text, flush=True)
+            yield
+
+
+def measure(setup: Setup, with_ros: bool, progress: Progress) -> tuple[dict[str, Any], Curves]:
+    """One configuration: everything side by side on the same virtual sensors."""
+    name = f"{setup.rate_hz} Hz, {setup.sensors} sensor{'s' * (setup.sensors > 1)}"
+    result: dict[str, Any] = {
+        "rate_hz": setup.rate_hz,
+        "sensors": setup.sensors,
+        "project": {},
+        "polling": None,
+    }
+    curves: Curves = {}
+    floor_s = setup.seconds / 2
+    with virtual_bus(setup) as (ifname, sensor):
+        with progress.part(f"{name}: floor"):
+            result["floor"], curves["floor"] = chains.floor(setup, ifname, floor_s, setup.priority)
+            if setup.priority and setup.sensors == 1:
+                result["floor_ordinary"], _ = chains.floor(setup, ifname, floor_s, 0)
+        programs = {"project": (chains.project_tcp, chains.project_ros)}
+        if setup.sensors == 1:  # the polling programs know one sensor only
+            programs["polling"] = (chains.polling_tcp, chains.polling_ros)
+        for program, (to_client, to_subscriber) in programs.items():
+            with progress.part(f"{name}: {program}, TCP"):
+                figures, curves[f"{program}, TCP"] = to_client(setup, ifname, sensor)
+                result[program] = {"tcp": figures, "ros": None}
+            if with_ros:
+                with progress.part(f"{name}: {program}, ROS"):
+                    figures, curves[f"{program}, ROS"] = to_subscriber(setup, ifname, sensor)
+                    result[program]["ros"] = figures
+    return result, curves
+
+
+def run(options: argparse.Namespace, console: Console) -> None:
+    """Measure, show, write. DemoError or Stopped end it early."""
+    loopback_up()
+    os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:MOST_CPUS]))
+    priority = options.rt_priority
+    if priority and not may_be_real_time():
+        console.print("no real-time scheduling here (CAP_SYS_NICE): everything runs with ordinary scheduling")
+        priority = 0
+    if options.ros and find_spec("rclpy") is None:
+        console.print("no ROS 2 here (rclpy): only up to a TCP client")
+        options.ros = False
+    seconds = options.seconds or (_QUICK_SECONDS if options.quick else _SECONDS)
+
+    def setup(rate: int, sensors: int) -> Setup:
+        return Setup(rate, sensors, seconds, warm_up_s=1.0, priority=priority, ppm=options.ppm)
+
+    if options.soak:
+        result: dict[str, Any] = soak(setup(options.rates[0], options.sensors[0]), options.soak * 60, console)
+        write_json(options.json, options, priority, soak=result)
+        print(f"written: {options.json}")
+        return
+    for name, mode in MODES.items():
+        if getattr(options, name):
+            one = replace(
+                setup(options.rates[0], options.sensors[0]), seconds=options.seconds or mode.seconds
+            )
+            result = mode.measure(one, console)
+            write_json(options.json, options, priority, **{name: result})
+            print(f"written: {options.json}")
+            return
+    wanted = [setup(rate, sensors) for rate in options.rates for sensors in options.sensors]
+    ways = 2 if options.ros else 1
+    progress = Progress(console, sum(1 + ways * (2 if one.sensors == 1 else 1) for one in wanted))
+    began = time.monotonic()
+    results, curves = [], {}
+    for one in wanted:
+        result, curves[one.rate_hz, one.sensors] = measure(one, options.ros, progress)
+        results.append(result)
+    for result in results:
+        print_configuration(result, console)
+    write_json(options.json, options, priority, seconds=seconds, configurations=results)
+    written = str(options.json)
+    try:
+        draw(curves, options.plot)
+        written += f" and {options.plot}"
+    except DemoError as error:
+        console.print(str(error))
+    print(f"{time.monotonic() - began:.0f} s; written: {written}")
+
+
+def write_json(path: Path, options: argparse.Namespace, priority: int, **results: Any) -> None:
+    """Everything that was measured, and where and how."""
+    content = {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "machine": {
+            "kernel": platform.release(),
+            "machine": platform.machine(),
+            "cpus_used": len(os.sched_getaffinity(0)),
+            "python": platform.python_version(),
+            "load_average": os.getloadavg(),
+        },
+        "rt_priority": priority,
+        "ppm": options.ppm,
+        **results,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def parse(argv: list[str] | None = None) -> argparse.Namespace:
+    """The command line; argparse exits with 2 for what is wrong with it."""
+    parser = argparse.ArgumentParser(
+        prog="scripts/benchmark",
+        description="Measure this project beside the floor of this machine and a polling design.",
+    )
+    here = Path(os.environ.get("CALLED_FROM") or Path.cwd())
+    folder = here / "benchmark-results"
+    parser.add_argument("--quick", action="store_true", help="one configuration only, in half a minute")
+    parser.add_argument("--seconds", type=_seconds, help=f"how long each chain is measured ({_SECONDS:g})")
+    parser.add_argument("--json", type=Path, default=folder / "benchmark.json", metavar="FILE")
+    parser.add_argument("--plot", type=Path, default=folder / "benchmark.png", metavar="FILE.png")
+    parser.add_argument("--rates", type=_rates, metavar="HZ,...", help="sample rates (800,1600)")
+    parser.add_argument("--sensors", type=_counts, metavar="N,...", help="sensors on the bus (1,2)")
+    parser.add_argument("--ppm", type=float, default=150.0, help="the sensors' clock error (%(default)g)")
+    parser.add_argument("--soak", type=float, metavar="MINUTES", help="only the server: losses, memory")
+    for name, mode in MODES.items():
+        parser.add_argument(f"--{name}", action="store_true", help=mode.help)
+    parser.add_argument("--no-ros", dest="ros", action="store_false", help="TCP only")
+    parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
+                        help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip
+    options = parser.parse_args(argv)
+    options.json, options.plot = here / options.json, here / options.plot
+    only_one = options.quick or options.soak or any(getattr(options, name) for name in MODES)
+    options.rates = options.rates or ([800] if only_one else [800, 1600])
+    options.sensors = options.sensors or ([1] if only_one else [1, 2])
+    return options
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.5 <= value <= 3600:
+        raise argparse.ArgumentTypeError("must be from 0.5 to 3600")
+    return value
+
+
+def _rates(text: str) -> list[int]:
+    rates = [int(word) for word in text.split(",")]
+    if not set(rates) <= set(_RATES):
+        raise argparse.ArgumentTypeError(f"rates must be among {', '.join(map(str, sorted(_RATES)))}")
+    return rates
+
+
+def _counts(text: str) -> list[int]:
+    counts = [int(word) for word in text.split(",")]
+    if not all(1 <= count <= 16 for count in counts):
+        raise argparse.ArgumentTypeError("numbers of sensors must be from 1 to 16")
+    return counts
+
+
+def main() -> int:
+    """Run; returns the exit code."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    directory = os.environ.get("DEMO_DIRECTORY")
+    made = None if directory else tempfile.mkdtemp()
+    os.environ["DEMO_DIRECTORY"] = directory or str(made)
+    try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+        options = parse()
+        run(options, Console(width=max(Console().width, _WIDTH)))
+    except Stopped:
+        print("stopped; nothing is written", file=sys.stderr)
+        return 130
+    except (DemoError, ServerError, OSError) as error:
+        print(f"benchmark: {error}", file=sys.stderr)
+        return 1
+    finally:
+        ignore_signals()
+        shutil.rmtree(os.environ["DEMO_DIRECTORY"], ignore_errors=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""What the benchmark's recording processes share: the record, its file, the warm-up, the scheduling.
+
+A record is five whole numbers: position of the sensor, number of the sample, CLOCK_MONOTONIC of the sample
+as it says itself, the same as the server says (0: it does not), CLOCK_MONOTONIC of its arrival.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import socket
+import time
+from array import array
+from pathlib import Path
+from typing import Final
+
+COLUMNS: Final = 5
+_NS: Final = 1_000_000_000
+
+
+class Recording:
+    """Keeps what arrives once the warm-up is over, for a time; then writes it to `path`."""
+
+    def __init__(self, path: Path, warm_up_s: float, seconds: float) -> None:
+        self._path = path
+        self._warm_up_ns = int(warm_up_s * _NS)
+        self._length_ns = int(seconds * _NS)
+        self._from_ns = 0
+        self._until_ns = 0
+        self._values = array("q")
+
+    def take(self, position: int, number: int, instant_ns: int, stamp_ns: int, received_ns: int) -> bool:
+        """Note one arrival; False when the time is over."""
+        if received_ns < self._from_ns:
+            return True
+        if not self._until_ns:
+            if not self._from_ns:
+                self._from_ns = received_ns + self._warm_up_ns
+                return True
+            self._until_ns = received_ns + self._length_ns
+            began(self._path).touch()
+        self._values.extend((position, number, instant_ns, stamp_ns, received_ns))
+        return received_ns < self._until_ns
+
+    def write(self) -> None:
+        """Write all records."""
+        write(self._path, self._values)
+
+
+def began(path: Path) -> Path:
+    """The file that appears when recording into `path` begins."""
+    return path.with_suffix(".began")
+
+
+def write(path: Path, values: array[int]) -> None:
+    """Write whole numbers, so that the file is there only when it is complete."""
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_bytes(values.tobytes())
+    unfinished.replace(path)
+
+
+def recording_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments that every recording process takes."""
+    parser.add_argument("path", type=Path)
+    parser.add_argument("--warm-up", type=float, default=1.0)
+    parser.add_argument("--seconds", type=float, default=5.0)
+
+
+def steady(priority: int) -> None:
+    """Make this process as steady as the server makes itself: SCHED_FIFO, or fine timers; no collector."""
+    if priority:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    else:
+        Path("/proc/self/timerslack_ns").write_text("1000", encoding="ascii")
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+
+def may_be_real_time() -> bool:
+    """Whether this process may have real-time scheduling."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
+def sleep_until(due_ns: int) -> int:
+    """Sleep until CLOCK_MONOTONIC is `due_ns`; the time then."""
+    if (left := due_ns - time.monotonic_ns()) > 0:
+        time.sleep(left * 1e-9)
+    return time.monotonic_ns()
+
+
+def connect(port: int) -> socket.socket:
+    """Connect to a program on this machine as soon as it listens."""
+    while True:
+        try:
+            return socket.create_connection(("127.0.0.1", port))
+        except ConnectionRefusedError:
+            time.sleep(0.02)

@@ -1,0 +1,1 @@
+"""`scripts/demo`: starts the whole chain, measures it, shows it."""

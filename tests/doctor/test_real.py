@@ -1,0 +1,250 @@
+"""The doctor on real interfaces and as other users: what only the kernel can answer.
+
+What it makes of the answers is tested on made-up machines and simulated buses.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ethercat_server.doctor.cli import main
+from ethercat_server.doctor.machine.facts import Link, Routes, collect
+from ethercat_server.links.holder import find_holder
+from tests.doctor.running import MODULE, doctor, doctor_here, doctor_of_nobody, levels
+from tests.server import readable
+from tests.server.as_another_user import NOBODY
+from tests.server.commands import command, stats
+from tests.server.running import (
+    PATIENCE_S,
+    Program,
+    Veth,
+    needs_bus,
+    server,
+    virtual_sensor,
+    wait_until,
+)
+
+pytestmark = [pytest.mark.bus, needs_bus]
+Bench = tuple[Veth, Program]
+QUICK = ("--json", "--seconds", "0.2")
+_ATTEMPTS = 3
+_STARVED = ("no EtherCAT slave answers", "does not answer")
+LOOK = ("--json", "--seconds", "0")
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    """Two sensors of different models at 100 Hz, which takes little of the machine."""
+    models = "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8"
+    with virtual_sensor("--model", models, "--serial", "10,20", "--sinc", "512") as (veth, sensor):
+        yield veth, sensor
+
+
+def promiscuous(veth: Veth) -> bool:
+    return "promiscuity 0" not in veth.ip("-d", "link", "show", veth.near)
+
+
+def test_the_whole_doctor(bench: Bench) -> None:
+    """pysoem's frames, a process that measures with real-time scheduling, facts from the kernel."""
+    veth, sensor = bench
+    ended = doctor(veth.near, *QUICK)
+    found = ended.findings("bus")
+    assert found["slaves"]["values"] == {"slaves": 2}
+    assert set(levels(found).values()) == {"ok"}
+    measured = ended.findings("measurement")
+    assert measured["wake-ups"]["values"]["wake_ups"] > 0
+    assert measured["messages"]["values"]["p50"] > 0
+    interface, others = ended.findings("interface"), ended.findings("other software")
+    assert interface["link"]["values"]["kind"] == "veth"
+    assert interface["driver"]["values"]["driver"] == "veth"
+    assert interface["coalescing"]["level"] == "ok"
+    assert others["addresses"]["level"] in {"ok", "note"}, "nothing but a link-local address"
+    assert others["listeners"]["level"] in {"ok", "warning"}
+    for position in range(2):
+        now = stats(sensor, position)
+        assert (now["al_state"], now["al_error"], now["sdo_write_count"]) == ("INIT", False, 0)
+    assert not promiscuous(veth), "SOEM leaves it so"
+
+
+def test_a_terminal_gets_colour_and_is_told_what_takes_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether its output is a terminal is the kernel's to say."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("NO_COLOR", "")
+    ours, its = os.openpty()
+    with open(its, "w") as terminal, contextlib.redirect_stdout(terminal):  # noqa: PTH123
+        main(["nosuch0", "--seconds", "0.05", "--rt-priority", "0"])
+    shown = b""
+    with contextlib.suppress(OSError):  # EIO: the other end is closed
+        while part := os.read(ours, 65536):
+            shown += part
+    os.close(ours)
+    assert b"\x1b[32mok" in shown
+    assert b"measuring for 0.05 s ..." in shown
+
+
+@pytest.mark.parametrize(
+    ("commands", "up", "carrier", "master", "addresses"),
+    [
+        ([], True, True, False, ()),
+        ([("link", "set", "{near}", "down")], False, False, False, ()),
+        ([("link", "set", "{far}", "down")], True, False, False, ()),
+        ([("address", "add", "192.0.2.77/32", "dev", "{near}")], True, True, False, ("192.0.2.77/32",)),
+        (
+            [("link", "add", "{bridge}", "type", "bridge"), ("link", "set", "{near}", "master", "{bridge}")],
+            True,
+            True,
+            True,
+            (),
+        ),
+    ],
+    ids=["up", "down", "no carrier", "with an address", "in a bridge"],
+)
+def test_the_kernel_says_what_an_interface_is_used_for(
+    commands: list[tuple[str, ...]], up: bool, carrier: bool, master: bool, addresses: tuple[str, ...]
+) -> None:
+    """No frame is sent where there is an address or a bridge: the kernel says so in messages of its own."""
+    with contextlib.ExitStack() as cleanup:
+        veth = cleanup.enter_context(Veth())
+        names = {"near": veth.near, "far": veth.far, "bridge": f"eb{os.getpid()}"}
+        bridge = ["ip", "link", "del", names["bridge"]]
+        cleanup.callback(subprocess.run, bridge, check=False, capture_output=True)
+        for words in commands:
+            veth.ip(*(word.format(**names) for word in words))
+        facts = collect(veth.near)
+        assert isinstance(facts.link, Link)
+        assert isinstance(facts.routes, Routes)
+        assert (facts.link.kind, facts.link.up, facts.link.carrier) == ("veth", up, carrier)
+        assert bool(facts.link.master) == master
+        assert facts.routes.addresses == addresses
+        assert not facts.routes.default
+
+
+def test_another_master_is_not_disturbed(bench: Bench) -> None:
+    """Which process has a socket is known to the kernel alone."""
+    veth, sensor = bench
+    found = doctor_here(veth.far, *LOOK).findings("bus")["slaves"]
+    assert found["level"] == "bad"
+    assert f"process {sensor.process.pid}" in found["found"]
+    assert found["commands"] == [f"sudo kill {sensor.process.pid}"]
+
+
+def is_running(pid: str) -> bool:
+    """Whether this process is there and no zombie, whose parent need not be quick."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@contextlib.contextmanager
+def measuring(ifname: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A doctor that has found two slaves and measures until it is stopped, and what it said so far.
+
+    Started again where a busy machine let the virtual sensor's process wait for too long.
+    """
+    for _ in range(_ATTEMPTS):
+        command = [sys.executable, "-m", MODULE, ifname, "--seconds", "600"]
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as running:
+            assert running.stdout is not None
+            said = ""
+            try:
+                while not any(words in said for words in ("slave 1 errors", *_STARVED)):
+                    line = running.stdout.readline()
+                    assert line, said
+                    said += line
+                if "slave 1 errors" in said:
+                    yield running, said
+                    return
+            finally:
+                running.kill()
+    pytest.fail(said)
+
+
+def test_stopped_while_it_measures_it_leaves_nothing_behind(bench: Bench) -> None:
+    """A signal from outside, a child process, sockets, and another doctor's look at them."""
+    veth, sensor = bench
+    with measuring(veth.near) as (running, said):
+
+        def receivers() -> list[str]:
+            return Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
+
+        def listens() -> bool:
+            holder = find_holder(veth.near)
+            return holder is None or holder.address is not None
+
+        wait_until(lambda: bool(receivers()), "the receiver")
+        wait_until(lambda: not listens(), "its connection")
+        started = receivers()
+        second = doctor_here(veth.near, *LOOK).findings("bus")["slaves"]
+        running.send_signal(signal.SIGINT)
+        _, err = running.communicate(timeout=PATIENCE_S)
+    assert f"process {running.pid}" in second["found"]
+    assert "2 slaves answer" in said
+    assert (running.returncode, err) == (1, "ethercat-doctor: stopped\n")
+    wait_until(lambda: not any(is_running(pid) for pid in started), "the receiver's end")
+    assert stats(sensor)["al_state"] == "INIT"
+    assert not promiscuous(veth)
+
+
+def test_without_rights_it_says_what_it_skipped(bench: Bench) -> None:
+    """Another user's rights, as the kernel grants them."""
+    veth, sensor = bench
+    before = command(sensor, "stats")
+    ended = doctor_of_nobody(veth.near, *QUICK)
+    assert not ended.json["root"]
+    assert ended.findings("bus")["slaves"]["found"] == (
+        "not checked: CAP_NET_RAW and CAP_NET_ADMIN missing; run with sudo"
+    )
+    assert ended.findings("rights")["capabilities"]["level"] == "note"
+    assert ended.findings("measurement")["scheduling"]["values"] == {"real_time": False}
+    assert ended.findings("measurement")["wake-ups"]["values"]["wake_ups"] > 0
+    assert ended.findings("interface")["driver"]["values"]["driver"] == "veth", "this needs no rights"
+    assert before.partition("sensors")[0] == command(sensor, "stats").partition("sensors")[0], (
+        "no frame was sent"
+    )
+
+
+def test_another_user_sees_that_an_interface_is_in_use_but_not_by_whom(bench: Bench) -> None:
+    """The kernel shows other users' sockets, but not whose they are."""
+    become = ("setpriv", f"--reuid={NOBODY.pw_uid}", f"--regid={NOBODY.pw_gid}", "--clear-groups")
+    readable.need(*become)
+    script = f"from ethercat_server.links.holder import find_holder; print(find_holder({bench[0].far!r}))"
+    seen = subprocess.run(
+        [*readable.under(), *become, readable.PYTHON, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert seen.stdout == "another EtherCAT master\n"
+
+
+def test_virtual_brings_a_bus_of_its_own_and_takes_it_away() -> None:
+    """A network namespace and its interfaces."""
+    ended = doctor("virtual", *QUICK)
+    assert ended.findings("bus")["slave 0"]["found"].startswith("BFT-SENS-ECAT-M8, serial 1")
+    assert ended.findings("measurement")["age of data"]["values"]["p50"] > 0
+    assert ended.json["interface"] == "virtual"
+    assert "ecat" not in str([row["commands"] for row in ended.json["findings"]]), (
+        "what is gone needs no mending"
+    )
+
+
+def test_the_server_that_holds_the_interface_is_asked(bench: Bench) -> None:
+    """Its process and port come from the kernel's tables, its replies over a real socket."""
+    veth, _ = bench
+    with server(veth.near, "--rt-priority", "0", "--set", "sinc_length=512") as running:
+        ended = doctor_here(veth.near, *QUICK)
+    found = ended.findings("server")
+    assert f"process {running.process.pid}" in found["server"]["found"]
+    assert found["server"]["values"]["port"] == running.port
+    assert not ended.findings("bus")
+    assert not ended.findings("measurement"), "its loop is the measurement"

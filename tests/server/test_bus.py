@@ -1,0 +1,202 @@
+"""Datagrams and exchanges on a wire in memory: answers matched by index, late and foreign frames dropped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import pytest
+
+from ethercat_server.acquisition.start_up import bring_up
+from ethercat_server.ethercat.backend import Backend
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.wire import Command, build, parse, working_counter
+from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.simulation.machine import Machine, SimulatedClock
+from ethercat_server.virtual_sensor.measurement.signals import decode_clock
+from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.pdo import LAYOUTS
+from tests.simulation import Asked
+
+STATION = 0x1001
+Answer = Callable[[bytearray], list[bytes]]
+
+
+class ScriptedWire:
+    """A wire on which every frame is answered as a test says; waiting takes simulated time only."""
+
+    ifname = "scripted"
+
+    def __init__(self, answer: Answer = lambda _: []) -> None:
+        self.clock = SimulatedClock(Machine(wake_ns=0))
+        self.answer = answer
+        self.sent: list[bytes] = []
+        self._coming: list[bytes] = []
+
+    def send(self, frame: bytearray) -> None:
+        self.sent.append(bytes(frame))
+        self._coming += self.answer(bytearray(frame))
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        if self._coming:
+            return self._coming.pop(0)
+        self.clock.sleep(max(timeout_s, 0))
+        return None
+
+
+def scripted(answer: Answer = lambda _: []) -> tuple[Bus, ScriptedWire]:
+    wire = ScriptedWire(answer)
+    bus = Bus(cast(Backend, wire))
+    bus.stations = [STATION]
+    return bus, wire
+
+
+def done(frame: bytearray, data: bytes = b"", wkc: int = 1) -> bytes:
+    """The frame as it comes back from slaves that did what it asks."""
+    datagram = parse(frame, len(frame))[0]
+    frame[datagram.data : datagram.data + len(data)] = data
+    frame[datagram.end : datagram.end + 2] = wkc.to_bytes(2, "little")
+    return bytes(frame)
+
+
+def test_a_datagram_brings_back_its_data() -> None:
+    bus, _ = scripted(lambda frame: [done(frame, b"\x08\x00")])
+    assert bus.read_register(0, 0x0130, 2) == b"\x08\x00"
+    assert bus.read_at(0, 0x0130, 2) == b"\x08\x00"
+    assert bus.count_slaves(2, 0.01) == 1
+
+
+def test_what_is_on_the_wire_is_a_datagram_of_the_standard() -> None:
+    bus, wire = scripted()
+    assert not bus.write_register(0, 0x0120, b"\x02\x00")
+    (frame,) = wire.sent
+    assert frame[12:14] == b"\x88\xa4"
+    assert len(frame) == 60
+    assert int.from_bytes(frame[14:16], "little") == 0x1000 | 14
+    assert frame[16] == Command.FPWR
+    assert frame[18:24] == STATION.to_bytes(2, "little") + b"\x20\x01" + b"\x02\x00"
+    assert frame[26:30] == b"\x02\x00\x00\x00", "data, then the working counter"
+    bus.read_at(3, 0x0130, 2)
+    assert wire.sent[1][16:20] == bytes((Command.APRD, wire.sent[1][17], 0xFD, 0xFF)), "minus the position"
+
+
+def test_a_slave_that_did_not_do_it_and_a_lost_frame_are_no_answer() -> None:
+    for answer in (lambda frame: [done(frame, wkc=0)], lambda _: []):
+        bus, _ = scripted(answer)
+        assert not bus.write_register(0, 0x1000, b"\1")
+        assert bus.read_register(0, 0x0130, 2) is None
+    assert bus.count_slaves(2, 0.01) == -1
+
+
+def foreign_frames() -> list[bytes]:
+    soem = bytes(build((Command.LRW, 0, 0, b"\4\0"), first_index=3).ljust(60, b"\0"))
+    short = b"\xff" * 6 + b"\x01" * 6 + b"\x88\xa4"
+    other = bytes(build((Command.FPRD, STATION, 0x0130, b"\4\0\0"), first_index=0x81).ljust(60, b"\0"))
+    return [soem, short, b"", other, bytes(60)]
+
+
+def test_neither_late_nor_foreign_frames_are_taken_for_the_answer() -> None:
+    late: list[bytes] = []
+
+    def answer(frame: bytearray) -> list[bytes]:
+        answers = [*late, *foreign_frames(), done(frame, b"\x02\x00")]
+        late[:] = [done(frame, b"\x04\x00")]
+        return answers
+
+    bus, _ = scripted(answer)
+    assert [bus.read_register(0, 0x0130, 2) for _ in range(5)] == [b"\x02\x00"] * 5
+
+
+def test_indices_are_none_of_soems() -> None:
+    bus, wire = scripted()
+    for _ in range(300):
+        bus.read_register(0, 0x0130, 2)
+    assert {frame[17] for frame in wire.sent} == set(range(0x80, 0x100))
+
+
+def operational(*sensors: SensorOptions, machine: Machine | None = None) -> tuple[Bus, MemoryBackend]:
+    backend = MemoryBackend(*sensors, machine=machine)
+    bus = Bus(backend)
+    bring_up(bus, Asked(), lambda: None)
+    return bus, backend
+
+
+def exchange(bus: Bus) -> int:
+    bus.send()
+    return bus.receive(0.01)
+
+
+def test_an_exchange_brings_every_sensors_process_data() -> None:
+    sensors = [
+        SensorOptions(serial=n, pdo_size=size, signal="constant") for n, size in enumerate((61, 77, 61))
+    ]
+    bus, backend = operational(*sensors)
+    assert exchange(bus) == 9
+    assert [bus.working_counter(position) for position in range(3)] == [3, 3, 3]
+    for position, options in enumerate(sensors):
+        life = backend.sensors.sensors[position].life
+        assert life is not None
+        assert bus.process_data(position) == life.inputs()
+        assert len(bus.process_data(position)) == options.pdo_size
+
+
+def test_process_data_that_does_not_fit_one_frame_goes_in_several() -> None:
+    bus, backend = operational(*(SensorOptions(serial=n, pdo_size=77, signal="constant") for n in range(20)))
+    sent: list[int] = []
+    send = backend.send
+
+    def noted(frame: bytearray) -> None:
+        sent.append(len(frame))
+        send(frame)
+
+    cast(Any, bus)._send = noted
+    assert exchange(bus) == 60
+    assert len(sent) == 2
+    assert max(sent) <= 1514
+    for position in range(20):
+        life = backend.sensors.sensors[position].life
+        assert life is not None
+        assert bus.process_data(position) == life.inputs()
+
+
+def test_a_lost_frame_is_a_miss_and_the_data_stay_those_of_before() -> None:
+    bus, backend = operational(SensorOptions(signal="constant"))
+    assert exchange(bus) == 3
+    before = bus.process_data(0)
+    backend.command("lose 1")
+    assert exchange(bus) == -1
+    assert bus.process_data(0) == before
+    assert exchange(bus) == 3
+
+
+@pytest.mark.parametrize("late", [0.2, 0.9])
+def test_a_frame_that_comes_too_late_is_never_taken_for_the_next_ones(late: float) -> None:
+    bus, backend = operational(SensorOptions(signal="clock"))
+    backend.wire = type(backend.wire)(Machine(seed=5, late=late, late_ns=15_000_000, frame_jitter_ns=0))
+    seen: list[bytes] = []
+    for _ in range(300):
+        sent_ns = backend.clock.now_ns
+        if exchange(bus) == 3:
+            instant_ns = decode_clock(LAYOUTS[61].struct.unpack(bus.process_data(0))[2:8]).instant_ns
+            assert sent_ns - 1_250_000 <= instant_ns <= backend.clock.now_ns
+            seen.append(bus.process_data(0))
+        backend.clock.sleep(0.00125)
+    assert len(seen) > 10
+    assert len(set(seen)) > 0.9 * len(seen), "each brought what the sensor had then"
+
+
+def test_a_frame_that_is_cut_short_is_a_miss() -> None:
+    bus, backend = operational(SensorOptions(signal="constant"))
+    receive = backend.receive
+
+    def cut(timeout_s: float) -> bytes | None:
+        frame = receive(timeout_s)
+        return frame[:40] if frame is not None else None
+
+    cast(Any, bus)._receive = cut
+    assert exchange(bus) == -1
+
+
+def test_working_counters_add_up() -> None:
+    frame = bytearray(done(build((Command.BRD, 0, 0, b"\0\0")), wkc=7))
+    assert working_counter(frame, parse(frame, len(frame))[0]) == 7

@@ -1,0 +1,246 @@
+"""The buses of the tool and the doctor in memory: no processes, no interface, no real time.
+
+    with simulated_bus("--serial", "10,20") as bus:
+        bus.command("power cycle 0.5")
+        result = run_here(main, "plan", bus.near, "--set", "fir=on")
+        assert bus.written(1) == []
+
+Within `simulated_bus` whatever opens an interface gets these virtual sensors; within `simulated_server`
+whatever connects to a server gets one that streams them. Time passes only while somebody waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from ethercat_server.acquisition.cycle import Cycle
+from ethercat_server.acquisition.jobs import Jobs
+from ethercat_server.acquisition.recovery import Recovery
+from ethercat_server.acquisition.start_up import bring_up
+from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.doctor.bus import measurement
+from ethercat_server.doctor.bus.receiver import MESSAGE
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.links import direct
+from ethercat_server.links.remote import ServerLink
+from ethercat_server.process import realtime
+from ethercat_server.serving.actions import Actions
+from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.sensor_actions import SensorActions
+from ethercat_server.serving.transport.in_memory import InMemoryTransport
+from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.simulation.machine import Machine
+from ethercat_server.virtual_sensor.cli import build_parser, options_from
+from protocol.client import blocking
+from protocol.control import request
+from protocol.errors import ConnectionFailedError
+from protocol.framing import DataMessage, FrameDecoder, encode_json
+from protocol.text.json_text import JsonObject
+from tests.simulation import Asked, NoWatchdog
+
+PATIENCE_S = 60.0
+"""Simulated time that anything may take."""
+SINC_LENGTH, RATE_HZ = 512, 100
+"""What a server sets the sensors to: the fewer samples, the faster it is simulated."""
+MESSAGE_NS = 40_000
+"""How long a message takes to the doctor's client."""
+
+
+class SimulatedBus:
+    """Virtual sensors on the interface `near`."""
+
+    near = "lo"
+    """The doctor asks the kernel about it, so there must be such an interface; nothing is sent there."""
+
+    def __init__(self, backend: MemoryBackend) -> None:
+        self.backend = backend
+        self.clock = backend.clock
+
+    def command(self, line: str) -> str:
+        """Have a fault command of the virtual sensor obeyed now; returns its answer."""
+        answer = self.backend.command(line)
+        assert answer.startswith("ok"), answer
+        return answer[3:]
+
+    def at(self, seconds: float, action: str | Callable[[], object]) -> None:
+        """Have a fault command obeyed, or `action` called, so many seconds from now."""
+
+        def act() -> None:
+            if isinstance(action, str):
+                self.command(action)
+            else:
+                action()
+
+        self.clock.at(self.clock.now_ns + round(seconds * 1e9), act)
+
+    def power_cycle(self) -> None:
+        """Off, on again, and nobody looks meanwhile."""
+        self.command("power cycle 0.1")
+        self.clock.sleep(0.2)
+
+    def stats(self, position: int = 0) -> dict[str, Any]:
+        """What a virtual sensor says of itself."""
+        found: dict[str, Any] = json.loads(self.command("stats"))["sensors"][position]
+        return found
+
+    def written(self, position: int = 0) -> list[tuple[str, int, str]]:
+        """The SDO writes so far: index, sub-index, data."""
+        return [(row["index"], row["subindex"], row["hex"]) for row in self.stats(position)["sdo_writes"]]
+
+
+@contextlib.contextmanager
+def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterator[SimulatedBus]:
+    """Sensors as `ethercat-virtual-sensor IFACE arguments...` simulates; nobody writes their calibration."""
+    options = options_from(build_parser().parse_args(["lo", *map(str, arguments)]))
+    bus = SimulatedBus(MemoryBackend(*options.sensors, machine=machine))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(direct, "open_bus", lambda _ifname, _cleanup: Bus(bus.backend))
+        patch.setattr(realtime, "prepare", lambda _priority, _cpu: None)
+        patch.setattr(measurement, "_client", _client)
+        yield bus
+    assert not any(bus.stats(position)["calibration_writes"] for position in range(len(options.sensors)))
+
+
+class SimulatedServer:
+    """A server that streams the sensors of a bus, while somebody waits for something from it."""
+
+    address = "localhost:12001"
+
+    def __init__(self, bus: SimulatedBus) -> None:
+        self.bus = bus
+        self.events: list[JsonObject] = []
+        self.clock = _ServersClock(self)
+        self.hangs = False
+        """Whether it is stopped by somebody."""
+        ethercat = Bus(bus.backend)
+        sensors = bring_up(ethercat, Asked({"sinc_length": SINC_LENGTH}), lambda: None)
+        self.streams = [SensorStream(sensor.position, sensor.period_ns, bus.clock) for sensor in sensors]
+        self.transport = InMemoryTransport(bus.clock)
+        self.hub = Hub(self.transport, bus.clock.monotonic_ns)
+        self.recovery = Recovery(ethercat, sensors, self.streams, self._announce)
+        self.jobs = Jobs(ethercat, sensors)
+        self.cycle = Cycle(ethercat, sensors, self.streams, self, self.recovery, self.jobs, NoWatchdog())
+        actions = SensorActions(ethercat, self.hub, self.recovery, self.jobs, sensors, self.streams)
+        self.hub.start(Actions(self.hub, self.cycle, actions).handle)
+        self._stop_if: Callable[[], object] = lambda: False
+
+    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
+        """See `Outlet`."""
+        self.hub.publish(frame, position, flags, now_ns)
+
+    def serve(self, until_ns: int) -> None:
+        """See `Outlet`."""
+        self.hub.serve(until_ns)
+        if self._stop_if():
+            self.cycle.stop()
+
+    def _announce(self, event: JsonObject) -> None:
+        self.events.append(event)
+        self.hub.broadcast(event)
+
+    def run_until(self, condition: Callable[[], object], seconds: float = PATIENCE_S) -> bool:
+        """Let it run until `condition` holds, at most for this simulated time; returns whether it does."""
+        until_ns = self.bus.clock.now_ns + round(seconds * 1e9)
+        if self.hangs:
+            self.bus.clock.sleep(seconds)
+        elif not condition() and seconds > 0:
+            self._stop_if = lambda: condition() or self.bus.clock.now_ns >= until_ns
+            self.cycle.stopping = False
+            self.cycle.run()
+        return bool(condition())
+
+    def connect(self) -> _Connection:
+        """A connection for this test's own requests."""
+        return _Connection(self)
+
+
+@contextlib.contextmanager
+def simulated_server(bus: SimulatedBus) -> Iterator[SimulatedServer]:
+    """A server that streams from `bus`, behind every address."""
+    server = SimulatedServer(bus)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(blocking, "FramedConnection", lambda *_: _Connection(server))
+        patch.setattr(ServerLink, "clock", server.clock)
+        yield server
+
+
+class _ServersClock:
+    """A client's time: while it sleeps, the server goes on."""
+
+    def __init__(self, server: SimulatedServer) -> None:
+        self._server = server
+
+    def monotonic_ns(self) -> int:
+        """See `Clock`."""
+        return self._server.bus.clock.monotonic_ns()
+
+    def time_ns(self) -> int:
+        """See `Clock`."""
+        return self._server.bus.clock.time_ns()
+
+    def sleep(self, seconds: float, /) -> None:
+        """See `Clock`."""
+        self._server.run_until(lambda: False, seconds)
+
+
+class _Connection:
+    """A `FramedConnection` in memory."""
+
+    def __init__(self, server: SimulatedServer) -> None:
+        self._server = server
+        self._end = server.transport.connect(buffer_size=1 << 20)
+        self._decoder = FrameDecoder()
+
+    def wait(self, timeout_s: float) -> bool:
+        """See `FramedConnection`."""
+        return self._server.run_until(lambda: self._end.readable, timeout_s)
+
+    def receive(self, *, wait: bool = True) -> bool | None:
+        """See `FramedConnection`."""
+        if self._end.at_end:
+            raise ConnectionFailedError("the server closed it")
+        self._decoder.feed(self._end.recv_all())
+        return False
+
+    def next_message(self) -> DataMessage | JsonObject | None:
+        """See `FramedConnection`."""
+        return self._decoder.next_message()
+
+    def send(self, message: JsonObject) -> None:
+        """See `FramedConnection`."""
+        self._end.send(encode_json(message))
+
+    def close(self) -> None:
+        """See `FramedConnection`."""
+        self._end.close()
+
+    def ask(self, action: str, **values: object) -> JsonObject:
+        """The reply to a request; for tests that look at the server themselves."""
+        self.send(request(action, 1, **values))
+        while self.wait(PATIENCE_S):
+            self.receive()
+            while (message := self.next_message()) is not None:
+                if isinstance(message, dict) and "reply" in message:
+                    return message
+        pytest.fail(f"no reply to {action}")
+
+
+class _Receiver:
+    """Stands for the process in which the doctor's client runs."""
+
+    def __init__(self) -> None:
+        self.result: dict[int, int] = {}
+
+    def send(self, message: bytes) -> None:
+        number, _ = MESSAGE.unpack(message)
+        self.result[number] = MESSAGE_NS
+
+
+@contextlib.contextmanager
+def _client() -> Iterator[_Receiver]:
+    yield _Receiver()

@@ -1,0 +1,307 @@
+"""The whole server in memory: loop, recovery, jobs, hub and clients on virtual sensors, in simulated time.
+
+    simulation = Simulation(machine=Machine(seed=3, lost=0.01))
+    client = simulation.connect()
+    client.ask("subscribe")
+    simulation.command("power cycle 0.5")
+    client.wait_event("sensor_back")
+    assert client.ask("status")["sensors"][0]["recoveries"] == 1
+    check_frames(simulation.frames)
+
+Time passes while a client waits for something, and by `run`. Nothing really waits, nothing else runs: a
+failure is repeated by the same arguments, step by step in a debugger.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from ethercat_server.acquisition.cycle import Cycle
+from ethercat_server.acquisition.jobs import Jobs
+from ethercat_server.acquisition.recovery import Recovery
+from ethercat_server.acquisition.start_up import bring_up
+from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.sensor.sensor import Identity
+from ethercat_server.serving.actions import Actions
+from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.sensor_actions import SensorActions
+from ethercat_server.serving.transport.in_memory import InMemoryTransport
+from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.simulation.machine import Machine
+from ethercat_server.virtual_sensor.measurement.signals import ClockReading, decode_clock
+from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.control import request
+from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_json
+from protocol.pdo import LAYOUTS
+from protocol.settings import SettingValue, start_up_defaults
+from protocol.text.json_text import JsonObject
+
+PATIENCE_S = 60.0
+"""Simulated time that anything may take."""
+OLD = DataFlag.REPEATED | DataFlag.INVALID
+
+
+class Asked:
+    """What command line and configuration ask of the sensors; see `start_up.Wanted`."""
+
+    sensor_name: str | None = None
+
+    def __init__(self, settings: Mapping[str, SettingValue] = {}) -> None:
+        self._settings = dict(settings)
+
+    def wanted_settings(self, _position: int, _name: str, _serial: int) -> dict[str, SettingValue]:
+        return {**start_up_defaults(), **self._settings}
+
+    def asked_settings(self, _position: int, _name: str, _serial: int) -> dict[str, SettingValue]:
+        return dict(self._settings)
+
+    def check_sensors(self, found: Mapping[int, Identity]) -> None:
+        pass
+
+
+class NoWatchdog:
+    feed_every_ns = 1 << 62
+
+    def feed(self) -> None:
+        pass
+
+
+class Simulation:
+    """A server that streams. `frames` has all that it handed to its clients, `events` what it announced."""
+
+    def __init__(
+        self,
+        *sensors: SensorOptions,
+        machine: Machine | None = None,
+        settings: Mapping[str, SettingValue] = {},
+        backend: MemoryBackend | None = None,
+    ) -> None:
+        """`backend` is that of a simulation before, for a server that is started again."""
+        self.backend = backend or MemoryBackend(*sensors, machine=machine)
+        self.clock = self.backend.clock
+        self.started_ns = self.clock.now_ns
+        self.transport = InMemoryTransport(self.clock)
+        self.hub = Hub(self.transport, self.clock.monotonic_ns)
+        self.bus = Bus(self.backend)
+        self.sensors = bring_up(self.bus, Asked(settings), lambda: None)
+        self.streams = [SensorStream(s.position, s.period_ns, self.clock) for s in self.sensors]
+        self.events: list[JsonObject] = []
+        self.recovery = Recovery(self.bus, self.sensors, self.streams, self._announce)
+        self.jobs = Jobs(self.bus, self.sensors)
+        self.cycle = Cycle(self.bus, self.sensors, self.streams, self, self.recovery, self.jobs, NoWatchdog())
+        actions = SensorActions(self.bus, self.hub, self.recovery, self.jobs, self.sensors, self.streams)
+        self.hub.start(Actions(self.hub, self.cycle, actions).handle)
+        self.clients: list[Client] = []
+        self.frames: list[DataMessage] = []
+        self.published_ns: list[int] = []
+        """When each was handed out."""
+        self._decoder = FrameDecoder()
+        self._awaited: Callable[[], object] = lambda: False
+        self.on_serve: Callable[[int], None] = lambda _: None
+
+    # -- what the loop hands its samples to
+
+    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
+        self._decoder.feed(frame)
+        for message in self._decoder:
+            assert isinstance(message, DataMessage)
+            self.frames.append(message)
+            self.published_ns.append(self.clock.now_ns)
+        self.hub.publish(frame, position, flags, now_ns)
+
+    def serve(self, until_ns: int) -> None:
+        self.on_serve(until_ns)
+        self.hub.serve(until_ns)
+        for client in self.clients:
+            client.receive()
+        if self._awaited():
+            self.cycle.stop()
+
+    def _announce(self, event: JsonObject) -> None:
+        self.events.append(event)
+        self.hub.broadcast(event)
+
+    # -- what a test does
+
+    def connect(self, uid: int | None = 0, *, buffer_size: int = 65536) -> Client:
+        """A client of user `uid`, on a framed connection."""
+        return Client(self, uid, buffer_size)
+
+    def command(self, line: str) -> str:
+        """Have a fault command of the virtual sensor obeyed now; returns its answer."""
+        answer = self.backend.command(line)
+        assert answer.startswith("ok"), answer
+        return answer[3:]
+
+    def stats(self, position: int = 0) -> dict[str, Any]:
+        """What a virtual sensor says of itself."""
+        found: dict[str, Any] = json.loads(self.command("stats"))["sensors"][position]
+        return found
+
+    def at(self, seconds: float, action: str | Callable[[], object]) -> None:
+        """Have a fault command obeyed, or `action` called, so many seconds from now."""
+
+        def act() -> None:
+            if isinstance(action, str):
+                self.command(action)
+            else:
+                action()
+
+        self.clock.at(self.clock.now_ns + round(seconds * 1e9), act)
+
+    def run(self, seconds: float) -> None:
+        """Let the loop run for this simulated time."""
+        self.at(seconds, self.cycle.stop)
+        self._run()
+
+    def run_until(self, condition: Callable[[], object], what: str, seconds: float = PATIENCE_S) -> None:
+        """Let the loop run until `condition` holds."""
+        deadline_ns = self.clock.now_ns + round(seconds * 1e9)
+        met = False
+
+        def look() -> bool:
+            nonlocal met
+            met = bool(condition())
+            return met or self.clock.now_ns >= deadline_ns
+
+        if not condition():
+            self._awaited = look
+            self._run()
+            self._awaited = lambda: False
+            assert met or condition(), f"{what}: not within {seconds} s; events: {self.events[-6:]}"
+
+    def _run(self) -> None:
+        self.cycle.stopping = False
+        self.cycle.run()
+
+    def status(self) -> dict[str, Any]:
+        return self.cycle.status()
+
+    def close(self) -> None:
+        """The server ends, as by SIGTERM: the sensors go to INIT, the clients are disconnected."""
+        self.hub.close()
+        self.backend.close()
+
+
+class Client:
+    """A framed connection that keeps everything; simulated time passes while it waits for something."""
+
+    def __init__(self, simulation: Simulation, uid: int | None, buffer_size: int) -> None:
+        self.simulation = simulation
+        self.stream = simulation.transport.connect(uid, buffer_size=buffer_size)
+        self.frames: list[DataMessage] = []
+        self.events: list[JsonObject] = []
+        """Those that `wait_event` has not returned."""
+        self.replies: list[JsonObject] = []
+        self.reads = True
+        """Whether it takes what arrives."""
+        self._decoder = FrameDecoder()
+        self._id = 0
+        simulation.clients.append(self)
+
+    def receive(self) -> None:
+        """Take what has arrived."""
+        if not self.reads or not self.stream.readable:
+            return
+        self._decoder.feed(self.stream.recv_all())
+        for message in self._decoder:
+            if isinstance(message, DataMessage):
+                self.frames.append(message)
+            else:
+                (self.events if "event" in message else self.replies).append(message)
+
+    @property
+    def at_end(self) -> bool:
+        """Whether the server has closed the connection."""
+        return self.stream.at_end
+
+    def send(self, action: str, **keys: object) -> int:
+        """Send a request; returns its id."""
+        self._id += 1
+        self.stream.send(encode_json(request(action, self._id, **keys)))
+        return self._id
+
+    def ask(self, action: str, **keys: object) -> dict[str, Any]:
+        """The reply to a request."""
+        return self.reply(self.send(action, **keys))
+
+    def reply(self, number: int) -> dict[str, Any]:
+        """Wait for the reply to the request with this id."""
+
+        def found() -> list[JsonObject]:
+            return [reply for reply in self.replies if reply.get("id") == number]
+
+        self.simulation.run_until(found, f"the reply to request {number}")
+        return found()[0]
+
+    def wait_event(self, name: str, sensor: int = 0) -> JsonObject:
+        """The first event of this name that has not been returned yet."""
+
+        def found() -> list[JsonObject]:
+            return [e for e in self.events if e["event"] == name and e.get("sensor", sensor) == sensor]
+
+        self.simulation.run_until(found, name)
+        event = found()[0]
+        self.events.remove(event)
+        return event
+
+    def collect(self, count: int) -> list[DataMessage]:
+        """The next `count` frames."""
+        self.frames.clear()
+        self.simulation.run_until(lambda: len(self.frames) >= count, f"{count} frames")
+        return self.frames[:count]
+
+    def fresh(self, count: int) -> list[DataMessage]:
+        """The next `count` frames that are new and valid samples."""
+        self.frames.clear()
+        self.simulation.run_until(lambda: len(fresh(self.frames)) >= count, f"{count} new samples")
+        return fresh(self.frames)[:count]
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.stream.close()
+        self.simulation.clients.remove(self)
+
+
+def fresh(frames: Iterable[DataMessage]) -> list[DataMessage]:
+    """Those that carry a new sample."""
+    return [frame for frame in frames if not frame.flags & OLD]
+
+
+def reading(frame: DataMessage) -> ClockReading:
+    """The number and the instant that a sensor with the signal `clock` wrote into its sample."""
+    return decode_clock(LAYOUTS[len(frame.process_data)].struct.unpack(frame.process_data)[2:8])
+
+
+def check_frames(frames: Iterable[DataMessage], *, complete: bool = True, bad_wire: bool = False) -> None:
+    """What holds for one sensor's frames in every run, whatever happened; its signal has to be `clock`.
+
+    Nothing comes twice, nothing out of order, no old sample as a new one. `complete` if all frames that the
+    server made are there: then they are numbered without a gap, and what is missing is flagged. On a
+    `bad_wire` an exchange may take so long that nobody can know when the sensor answered: one sample in 200
+    may be missing without a flag.
+    """
+    last: DataMessage | None = None
+    new: DataMessage | None = None
+    visible, unflagged, count = True, 0, 0
+    for frame in frames:
+        if last is not None:
+            assert frame.sequence > last.sequence, "numbered through"
+            assert not complete or frame.sequence == last.sequence + 1
+            if frame.flags & OLD and complete:
+                assert frame.process_data == last.process_data, "it has nothing new to say"
+        # A sensor that gives the same data again for a while was watched: nothing was lost on the way.
+        visible |= bool(frame.flags & (DataFlag.GAP | DataFlag.REPEATED))
+        last = frame
+        if frame.flags & OLD:
+            continue
+        if new is not None:
+            before, after = reading(new), reading(frame)
+            assert after.instant_ns > before.instant_ns, "an old sample as a new one"
+            assert frame.monotonic_ns > new.monotonic_ns
+            unflagged += after.number != before.number + 1 and not visible
+        new, visible, count = frame, False, count + 1
+    assert unflagged <= bad_wire * (1 + count // 200), f"{unflagged} of {count} follow a loss without a flag"

@@ -1,0 +1,213 @@
+"""The architecture as one table: which room may import which, read from the sources."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+ROOT: Final = Path(__file__).parent.parent
+ROOTS: Final = {"bridge": ROOT / "ros2_bridge", "ft_compensation": ROOT / "ros2_bridge"}
+S: Final = "ethercat_server"
+
+PROTOCOL: Final = {"protocol", "protocol.text", "protocol.sensor"}
+ETHERCAT: Final = {S, f"{S}.ethercat"}
+SENSOR: Final = ETHERCAT | {f"{S}.sensor"} | PROTOCOL
+ACQUISITION: Final = SENSOR | {f"{S}.acquisition"}
+SERVING: Final = ACQUISITION | {f"{S}.serving"}
+DAEMON: Final = SERVING | {f"{S}.process", f"{S}.daemon", f"{S}.virtual_sensor"}
+LINKS: Final = ACQUISITION | {f"{S}.process", f"{S}.virtual_sensor", f"{S}.links", "protocol.client"}
+CLIENTS: Final = {"clients", "clients.recording", "protocol.client"} | PROTOCOL
+
+ROOMS: Final[dict[str, set[str]]] = {
+    "protocol": PROTOCOL,
+    "protocol.text": {"protocol.text", "protocol.errors"},
+    "protocol.sensor": PROTOCOL,
+    "protocol.client": PROTOCOL | {"protocol.client"},
+    # The server: ethercat <- sensor <- acquisition <- serving <- daemon.
+    S: {S},
+    f"{S}.ethercat": ETHERCAT,
+    f"{S}.sensor": SENSOR,
+    f"{S}.acquisition": ACQUISITION,
+    f"{S}.serving": SERVING,
+    f"{S}.process": {S, f"{S}.process", "protocol.errors"},
+    f"{S}.daemon": DAEMON,
+    # Programs beside the server.
+    f"{S}.virtual_sensor": SENSOR | {f"{S}.process", f"{S}.virtual_sensor"},
+    f"{S}.simulation": SENSOR | {f"{S}.virtual_sensor", f"{S}.simulation"},
+    f"{S}.links": LINKS,
+    f"{S}.tool": LINKS | {f"{S}.daemon", f"{S}.tool"},
+    f"{S}.doctor": LINKS | {f"{S}.daemon", f"{S}.doctor"},
+    # ROS 2.
+    "ft_compensation": {"ft_compensation"} | PROTOCOL,
+    "bridge": {"bridge", "ft_compensation", "protocol.client"} | PROTOCOL,
+    # Programs that are ordinary clients of the server.
+    "clients": {"clients"} | PROTOCOL,
+    "clients.recording": CLIENTS,
+    "clients.record": CLIENTS | {"clients.record"},
+    "clients.report": CLIENTS | {"clients.report"},
+    "clients.monitor": CLIENTS | {"clients.monitor"},
+    "clients.replay": CLIENTS | {"clients.replay", f"{S}.serving", S},
+    "clients.identify": CLIENTS | {"clients.identify", "ft_compensation"},
+}
+"""A room, and the rooms it may import. A room without a line of its own belongs to the one above it."""
+
+PACKAGES: Final[dict[str, set[str]]] = {
+    "pysoem": {f"{S}.ethercat.soem"},
+    "pyroute2": {S},
+    "numpy": {"ft_compensation", "bridge", "clients"},
+    "matplotlib": {"clients.report"},
+    "mcap": {"clients.recording"},
+    "zstandard": {"clients.recording"},
+    "jinja2": {"clients.report.page"},
+    "rich": {"clients"},
+    "textual": {"clients.monitor.app"},
+} | {
+    ros: {"bridge"}
+    for ros in (
+        "rclpy", "std_msgs", "std_srvs", "geometry_msgs", "sensor_msgs", "diagnostic_msgs", "rcl_interfaces",
+        "tf2_ros",
+    )
+}  # fmt: skip
+"""Everything that is not the standard library, and which modules may load it."""
+
+WITHOUT_ROS: Final = (
+    "bridge.stream", "bridge.client", "bridge.middleware", "bridge.signals", "bridge.parameters.table",
+    "bridge.compensating.gravity_sources", "bridge.publishing.compensated_wrench",
+    "bridge.diagnostics.health", "bridge.diagnostics.observer",
+)  # fmt: skip
+"""What can run, and be tested, where there is no ROS; `bridge.client` loads it later."""
+SOCKETS: Final = {"socket", "socketserver", "select", "selectors", "asyncio", "ssl"}
+THREADS: Final = {"threading", "_thread", "multiprocessing", "concurrent", "subprocess", "queue"}
+MOST_LINES: Final = 300
+MOST_MODULES: Final = 8
+
+
+def modules() -> Iterator[tuple[str, Path]]:
+    """Every module of the product: its dotted name and its file."""
+    for package in ("protocol", S, "bridge", "ft_compensation", "clients"):
+        root = ROOTS.get(package, ROOT)
+        for path in sorted((root / package).rglob("*.py")):
+            parts = path.relative_to(root).with_suffix("").parts
+            yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
+
+
+MODULES: Final = dict(modules())
+
+
+def imports(path: Path) -> set[str]:
+    """Whole names of what a file imports, modules where they are ours."""
+    return names_in(ast.parse(path.read_text()))
+
+
+def names_in(tree: ast.AST) -> set[str]:
+    """What a part of a file imports."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative import"
+            base = str(node.module)
+            found |= {f"{base}.{a.name}" if f"{base}.{a.name}" in MODULES else base for a in node.names}
+    return found
+
+
+def room(module: str) -> str:
+    """The room a module stands in: the longest line of the table that is its package or above it."""
+    path = MODULES[module]
+    parts = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
+    while ".".join(parts) not in ROOMS:
+        parts.pop()
+    return ".".join(parts)
+
+
+def is_below(module: str, package: str) -> bool:
+    return module == package or module.startswith(f"{package}.")
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_follow_the_table(module: str) -> None:
+    allowed = ROOMS[room(module)]
+    for imported in imports(MODULES[module]):
+        if imported in MODULES:
+            assert room(imported) in allowed or imported in allowed, f"{module} -> {imported}"
+        else:
+            package = imported.split(".")[0]
+            if package not in sys.stdlib_module_names:
+                assert package in PACKAGES, f"{module}: {package}"
+                assert any(is_below(module, position) for position in PACKAGES[package]), (
+                    f"{module}: {package}"
+                )
+
+
+def test_every_room_and_package_of_the_tables_is_there() -> None:
+    assert set(ROOMS) <= set(MODULES)
+    used = {imported.split(".")[0] for path in MODULES.values() for imported in imports(path)}
+    assert set(PACKAGES) <= used
+
+
+def test_there_is_no_import_cycle() -> None:
+    arrows = {name: imports(path) & set(MODULES) - {name} for name, path in MODULES.items()}
+    while ends := {name for name, targets in arrows.items() if not targets}:
+        arrows = {name: targets - ends for name, targets in arrows.items() if name not in ends}
+    assert not arrows
+
+
+def test_the_protocol_is_sans_io_but_for_its_client() -> None:
+    for name, path in MODULES.items():
+        if is_below(name, "protocol"):
+            forbidden = THREADS if is_below(name, "protocol.client") else THREADS | SOCKETS
+            assert not {imported.split(".")[0] for imported in imports(path)} & forbidden, name
+
+
+def reached(module: str) -> set[str]:
+    """All that a module imports, also through others, but for what a function imports."""
+    found: set[str] = set()
+    waiting = {module}
+    while waiting:
+        name = waiting.pop()
+        found.add(name)
+        if name in MODULES:
+            body = ast.parse(MODULES[name].read_text()).body
+            top = ast.Module([node for node in body if isinstance(node, ast.Import | ast.ImportFrom)], [])
+            waiting |= names_in(top) - found
+    return found
+
+
+@pytest.mark.parametrize("part", WITHOUT_ROS)
+def test_what_needs_no_ros_loads_none(part: str) -> None:
+    for name in MODULES:
+        if is_below(name, part):
+            ros = {found for found in reached(name) if PACKAGES.get(found.split(".")[0]) == {"bridge"}}
+            assert not ros, name
+
+
+def folders() -> dict[str, list[Path]]:
+    found: dict[str, list[Path]] = {}
+    for path in MODULES.values():
+        if path.name != "__init__.py":
+            found.setdefault(str(path.parent.relative_to(ROOT)), []).append(path)
+    return found
+
+
+@pytest.mark.parametrize(("folder", "files"), folders().items())
+def test_a_folder_is_taken_in_at_a_glance(folder: str, files: list[Path]) -> None:
+    assert len(files) <= MOST_MODULES, folder
+    for path in files:
+        assert len(path.read_text().splitlines()) <= MOST_LINES, path
+
+
+def test_every_room_says_what_lives_there() -> None:
+    for name, path in MODULES.items():
+        if path.name == "__init__.py":
+            assert ast.get_docstring(ast.parse(path.read_text())), name
+
+
+def test_the_scripts_folder_is_taken_in_at_a_glance() -> None:
+    entries = {path.name for path in (ROOT / "scripts").iterdir()} - {"__pycache__"}
+    assert len(entries) <= 12, entries

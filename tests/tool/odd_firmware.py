@@ -1,0 +1,80 @@
+"""Virtual sensors in memory that are wrong in one way; the program under test keeps its own tables.
+
+The same ways as `odd_sensor`, which is for sensors that run as a process.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection
+
+import pytest
+
+from ethercat_server.ethercat.slave.abort_codes import AbortCode
+from ethercat_server.virtual_sensor.firmware import dictionary, firmware
+from ethercat_server.virtual_sensor.firmware.al import AlState
+
+REFUSED = {(0x8006, 1): b"\x80\0", (0x8000, 5): struct.pack("<f", 0.5)}
+FEWER = frozenset({(0x8010, 4), (0x8010, 5)})
+FOREIGN_LACKS = frozenset({0x1009, 0x1018, 0x2000, 0x7000, 0x8000, 0x8001, 0x8006, 0x8010, 0x8030})
+FOREIGN_VENDOR = 0xDEAD
+_VENDOR = slice(0x10, 0x14)
+"""In the EEPROM."""
+_MAILBOXES = slice(0x30, 0x3A)
+
+
+def refusing(patch: pytest.MonkeyPatch) -> None:
+    """Refuses the SINC length 128, which is written last, and one offset."""
+    check, write = dictionary.Dictionary.check_write, dictionary.Dictionary.write
+
+    def refuse(self: dictionary.Dictionary, index: int, subindex: int, data: bytes, state: AlState) -> None:
+        check(self, self.entry(index, subindex), len(data), state)
+        if REFUSED.get((index, subindex)) == data:
+            raise dictionary.SdoAbortError(AbortCode.INVALID_VALUE)
+        write(self, index, subindex, data, state)
+
+    patch.setattr(dictionary.Dictionary, "write", refuse)
+
+
+def wrong_rate(patch: pytest.MonkeyPatch) -> None:
+    """A sampling rate that the SINC length does not imply."""
+    patch.setattr(dictionary, "sampling_rate_hz", lambda _: 500)
+
+
+def fewer_objects(patch: pytest.MonkeyPatch) -> None:
+    """No coordinate system and no inertia compensation."""
+    _lack(patch, FEWER, AbortCode.NO_SUBINDEX)
+
+
+def foreign(patch: pytest.MonkeyPatch) -> None:
+    """No sensor of Bota's, which has only some of the objects."""
+    lacking = {(index, subindex) for index in FOREIGN_LACKS for subindex in range(256)}
+    _lack(patch, lacking, AbortCode.NO_OBJECT)
+    _change_eeprom(patch, _VENDOR, FOREIGN_VENDOR.to_bytes(4, "little"))
+
+
+def no_mailbox(patch: pytest.MonkeyPatch) -> None:
+    """No mailbox at all, as a simple slave."""
+    _change_eeprom(patch, _MAILBOXES, bytes(10))
+    patch.setattr(firmware.Firmware, "_mailbox_fault", lambda _: 0)
+
+
+def _lack(patch: pytest.MonkeyPatch, addresses: Collection[tuple[int, int]], code: AbortCode) -> None:
+    read = dictionary.Dictionary.read
+
+    def read_some(self: dictionary.Dictionary, index: int, subindex: int) -> bytes:
+        if (index, subindex) in addresses:
+            raise dictionary.SdoAbortError(code)
+        return read(self, index, subindex)
+
+    patch.setattr(dictionary.Dictionary, "read", read_some)
+
+
+def _change_eeprom(patch: pytest.MonkeyPatch, where: slice, data: bytes) -> None:
+    build = firmware.build_image  # type: ignore[attr-defined]
+
+    def changed(model: str, serial: int, pdo_size: int) -> bytes:
+        image: bytes = build(model, serial, pdo_size)
+        return image[: where.start] + data + image[where.stop :]
+
+    patch.setattr(firmware, "build_image", changed)

@@ -1,0 +1,115 @@
+"""The tool on a real interface: pysoem's frames, the kernel's tables of sockets and links, signals, pipes.
+
+What it does with the sensors is tested in memory.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from tests.server.commands import stats, written
+from tests.server.running import (
+    PATIENCE_S,
+    Program,
+    Veth,
+    needs_bus,
+    server,
+    virtual_sensor,
+    wait_until,
+)
+from tests.tool.running import MODULE, complaints, one_sentence, tool, tool_here
+
+pytestmark = [pytest.mark.bus, needs_bus]
+Bench = tuple[Veth, Program]
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    """Two sensors of different models at 100 Hz, which takes little of the machine."""
+    models = "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8"
+    options = ("--model", models, "--serial", "10,20", "--pdo", "77", "--sinc", "512", "--signal", "rest")
+    with virtual_sensor(*options) as (veth, sensor):
+        yield veth, sensor
+        assert [stats(sensor, position)["calibration_writes"] for position in (0, 1)] == [0, 0]
+
+
+def test_adapters_say_what_state_they_are_in(bench: Bench) -> None:
+    """The states are the kernel's, and who uses an interface is found in its tables of sockets."""
+    veth, sensor = bench
+    found = {row["name"]: row for row in tool_here("adapters", "--json").json["adapters"]}
+    near, far = found[veth.near], found[veth.far]
+    assert (near["up"], near["carrier"], near["held_by"]) == (True, True, None)
+    assert f"process {sensor.process.pid}" in far["held_by"]
+    assert found["lo"]["loopback"]
+    line = next(line for line in tool_here("adapters").out.splitlines() if line.startswith(veth.near))
+    assert "up" in line
+
+
+def test_a_master_that_is_no_server_is_named(bench: Bench) -> None:
+    """Which process has a socket is known to the kernel alone."""
+    veth, sensor = bench
+    said = one_sentence(tool_here("objects", veth.far, code=1))
+    assert f"{veth.far} is in use by process {sensor.process.pid}" in said
+
+
+def test_a_whole_command_on_the_interface(bench: Bench) -> None:
+    """pysoem's SDO transfers and its way to PREOP, standard output that is a pipe, settings that stay."""
+    veth, sensor = bench
+    changed = ("--sensor", "20", "--set", "fir=on")
+    assert tool("apply", veth.near, *changed, "--json").json["settings"]["fir"] is True
+    assert '"serial": 20' in tool("snapshot", veth.near, "/dev/stdout", "--sensor", "20").out
+    assert ("0x8006", 2, "00") in written(sensor, 1), "FIR had been switched on"
+    assert {row[0] for row in written(sensor, 1)} == {"0x8006"}
+    assert written(sensor, 0) == []
+    assert stats(sensor)["al_state"] == "INIT"
+
+
+def test_the_eeproms_of_a_chain(bench: Bench) -> None:
+    """Each slave's own name, though pysoem gives the second one the first one's."""
+    found = tool("eeprom", bench[0].near, "--json").json["slaves"]
+    assert [row["name"] for row in found] == ["BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8"]
+
+
+def test_watch_ends_with_ctrl_c_and_leaves_the_bus(bench: Bench) -> None:
+    """A signal from outside while pysoem's frames are under way."""
+    veth, sensor = bench
+    watching = subprocess.Popen(
+        [sys.executable, "-m", MODULE, "watch", veth.near, "--interval", "0.1"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert watching.stdout is not None
+    while "samples" not in (line := watching.stdout.readline()):
+        assert line, watching.communicate()
+    watching.send_signal(signal.SIGINT)
+    out, err = watching.communicate(timeout=PATIENCE_S)
+    assert (watching.returncode, complaints(err)) == (0, [])
+    assert "sensor 1: " in out.splitlines()[-1]
+    wait_until(lambda: stats(sensor)["al_state"] == "INIT", "INIT")
+
+
+def test_a_server_that_holds_the_interface_is_found_and_said(bench: Bench) -> None:
+    """Its process and port come from the kernel, its replies over a real socket."""
+    veth, _ = bench
+    with server(veth.near, "--rt-priority", "0", "--set", "sinc_length=512") as running:
+        ended = tool_here("read", veth.near, "sampling rate", "--sensor", 0, "--json")
+        used = f"the server at 127.0.0.1:{running.port}, process {running.process.pid}"
+        assert used in one_sentence(ended)
+        assert used in ended.json["through"]
+        held = {row["name"]: row["held_by"] for row in tool_here("adapters", "--json").json["adapters"]}
+        assert f"process {running.process.pid}" in held[veth.near]
+        where = ("--server", f"localhost:{running.port}")
+        assert "samples" in tool_here("watch", *where, "--sensor", 20, "--samples", 5).out
+
+
+@pytest.mark.parametrize("where", ["localhost:1", "[::1]:1"])
+def test_a_port_where_no_server_is(where: str) -> None:
+    """Refused by the kernel; no address but a real one is."""
+    said = one_sentence(tool_here("objects", "--server", where, "--json", code=1))
+    assert f"no server at {where} " in said
