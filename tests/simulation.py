@@ -276,13 +276,11 @@ def reading(frame: DataMessage) -> ClockReading:
     return decode_clock(LAYOUTS[len(frame.process_data)].struct.unpack(frame.process_data)[2:8])
 
 
-def check_frames(frames: Iterable[DataMessage], *, complete: bool = True, bad_wire: bool = False) -> None:
+def check_frames(frames: Iterable[DataMessage], *, complete: bool = True) -> None:
     """What holds for one sensor's frames in every run, whatever happened; its signal has to be `clock`.
 
     Nothing comes twice, nothing out of order, no old sample as a new one. `complete` if all frames that the
-    server made are there: then they are numbered without a gap, and what is missing is flagged. On a
-    `bad_wire` an exchange may take so long that nobody can know when the sensor answered: one sample in 200
-    may be missing without a flag.
+    server made are there: then they are numbered without a gap, and what is missing is flagged.
     """
     last: DataMessage | None = None
     new: DataMessage | None = None
@@ -304,4 +302,4 @@ def check_frames(frames: Iterable[DataMessage], *, complete: bool = True, bad_wi
             assert frame.monotonic_ns > new.monotonic_ns
             unflagged += after.number != before.number + 1 and not visible
         new, visible, count = frame, False, count + 1
-    assert unflagged <= bad_wire * (1 + count // 200), f"{unflagged} of {count} follow a loss without a flag"
+    assert unflagged == 0, f"{unflagged} of {count} follow a loss without a flag"

@@ -20,6 +20,8 @@ _SEARCH_STEPS: Final = 8
 """Exchanges a sample once one is overdue."""
 _NARROW: Final = 0.4
 """A bracket narrower than this part of a period contains one instant for certain."""
+_WATCHED: Final = 0.9
+"""A bracket narrower than this many periods begins with a poll that was early."""
 _UNDISTURBED: Final = 1.25
 """A bracket wider than this many periods comes from a stall."""
 _NEAR_TO_LOCK: Final = 0.03
@@ -37,6 +39,8 @@ _FLIGHT_GAIN: Final = 1 / 64
 _HALF: Final = 0.45
 _SURELY_ONE: Final = 0.8
 """Only one sample can have come in this part of a period, even if the bracket is somewhat off."""
+_UNEVEN: Final = 0.2
+"""Exchanges that take so much longer than the shortest on average do not say when a sample came to be."""
 _LONGEST_LOOK: Final = 0.5
 """The sensor looks at its data within this part of a period after the frame was sent."""
 _CREEP_NS: Final = 150.0
@@ -67,8 +71,9 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_flight_ns", "_high", "_hits", "_learned", "_low", "_nominal_ns", "_polled_ns", "_quality",
-        "_tried_ns", "instant_ns", "locked", "period_ns", "steps", "uncertain",
+        "_doubtful", "_flight_ns", "_high", "_hits", "_learned", "_least_flight_ns", "_low", "_newest_ns",
+        "_nominal_ns", "_polled_ns", "_quality", "_tried_ns", "instant_ns", "locked", "period_ns", "steps",
+        "uncertain",
     )  # fmt: skip
 
     def __init__(self, period_ns: float, start_ns: int = 0) -> None:
@@ -84,6 +89,10 @@ class SampleClock:
         self.uncertain = False
         """Whether more may have been lost than `steps` says: the sensor may have looked at its data early or
         late in a slow exchange. The samples after it tell, and their `steps` put it right."""
+        self._doubtful = False
+        """Whether the bracket may be another sample's: one was `uncertain`, and none was watched since."""
+        self._newest_ns = 0.0
+        """The instant estimated for the sample before."""
         self._quality = 0.0
         self._learned = 0
         self._hits = 0
@@ -94,6 +103,8 @@ class SampleClock:
         """When the last exchange was sent, valid or not."""
         self._flight_ns = 0.0
         """How long an exchange usually takes."""
+        self._least_flight_ns = period_ns
+        """How long the shortest took: half of it is the least a frame needs to the slave or back."""
         self._low = self._high = 0.0
         """Bracket in which the next sample is expected."""
 
@@ -126,6 +137,8 @@ class SampleClock:
         # aimed earlier by more, until one is early and bounds the instant from below again.
         creep_ns = min(_CREEP_NS * self._hits * self._hits, _MAX_CREEP * self.period_ns)
         first = (self._low + self._high - self._flight_ns) / 2 + AIM_NS - creep_ns
+        if self._doubtful:
+            first = self._low - self._flight_ns  # early for certain: then the next sample is watched coming
         if tried_ns < first - _EARLY_NS:
             return first
         if tried_ns < self._high:
@@ -147,20 +160,30 @@ class SampleClock:
             self.instant_ns = min(received_ns, sent_ns + period) - min(unwatched, period) / 2
             return
         expected = (self._low + self._high) / 2
+        # What makes an exchange longer than the shortest may be before the sensor looks at its data or after.
+        looking = _HALF * self._least_flight_ns
         if unwatched < _NARROW * period:
             self.steps = max(0, 1 + round(((after + received_ns) / 2 - expected) / period))
+        elif self._doubtful and self.locked and received_ns - looking < self._low:
+            self.steps = 0  # too early for the next one: what was uncertain was the one before it
         else:
             # Several samples may lie in a wide bracket: the newest is the last one due before the exchange.
             # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought
             # is dated from before, never as younger than it may be.
             into = min((received_ns - sent_ns) / 2, _LONGEST_LOOK * period)
             self.steps = max(1, 1 + int((sent_ns + into - expected) // period))
-        # The sensor looks at its data about half-way through an exchange of the usual length.
-        looking = _HALF * self._flight_ns
-        self.uncertain = (
-            unwatched - 2 * looking >= period and received_ns - looking - self._low >= _SURELY_ONE * period
+        self.uncertain = unwatched - 2 * looking >= period and (
+            not self._trusted or received_ns - looking - self._low >= _SURELY_ONE * period
         )
         self.instant_ns = min(max(expected + (self.steps - 1) * period, after), received_ns)
+        if not self.steps:  # the one before it was dated as this one should be
+            self.instant_ns = max(self.instant_ns, self._newest_ns + 1)
+
+    @property
+    def _trusted(self) -> bool:
+        """Whether the next sample comes to be within the bracket for certain."""
+        uneven_ns = self._flight_ns - self._least_flight_ns
+        return self.locked and not self._doubtful and uneven_ns < _UNEVEN * self.period_ns
 
     def _begins_anew(self, after: int) -> bool:
         """Whether nothing was expected, or the sensor was watched and silent for longer than a period."""
@@ -170,18 +193,23 @@ class SampleClock:
         """Learn from one valid exchange whether it brought a new sample (`fresh`)."""
         if fresh:
             self.predict(sent_ns, received_ns)
-        self._flight_ns += _FLIGHT_GAIN * (min(received_ns - sent_ns, self.period_ns) - self._flight_ns)
+        took_ns = min(received_ns - sent_ns, self.period_ns)
+        self._flight_ns += _FLIGHT_GAIN * (took_ns - self._flight_ns)
+        self._least_flight_ns = min(self._least_flight_ns, took_ns)
         if not fresh:
             self._polled_ns = self._tried_ns = sent_ns
             if self.locked and sent_ns > self._high + _SILENT * self.period_ns:
                 self.restart()
             return
         after, self._polled_ns, self._tried_ns = self._polled_ns, sent_ns, sent_ns
+        watched = received_ns - after < _WATCHED * self.period_ns
+        self._doubtful = self.uncertain or (self._doubtful and not watched)
+        self._newest_ns = self.instant_ns
         if self._begins_anew(after):
             self._low, self._high = max(after, received_ns - self.period_ns), float(received_ns)
             self._expect_next()
             return
-        self._hits = 0 if received_ns - after < _NARROW * self.period_ns else self._hits + 1
+        self._hits = 0 if watched else self._hits + 1
         moved = (self.steps - 1) * self.period_ns
         low, high = self._low + moved, self._high + moved
         believed = (low + high) / 2

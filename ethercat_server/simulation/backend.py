@@ -75,12 +75,12 @@ class MemoryBackend:
         """See `Backend`."""
 
     def send(self, frame: bytes | bytearray) -> None:
-        """See `Backend`. The slaves see the frame when half its round trip is over."""
-        round_trip_ns = self.wire.round_trip_ns()
-        if round_trip_ns is None:
+        """See `Backend`."""
+        if (times := self.wire.carry()) is None:
             return
+        outward_ns, round_trip_ns = times
         answer, now_ns = bytearray(frame), self.clock.now_ns
-        arrives_ns = now_ns + round_trip_ns // 2
+        arrives_ns = now_ns + outward_ns
         self.sensors.idle(arrives_ns)  # the watchdogs have run meanwhile
         if self.sensors.process(answer, len(answer), arrives_ns):
             self._sent += 1

@@ -114,10 +114,15 @@ class Wire:
         """Be this machine's from now on."""
         self._machine = machine
 
-    def round_trip_ns(self) -> int | None:
-        """The next frame's; None if it is lost."""
+    def carry(self) -> tuple[int, int] | None:
+        """The next frame's times in ns until the slaves see it and until it is back; None if it is lost."""
         machine, chance = self._machine, self._chance
         if machine.lost and chance.random() < machine.lost:
             return None
         late_ns = machine.late_ns if machine.late and chance.random() < machine.late else 0.0
-        return round(machine.frame_ns + chance.expovariate(1) * machine.frame_jitter_ns + late_ns)
+        delay_ns = chance.expovariate(1) * machine.frame_jitter_ns + late_ns
+        # It may be held up on its way out, on its way back, or by a slave in between.
+        return (
+            round(machine.frame_ns / 2 + chance.random() * delay_ns),
+            round(machine.frame_ns + delay_ns),
+        )

@@ -11,7 +11,7 @@ from ethercat_server.virtual_sensor.measurement.signals import ClockReading, dec
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import LAYOUTS
-from tests.simulation import Simulation
+from tests.simulation import Simulation, check_frames
 
 PERIOD_NS = 1_250_000
 OLD = DataFlag.REPEATED | DataFlag.INVALID
@@ -98,6 +98,18 @@ def test_what_is_lost_is_flagged_and_counted_on_a_bad_wire() -> None:
     assert sum(unflagged) <= 0.02 * sum(gaps)
     assert running.status()["sensors"][0]["lost_samples"] == pytest.approx(sum(gaps), rel=0.2)
     assert running.events == [], "single lost frames and stalls are no lost sensor"
+
+
+@pytest.mark.parametrize("jitter_us", [200, 400, 700])
+@pytest.mark.parametrize("seed", [3, 1])
+def test_whatever_is_lost_is_flagged_though_frames_take_long_and_unevenly(seed: int, jitter_us: int) -> None:
+    """A starved slave looks at its data anywhere within an exchange, so `lost_samples` is a guess."""
+    running = simulation(Machine(seed=seed, frame_jitter_ns=jitter_us * 1e3, wake_ns=50e3))
+    running.run(2.0)
+    check_frames(running.frames)
+    new = [reading(frame).number for frame in running.frames if not frame.flags & OLD]
+    lost = new[-1] - new[0] + 1 - len(new)
+    assert running.status()["sensors"][0]["lost_samples"] == pytest.approx(lost, rel=0.5, abs=3)
 
 
 def test_a_frame_may_take_as_long_as_the_rate_in_force_allows() -> None:

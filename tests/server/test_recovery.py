@@ -247,7 +247,7 @@ def test_one_late_answer_does_not_put_every_exchange_one_frame_behind() -> None:
     lost = after["lost_frames"] - before["lost_frames"]
     # One frame behind, nearly all would be lost.
     assert lost < 0.03 * cycles, f"{lost} of {cycles}"
-    check_frames(simulation.frames, bad_wire=True)
+    check_frames(simulation.frames)
 
 
 def test_a_client_that_has_said_all_still_gets_its_samples() -> None:
@@ -314,7 +314,7 @@ def test_whatever_happens_the_stream_is_true_and_comes_back(seed: int) -> None:
     simulation.run(1.0)
 
     assert len(listener.fresh(100)) == 100
-    check_frames(simulation.frames, bad_wire=True)
+    check_frames(simulation.frames)
     sent = [frame.sequence for frame in listener.frames]
     assert sent == sorted(set(sent))
     assert not listener.at_end

@@ -46,7 +46,7 @@ def test_samples_come_and_come_back_after_a_power_cut(machine: str) -> None:
         client.fresh(20)
         client.events.clear()
     assert client.ask("status")["ok"]
-    check_frames(simulation.frames, bad_wire=True)
+    check_frames(simulation.frames)
     simulation.backend.become(Machine())
     simulation.run(3.0)
     simulation.frames.clear()
