@@ -14,7 +14,7 @@ from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.sensor.sensor import Sensor
+from ethercat_server.sensor.sensor import Sensor, SensorState
 
 _SERVE_MARGIN_NS: Final = 80_000
 """Sockets are not served this shortly before a deadline: select may wake late."""
@@ -97,7 +97,8 @@ class Cycle:
     def run(self) -> None:
         """The loop."""
         bus, hub, streams, recovery = self._bus, self._hub, self._streams, self._recovery
-        jobs, watchdog, sensors = self._jobs, self._watchdog, self._sensors
+        jobs, watchdog = self._jobs, self._watchdog
+        each = tuple(zip(self._sensors, streams, strict=True))
         monotonic_ns, sleep = bus.clock.monotonic_ns, bus.clock.sleep
         shortest_ns, timeout_s = self._limits()
         lead_ns = 0.0  # usual lateness of wake-ups, by which deadlines are brought forward
@@ -123,15 +124,15 @@ class Cycle:
                 self._wake.record(late)
                 if late > shortest_ns:
                     self._missed_deadlines += int(late // shortest_ns)
-            bus.send()
+            bus.send(sent)
             wkc = bus.receive(wait_s)
             back = monotonic_ns()
             complete = wkc >= recovery.alive_wkc
-            for sensor, stream in zip(sensors, streams, strict=True):
-                valid = complete and sensor.streams
-                made = stream.take(bus.process_data(stream.position), wkc, valid, sent, back)
-                if made:
-                    hub.publish(made[0], stream.position, made[1], back)
+            for sensor, stream in each:
+                valid = complete and sensor.state is SensorState.STREAMING
+                position = stream.position
+                if made := stream.take(bus.process_data(position), wkc, valid, sent, back):
+                    hub.publish(made[0], position, made[1], back)
             for stream in streams:
                 stream.learn()
             recovery.attend(wkc, back)

@@ -66,8 +66,8 @@ _UNLOCK_AT: Final = 0.6
 class SampleClock:
     """The sampling clock of one sensor, as far as the exchanges have shown it. Times are CLOCK_MONOTONIC ns.
 
-    Call `observe` after every valid exchange, before it `predict` if the sample is to be handed out first;
-    ask `next_poll_ns` when the next exchange is wanted.
+    Call `observe` after every valid exchange, before it `predict` if that brought a new sample; ask
+    `next_poll_ns` when the next exchange is wanted.
     """
 
     __slots__ = (
@@ -190,9 +190,7 @@ class SampleClock:
         return self._high == 0.0 or after > self._high + self.period_ns
 
     def observe(self, sent_ns: int, received_ns: int, fresh: bool) -> None:
-        """Learn from one valid exchange whether it brought a new sample (`fresh`)."""
-        if fresh:
-            self.predict(sent_ns, received_ns)
+        """Learn from one valid exchange whether it brought a new sample (`fresh`: after `predict`)."""
         took_ns = min(received_ns - sent_ns, self.period_ns)
         self._flight_ns += _FLIGHT_GAIN * (took_ns - self._flight_ns)
         self._least_flight_ns = min(self._least_flight_ns, took_ns)

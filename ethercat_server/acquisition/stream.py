@@ -70,12 +70,12 @@ class SensorStream:
             self._valid_ns = back_ns
         if fresh:
             self.process_data = data
+            clock.predict(sent_ns, back_ns)
             if self._discard:
                 self._discard -= 1
                 self._idle_at_ns = back_ns + _IDLE_PERIODS * clock.period_ns
                 return None
             self._handed_out = data
-            clock.predict(sent_ns, back_ns)
             flags = self._new_sample(back_ns)
             # After a stall in the exchange its end says nothing of when the sample came to be.
             moment_ns = int(clock.instant_ns if clock.locked else min(back_ns, sent_ns + clock.period_ns))

@@ -1,7 +1,7 @@
 """The seam between the server and an EtherCAT bus: what is needed of one, whatever answers on it.
 
 Two backends have it: `soem.SoemBackend`, pysoem on a network interface, and
-`virtual_sensor.in_memory.MemoryBackend`, in which the virtual sensor answers without sockets, processes or
+`simulation.backend.MemoryBackend`, in which the virtual sensor answers without sockets, processes or
 real time. Everything above runs on either.
 """
 

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend, CheckInterrupt, SlaveIdentity
+from ethercat_server.ethercat.late_answers import LateAnswers
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import (
     COUNTER_SIZE,
@@ -27,9 +28,6 @@ from ethercat_server.ethercat.wire import (
 _DATAGRAM_TIMEOUT_S: Final = 0.002
 _PATIENT_TIMEOUT_S: Final = 0.02
 _LEAST_TIMEOUT_S: Final = 0.0003
-_LONGEST_TIMEOUT_S: Final = 0.25
-_LATE_FACTOR: Final = 2.0
-"""On a bus whose answers come late the timeout is this many times the longest recent round trip."""
 _ANSWER_ATTEMPTS: Final = 3
 _REGISTER_ATTEMPTS: Final = 20
 _FIRST_INDEX: Final = 0x80
@@ -61,10 +59,8 @@ class Bus:
         self._monotonic_ns = backend.clock.monotonic_ns
         self._index = 0
         self._datagram_timeout_s = _PATIENT_TIMEOUT_S
-        self._late_timeout_s = 0.0
-        """The timeout at least, after answers that came too late; 0 on a bus that is in time."""
-        self._sent_ns = [0] * 0x80
-        """When a frame was sent that is not back, by index."""
+        self._late = LateAnswers(backend.clock, _FIRST_INDEX)
+        self._pending_ns = self._late.pending_ns
         self.stations: list[int] = []
         """Configured station addresses, by position."""
         self.fmmus: list[bytes] = []
@@ -133,60 +129,40 @@ class Bus:
 
     # -- the exchange
 
-    def send(self) -> None:
+    def send(self, now_ns: int) -> None:
         """Send the process data; `receive` must follow. Only after `go_operational`."""
         sent = self._sent
         sent.clear()
         for n, frame in enumerate(self._frames):
-            self._index = index = (self._index + 1) % 0x80
+            self._index = index = (self._index + 1) % len(self._pending_ns)
+            self._pending_ns[index] = now_ns
             frame[DATAGRAM_INDEX] = index = index + _FIRST_INDEX
             sent[index] = n
             self._send(frame)
 
     def receive(self, timeout_s: float) -> int:
-        """Wait at most `timeout_s` for the process data to come back; returns the working counter.
+        """Wait for the process data to come back; returns the working counter, -1 if it does not.
 
-        -1 if the frame did not come back. Longer on a bus whose answers come late, so that a machine that is
-        slow reads its sensors slowly, not never.
+        At most `timeout_s`, or longer where answers come late.
         """
-        sent, wkc, missing = self._sent, 0, len(self._frames)
-        timeout_s = max(timeout_s, self._late_timeout_s)
-        left_s = timeout_s
-        self._sent_ns[self._index] = now_ns = self._monotonic_ns()
-        until_ns = now_ns + int(timeout_s * 1e9)
-        while True:
-            answer = self._receive(left_s)
-            if answer is None:
-                return -1
+        timeout_s = max(timeout_s, self._late.timeout_s)
+        answer, sent, wkc = self._receive(timeout_s), self._sent, 0
+        while answer is not None:
             n = sent.pop(answer[DATAGRAM_INDEX], -1) if len(answer) > DATAGRAM_INDEX else -1
-            if n >= 0 and len(answer) >= self._ends[n] + COUNTER_SIZE:
+            if n >= 0 and len(answer) >= (end := self._ends[n]) + COUNTER_SIZE:
                 self._answers[n] = answer
-                wkc += int.from_bytes(answer[self._ends[n] : self._ends[n] + COUNTER_SIZE], "little")
-                missing -= 1
-                if not missing:
-                    if self._late_timeout_s:
-                        self._note_in_time()
-                    self._sent_ns[self._index] = 0
+                wkc += answer[end] | answer[end + 1] << 8
+                if not sent:
+                    if self._late.timeout_s:
+                        self._late.in_time(self._index)
+                    self._pending_ns[self._index] = 0
                     return wkc
             else:
-                self._note_late(answer)
-            left_s = (until_ns - self._monotonic_ns()) * 1e-9
-            if left_s <= 0:
-                return -1
-
-    def _note_late(self, answer: bytes) -> None:
-        """An answer that nobody waits for any more says how long a frame takes now."""
-        index = answer[DATAGRAM_INDEX] - _FIRST_INDEX if len(answer) > DATAGRAM_INDEX else -1
-        if index >= 0 and self._sent_ns[index]:
-            took_s = (self._monotonic_ns() - self._sent_ns[index]) * 1e-9
-            self._sent_ns[index] = 0
-            self._late_timeout_s = min(max(self._late_timeout_s, _LATE_FACTOR * took_s), _LONGEST_TIMEOUT_S)
-
-    def _note_in_time(self) -> None:
-        """Wait less from now on, if the answer that is just in came sooner."""
-        took_s = (self._monotonic_ns() - self._sent_ns[self._index]) * 1e-9
-        left_s = max(self._late_timeout_s / 2, _LATE_FACTOR * took_s)
-        self._late_timeout_s = left_s if left_s > _LEAST_TIMEOUT_S else 0.0
+                self._late.note(answer)
+            until_ns = self._pending_ns[self._index] + int(timeout_s * 1e9)
+            left_ns = until_ns - self._monotonic_ns()
+            answer = self._receive(left_ns * 1e-9) if left_ns > 0 else None
+        return -1
 
     def working_counter(self, position: int) -> int:
         """What a slave adds to the working counter of an exchange: 2 for its outputs, 1 for its inputs."""
@@ -268,12 +244,11 @@ class Bus:
         self, command: Command, adp: int, ado: int, data: bytes, timeout_s: float
     ) -> tuple[int, bytes] | None:
         """Send one datagram and wait for it: its working counter and data; None if it does not come back."""
-        self._index = (self._index + 1) % 0x80
+        self._index = (self._index + 1) % len(self._pending_ns)
         index = self._index + _FIRST_INDEX
         frame = build((command, adp, ado, data), first_index=index)
-        timeout_s = max(timeout_s, self._late_timeout_s)
-        self._sent_ns[self._index] = now_ns = self._monotonic_ns()
-        until_ns = now_ns + int(timeout_s * 1e9)
+        self._pending_ns[self._index] = now_ns = self._monotonic_ns()
+        until_ns = now_ns + int(max(timeout_s, self._late.timeout_s) * 1e9)
         self._send(frame.ljust(_SHORTEST_FRAME, b"\0"))
         end = FIRST_DATA + len(data)
         while (left_ns := until_ns - self._monotonic_ns()) > 0:
@@ -281,9 +256,9 @@ class Bus:
             if answer is None:
                 return None
             if is_answer(answer, command, index, len(data)):
-                self._sent_ns[self._index] = 0
+                self._pending_ns[self._index] = 0
                 return _U16.unpack_from(answer, end)[0], answer[FIRST_DATA:end]
-            self._note_late(answer)
+            self._late.note(answer)
         return None
 
 

@@ -102,10 +102,11 @@ class Hub:
     def _serve_once(self, now_ns: int, last_start_ns: int, until_ns: int) -> None:
         """Wait for something to do and do it."""
         reads = self._pause_ends_ns <= now_ns < last_start_ns
-        if reads:
-            wake_ns = now_ns if self._ready else min(last_start_ns, until_ns)
-        else:
-            wake_ns = min(self._pause_ends_ns, until_ns) if now_ns < self._pause_ends_ns else until_ns
+        wake_ns = until_ns
+        if reads and self._ready:
+            wake_ns = now_ns
+        elif now_ns < self._pause_ends_ns:
+            wake_ns = min(self._pause_ends_ns, until_ns)
         readers: list[int] = []
         if reads and self._handler is not None:
             readers = [fd for fd, c in self.connections.items() if c.state.reads]
@@ -114,8 +115,10 @@ class Hub:
         readable, writable = self._transport.wait(readers, writers, max(0, wake_ns - now_ns) * 1e-9)
         for fd in writable:
             self.connections[fd].outbox.flush()
-        if reads and (readable or self._ready):
+        if readable or (reads and self._ready):
             began_ns = self._monotonic_ns()
+            if began_ns >= last_start_ns and wake_ns > now_ns:
+                return  # what came after the last moment to begin has its turn after the exchange
             self._read(readable)
             self._answer_some(last_start_ns)
             ended_ns = self._monotonic_ns()

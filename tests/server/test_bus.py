@@ -122,7 +122,7 @@ def operational(*sensors: SensorOptions, machine: Machine | None = None) -> tupl
 
 
 def exchange(bus: Bus) -> int:
-    bus.send()
+    bus.send(bus.clock.monotonic_ns())
     return bus.receive(0.01)
 
 

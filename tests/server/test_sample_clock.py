@@ -31,6 +31,13 @@ class Run:
         return sorted(values)[len(values) // 2]
 
 
+def show(clock: SampleClock, sent_ns: int, received_ns: int, fresh: bool) -> None:
+    """One valid exchange."""
+    if fresh:
+        clock.predict(sent_ns, received_ns)
+    clock.observe(sent_ns, received_ns, fresh)
+
+
 def simulate(
     ppm: float,
     *,
@@ -63,7 +70,7 @@ def simulate(
             continue
         newest = shown if silent(evaluated) else int((evaluated - phase) // true_period)
         fresh = newest != shown
-        clock.observe(int(sent), int(received), fresh)
+        show(clock, int(sent), int(received), fresh)
         if not fresh:
             continue
         if shown >= 0:
@@ -150,7 +157,7 @@ def test_does_not_follow_a_sensor_that_is_not_periodic() -> None:
             newest += 1
         fresh, shown = newest != shown, newest
         fresh_count += fresh
-        clock.observe(int(now), int(now) + 50_000, fresh)
+        show(clock, int(now), int(now) + 50_000, fresh)
     assert fresh_count > 1000
     assert not clock.locked
     assert clock.describe()["mode"] == "oversampling"
@@ -178,7 +185,7 @@ def test_follows_a_simulated_sensor_that_sleeps_between_its_samples(sleep_more_n
             change += NOMINAL_NS + noise.gammavariate(4, sleep_more_ns / 4)
             newest += 1
         fresh = newest != shown
-        clock.observe(int(sent), int(received), fresh)
+        show(clock, int(sent), int(received), fresh)
         if fresh and shown:
             lost += newest - shown - 1
             claimed += max(0, clock.steps - 1)
