@@ -203,7 +203,7 @@ class Recovery:
                 log.warning("sensor %d is not back yet: %s", position, error)
                 self._work[position] = self._ladders[position].bring_back(_FAILED_PAUSE_S)
             elif change.failed is not None:
-                self._lose_in_change(position, f"putting back what was in force failed too: {error}")
+                self._lose_in_change(position, f"restoring the former settings failed too: {error}")
             else:
                 self._work[position] = self._ladders[position].bring_back()
                 self._revert(position, error)

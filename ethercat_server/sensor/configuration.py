@@ -59,7 +59,7 @@ def apply_in_op(sdo: Sdo, sensor: Sensor, change: Change) -> Steps[None]:
                 if name in sensor.settings:
                     yield from write_setting(sdo, sensor, name, sensor.settings[name])
         except BusError as worse:
-            raise extended(error, f"; putting back what was in force failed too: {worse}; {_AGAIN}") from None
+            raise extended(error, f"; restoring the former settings failed too: {worse}; {_AGAIN}") from None
         sensor.unsettled = False
         raise extended(error, IN_FORCE) from None
 

@@ -103,7 +103,7 @@ def _take_back(
             yield from write_offset(sdo, old)
         except BusError as worse:
             sensor.offset, sensor.unsettled = old, True
-            addition = f"; putting back the old offset failed too: {worse}; tare it again"
+            addition = f"; restoring the former offset failed too: {worse}; tare it again"
     if isinstance(error, RequestError):
         return RequestError(error.code, f"{error}{addition}", **error.extra)
     return extended(error, addition)

@@ -110,7 +110,7 @@ def test_putting_back_what_was_in_force_fails_too_in_op(bench: tuple[Bench, Clie
     refused = error(asking.ask("configure", settings=IN_OP))
     assert "imu_active = 3 did not take" in refused["message"]
     assert (
-        "; putting back what was in force failed too: the setting temperature_compensation"
+        "; restoring the former settings failed too: the setting temperature_compensation"
         in refused["message"]
     )
     assert refused["message"].endswith("; configure it again")
@@ -138,7 +138,7 @@ def test_putting_back_what_was_in_force_fails_too_by_way_of_preop(bench: tuple[B
     sensor.command("on-write 0x8006 1 abort 0x8006 1 0x08000022")
     refused = error(asking.ask("configure", settings=BY_PREOP))
     assert "sinc_length = 128 did not take" in refused["message"]
-    assert "; putting back what was in force failed too: " in refused["message"]
+    assert "; restoring the former settings failed too: " in refused["message"]
     assert refused["message"].endswith("; it gets its former settings when it is back")
     sensor.wait_event("sensor_lost")
     sensor.wait_event("sensor_back")
