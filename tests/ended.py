@@ -30,7 +30,7 @@ class Result(NamedTuple):
 
 def run_here(main: Callable[[Sequence[str]], int], *arguments: object) -> Result:
     """Run a program's `main` in this process."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     out, err = io.StringIO(), io.StringIO()
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

@@ -111,16 +111,18 @@ class SoemBackend:
         )
         thread.start()
         deadline = time.monotonic() + _SCAN_TIMEOUT_S
-        self._abandoned = self._scanned = True
-        while thread.is_alive():
-            thread.join(0.05)
-            check_interrupt()
-            if time.monotonic() > deadline:
-                raise BusError(
-                    f"the scan of {self.ifname} does not end: a slave stopped answering in its middle, or "
-                    "its EEPROM does not answer; check cable and power, then start again"
-                )
-        self._abandoned = False
+        self._scanned = True
+        try:
+            while thread.is_alive():
+                thread.join(0.05)
+                check_interrupt()
+                if time.monotonic() > deadline:
+                    raise BusError(
+                        f"the scan of {self.ifname} does not end: a slave stopped answering in its middle, "
+                        "or its EEPROM does not answer; check cable and power, then start again"
+                    )
+        finally:
+            self._abandoned = thread.is_alive()
         return counts[0] if counts else 0
 
     def check_preop(self, check_interrupt: CheckInterrupt) -> None:

@@ -6,7 +6,7 @@ import json
 import time
 from typing import Any
 
-from tests.server.running import Program
+from tests.server.running import PATIENCE_S, Program
 
 
 def command(sensor: Program, text: str) -> str:
@@ -15,7 +15,7 @@ def command(sensor: Program, text: str) -> str:
     before = len(sensor.said())
     sensor.process.stdin.write(text + "\n")
     sensor.process.stdin.flush()
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE_S
     while not sensor.said()[before:].endswith("\n"):
         assert time.monotonic() < deadline
         time.sleep(0.005)

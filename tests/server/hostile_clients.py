@@ -1,7 +1,7 @@
-"""Clients that mean no good, run as a process: `hostile_clients.py PORT COUNT SEED` makes COUNT connections.
+"""Clients that mean no good, on streams that never block: in memory, or real sockets.
 
-Each is of a random kind. With `crowd` for the seed all COUNT are there at once and ask without pause for some
-seconds. Prints at the end how many there were of each kind and what the server answered.
+Each kind is a generator that pauses for a turn where it waits: for the server's loop in memory, for a moment
+at a real server.
 """
 
 from __future__ import annotations
@@ -9,247 +9,278 @@ from __future__ import annotations
 import collections
 import contextlib
 import errno
-import itertools
-import json
-import os
 import random
-import select
-import socket
 import struct
-import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
+from typing import Protocol
 
 from ethercat_server.serving.connection import MAX_REQUEST_LENGTH
 from protocol.control import request
 from protocol.framing import encode_json
 from protocol.text.bare_json import encode_bare_json
 from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, mutate
-from tests.server.as_another_user import NO_OTHER_USER, become_nobody
 
-MOST_HELD = 8
-"""Connections that are left hanging at a time: half of what one user may have."""
-CROWD_S = 3.0
-FIRST_UID, USERS, OF_ONE_USER = 60_000, 1_000, 4
+AT_ONCE, MOST_HELD = 10, 8
+"""Connections that act, and that are left hanging: together somewhat more than one user may have."""
+FIRST_UID, USERS, OF_ONE_USER = 60_000, 1_000, 20
 """The connections come from many users, because one may not have many."""
-_RESET = struct.pack("ii", 1, 0)
+PATIENCE_TURNS = 50_000
 _SHUTDOWN = request("shutdown")
 
-held: collections.deque[socket.socket] = collections.deque()
-answers: collections.Counter[str] = collections.Counter()
-KINDS: list[Callable[[socket.socket, random.Random], None]] = []
+Steps = Generator[None, None, None]
 
 
-def kind(
-    function: Callable[[socket.socket, random.Random], None],
-) -> Callable[[socket.socket, random.Random], None]:
+class Stream(Protocol):
+    """The client's end of a connection; BlockingIOError for what cannot be done yet."""
+
+    def send(self, data: bytes, /) -> int: ...
+    def recv(self, size: int, /) -> bytes: ...
+    def end_sending(self) -> None: ...
+    def reset(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class Client:
+    """A hostile one."""
+
+    def __init__(self, stream: Stream, chance: random.Random, answers: collections.Counter[str]) -> None:
+        self.stream, self.chance, self.answers = stream, chance, answers
+        self.is_held = False
+        """It stays open and says no more."""
+
+    def hold(self) -> None:
+        self.is_held = True
+
+    def send_some(self, data: bytes) -> int:
+        """As much as can be sent now."""
+        with contextlib.suppress(BlockingIOError):
+            return self.stream.send(data)
+        return 0
+
+    def send(self, data: bytes) -> Steps:
+        while data := data[self.send_some(data) :]:
+            yield
+
+    def hear_some(self) -> bytes | None:
+        """What has come, None if nothing has, b"" at the end."""
+        with contextlib.suppress(BlockingIOError):
+            data = self.stream.recv(65536)
+            self.answers["refusals"] += data.count(b'"ok":false')
+            self.answers["grants"] += data.count(b'"ok":true')
+            return data
+        return None
+
+    def hear(self, turns: int = 16, until: bytes = b"") -> Generator[None, None, bytes]:
+        """What the server says in so many turns, or before it ends the connection or has said `until`."""
+        found = b""
+        for _ in range(turns):
+            data = self.hear_some()
+            found += data or b""
+            if data == b"" or (until and until in found):
+                return found
+            yield
+        assert turns < PATIENCE_TURNS, f"neither {until!r} nor an end; it said {found!r}"
+        return found
+
+
+Kind = Callable[[Client], Steps]
+KINDS: list[Kind] = []
+
+
+def kind(function: Kind) -> Kind:
     """One way to be a nuisance. The connection is closed afterwards unless it is held."""
     KINDS.append(function)
     return function
 
 
-def hold(sock: socket.socket) -> None:
-    """Leave it open and say no more; the oldest one is closed."""
-    held.append(sock)
-    if len(held) > MOST_HELD:
-        held.popleft().close()
-
-
-def reset(sock: socket.socket) -> None:
-    """Close it with RST."""
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
-    sock.close()
-
-
-def hear(sock: socket.socket, seconds: float = 0.01, until: bytes = b"") -> bytes:
-    """What the server answers within the time, or until it ends the connection or has said `until`."""
-    deadline, found = time.monotonic() + seconds, b""
-    with contextlib.suppress(TimeoutError):
-        while (left := deadline - time.monotonic()) > 0:
-            sock.settimeout(left)
-            if not (data := sock.recv(65536)):
-                break
-            found += data
-            if until and until in found:
-                break
-    answers["refusals"] += found.count(b'"ok":false')
-    answers["grants"] += found.count(b'"ok":true')
-    return found
+def any_form(client: Client, message: dict[str, object]) -> bytes:
+    return client.chance.choice((encode_json, encode_bare_json))(message)
 
 
 @kind
-def random_bytes(sock: socket.socket, rng: random.Random) -> None:
-    sock.sendall(rng.randbytes(rng.choice((1, 4, 5, 100, 4000))))
-    hear(sock)
+def random_bytes(client: Client) -> Steps:
+    yield from client.send(client.chance.randbytes(client.chance.choice((1, 4, 5, 100, 4000))))
+    yield from client.hear()
 
 
 @kind
-def mutated_requests(sock: socket.socket, rng: random.Random) -> None:
-    good = rng.choice((FRAMED, BARE))
-    sock.sendall(b"".join(mutate(rng, rng.choice(good), good) for _ in range(rng.randint(1, 4))))
-    hear(sock)
+def mutated_requests(client: Client) -> Steps:
+    chance = client.chance
+    good = chance.choice((FRAMED, BARE))
+    count = chance.randint(1, 4)
+    yield from client.send(b"".join(mutate(chance, chance.choice(good), good) for _ in range(count)))
+    yield from client.hear()
 
 
 @kind
-def connect_and_close(sock: socket.socket, _rng: random.Random) -> None:
-    sock.close()
+def connect_and_close(client: Client) -> Steps:
+    yield from ()
 
 
 @kind
-def half_close(sock: socket.socket, rng: random.Random) -> None:
-    sock.sendall(rng.choice((encode_json, encode_bare_json))(request("status")))
-    sock.shutdown(socket.SHUT_WR)
-    began = time.monotonic()
-    if not hear(sock, 20):
-        assert time.monotonic() - began < 20, "neither an answer nor an end"
+def half_close(client: Client) -> Steps:
+    yield from client.send(any_form(client, request("status")))
+    client.stream.end_sending()
+    if not (yield from client.hear(PATIENCE_TURNS)):
         raise ConnectionAbortedError("one too many: not let in")
-    answers["heard after a half close"] += 1
+    client.answers["heard after a half close"] += 1
 
 
 @kind
-def half_close_at_once(sock: socket.socket, _rng: random.Random) -> None:
-    sock.shutdown(socket.SHUT_WR)
-    assert hear(sock, 20) == b""
+def half_close_at_once(client: Client) -> Steps:
+    client.stream.end_sending()
+    assert (yield from client.hear(PATIENCE_TURNS)) == b""
 
 
 @kind
-def reset_with_a_request(sock: socket.socket, rng: random.Random) -> None:
-    sock.sendall(rng.choice(FRAMED[:-2]) * rng.randint(0, 3))
-    reset(sock)
+def reset_with_a_request(client: Client) -> Steps:
+    yield from client.send(client.chance.choice(FRAMED[:-2]) * client.chance.randint(0, 3))
+    if client.chance.random() < 0.5:
+        yield
+    client.stream.reset()
 
 
 @kind
-def half_a_message_then_silence(sock: socket.socket, rng: random.Random) -> None:
-    whole = rng.choice((*FRAMED[:3], *BARE[:3]))
-    sock.sendall(whole[: rng.randrange(1, len(whole))])
-    hold(sock)
+def half_a_message_then_silence(client: Client) -> Steps:
+    whole = client.chance.choice((*FRAMED[:3], *BARE[:3]))
+    yield from client.send(whole[: client.chance.randrange(1, len(whole))])
+    client.hold()
 
 
 @kind
-def silence(sock: socket.socket, _rng: random.Random) -> None:
-    hold(sock)
+def silence(client: Client) -> Steps:
+    client.hold()
+    yield from ()
 
 
 @kind
-def huge_length(sock: socket.socket, rng: random.Random) -> None:
-    sock.sendall(struct.pack(">IB", rng.choice((16386, 2**24, 2**32 - 1)), 2) + b"{" * 1000)
-    hear(sock)
+def huge_length(client: Client) -> Steps:
+    length = client.chance.choice((16386, 2**24, 2**32 - 1))
+    yield from client.send(struct.pack(">IB", length, 2) + b"{" * 1000)
+    yield from client.hear()
 
 
 @kind
-def json_bomb(sock: socket.socket, rng: random.Random) -> None:
-    text = rng.choice(HOSTILE_TEXTS)
-    sock.sendall(framed(text) if rng.random() < 0.5 else b"{" + text + b"\n")
-    hear(sock)
+def json_bomb(client: Client) -> Steps:
+    text = client.chance.choice(HOSTILE_TEXTS)
+    yield from client.send(framed(text) if client.chance.random() < 0.5 else b"{" + text + b"\n")
+    yield from client.hear()
 
 
 @kind
-def flood(sock: socket.socket, rng: random.Random) -> None:
-    with contextlib.suppress(BlockingIOError):
-        sock.setblocking(False)
-        sock.send(rng.choice((encode_json, encode_bare_json))(request("status")) * rng.randint(50, 2000))
-    if rng.random() < 0.5:
-        hold(sock)  # the answers wait for ever
+def flood(client: Client) -> Steps:
+    client.send_some(any_form(client, request("status")) * client.chance.randint(50, 2000))
+    if client.chance.random() < 0.5:
+        client.hold()  # the answers wait for ever
+    yield
 
 
 @kind
-def asks_much_and_reads_nothing(sock: socket.socket, _rng: random.Random) -> None:
-    sock.setblocking(False)
-    with contextlib.suppress(BlockingIOError):
-        sock.send(encode_json(request("describe", "x" * (MAX_REQUEST_LENGTH - 60))) * 90)
-    hold(sock)
+def asks_much_and_reads_nothing(client: Client) -> Steps:
+    client.send_some(encode_json(request("describe", "x" * (MAX_REQUEST_LENGTH - 60))) * 90)
+    client.hold()
+    yield
 
 
 @kind
-def subscribe_and_vanish(sock: socket.socket, rng: random.Random) -> None:
-    sock.sendall(encode_json(request("subscribe", every=rng.choice((1, 7)), fresh_only=False)))
-    if rng.random() < 0.5:
-        hear(sock)
-    rng.choice((reset, hold, socket.socket.close))(sock)
+def subscribe_and_vanish(client: Client) -> Steps:
+    every = client.chance.choice((1, 7))
+    yield from client.send(encode_json(request("subscribe", every=every, fresh_only=False)))
+    if client.chance.random() < 0.5:
+        yield from client.hear()
+    client.chance.choice((client.stream.reset, client.hold, client.stream.close))()
 
 
 @kind
-def byte_by_byte(sock: socket.socket, rng: random.Random) -> None:
-    for byte in rng.choice((FRAMED[0], BARE[0])):
-        sock.sendall(bytes((byte,)))
-        if rng.random() < 0.1:
-            time.sleep(0.001)
-    assert b'"ok":true' in hear(sock, 20, until=b'"ok":true')
+def byte_by_byte(client: Client) -> Steps:
+    for byte in client.chance.choice((FRAMED[0], BARE[0])):
+        yield from client.send(bytes((byte,)))
+        if client.chance.random() < 0.1:
+            yield
+    if b'"ok":true' not in (yield from client.hear(PATIENCE_TURNS, until=b'"ok":true')):
+        raise ConnectionAbortedError("one too many: not let in")
 
 
 @kind
-def shut_it_down(sock: socket.socket, rng: random.Random) -> None:
-    forged = {**_SHUTDOWN, "uid": 0, "user": "root"}
-    message = rng.choice((_SHUTDOWN, forged))
-    sock.sendall(rng.choice((encode_json, encode_bare_json))(message) * rng.randint(1, 3))
-    rng.choice((reset, socket.socket.close, hear))(sock)
+def shut_it_down(client: Client) -> Steps:
+    message = client.chance.choice((_SHUTDOWN, {**_SHUTDOWN, "uid": 0, "user": "root"}))
+    yield from client.send(any_form(client, message) * client.chance.randint(1, 3))
+    if client.chance.random() < 0.5:
+        yield
+    how = client.chance.randrange(3)
+    if how == 2:
+        yield from client.hear()
+    else:
+        (client.stream.reset, client.stream.close)[how]()
 
 
-def crowd(port: int, count: int) -> None:
-    """All ask as much as they can, all kinds of requests, and read the answers."""
+def ask_without_pause(client: Client) -> Steps:
+    """One of a crowd: asks as much as it can, all kinds of requests, and reads the answers. Without end."""
     room = MAX_REQUEST_LENGTH - 60
-    asked = [encode_json(m) for m in (request("status"), request("describe", "x" * room), request("no"))]
+    plain = (request("status"), request("describe", "x" * room), request("no"), _SHUTDOWN)
+    asked = [encode_json(message) for message in plain]
     asked.append(encode_json(request("sdo_read", index=0x1008)))
     asked.append(framed(b'{"action":"describe","id":[' + b",".join([b"1e15"] * (room // 5)) + b"]}"))
-    waiting = {socket.create_connection(("127.0.0.1", port), timeout=20): b"" for _ in range(count)}
-    ending = time.monotonic() + CROWD_S
-    for turn in itertools.count():
-        if time.monotonic() > ending or not waiting:
-            break
-        readable, writable, _ = select.select(waiting, waiting, (), 0.1)
-        for sock in readable:
-            hear_some(sock)
-        for sock in writable:
-            whole = waiting[sock] or asked[turn % len(asked)] * 4
-            waiting[sock] = whole[sock.send(whole, socket.MSG_DONTWAIT) :]
-        time.sleep(0.001)
-    print(json.dumps({"done": {"crowd": count}, "answers": answers}))
+    while True:
+        for some in asked:
+            yield from client.send(some * 4)
+            if client.hear_some() == b"":
+                raise ConnectionAbortedError
 
 
-def hear_some(sock: socket.socket) -> None:
-    """What there is; ConnectionError once the server has closed it."""
-    if not (data := sock.recv(65536)):
-        raise ConnectionError
-    answers["refusals"] += data.count(b'"ok":false')
-    answers["grants"] += data.count(b'"ok":true')
+class Siege:
+    """`count` hostile connections of random kinds, some at a time; the first ones are of one kind each."""
 
+    def __init__(
+        self, connect: Callable[[int], Stream], count: int, seed: int, kinds: Iterable[Kind] = KINDS
+    ) -> None:
+        """`connect` makes a connection of a user."""
+        self.done: collections.Counter[str] = collections.Counter()
+        self.answers: collections.Counter[str] = collections.Counter()
+        self._connect, self._count, self._kinds = connect, count, list(kinds)
+        self._chance = random.Random(seed)
+        self._acting: dict[Client, tuple[Kind, Steps]] = {}
+        self._held: collections.deque[Client] = collections.deque()
+        self._begun = 0
 
-def main() -> None:
-    """Make the connections."""
-    port, count = int(sys.argv[1]), int(sys.argv[2])
-    if sys.argv[3] == "crowd":
-        become_nobody()
-        crowd(port, count)
-        return
-    am_root = NO_OTHER_USER is None
-    "x".encode("idna")  # what connecting by name loads, while this user can still read it
-    rng = random.Random(int(sys.argv[3]))
-    done: collections.Counter[str] = collections.Counter()
-    for number in range(count):
-        nuisance = KINDS[number] if number < len(KINDS) else rng.choice(KINDS)
-        if am_root and number % OF_ONE_USER == 0:
-            # A socket belongs to whoever its maker was at that moment.
-            os.seteuid(0)
-            os.seteuid(FIRST_UID + number // OF_ONE_USER % USERS)
-        host = "::1" if rng.random() < 0.1 and socket.has_ipv6 else "127.0.0.1"
-        try:
-            sock = socket.create_connection((host, port), timeout=20)
-            nuisance(sock, rng)
-        except ConnectionError:
-            answers["cut off"] += 1
-        except OSError as error:
-            # One too many is closed at once, and then the socket is not connected any more.
-            if error.errno == errno.ENOTCONN:
-                answers["cut off"] += 1
-            elif isinstance(error, TimeoutError) or host == "127.0.0.1":
-                raise
-        if sock not in held:
-            sock.close()
-        done[nuisance.__name__] += 1
-    for sock in held:
-        sock.close()
-    print(json.dumps({"done": done, "answers": answers}))
+    def act(self) -> None:
+        """A turn of each."""
+        if self._begun < self._count and len(self._acting) < AT_ONCE and self._chance.random() < 0.6:
+            self._begin()
+        for client, (nuisance, steps) in list(self._acting.items()):
+            try:
+                next(steps)
+                continue
+            except StopIteration:
+                pass
+            except OSError as error:
+                # One too many is closed at once, and then the socket is not connected any more.
+                if not isinstance(error, ConnectionError) and error.errno != errno.ENOTCONN:
+                    raise
+                self.answers["cut off"] += 1
+            del self._acting[client]
+            self.done[nuisance.__name__] += 1
+            self._held.append(client)
+            if not client.is_held or len(self._held) > MOST_HELD:
+                (self._held.popleft() if client.is_held else self._held.pop()).stream.close()
+        if self.is_over:
+            while self._held:
+                self._held.pop().stream.close()
 
+    def _begin(self) -> None:
+        chance, number = self._chance, self._begun
+        self._begun += 1
+        stream = self._connect(FIRST_UID + number // OF_ONE_USER % USERS)
+        nuisance = self._kinds[number] if number < len(self._kinds) else chance.choice(self._kinds)
+        client = Client(stream, chance, self.answers)
+        self._acting[client] = nuisance, nuisance(client)
 
-if __name__ == "__main__":
-    main()
+    @property
+    def is_over(self) -> bool:
+        return self._begun == self._count and not self._acting
+
+    def check(self) -> None:
+        """They were of all kinds."""
+        print(self.done, self.answers)
+        assert sum(self.done.values()) == self._count
+        assert all(self.done[nuisance.__name__] for nuisance in self._kinds)

@@ -1,145 +1,197 @@
-"""Hundreds of hostile connections to a real server: one that only listens notices nothing of them."""
+"""Hundreds of hostile connections: an honest client notices nothing of them, and nothing of them remains.
+
+In simulated time, and some on real sockets.
+"""
 
 from __future__ import annotations
 
-import json
+import contextlib
+import gc
+import io
+import logging
 import os
 import socket
-import subprocess
+import struct
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from random import Random
+from types import SimpleNamespace
 
 import pytest
 
-from ethercat_server.serving.connection import MAX_REQUEST_LENGTH
+from ethercat_server.process import logs
+from ethercat_server.serving.connection import MAX_REQUEST_LENGTH, Connection
 from ethercat_server.serving.permissions import MAX_CLIENTS_PER_USER
-from protocol.control import request
+from ethercat_server.serving.transport.in_memory import InMemoryStream
+from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.control import ACTIONS, request
 from protocol.framing import DataFlag, encode_json
+from protocol.text.json_text import JsonObject
 from tests.hostile_bytes import framed
-from tests.server.running import Client, Server, needs_bus, server, wait_until
-from tests.server.test_end_to_end import sample_number
+from tests.server import hostile_clients
+from tests.server.as_another_user import NO_OTHER_USER
+from tests.server.hostile_clients import KINDS, Siege, ask_without_pause, shut_it_down
+from tests.server.running import needs_bus, server, wait_until
+from tests.simulation import OLD, Simulation, check_frames, reading
 
-pytestmark = [pytest.mark.bus, needs_bus]
-NOT_NEW = DataFlag.REPEATED | DataFlag.INVALID
 SEED = int(os.environ.get("FUZZ_SEED", "20261121"))
+REQUEST_NS = 150_000
+"""What a request costs the server's thread in simulated time."""
+LINGER_S = 1.2
+"""After which the server has closed whatever it does not need."""
+CROWD_S = 2.0
 GROWTH_MB = 8
-"""What the second half of the connections may add: those that hang at one time may be of a larger kind."""
+"""What as many connections again may add to a real server: others may hang at that time."""
+IPV6 = socket.has_ipv6 and Path("/proc/net/if_inet6").exists()
 LOG_LIMIT = 20_000
 """Characters that hostile clients may make the server log in ten seconds."""
 
 
-@pytest.fixture(scope="module")
-def one() -> Iterator[Server]:
-    """One server for the tests that only look at its memory."""
-    with server("virtual") as running:
-        yield running
+class Besieged:
+    """A server whose requests take time, and an honest client that only listens."""
+
+    def __init__(self) -> None:
+        self.simulation = Simulation(SensorOptions(signal="clock", ppm=150.0))
+        self.log = io.StringIO()
+        self.granted: list[JsonObject] = []
+        """What others were granted although it needs a right that they do not have."""
+        self._streams: list[InMemoryStream] = []
+        assert self.simulation.hub._handler is not None
+        self._handle = self.simulation.hub._handler
+        self.simulation.hub.start(self._handle_slowly)
+        self.listener, self.asking = self.simulation.connect(), self.simulation.connect()
+        self.listener.ask("subscribe")
+        self.listener.fresh(200)
+
+    def _handle_slowly(self, connection: Connection, message: JsonObject) -> JsonObject | None:
+        self.simulation.clock.stall(REQUEST_NS)
+        answer = self._handle(connection, message)
+        if connection.uid != 0 and ACTIONS[message["action"]].controls:
+            self.granted.append(message)
+        return answer
+
+    def connect(self, uid: int) -> InMemoryStream:
+        self._streams.append(self.simulation.transport.connect(uid))
+        return self._streams[-1]
+
+    def endure(self, siege: Siege) -> None:
+        def act(_: int) -> None:
+            siege.act()
+            if len(self.listener.frames) > 2000:
+                self.check()
+
+        self.simulation.on_serve = act
+        self.simulation.run_until(lambda: siege.is_over, "the end of the siege", 1e6)
+        self.simulation.on_serve = lambda _: None
+        self.simulation.run(LINGER_S)
+        siege.check()
+        assert {"grants", "refusals", "heard after a half close"} <= siege.answers.keys()
+        self.check_status()
+        self.forget_streams()
+
+    def forget_streams(self) -> None:
+        """The two ends of a connection refer to one another."""
+        for stream in self._streams:
+            assert stream.other.closed
+            del stream.other.other, stream.other
+        self._streams.clear()
+
+    def check(self) -> None:
+        """The honest client got every sample; only the last one is kept."""
+        frames = self.listener.frames
+        check_frames(frames)
+        assert not any(frame.flags & (OLD | DataFlag.GAP) for frame in frames)
+        assert reading(frames[-1]).number - reading(frames[0]).number == len(frames) - 1
+        del frames[:-1]
+        self.simulation.frames.clear()
+        self.simulation.published_ns.clear()
+
+    def check_status(self) -> None:
+        self.check()
+        status = self.asking.ask("status")
+        assert [row["withheld"] for row in status["clients"]] == [0, 0], "nobody else is left"
+        assert (status["sensors"][0]["lost_samples"], status["sensors"][0]["recoveries"]) == (0, 0)
+        assert self.granted == []
+        assert "Traceback" not in self.log.getvalue()
+        self.asking.replies.clear()
 
 
-class Listener:
-    """The honest subscriber: checks every frame as it comes and keeps none."""
+@contextlib.contextmanager
+def besieged() -> Iterator[Besieged]:
+    """With the log as the server writes it, and with the collector off, as it is in the loop.
 
-    def __init__(self, client: Client) -> None:
-        client.ask("subscribe")
-        self._client = client
-        self.samples = self.lost = self.unflagged = 0
-        self._number = -1
-        self._gap = False
-
-    def listen(self, count: int) -> None:
-        """Take the next frames."""
-        for frame in self._client.collect(count):
-            self._gap |= bool(frame.flags & DataFlag.GAP)
-            if frame.flags & NOT_NEW:
-                continue
-            number = sample_number(frame)
-            if self._number >= 0:
-                assert number > self._number, "a sample came twice or out of order"
-                skipped = number - self._number - 1
-                self.lost += skipped
-                self.unflagged += skipped > 0 and not self._gap
-            self._number, self._gap = number, False
-            self.samples += 1
-
-    def check(self, status: dict[str, Any]) -> None:
-        """Nothing was withheld, and what is lost was the bus's, and the server says so."""
-        own_port = self._client.sock.getsockname()[1]
-        (mine,) = [row for row in status["clients"] if row["peer"].endswith(f":{own_port}")]
-        assert mine["withheld"] == 0
-        assert self.unflagged <= 1 + self.samples // 1000, "a starved sensor answers when nobody can know"
-        counted = status["sensors"][0]["lost_samples"]
-        assert self.lost <= counted + 1 + self.samples // 100, "lost between server and client"
-
-
-class Resources:
-    """What the server's process takes."""
-
-    def __init__(self, running: Server) -> None:
-        self._proc = Path("/proc", str(running.process.pid))
-
-    def resident_mb(self) -> float:
-        return int((self._proc / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-    def descriptors(self) -> int:
-        return len(list((self._proc / "fd").iterdir()))
-
-
-def attack(running: Server, listener: Listener, count: int, seed: int | str) -> Any:
-    """Hostile connections, while the honest one listens; what they report."""
-    command = [sys.executable, "-m", "tests.server.hostile_clients", str(running.port), str(count), str(seed)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as clients:
-        try:
-            while clients.poll() is None:
-                listener.listen(100)
-        finally:
-            clients.kill()
-        said, complaints = clients.communicate()
-    assert clients.returncode == 0, f"seed {seed}: {complaints}"
-    report = json.loads(said)
-    assert sum(report["done"].values()) == count
-    assert report["answers"]["grants"] > 0
-    assert report["answers"]["refusals"] > 0
-    assert "half_close" not in report["done"] or report["answers"].get("heard after a half close", 0) > 0
-    print(f"seed {seed}: {report}")
-    return report
+    To be entered by the test itself: what a fixture logs is recorded by pytest.
+    """
+    found = Besieged()
+    clock = found.simulation.clock
+    handler = logging.StreamHandler(found.log)
+    handler.setFormatter(logs.PlainFormatter())
+    handler.addFilter(logs.Repetitions())
+    logger = logging.getLogger("ethercat_server")
+    with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as cleanup:
+        patch.setattr(logs, "time", SimpleNamespace(monotonic=lambda: clock.now_ns * 1e-9))
+        patch.setattr(logger, "propagate", False)
+        patch.setattr(logger, "level", logging.INFO)
+        logger.addHandler(handler)
+        cleanup.callback(logger.removeHandler, handler)
+        gc.collect()
+        gc.disable()
+        cleanup.callback(gc.enable)
+        yield found
 
 
 def besiege(count: int) -> None:
-    with server("virtual", "--virtual", "--signal clock --ppm 150") as running, running.connect() as client:
-        resources, listener = Resources(running), Listener(client)
-        listener.listen(200)
-        descriptors, resident = resources.descriptors(), []
-        for part in range(2):
-            attack(running, listener, count // 2, SEED + part)
-            listener.check(client.ask("status"))
-            resident.append(resources.resident_mb())
-        print(f"{listener.samples} samples, {listener.lost} lost; resident {resident} MB")
-        assert resident[1] - resident[0] < GROWTH_MB, f"memory grows: {resident} MB"
-        wait_until(lambda: resources.descriptors() == descriptors, "all connections to be closed")
-        with running.connect() as other:
-            assert other.ask("describe")["ok"]
-        listener.listen(200)
-        log = running.said()
-        assert "Traceback" not in log
-        assert len(log) < LOG_LIMIT * (1 + listener.samples // 8000), "the log can be flooded"
-        assert client.ask("shutdown")["ok"]
-        assert running.wait() == 0
+    with besieged() as found:
+        began_ns, blocks = found.simulation.clock.now_ns, []
+        for part in range(3):
+            found.endure(Siege(found.connect, count, SEED + part))
+            circles = gc.collect()
+            blocks.append(sys.getallocatedblocks())
+        assert circles == 0, "nobody collects them while the bus runs"
+        assert blocks[2] - blocks[1] < 2 * count, f"memory grows: {blocks} blocks"
+        tens = (found.simulation.clock.now_ns - began_ns) * 1e-10
+        assert len(found.log.getvalue()) < LOG_LIMIT * (1 + tens), "the log can be flooded"
+        assert found.asking.ask("describe")["ok"]
 
 
 def test_hostile_connections_harm_nobody() -> None:
     besiege(300)
 
 
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_fifty_thousand_hostile_connections_harm_nobody() -> None:
+    besiege(50_000)
+
+
 def test_a_crowd_that_asks_without_pause_costs_no_samples() -> None:
-    with server("virtual", "--virtual", "--signal clock --ppm 150") as running, running.connect() as client:
-        listener = Listener(client)
-        attack(running, listener, MAX_CLIENTS_PER_USER, "crowd")
-        status = client.ask("status")
-        listener.check(status)
-        print(f"{listener.samples} samples, {listener.lost} lost")
-        asked_in_time = status["sensors"][0]["recoveries"] == 0
-        assert asked_in_time or status["lost_frames"], "or it was starved itself"
+    with besieged() as found:
+        answers: list[Counter[str]] = [Counter() for _ in range(MAX_CLIENTS_PER_USER + 4)]
+        crowd = {
+            number: ask_without_pause(hostile_clients.Client(found.connect(4711), Random(SEED), counted))
+            for number, counted in enumerate(answers)
+        }
+
+        def act(_: int) -> None:
+            for number, steps in list(crowd.items()):
+                try:
+                    next(steps)
+                except ConnectionError:
+                    del crowd[number]
+
+        found.simulation.on_serve = act
+        found.simulation.run(CROWD_S)
+        found.check()
+        assert len(crowd) == MAX_CLIENTS_PER_USER, "more are not let in"
+        assert found.granted == []
+        assert found.log.getvalue().count("shutdown denied") == 5, "more are summed up later"
+        handled = [answers[number]["grants"] + answers[number]["refusals"] for number in crowd]
+        assert min(handled) > 0.5 * max(handled), "each has its turn"
+        spent = sum(handled) * REQUEST_NS / (CROWD_S * 1e9)
+        assert 0.05 < spent < 0.11, "they get a tenth of the time"
+        assert found.asking.ask("status")["sensors"][0]["lost_samples"] == 0
 
 
 REFUSED = {
@@ -153,23 +205,90 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("sent", REFUSED.values(), ids=REFUSED)
-def test_what_was_refused_leaves_nothing_behind(one: Server, sent: bytes) -> None:
+def test_what_was_refused_leaves_nothing_behind(sent: bytes) -> None:
     """The server collects no circles while the bus runs, and an exception that is kept easily makes one."""
-    resources = Resources(one)
+    with besieged() as found:
 
-    def refuse(count: int) -> float:
-        for _ in range(count):
-            with socket.create_connection(("127.0.0.1", one.port), timeout=20) as sock:
-                sock.sendall(sent)
-                sock.shutdown(socket.SHUT_WR)
-                assert b'"ok":false' in sock.recv(65536)
-        return resources.resident_mb()
+        def refuse(count: int) -> int:
+            streams = [found.connect(0) for _ in range(count)]
+            for stream in streams:
+                stream.send(sent)
+                stream.end_sending()
+            found.simulation.run_until(lambda: all(stream.other.closed for stream in streams), "the end")
+            assert all(b'"ok":false' in stream.recv_all() for stream in streams)
+            found.check_status()
+            found.forget_streams()
+            return sys.getallocatedblocks()
 
-    before = refuse(100)
-    assert refuse(500) - before < 0.5
+        for _ in range(3):
+            before = refuse(50)
+        assert refuse(50) - before < 500, "a circle is of more than ten blocks"
+        assert gc.collect() == 0
+
+
+class Socket:
+    """A client's end on a real socket."""
+
+    def __init__(self, port: int, uid: int) -> None:
+        # A socket belongs to whoever its maker was at that moment.
+        family, host = (socket.AF_INET6, "::1") if uid % 2 and IPV6 else (socket.AF_INET, "127.0.0.1")
+        if NO_OTHER_USER is None:
+            os.seteuid(uid)
+        try:
+            self._sock = socket.socket(family)
+        finally:
+            if NO_OTHER_USER is None:
+                os.seteuid(0)
+        self._sock.connect((host, port))
+        self._sock.setblocking(False)
+        self.send, self.recv, self.close = self._sock.send, self._sock.recv, self._sock.close
+
+    def end_sending(self) -> None:
+        self._sock.shutdown(socket.SHUT_WR)
+
+    def reset(self) -> None:
+        self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.close()
+
+
+def besiege_real(count: int) -> None:
+    # Whoever cannot become another user here may shut it down.
+    kinds = [nuisance for nuisance in KINDS if NO_OTHER_USER is None or nuisance is not shut_it_down]
+    with server("virtual") as running, running.connect() as listener:
+        process = Path("/proc", str(running.process.pid))
+
+        def descriptors() -> int:
+            return len(list((process / "fd").iterdir()))
+
+        listener.ask("subscribe")
+        listener.collect(10)
+        before, resident_mb = descriptors(), []
+        for part in range(2):
+            siege = Siege(lambda uid: Socket(running.port, uid), count, SEED + part, kinds)
+            while not siege.is_over:
+                siege.act()
+                listener.collect(1)
+            siege.check()
+            pages = int((process / "statm").read_text().split()[1])
+            resident_mb.append(pages * os.sysconf("SC_PAGE_SIZE") / 1e6)
+        wait_until(lambda: descriptors() == before, "all connections to be closed")
+        assert resident_mb[1] - resident_mb[0] < GROWTH_MB, f"memory grows: {resident_mb} MB"
+        listener.collect(10)
+        assert "Traceback" not in running.said()
+        assert listener.ask("shutdown")["ok"]
+        assert running.wait() == 0
+
+
+@pytest.mark.bus
+@needs_bus
+def test_hostile_connections_to_a_real_server() -> None:
+    """The kernel's resets, half-closed connections, full buffers and owners of sockets."""
+    besiege_real(20)
 
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_ten_thousand_hostile_connections_harm_nobody() -> None:
-    besiege(10_000)
+@pytest.mark.bus
+@needs_bus
+def test_ten_thousand_hostile_connections_to_a_real_server() -> None:
+    besiege_real(5_000)

@@ -1,7 +1,4 @@
-"""Virtual sensors in memory that are wrong in one way; the program under test keeps its own tables.
-
-The same ways as `odd_sensor`, which is for sensors that run as a process.
-"""
+"""Virtual sensors in memory that are wrong in one way; the program under test keeps its own tables."""
 
 from __future__ import annotations
 
@@ -20,6 +17,7 @@ FOREIGN_LACKS = frozenset({0x1009, 0x1018, 0x2000, 0x7000, 0x8000, 0x8001, 0x800
 FOREIGN_VENDOR = 0xDEAD
 _VENDOR = slice(0x10, 0x14)
 """In the EEPROM."""
+_PRODUCT = slice(0x14, 0x18)
 _MAILBOXES = slice(0x30, 0x3A)
 
 
@@ -51,6 +49,10 @@ def foreign(patch: pytest.MonkeyPatch) -> None:
     lacking = {(index, subindex) for index in FOREIGN_LACKS for subindex in range(256)}
     _lack(patch, lacking, AbortCode.NO_OBJECT)
     _change_eeprom(patch, _VENDOR, FOREIGN_VENDOR.to_bytes(4, "little"))
+
+
+def other_product(patch: pytest.MonkeyPatch) -> None:
+    _change_eeprom(patch, _PRODUCT, (7).to_bytes(4, "little"))
 
 
 def no_mailbox(patch: pytest.MonkeyPatch) -> None:

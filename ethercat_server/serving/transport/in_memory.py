@@ -105,6 +105,10 @@ class InMemoryStream:
         self.other._reset |= bool(self._received)
         self.other._ended = True
 
+    def reset(self) -> None:
+        """Close both sides; the other end finds the connection reset, whatever it has not read yet is gone."""
+        self.closed = self.other._reset = self.other._ended = True
+
     @property
     def at_end(self) -> bool:
         """Whether nothing more comes: everything until the other end closed was read, or it was reset."""
