@@ -119,12 +119,12 @@ def draw(path: Path, data: Samples, shown: Mapping[str, Array]) -> None:
     """Write the figure."""
     import matplotlib as mpl
 
-    mpl.use("Agg")
+    from matplotlib.figure import Figure
+
     mpl.rcParams["svg.fonttype"] = "none"
     mpl.rcParams["svg.hashsalt"] = "compensation"  # the same file every time
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(3, 3, figsize=(12, 8), sharex=True)
+    figure = Figure(figsize=(12, 8))
+    axes = figure.subplots(3, 3, sharex=True)
     three_sigma = 3 * scene.Scene(1, noise=True).deviations[0]
     for number, (name, left) in enumerate(shown.items()):
         panel = axes[number // 3][number % 3]
@@ -148,7 +148,6 @@ def draw(path: Path, data: Samples, shown: Mapping[str, Array]) -> None:
     figure.suptitle(title, fontsize=10)
     figure.tight_layout()
     figure.savefig(path, metadata={"Date": None})
-    pyplot.close(figure)
 
 
 if __name__ == "__main__":
