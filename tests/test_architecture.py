@@ -141,7 +141,7 @@ def is_below(module: str, package: str) -> bool:
 def may_import(module: str, imported: str) -> bool:
     if imported in MODULES:
         return not {room(imported), imported}.isdisjoint(ROOMS[room(module)])
-    package = imported.split(".")[0]
+    package = imported.split(".", maxsplit=1)[0]
     return package in sys.stdlib_module_names or any(
         is_below(module, position) for position in PACKAGES.get(package, ())
     )

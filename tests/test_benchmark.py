@@ -205,10 +205,12 @@ def running(program: Callable[[argparse.Namespace], None], **options: object) ->
 
 def test_the_client_records_every_sample_and_its_age(tmp_path: Path) -> None:
     recording = Recording(path := tmp_path / "records", 0.0, 0.1)
-    with served(SensorOptions(signal="clock"), sinc_length=256) as server:
-        with socket.create_connection(("127.0.0.1", server.port)) as connection:
-            connection.sendall(encode_json(request("subscribe")))
-            client.record(connection, recording)
+    with (
+        served(SensorOptions(signal="clock"), sinc_length=256) as server,
+        socket.create_connection(("127.0.0.1", server.port)) as connection,
+    ):
+        connection.sendall(encode_json(request("subscribe")))
+        client.record(connection, recording)
     recording.write()
     figures, ages = statistics.summary(statistics.read_arrivals(path), 5_000_000, NO_STOPS)
     assert figures["made"] == figures["arrivals"] + figures["lost"] > 1

@@ -60,7 +60,7 @@ def test_it_is_built_with_the_compiler_that_is_there(tmp_path: Path, monkeypatch
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     assert "-O2 " in build(tmp_path).read_text()
     compiler.write_text("#!/bin/sh\necho an error >&2\nexit 1\n")
-    with pytest.raises(DemoError, match="could not build the C.. benchmark:\nan error"):
+    with pytest.raises(DemoError, match=r"could not build the C\+\+ benchmark:\nan error"):
         build(tmp_path)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(DemoError, match=r"apt install g\+\+"):

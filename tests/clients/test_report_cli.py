@@ -23,7 +23,6 @@ from tests.clients.simulated import STARTED_AT_NS, described, simulate
 from tests.server.running import PATIENCE_S, free_port
 from tests.simulated_links import simulated_bus, simulated_server
 
-
 SINC, SPLIT = 128, 600
 
 

@@ -118,7 +118,6 @@ def panels(data: Samples) -> Iterator[tuple[str, Array]]:
 def draw(path: Path, data: Samples, shown: Mapping[str, Array]) -> None:
     """Write the figure."""
     import matplotlib as mpl
-
     from matplotlib.figure import Figure
 
     mpl.rcParams["svg.fonttype"] = "none"
