@@ -28,6 +28,7 @@ from ethercat_server.sensor.sensor import Identity
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.sensor_actions import SensorActions
+from ethercat_server.serving.transport.base import Transport
 from ethercat_server.serving.transport.in_memory import InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
@@ -84,7 +85,7 @@ class Simulation:
         self.clock = self.backend.clock
         self.started_ns = self.clock.now_ns
         self.transport = InMemoryTransport(self.clock)
-        self.hub = Hub(self.transport, self.clock.monotonic_ns)
+        self.hub = Hub(self.listen(), self.clock.monotonic_ns)
         self.bus = Bus(self.backend)
         self.sensors = bring_up(self.bus, Asked(settings), lambda: None)
         self.streams = [SensorStream(s.position, s.period_ns, self.clock) for s in self.sensors]
@@ -101,6 +102,10 @@ class Simulation:
         self._decoder = FrameDecoder()
         self._awaited: Callable[[], object] = lambda: False
         self.on_serve: Callable[[int], None] = lambda _: None
+
+    def listen(self) -> Transport:
+        """Where its clients come from."""
+        return self.transport
 
     # -- what the loop hands its samples to
 

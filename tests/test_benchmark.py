@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import io
+import itertools
 import json
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,13 +25,21 @@ import pytest
 
 np = pytest.importorskip("numpy")
 
+from rich.console import Console  # noqa: E402
+
+from ethercat_server.virtual_sensor.options import SensorOptions  # noqa: E402
+from protocol.control import request  # noqa: E402
+from protocol.framing import encode_json  # noqa: E402
+from protocol.pdo import encode  # noqa: E402
+from scripts.benchmarks import chains, statistics  # noqa: E402
 from scripts.benchmarks import program as benchmark  # noqa: E402
-from scripts.benchmarks import statistics  # noqa: E402
 from scripts.benchmarks.modes.soak import Tally, slope_kb_per_hour  # noqa: E402
+from scripts.benchmarks.processes import client, floor, polling  # noqa: E402
 from scripts.benchmarks.records import Recording, began, write  # noqa: E402
 from scripts.benchmarks.report import rows  # noqa: E402
 from scripts.benchmarks.statistics import Arrivals, Counts, Ints  # noqa: E402
-from tests.server.running import needs_bus  # noqa: E402
+from tests.served_simulation import served  # noqa: E402
+from tests.server.running import PATIENCE_S, free_port, needs_bus, wait_until  # noqa: E402
 
 ROOT = Path(__file__).parent.parent
 PERIOD = 1_250_000
@@ -170,7 +184,95 @@ def test_wrong_arguments_are_refused(wrong: list[str], capsys: pytest.CaptureFix
     assert wrong[0] in capsys.readouterr().err
 
 
+# -- its programs, as threads
+
+
+def clock_data(number: int) -> bytes:
+    """Process data as the signal `clock` has it."""
+    whole, rest = divmod(time.monotonic_ns(), 10**9)
+    values = (number, whole % 2**20, rest // 1000, rest % 1000)
+    return encode(61, dict(zip(("force.x", "force.y", "force.z", "torque.x"), values, strict=True)))
+
+
+@contextlib.contextmanager
+def running(program: Callable[[argparse.Namespace], None], **options: object) -> Iterator[threading.Thread]:
+    thread = threading.Thread(target=program, args=(argparse.Namespace(**options),))
+    thread.start()
+    yield thread
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+
+
+def test_the_client_records_every_sample_and_its_age(tmp_path: Path) -> None:
+    recording = Recording(path := tmp_path / "records", 0.0, 0.1)
+    with (
+        served(SensorOptions(signal="clock"), sinc_length=256) as server,
+        socket.create_connection(("127.0.0.1", server.port)) as connection,
+    ):
+        connection.sendall(encode_json(request("subscribe")))
+        client.record(connection, recording)
+    recording.write()
+    figures, ages = statistics.summary(statistics.read_arrivals(path), 5_000_000, NO_STOPS)
+    assert figures["made"] == figures["arrivals"] + figures["lost"] > 1
+    assert figures["repeated"] == 0
+    assert ages.min() > 0
+
+
+def test_the_polling_client_takes_what_is_there_when_it_looks(tmp_path: Path) -> None:
+    path, count = tmp_path / "records", itertools.count()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        with running(polling.client, path=path, port=port, rate=1000, warm_up=0.0, seconds=0.05) as looks:
+            sender, _ = listener.accept()
+            with sender, contextlib.suppress(ConnectionError):
+                while looks.is_alive():
+                    sender.sendall(clock_data(next(count) // 2))
+                    time.sleep(0.001)
+    (found,) = statistics.read_arrivals(path)
+    counts = statistics.count(found, 1e6, NO_STOPS)
+    assert counts.lost == 0, "it reads one after the other"
+    assert counts.repeated == pytest.approx(counts.made, abs=2)
+    assert statistics.ages(found).min() > 0
+    assert not found.stamp.any()
+
+
+def test_the_floor_has_the_way_of_a_bare_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(floor, "steady", lambda _: None)
+    monkeypatch.setattr(floor, "_WARM_UP_S", -1.0)  # even the first one counts
+    port, sent, received = free_port(), tmp_path / "sent", tmp_path / "received"
+    with (
+        running(floor.send, path=sent, port=port, rate=1000, seconds=1.05, priority=0, sensors=2),
+        running(floor.receive, path=received, port=port),
+    ):
+        pass
+    ways = statistics.read_numbers(received, 1)
+    assert len(ways) % 2 == 0 < len(ways)
+    assert ways.min() > 0
+    assert sent.exists()
+
+
 # -- the thing itself
+
+
+def test_what_was_measured_is_shown_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures, ages = statistics.summary([arrivals(*range(5, 105))], PERIOD, NO_STOPS)
+    measured = {**figures, "rss_mb": {"server": 40.0}, "cpu_percent": {}}, ages
+    for chain in ("floor", "project_tcp", "polling_tcp"):
+        monkeypatch.setattr(chains, chain, lambda *_: measured)
+    monkeypatch.setattr(benchmark, "virtual_bus", lambda _: contextlib.nullcontext(("ecat0", 1)))
+    monkeypatch.setattr(benchmark, "loopback_up", lambda: None)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)
+    files = ("--json", str(tmp_path / "b.json"), "--plot", str(tmp_path / "b.png"))
+    shown = io.StringIO()
+    options = benchmark.parse([*files, "--no-ros", "--rates", "800", "--sensors", "1", "--rt-priority", "0"])
+    benchmark.run(options, Console(file=shown, width=100))
+    content = json.loads((tmp_path / "b.json").read_text())
+    (result,) = content["configurations"]
+    assert all(map(math.isfinite, numbers(content)))
+    assert (result["rate_hz"], result["sensors"]) == (800, 1)
+    assert result["polling"]["tcp"]["made"] == 100
+    assert "Up to a TCP client" in shown.getvalue()
+    assert (tmp_path / "b.png").exists() == (find_spec("matplotlib") is not None)
 
 
 def run(tmp_path: Path, *arguments: str) -> subprocess.Popen[str]:
@@ -221,6 +323,7 @@ def test_a_run_with_ros_and_two_sensors(tmp_path: Path) -> None:
 
 @needs_bus
 @pytest.mark.bus
+@pytest.mark.long
 def test_a_short_run(tmp_path: Path) -> None:
     short = ("--no-ros", "--seconds", "1", "--rates", "800", "--sensors", "1")
     running = run(tmp_path, *short)
@@ -250,10 +353,9 @@ def test_a_short_run(tmp_path: Path) -> None:
 @pytest.mark.bus
 def test_it_can_be_stopped_at_any_time(tmp_path: Path) -> None:
     running = run(tmp_path, "--soak", "10")
-    deadline = time.monotonic() + 30
-    while not list(tmp_path.glob("*/*/canary-0.log")) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    time.sleep(1.0)
+    wait_until(
+        lambda: any("streaming" in log.read_text() for log in tmp_path.glob("*/*/server.log")), "the server"
+    )
     running.send_signal(signal.SIGINT)
     said, _ = running.communicate(timeout=30)
     assert running.returncode in {0, 130}, said

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import tomllib
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parent.parent
 PRODUCT = sorted(
@@ -28,10 +25,9 @@ OTHERS = sorted(
 )
 
 
-@pytest.mark.parametrize("path", PRODUCT + OTHERS, ids=lambda p: str(p.relative_to(ROOT)))
-def test_every_file_says_what_it_is_for(path: Path) -> None:
-    text = path.read_text()
-    assert not text or ast.get_docstring(ast.parse(text)), path
+def test_every_file_says_what_it_is_for() -> None:
+    said = re.compile(r'(#.*\n)*\s*"""\S|$')
+    assert not [path for path in PRODUCT + OTHERS if not said.match(path.read_text())]
 
 
 def test_one_version() -> None:

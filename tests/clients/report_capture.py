@@ -8,16 +8,21 @@ Matplotlib may draw otherwise.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import html
 import re
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
+from unittest import mock
 
 from PIL import Image, PngImagePlugin
 
 from clients.report.examine import examine
+from clients.report.page import plots, stream_plots
 from clients.report.page.page import render
 from tests.clients import chromium
 from tests.clients.simulated import sensor
@@ -33,6 +38,17 @@ def fixed_page() -> str:
     """The page of the picture: a noisy axis, and some samples lost."""
     noisy = sensor(12, "noise force.y 0.6", "skip 0.3", seed=12)
     return render([examine(noisy)], made="2026-01-01 00:01 UTC", program="ethercat-report")
+
+
+@contextlib.contextmanager
+def undrawn() -> Iterator[None]:
+    """Pages without lines in their plots, which take a second each."""
+
+    def draw(_name: str, title: str, description: str, *_: object) -> str:
+        return f"<svg><title>{html.escape(title)}</title><desc>{html.escape(description)}</desc></svg>"
+
+    with mock.patch.object(plots, "draw", draw), mock.patch.object(stream_plots, "draw", draw):
+        yield
 
 
 def digest(page: str) -> str:

@@ -53,7 +53,7 @@ def simulate(
     clock = SimpleNamespace(monotonic_ns=lambda: now, time_ns=lambda: now - START_NS + STARTED_AT_NS)
     life = bus.sensors[0].life
     assert life is not None
-    decoder, frames = FrameDecoder(), list[DataMessage]()
+    wire = list[bytes]()
     end = START_NS + round(seconds * 1e9)
     stream = SensorStream(0, life.sampler.clock.sinc_length * 1e9 / 51200, cast(Clock, clock))
     while now < end:
@@ -67,8 +67,10 @@ def simulate(
         made = stream.take(data if valid else stream.process_data, 3 if valid else -1, valid, sent, now)
         stream.learn()
         if made is not None:
-            decoder.feed(made[0])
-            frames += [message for message in decoder if isinstance(message, DataMessage)]
+            wire.append(made[0])
+    decoder, frames = FrameDecoder(), list[DataMessage]()
+    decoder.feed(b"".join(wire))
+    decoder.take_data(frames)
     return tuple(frames)
 
 

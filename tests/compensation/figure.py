@@ -6,7 +6,7 @@ usage: python -m tests.compensation.figure [OUT.svg]. The virtual sensor runs at
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -106,24 +106,26 @@ def mistakes(data: Samples) -> Iterator[tuple[str, Array]]:
     yield "frame turned by 90° about z", compensated(data, gravity=data.gravity[:, [1, 0, 2]] * (1, -1, 1))
 
 
-def draw(path: Path) -> None:
+def panels(data: Samples) -> Iterator[tuple[str, Array]]:
+    """Title, and what is left, (n, 6)."""
+    yield "as measured", np.hstack([data.force, data.torque])
+    yield "bias subtracted (IV.1)", compensated(data, mass=0.0)
+    yield "gravity subtracted too (IV.5)", compensated(data)
+    for name, left in mistakes(data):
+        yield f"mistake: {name}", left
+
+
+def draw(path: Path, data: Samples, shown: Mapping[str, Array]) -> None:
     """Write the figure."""
     import matplotlib as mpl
+    from matplotlib.figure import Figure
 
-    mpl.use("Agg")
     mpl.rcParams["svg.fonttype"] = "none"
     mpl.rcParams["svg.hashsalt"] = "compensation"  # the same file every time
-    from matplotlib import pyplot
-
-    data = samples()
-    figure, axes = pyplot.subplots(3, 3, figsize=(12, 8), sharex=True)
-    stages = (
-        ("as measured", np.hstack([data.force, data.torque])),
-        ("bias subtracted (IV.1)", compensated(data, mass=0.0)),
-        ("gravity subtracted too (IV.5)", compensated(data)),
-    )
+    figure = Figure(figsize=(12, 8))
+    axes = figure.subplots(3, 3, sharex=True)
     three_sigma = 3 * scene.Scene(1, noise=True).deviations[0]
-    for number, (name, left) in enumerate([*stages, *mistakes(data)]):
+    for number, (name, left) in enumerate(shown.items()):
         panel = axes[number // 3][number % 3]
         for axis, colour in enumerate(("tab:red", "tab:green", "tab:blue")):
             panel.plot(
@@ -133,7 +135,7 @@ def draw(path: Path) -> None:
         if number == 2:
             for limit in (-three_sigma, three_sigma):
                 panel.axhline(limit, color="0.5", linestyle=":", linewidth=0.8)
-        panel.set_title(name if number < 3 else f"mistake: {name}", fontsize=9)
+        panel.set_title(name, fontsize=9)
         panel.set_ylim(-22, 22)
         panel.grid(visible=True, color="0.93")
     axes[0][0].legend(loc="upper right", fontsize=7, ncols=3)
@@ -145,8 +147,8 @@ def draw(path: Path) -> None:
     figure.suptitle(title, fontsize=10)
     figure.tight_layout()
     figure.savefig(path, metadata={"Date": None})
-    pyplot.close(figure)
 
 
 if __name__ == "__main__":
-    draw(Path(sys.argv[1]) if len(sys.argv) > 1 else FIGURE)
+    turn = samples()
+    draw(Path(sys.argv[1]) if len(sys.argv) > 1 else FIGURE, turn, dict(panels(turn)))

@@ -17,8 +17,8 @@ from protocol.pdo import Sample, SampleDecoder
 Stream = Iterable[tuple[float, Sample]]
 """Samples with their times, s since the signal began."""
 
-SINC = 128
-"""400 Hz: quick to simulate."""
+SINC = 256
+"""200 Hz: quick to simulate."""
 OFFSET = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)
 """What the sensor adds to its readings (object 0x8000): the bias that is to be found. N, Nm."""
 POSES_TAKE = len(POSES) * (POSE_LENGTH + MOVE_LENGTH)

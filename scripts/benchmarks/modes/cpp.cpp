@@ -31,6 +31,7 @@ struct Age {
     std::int64_t ns;
 };
 std::vector<Age> ages;
+std::size_t noted[2][2] = {};
 
 [[noreturn]] void fail(const char* what) {
     std::fprintf(stderr, "benchmark: %s\n", what);
@@ -100,7 +101,10 @@ private:
     std::uint64_t state_ = 88172645463325252u;
 };
 
-void note(Way way, Who who, std::uint64_t stamp) { ages.push_back({way, who, monotonic_now_ns() - static_cast<std::int64_t>(stamp)}); }
+void note(Way way, Who who, std::uint64_t stamp) {
+    ages.push_back({way, who, monotonic_now_ns() - static_cast<std::int64_t>(stamp)});
+    ++noted[way][who];
+}
 
 void take_bare(Bare& bare_socket, Way way) {
     for (;;) {
@@ -163,14 +167,16 @@ void pair(double hz, double seconds) {
     Client sensor("127.0.0.1", ntohs(address.sin_port));
     if (!sensor.connect()) fail(sensor.error());
     const auto until = [&] { return monotonic_now_ns() + static_cast<std::int64_t>(seconds * 1e9); };
+    // A busy machine may let all the time pass before there is one age of each.
+    const auto goes_on = [&](Way way, std::int64_t end) { return monotonic_now_ns() < end || !noted[way][bare] || !noted[way][client]; };
     Turns turns;
-    for (const std::int64_t end = until(); monotonic_now_ns() < end;) {
+    for (const std::int64_t end = until(); goes_on(waiting, end);) {
         if (turns.next() == bare)
             take_bare(bare_socket, waiting);
         else
             take_client(sensor, waiting);
     }
-    for (const std::int64_t end = until(); monotonic_now_ns() < end;) {
+    for (const std::int64_t end = until(); goes_on(polling, end);) {
         if (const std::uint64_t stamp = bare_socket.read(polling)) note(polling, bare, stamp);
         const Reading reading = sensor.latest();
         if (reading.is_new) note(polling, client, reading.monotonic_ns);
