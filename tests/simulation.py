@@ -15,8 +15,10 @@ failure is repeated by the same arguments, step by step in a debugger.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
+
+import pytest
 
 from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.acquisition.jobs import Jobs
@@ -42,7 +44,8 @@ from protocol.text.json_text import JsonObject
 
 PATIENCE_S = 60.0
 """Simulated time that anything may take."""
-OLD = DataFlag.REPEATED | DataFlag.INVALID
+OLD = int(DataFlag.REPEATED | DataFlag.INVALID)
+_EXCUSE = int(DataFlag.GAP | DataFlag.REPEATED)
 
 
 class Asked:
@@ -111,10 +114,8 @@ class Simulation:
 
     def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
         self._decoder.feed(frame)
-        for message in self._decoder:
-            assert isinstance(message, DataMessage)
-            self.frames.append(message)
-            self.published_ns.append(self.clock.now_ns)
+        self._decoder.take_data(self.frames)
+        self.published_ns.append(self.clock.now_ns)
         self.hub.publish(frame, position, flags, now_ns)
 
     def serve(self, until_ns: int) -> None:
@@ -212,11 +213,8 @@ class Client:
         if not self.reads or not self.stream.readable:
             return
         self._decoder.feed(self.stream.recv_all())
-        for message in self._decoder:
-            if isinstance(message, DataMessage):
-                self.frames.append(message)
-            else:
-                (self.events if "event" in message else self.replies).append(message)
+        while (message := self._decoder.take_data(self.frames)) is not None:
+            (self.events if "event" in message else self.replies).append(message)
 
     @property
     def at_end(self) -> bool:
@@ -262,13 +260,28 @@ class Client:
     def fresh(self, count: int) -> list[DataMessage]:
         """The next `count` frames that are new and valid samples."""
         self.frames.clear()
-        self.simulation.run_until(lambda: len(fresh(self.frames)) >= count, f"{count} new samples")
-        return fresh(self.frames)[:count]
+        found: list[DataMessage] = []
+        looked_at = 0
+
+        def enough() -> bool:
+            nonlocal looked_at
+            found.extend(fresh(self.frames[looked_at:]))
+            looked_at = len(self.frames)
+            return len(found) >= count
+
+        self.simulation.run_until(enough, f"{count} new samples")
+        return found[:count]
 
     def close(self) -> None:
         """Disconnect."""
         self.stream.close()
         self.simulation.clients.remove(self)
+
+
+def more_if_long(usual: Collection[Any], every: Iterable[Any]) -> list[Any]:
+    """Values of a parameter: all of `every`, those that are not in `usual` in long runs only."""
+    marks = ((value, [] if value in usual else [pytest.mark.long]) for value in every)
+    return [pytest.param(value, marks=mark) for value, mark in marks]
 
 
 def fresh(frames: Iterable[DataMessage]) -> list[DataMessage]:
@@ -297,7 +310,7 @@ def check_frames(frames: Iterable[DataMessage], *, complete: bool = True) -> Non
             if frame.flags & OLD and complete:
                 assert frame.process_data == last.process_data, "it has nothing new to say"
         # A sensor that gives the same data again for a while was watched: nothing was lost on the way.
-        visible |= bool(frame.flags & (DataFlag.GAP | DataFlag.REPEATED))
+        visible |= bool(frame.flags & _EXCUSE)
         last = frame
         if frame.flags & OLD:
             continue

@@ -19,6 +19,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
+from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics.monitor import Monitor
 from bridge.parameters.declare import declare
@@ -31,6 +32,7 @@ from bridge.services.identify import IdentifyServices
 from bridge.services.sensor import Services
 from bridge.signals import call_on_stop_signal
 from bridge.spinning import Spinner
+from bridge.stream.connection import Connection
 from bridge.stream.reader import Reader
 from bridge.stream.requests import Requests
 
@@ -45,6 +47,10 @@ class StartError(Exception):
 class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
     """The node `bridge`. What ends it sets `exit_code` and calls `on_finish`."""
 
+    clock: Clock = SYSTEM_CLOCK
+    connect: Callable[[str, int], Connection] = Connection
+    """How to connect. Tests have a clock and a connection of their own."""
+
     def __init__(self, arguments: Sequence[str] | None = None) -> None:
         """ParameterError or InvalidTopicNameException if a parameter is wrong.
 
@@ -56,7 +62,9 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         parameters = declare(self)
         compensated = CompensatedOutput(make_stages(self, parameters.frame_id))
         outputs = make(self, parameters, compensated)
-        self.reader = Reader(parameters, outputs, self.get_logger(), self._fail)
+        self.reader = Reader(
+            parameters, outputs, self.get_logger(), self._fail, connect=self.connect, clock=self.clock
+        )
         link = self.reader.link
         # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
         self.requests = Requests(parameters, link)

@@ -26,10 +26,11 @@ Step = bytes | float | None | Exception
 
 
 class Clock:
-    """CLOCK_MONOTONIC of a machine that only moves on when it is told to."""
+    """Only moves on when it is told to, or waited for: it notes the pauses, and lets them pass."""
 
     def __init__(self) -> None:
         self.ns = 5 * 10**9
+        self.pauses: list[float] = []
 
     def monotonic(self) -> float:
         return self.ns / 1e9
@@ -37,21 +38,16 @@ class Clock:
     def monotonic_ns(self) -> int:
         return self.ns
 
+    def time_ns(self) -> int:
+        return self.ns
+
     def sleep(self, seconds: float) -> None:
         self.ns += round(seconds * 1e9)
 
-
-class Pause(threading.Event):
-    """Notes the pauses, and lets them pass."""
-
-    def __init__(self, clock: Clock) -> None:
-        super().__init__()
-        self.clock, self.seconds = clock, list[float]()
-
-    def wait(self, timeout: float | None = None) -> bool:
-        self.seconds.append(timeout or 0.0)
-        self.clock.sleep(timeout or 0.0)
-        return self.is_set()
+    def wait(self, event: threading.Event, seconds: float) -> bool:
+        self.pauses.append(seconds)
+        self.sleep(seconds)
+        return event.is_set()
 
 
 class Memory(Connection):
@@ -126,7 +122,6 @@ class Bench:
 
     def __init__(self, *attempts: Sequence[Step] | Exception, **parameters: Any) -> None:
         self.clock = Clock()
-        self.pause = Pause(self.clock)
         self.outputs = Outputs()
         self.log = Log(None)
         self.failures: list[str] = []
@@ -136,13 +131,13 @@ class Bench:
         chosen = Parameters("localhost", 12001, 0, 0.0, "array", ImuUnits.G_DPS)._replace(**parameters)
         self.reader = Reader(
             chosen, self.outputs, self.log, self.failures.append,
-            connect=self._connect, clock=self.clock, stopping=self.pause,
+            connect=self._connect, clock=self.clock,
         )  # fmt: skip
 
     def _connect(self, host: str, port: int) -> Connection:
         assert (host, port) == ("localhost", 12001)
         if not self._attempts:
-            self.pause.set()
+            self.reader._stopping.set()
             raise UnreachableError("the test is over")
         attempt = self._attempts.pop(0)
         if isinstance(attempt, Exception):
@@ -188,7 +183,7 @@ def test_what_is_not_new_is_not_published() -> None:
 def test_attempts_to_connect_back_off_and_one_line_says_so() -> None:
     bench = Bench(*[UnreachableError("refused")] * 8)
     bench.run()
-    assert bench.pause.seconds == pytest.approx([0.1, 0.15, 0.225, 0.3375, 0.50625, 0.759375, 1.0, 1.0])
+    assert bench.clock.pauses == pytest.approx([0.1, 0.15, 0.225, 0.3375, 0.50625, 0.759375, 1.0, 1.0])
     assert bench.log.lines == ["no server at localhost:12001: refused; trying until there is one"]
     assert bench.reader.link.problem == "the test is over"
 
@@ -197,7 +192,7 @@ def test_after_a_connection_that_lasted_the_next_attempt_comes_soon() -> None:
     down = [UnreachableError("refused")] * 4
     bench = Bench(*down, [1.5, ConnectionFailedError("reset")], [0.5])
     bench.run()
-    assert bench.pause.seconds[4:6] == pytest.approx([0.1, 0.15])
+    assert bench.clock.pauses[4:6] == pytest.approx([0.1, 0.15])
     assert "connection to localhost:12001 ended: reset; connecting again" in bench.log.lines
     assert sum("connected again" in line for line in bench.log.lines) == 1
 

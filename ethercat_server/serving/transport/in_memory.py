@@ -157,7 +157,7 @@ class InMemoryTransport:
     ) -> tuple[Sequence[int], Sequence[int]]:
         """See `Transport`."""
         ready = self._ready(readers, writers)
-        if any(ready) or seconds <= 0:
+        if ready[0] or ready[1] or seconds <= 0:
             return ready
         self._clock.sleep(seconds)
         return self._ready(readers, writers)

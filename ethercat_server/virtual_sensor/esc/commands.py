@@ -32,8 +32,8 @@ def execute(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
         counted = _physical(esc, frame, datagram)
     else:
         return
-    events = esc.events & _U16.unpack_from(esc.memory, reg.EVENT_MASK)[0]
-    if events:
+    mask = _U16.unpack_from(esc.memory, reg.EVENT_MASK)[0]
+    if mask and (events := esc.events & mask):
         at = datagram.data - 2
         _U16.pack_into(frame, at, _U16.unpack_from(frame, at)[0] | events)
     if counted:
@@ -85,15 +85,16 @@ def _logical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
         esc.plans[key] = plan
     read = written = False
     base = datagram.data
-    incoming = bytes(frame[base : datagram.end]) if datagram.command == Command.LRW else b""
+    incoming = bytes(frame[base : datagram.end])
+    reads, writes = datagram.command != Command.LWR, datagram.command != Command.LRD
     for fmmu, offset, length, at in plan:
         start, end = base + offset, base + offset + length
-        if fmmu.writes and datagram.command != Command.LRD:
-            data = incoming[offset : offset + length] or bytes(frame[start:end])
+        if writes and fmmu.writes:
+            data = incoming[offset : offset + length]
             if fmmu.bitwise:
                 data = fmmu.insert(data, bytes(esc.memory[at : at + fmmu.span(length)]))
             written |= esc.write(at, data)
-        if fmmu.reads and datagram.command != Command.LWR:
+        if reads and fmmu.reads:
             if fmmu.bitwise:
                 current = esc.read(at, bytes(fmmu.span(length)))
                 if current is not None:

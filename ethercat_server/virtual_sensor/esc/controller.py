@@ -169,9 +169,9 @@ class Esc:
                 self._pdi.mailbox_read()
             return data
         if offset == 0:  # three buffers: the newest is handed over when the first byte is read
-            self.memory[manager.start : manager.end] = self._pdi.inputs()[: manager.length].ljust(
-                manager.length, b"\0"
-            )
+            newest = self._pdi.inputs()[: manager.length].ljust(manager.length, b"\0")
+            self.memory[manager.start : manager.end] = newest
+            return newest[:length]
         return bytes(self.memory[manager.start + offset : manager.start + offset + length])
 
     def _write_manager(self, manager: SyncManager, offset: int, data: bytes) -> bool:

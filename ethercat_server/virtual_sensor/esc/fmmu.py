@@ -28,6 +28,8 @@ class Fmmu:
     physical_bit: int
     reads: bool
     writes: bool
+    bitwise: bool
+    """Whether it maps anything but whole bytes onto whole bytes."""
 
     @classmethod
     def decode(cls, memory: bytearray, number: int) -> Fmmu | None:
@@ -37,12 +39,10 @@ class Fmmu:
         )
         if not active & 1 or length == 0 or not kind & 3:
             return None
-        return cls(logical, length, first & 7, last & 7, physical, bit & 7, bool(kind & 1), bool(kind & 2))
-
-    @property
-    def bitwise(self) -> bool:
-        """Whether it maps anything but whole bytes onto whole bytes."""
-        return (self.first_bit, self.last_bit, self.physical_bit) != (0, 7, 0)
+        bits = first & 7, last & 7, bit & 7
+        return cls(
+            logical, length, *bits[:2], physical, bits[2], bool(kind & 1), bool(kind & 2), bits != (0, 7, 0)
+        )
 
     def overlap(self, address: int, length: int) -> tuple[int, int, int] | None:
         """The part of a logical command that it maps; None if none.

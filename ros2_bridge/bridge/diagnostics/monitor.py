@@ -8,7 +8,6 @@ regular report, a second after the one before, has carried it.
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -39,11 +38,11 @@ class Monitor:
         outputs: Outputs,
         on_failure: Callable[[str], object],
     ) -> None:
-        self._observer = Observer(reader, compensation)
+        self._observer, self._clock = Observer(reader, compensation), reader.link.clock
         self._thresholds, self._outputs, self._on_failure = thresholds, outputs, on_failure
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
-        self._published_s = time.monotonic()
+        self._published_s = self._clock.monotonic()
         self._levels: list[int] = []
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
@@ -60,14 +59,16 @@ class Monitor:
 
     def _run(self) -> None:
         try:
-            while not self._stopping.wait(TICK_S):
-                self._outputs.refresh()
-                self._tick(time.monotonic())
+            while not self._clock.wait(self._stopping, TICK_S):
+                self.tick()
         except Exception as error:  # noqa: BLE001 - without diagnostics the node would seem dead
             if not self._stopping.is_set():
                 self._on_failure(f"the monitor failed: {type(error).__name__}: {error}")
 
-    def _tick(self, now_s: float) -> None:
+    def tick(self) -> None:
+        """Look once, and publish if it is time or a level has changed."""
+        self._outputs.refresh()
+        now_s = self._clock.monotonic()
         regular = now_s - self._published_s >= REPORT_S
         if regular:
             self._observer.measure(now_s)
@@ -78,12 +79,12 @@ class Monitor:
             self._levels, self._published_s = levels, now_s
             self._publish(statuses, snapshot)
         if regular:
-            self._observer.begin_interval(snapshot)
+            self._observer.begin_interval(snapshot, now_s)
 
     def _publish(self, statuses: Sequence[Status], snapshot: Snapshot) -> None:
         info = snapshot.info
         message = DiagnosticArray()
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self._clock.time_ns(), 1_000_000_000)
         message.status = [
             DiagnosticStatus(
                 name=self._prefix + status.name,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
@@ -30,7 +29,7 @@ class Observer:
         self._flags = Flags()
         self._age_us: tuple[float, float] | None = None
         self._rate_hz: float | None = None
-        self._fresh, self._fresh_s, self._epoch = 0, time.monotonic(), -1
+        self._fresh, self._fresh_s, self._epoch = 0, self._link.clock.monotonic(), -1
         """The last number of fresh samples, when it changed, and the link's epoch."""
         self._rate_fresh, self._rate_s = 0, self._fresh_s
         """Where the rate is measured from."""
@@ -95,7 +94,7 @@ class Observer:
         self._rate_hz = (fresh - self._rate_fresh) / elapsed_s if elapsed_s >= _SHORTEST_RATE_S else None
         self._rate_fresh, self._rate_s = fresh, now_s
 
-    def begin_interval(self, reported: Snapshot) -> None:
+    def begin_interval(self, reported: Snapshot, now_s: float) -> None:
         """`reported` was a regular report: what is new counts from there on. Asks the server again."""
         self._flags = Flags()
         self._then, self._then_not_finite = reported.counts, reported.not_finite
@@ -104,7 +103,7 @@ class Observer:
             self._then_server_lost = server_lost(reported.server, self._link.sensor)
         elif not reported.connected:
             self._then_server_lost = -1  # the next server counts from 0
-        self._poll.ask()
+        self._poll.ask(now_s)
 
     def _take_description(self, description: Mapping[str, Any]) -> None:
         try:

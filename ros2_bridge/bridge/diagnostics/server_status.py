@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from concurrent.futures import Future
 from typing import Any
@@ -36,11 +35,11 @@ class ServerStatus:
                 described = reply.result()
         return described
 
-    def ask(self) -> None:
+    def ask(self, now_s: float) -> None:
         """Ask again, unless an answer is still owed."""
         if self._connection is None or self._waiting:
             return
-        self._asked_s = time.monotonic()
+        self._asked_s = now_s
         try:
             for action in ("status", "describe"):
                 self._waiting[action] = self._connection.send_request(action)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Final
 
 from bridge.compensating.control import CompensationControl
@@ -27,14 +26,15 @@ def take_window(control: CompensationControl) -> RestWindow:
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
     window = RestWindow(seconds, limits, control.source)
     patience_s = 1.5 * seconds + _PATIENCE_S
-    deadline_s = time.monotonic() + patience_s
+    clock = link.clock
+    deadline_s = clock.monotonic() + patience_s
     sensors, bad = control.sensors, control.count_not_finite()
     control.output.window = window
     try:
-        while not window.done.wait(_LOOK_S):
+        while not clock.wait(window.done, _LOOK_S):
             if control.ending:
                 raise CompensationError("the node ends")
-            if time.monotonic() > deadline_s:
+            if clock.monotonic() > deadline_s:
                 raise CompensationError(
                     f"only {window.count} samples came in {patience_s:.1f} s: see /diagnostics, stream"
                 )

@@ -8,11 +8,11 @@ from __future__ import annotations
 import contextlib
 import itertools
 import threading
-import time
 from collections.abc import Mapping
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
+from bridge.clock import SYSTEM_CLOCK, Clock
 from protocol.client.connection import CONNECT_TIMEOUT_S, FramedConnection
 from protocol.control import check_version, request
 from protocol.errors import ConnectionFailedError, RefusedError, SettingError
@@ -47,6 +47,8 @@ class SensorInfo(NamedTuple):
 
 class Connection(FramedConnection):
     """A framed connection that several threads may ask over."""
+
+    clock: Clock = SYSTEM_CLOCK
 
     def __init__(self, host: str, port: int, timeout_s: float = CONNECT_TIMEOUT_S) -> None:
         """Connect; UnreachableError if there is nothing to connect to."""
@@ -85,10 +87,10 @@ class Connection(FramedConnection):
 
         For the reader only, before the stream runs. ConnectionFailedError also for a refusal.
         """
-        deadline = time.monotonic() + _REPLY_TIMEOUT_S
+        deadline = self.clock.monotonic() + _REPLY_TIMEOUT_S
         future = self.send_request(action, **values)
         while not future.done():
-            if time.monotonic() > deadline:
+            if self.clock.monotonic() > deadline:
                 raise ConnectionFailedError(f"no reply to {action} within {_REPLY_TIMEOUT_S:g} s")
             if self.receive() is None:
                 continue

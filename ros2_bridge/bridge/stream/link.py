@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from bridge.clock import Clock
 from bridge.stream.connection import Connection, SensorInfo, known_settings
 from protocol.control import Event
 from protocol.settings import SettingValue, sampling_rate_hz
@@ -20,8 +21,9 @@ NEVER_CONNECTED: Final = "no connection yet"
 class Link:
     """`on_change` is called, in the writer's thread, after each change of what is known."""
 
-    def __init__(self, address: str, sensor: int, now_s: Callable[[], float]) -> None:
-        """`now_s` tells the time, CLOCK_MONOTONIC."""
+    def __init__(self, address: str, sensor: int, clock: Clock) -> None:
+        self.clock = clock
+        """What everything is timed by."""
         self.address = address
         self.sensor = sensor
         self.on_change: Callable[[], object] = lambda: None
@@ -40,8 +42,7 @@ class Link:
         self.lost: str | None = None
         """The server's words, while the sensor is lost."""
         self.connects = 0
-        self._now_s = now_s
-        self.since_s = now_s()
+        self.since_s = clock.monotonic()
         """CLOCK_MONOTONIC when the connection was made or lost."""
         self.epoch = 0
         """Raised by everything that interrupts the stream or changes its rate."""
@@ -50,7 +51,7 @@ class Link:
         """The stream begins."""
         self.info, self.settings, self.rate_hz = info, info.settings, info.rate
         self.connects += 1
-        self.since_s = self._now_s()
+        self.since_s = self.clock.monotonic()
         self.lost = None
         self.epoch += 1
         self.connection = connection
@@ -65,7 +66,7 @@ class Link:
     def disconnected(self, problem: str, *, is_reachable: bool = False) -> None:
         """There is no connection (any more)."""
         if self.connection is not None:
-            self.since_s = self._now_s()
+            self.since_s = self.clock.monotonic()
         had, self.connection = self.connection, None
         self.settings, self.problem, self.lost = {}, problem, None
         # One that has just gone away is not there, whatever it said last.

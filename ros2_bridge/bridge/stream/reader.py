@@ -1,17 +1,16 @@
 """The reader: connects, receives, publishes, reconnects. Nothing else touches the stream.
 
-`read` is the hot path: one blocking read, every whole message there is, and straight to the outputs. Clock,
-connection and the pause between attempts can be given: `run` then needs neither sockets nor real time.
-`start` runs it in a thread.
+`read` is the hot path: one blocking read, every whole message there is, and straight to the outputs. Clock
+and connection can be given: `run` then needs neither sockets nor real time. `start` runs it in a thread.
 """
 
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Protocol
 
+from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.parameters.table import Parameters
 from bridge.stream.connection import Connection
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
@@ -47,16 +46,6 @@ class Log(Protocol):
         """Log what is not as it should be."""
 
 
-class Clock(Protocol):
-    """The part of the module `time` that is used here: CLOCK_MONOTONIC."""
-
-    def monotonic(self) -> float:
-        """Seconds."""
-
-    def monotonic_ns(self) -> int:
-        """Nanoseconds."""
-
-
 class Outputs(Protocol):
     """What the samples go to: `bridge.publishing.messages.Outputs`."""
 
@@ -82,10 +71,9 @@ class Reader:
         on_failure: Callable[[str], object],
         *,
         connect: Callable[[str, int], Connection] = Connection,
-        clock: Clock = time,
-        stopping: threading.Event | None = None,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
-        """Tests give `connect`, `clock`, and `stopping`, whose `wait` is the pause between attempts."""
+        """Tests give `connect` and `clock`."""
         self._parameters = parameters
         self._outputs = outputs
         self._log = log
@@ -95,9 +83,9 @@ class Reader:
         self._decoders = {size: SampleDecoder(size, parameters.imu_units) for size in LAYOUTS}
         self._address = str(Address(printable(parameters.server_host), parameters.server_port))
         self._connect, self._clock = connect, clock
-        self.link = Link(self._address, parameters.sensor, clock.monotonic)
+        self.link = Link(self._address, parameters.sensor, clock)
         self.watch = Watch(parameters.sensor)
-        self._stopping = stopping or threading.Event()
+        self._stopping = threading.Event()
         self._connection: Connection | None = None
         self._problem: str | None = None
         self._was_connected = False
@@ -138,7 +126,7 @@ class Reader:
                 if self._clock.monotonic() - began_s > _STEADY_S and not isinstance(error, UnreachableError):
                     delay_s = _FIRST_DELAY_S
                 self._log_problem(error)
-            self._stopping.wait(delay_s)
+            self._clock.wait(self._stopping, delay_s)
             delay_s = min(delay_s * 1.5, _LONGEST_DELAY_S)
 
     def _session(self) -> None:

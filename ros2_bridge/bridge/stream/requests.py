@@ -5,10 +5,8 @@ They go over the stream's connection; the reader finds the reply among the sampl
 
 from __future__ import annotations
 
-import time
-from concurrent.futures import FIRST_COMPLETED, Future
-from concurrent.futures import wait as wait_for
-from typing import Any, Final
+import threading
+from typing import Final
 
 from bridge.parameters.table import Parameters
 from bridge.stream.connection import Connection, refusal
@@ -35,12 +33,14 @@ class Requests:
     def __init__(self, parameters: Parameters, link: Link) -> None:
         self._parameters = parameters
         self._link = link
-        self._ending: Future[Any] = Future()
+        self._over = threading.Event()
+        """Set once the reply is there that is waited for, or none is wanted any more."""
+        self._ending = False
 
     def cancel(self) -> None:
         """Make whoever waits for a reply give up, now and from now on: the node ends."""
-        if not self._ending.done():
-            self._ending.set_result(None)
+        self._ending = True
+        self._over.set()
 
     def ask(self, action: str, timeout_s: float, **values: object) -> JsonObject:
         """The reply that grants the request; RequestFailedError otherwise. Blocks for `timeout_s` at most."""
@@ -55,12 +55,14 @@ class Requests:
     def _exchange(
         self, connection: Connection, action: str, timeout_s: float, values: dict[str, object]
     ) -> JsonObject:
+        over = self._over = threading.Event()
         waiting = connection.send_request(action, **values)
-        either: list[Future[Any]] = [waiting, self._ending]
-        wait_for(either, timeout_s, FIRST_COMPLETED)
+        waiting.add_done_callback(lambda _: over.set())
+        if not self._ending:
+            self._link.clock.wait(over, timeout_s)
         if not waiting.done():
             connection.forget(waiting)
-            why = "the node ends" if self._ending.done() else f"no reply within {timeout_s:g} s"
+            why = "the node ends" if self._ending else f"no reply within {timeout_s:g} s"
             raise RequestFailedError(
                 f"the server at {self._link.address} did not answer {action}: {why}; "
                 "whether it was done is not known"
@@ -77,13 +79,12 @@ class Requests:
         """
         address = self._link.address
         connection, own = self._link.connection, None
-        deadline = time.monotonic() + timeout_s
         try:
             if connection is None:
                 own = Connection(self._parameters.server_host, self._parameters.server_port, timeout_s)
                 own.ask("shutdown")
             else:
-                self._exchange(connection, "shutdown", max(deadline - time.monotonic(), 0.1), {})
+                self._exchange(connection, "shutdown", timeout_s, {})
         except RefusedError as error:
             return f"the server at {address} refused to shut down: {error}"
         except RequestFailedError:
