@@ -90,20 +90,23 @@ class Hub:
     def serve(self, until_ns: int) -> None:
         """Serve the clients until the clock is at `until_ns`; once, without waiting, if that has passed."""
         now_ns = self._monotonic_ns()
-        last_start_ns = max(until_ns - _REQUEST_NS, now_ns + 1)
+        last_start_ns = until_ns - _REQUEST_NS
+        # Where there is no time for a request one pass is made all the same: it may stay like this.
+        hurried = last_start_ns <= now_ns
         while True:
-            self._serve_once(now_ns, last_start_ns, until_ns)
+            self._serve_once(now_ns, last_start_ns, until_ns, hurried)
+            hurried = False
             now_ns = self._monotonic_ns()
             if now_ns >= until_ns:
                 break
         if now_ns >= self._sweep_at_ns:
             self._sweep(now_ns)
 
-    def _serve_once(self, now_ns: int, last_start_ns: int, until_ns: int) -> None:
+    def _serve_once(self, now_ns: int, last_start_ns: int, until_ns: int, hurried: bool) -> None:
         """Wait for something to do and do it."""
-        reads = self._pause_ends_ns <= now_ns < last_start_ns
+        reads = self._pause_ends_ns <= now_ns and (hurried or now_ns < last_start_ns)
         wake_ns = until_ns
-        if reads and self._ready:
+        if reads and (hurried or self._ready):
             wake_ns = now_ns
         elif now_ns < self._pause_ends_ns:
             wake_ns = min(self._pause_ends_ns, until_ns)
@@ -117,8 +120,8 @@ class Hub:
             self.connections[fd].outbox.flush()
         if readable or (reads and self._ready):
             began_ns = self._monotonic_ns()
-            if began_ns >= last_start_ns and wake_ns > now_ns:
-                return  # what came after the last moment to begin has its turn after the exchange
+            if began_ns >= last_start_ns and not hurried:
+                return  # what came too late to be begun has its turn after the exchange
             self._read(readable)
             self._answer_some(last_start_ns)
             ended_ns = self._monotonic_ns()
