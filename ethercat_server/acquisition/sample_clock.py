@@ -71,7 +71,7 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_doubtful", "_flight_ns", "_high", "_hits", "_learned", "_least_flight_ns", "_low", "_newest_ns",
+        "_doubtful", "_flight_ns", "_high", "_hits", "_learned", "_least_flight_ns", "_low",
         "_nominal_ns", "_polled_ns", "_quality", "_tried_ns", "instant_ns", "locked", "period_ns", "steps",
         "uncertain",
     )  # fmt: skip
@@ -91,8 +91,6 @@ class SampleClock:
         late in a slow exchange. The samples after it tell, and their `steps` put it right."""
         self._doubtful = False
         """Whether the bracket may be another sample's: one was `uncertain`, and none was watched since."""
-        self._newest_ns = 0.0
-        """The instant estimated for the sample before."""
         self._quality = 0.0
         self._learned = 0
         self._hits = 0
@@ -176,8 +174,6 @@ class SampleClock:
             not self._trusted or received_ns - looking - self._low >= _SURELY_ONE * period
         )
         self.instant_ns = min(max(expected + (self.steps - 1) * period, after), received_ns)
-        if not self.steps:  # the one before it was dated as this one should be
-            self.instant_ns = max(self.instant_ns, self._newest_ns + 1)
 
     @property
     def _trusted(self) -> bool:
@@ -202,7 +198,6 @@ class SampleClock:
         after, self._polled_ns, self._tried_ns = self._polled_ns, sent_ns, sent_ns
         watched = received_ns - after < _WATCHED * self.period_ns
         self._doubtful = self.uncertain or (self._doubtful and not watched)
-        self._newest_ns = self.instant_ns
         if self._begins_anew(after):
             self._low, self._high = max(after, received_ns - self.period_ns), float(received_ns)
             self._expect_next()
@@ -229,6 +224,7 @@ class SampleClock:
     def missed(self, sent_ns: int) -> None:
         """An exchange brought nothing valid: it counts for when to poll next, and for nothing else."""
         self._tried_ns = sent_ns
+        self._doubtful |= self._learned < _PERIOD_LEARNING  # the rate is not known well enough to bridge it
 
     def restart(self) -> None:
         """The sensor's clock starts again (its power was cut, say): keep only what is known of its rate."""

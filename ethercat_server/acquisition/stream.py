@@ -53,6 +53,8 @@ class SensorStream:
         self._rate_reported = False
         self._deviating_seconds = 0
         self._valid_ns = 0
+        self._moment_ns = 0
+        """Of the newest sample."""
         self._idle_at_ns = 0.0
 
     def take(
@@ -79,6 +81,9 @@ class SensorStream:
             flags = self._new_sample(back_ns)
             # After a stall in the exchange its end says nothing of when the sample came to be.
             moment_ns = int(clock.instant_ns if clock.locked else min(back_ns, sent_ns + clock.period_ns))
+            if moment_ns <= self._moment_ns:  # the one before was dated too young
+                moment_ns = self._moment_ns + 1
+            self._moment_ns = moment_ns
         elif back_ns >= self._idle_at_ns and self.process_data:
             self._discard = 0  # a sensor that is stuck from the start is to be seen too
             self._handed_out = self._handed_out or self.process_data
