@@ -91,7 +91,10 @@ def enter_op(bus: Bus, sensors: list[Sensor], check_interrupt: CheckInterrupt) -
             sensor.pdo_size = layout_for(size).size
         except PdoSizeError as error:
             bus.check_answers(sensor.position)
-            raise BusError(f"sensor {sensor.position} ({sensor.identity.name}) maps {error}") from None
+            who = f"sensor {sensor.position} ({sensor.identity.name})"
+            if size == 0:  # the master could not read the mapping
+                raise BusError(f"{who} did not answer what it maps: check cable and power") from None
+            raise BusError(f"{who} maps {error}") from None
     bus.go_operational(check_interrupt)
     for sensor in sensors:
         sensor.enter(SensorState.STREAMING)

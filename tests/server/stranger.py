@@ -1,16 +1,15 @@
 """A client of another user than the server's: `stranger.py HOST PORT WHAT [ARGUMENT]`, run as a process.
 
 `ask` sends the requests in ARGUMENT, a JSON list, and prints the replies. `stream` subscribes and prints how
-many frames it has got once there are ARGUMENT. `hit` sends the request ARGUMENT and is gone at once, in all
-the ways there are, over and over. `press` sends it on many connections at once, again and again, until its
-input ends.
+many frames it has got once there are ARGUMENT. `hit` sends one of the requests in ARGUMENT and is gone at
+once, in all the ways there are, over and over.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
-import select
 import socket
 import struct
 import sys
@@ -21,8 +20,8 @@ from protocol.framing import DataMessage, FrameDecoder, encode_json
 from protocol.text.bare_json import encode_bare_json
 from tests.server.as_another_user import become_nobody
 
-HITS = 200
-CONNECTIONS = 12
+HITS = 6
+"""Of each request, in each way to go."""
 _RESET = struct.pack("ii", 1, 0)
 
 
@@ -75,24 +74,13 @@ GOING: Sequence[Callable[[socket.socket], None]] = (
 )
 
 
-def hit(host: str, port: int, message: dict[str, object]) -> None:
-    for number in range(HITS):
+def hit(host: str, port: int, messages: Sequence[dict[str, object]]) -> None:
+    for number, (message, go) in enumerate(itertools.product(messages, GOING * HITS)):
         encode = encode_bare_json if number % 3 == 0 else encode_json
         with contextlib.suppress(OSError):  # the server may be rid of it already
             sock = socket.create_connection((host, port), timeout=20)
             sock.sendall(encode(message))
-            GOING[number % len(GOING)](sock)
-
-
-def press(host: str, port: int, message: dict[str, object]) -> None:
-    wire = encode_json(message)
-    socks = [socket.create_connection((host, port), timeout=20) for _ in range(CONNECTIONS)]
-    for sock in socks:
-        sock.sendall(wire * 20)
-    print(flush=True)
-    while not select.select((sys.stdin,), (), (), 0)[0]:
-        for sock in select.select(socks, (), (), 0.1)[0]:
-            sock.sendall(wire * sock.recv(65536).count(b'"reply"'))
+            go(sock)
 
 
 def main() -> None:
@@ -100,8 +88,8 @@ def main() -> None:
     host, port, what = sys.argv[1], int(sys.argv[2]), sys.argv[3]
     argument = json.loads(sys.argv[4])
     become_nobody()
-    if what in {"hit", "press"}:
-        (hit if what == "hit" else press)(host, port, argument)
+    if what == "hit":
+        hit(host, port, argument)
         return
     with socket.create_connection((host, port), timeout=20) as sock:
         (ask if what == "ask" else stream)(sock, argument)

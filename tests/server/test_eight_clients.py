@@ -14,7 +14,7 @@ from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.framing import DataFlag, DataMessage
 from tests.simulation import OLD, Client, Simulation, check_frames, reading
 
-ALL_FOR_S = 3.0
+ALL_FOR_S = 2.0
 SMALL_BUFFER = 4096
 """Bytes on their way to a client that reads slowly; a kernel holds more."""
 

@@ -194,6 +194,30 @@ def test_a_crowd_that_asks_without_pause_costs_no_samples() -> None:
         assert found.asking.ask("status")["sensors"][0]["lost_samples"] == 0
 
 
+def test_their_reading_does_not_keep_root_from_its_work() -> None:
+    with besieged() as found:
+        pressing = [found.simulation.connect(4711) for _ in range(12)]
+        for client in pressing:
+            for _ in range(20):
+                client.send("sdo_read", index=0x1008)
+        answered: Counter[bool] = Counter()
+
+        def press(_: int) -> None:
+            for client in pressing:
+                for reply in client.replies:
+                    answered[reply["ok"]] += 1
+                    client.send("sdo_read", index=0x1008)
+                client.replies.clear()
+
+        found.simulation.on_serve = press
+        for number in range(20):
+            reply = found.asking.ask("configure", settings={"imu_active": 1 + number % 2})
+            assert reply["ok"], reply
+        found.check()
+        assert answered[True] > 50
+        assert answered[False] > 50, "only some may wait for a sensor"
+
+
 REFUSED = {
     "a length that is too great": b"\xff" * 5,
     "a line without end": b"{" * (MAX_REQUEST_LENGTH + 1),

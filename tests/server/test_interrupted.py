@@ -15,6 +15,12 @@ BY_PREOP = {"chop": True, "sinc_length": 128}
 ABORT = "0x08000021"
 
 
+def moments(step_ms: int, count: int) -> list[Any]:
+    """In ms; every second one, and all of them with --long."""
+    marks = ((), pytest.mark.long)
+    return [pytest.param(number * step_ms, marks=marks[number % 2]) for number in range(count)]
+
+
 @pytest.fixture
 def bench() -> tuple[Bench, Client]:
     """A stationary sensor, and two clients: one that listens, one that asks."""
@@ -225,7 +231,7 @@ def cut_while_saving(bench: Bench) -> None:
     assert "whether it saved all, some or none of its settings is not known" in refused["message"]
 
 
-@pytest.mark.parametrize("after", range(0, 60, 2))
+@pytest.mark.parametrize("after", moments(2, 30))
 def test_a_sensor_lost_at_any_moment_of_a_change_has_its_former_settings_or_the_new_ones(after: int) -> None:
     """The power goes `after` ms into the change; what the reply says is what is in force."""
     bench = Bench()
@@ -244,7 +250,7 @@ def test_a_sensor_lost_at_any_moment_of_a_change_has_its_former_settings_or_the_
     assert asking.ask("configure", settings=BY_PREOP)["ok"], "the next one takes"
 
 
-@pytest.mark.parametrize("after", range(0, 90, 3))
+@pytest.mark.parametrize("after", moments(3, 30))
 def test_a_sensor_lost_at_any_moment_of_a_tare_has_its_old_offset_or_the_new_one(after: int) -> None:
     """It is deaf `after` ms into the tare; what the reply says is what is in force."""
     bench = Bench()

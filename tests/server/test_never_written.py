@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,20 +16,12 @@ from ethercat_server.sensor.dictionary import BY_SETTING, FACTORY_CALIBRATION
 from ethercat_server.sensor.guard import GuardedSdo
 from protocol.sensor.sdo_types import SDO_TYPE_NAMES
 from tests.server.bench import Bench
-from tests.server.running import needs_bus
-from tests.server.steady import SteadyBench, steady_bench, steady_sensor
+from tests.simulated_links import SimulatedServer, simulated_bus, simulated_server
 from tests.simulation import Client
-from tests.tool.running import tool
+from tests.tool.running import tool_here
 
 WAYS_TO_SAY_IT: tuple[Any, ...] = (0x2000, "0x2000", "8192", "0X2000", "0x02000", "08192", " 8192 ", "8_192")
 VALUES = {"string": "x", "bool": True}
-
-
-@pytest.fixture(scope="module")
-def bench() -> Iterator[SteadyBench]:
-    with steady_sensor() as sensor, steady_bench(sensor) as found:
-        yield found
-        assert sensor.stats()["calibration_writes"] == 0
 
 
 def refused(asking: Client, **keys: object) -> str:
@@ -67,21 +58,21 @@ def test_the_control_channel_writes_none_of_it() -> None:
     assert bench.stats()["calibration_writes"] == 0
 
 
-@pytest.mark.bus
-@needs_bus
-def test_no_command_of_the_tool_writes_it(bench: SteadyBench, tmp_path: Path) -> None:
-    address, path = ("--server", f"localhost:{bench.running.port}"), tmp_path / "a.json"
-    tool("snapshot", *address, path)
-    content = json.loads(path.read_text())
-    for row in content["objects"]:
-        if row["index"] == "0x2000":
-            row["hex"] = "00000000"
-    path.write_text(json.dumps(content))
-    assert "nothing to restore" in tool("restore", *address, path).out
-    assert "no setting" in tool("apply", *address, "--set", "0x2000:1=1", code=2).err
-    tool("read", *address, "Calibration")
-    tool("tare", *address, "--samples", 20)
-    tool("save", *address)
+def test_no_command_of_the_tool_writes_it(tmp_path: Path) -> None:
+    """`simulated_bus` sees to it that none did."""
+    address, path = ("--server", SimulatedServer.address), tmp_path / "a.json"
+    with simulated_bus("--signal", "rest") as bus, simulated_server(bus):
+        tool_here("snapshot", *address, path)
+        content = json.loads(path.read_text())
+        for row in content["objects"]:
+            if row["index"] == "0x2000":
+                row["hex"] = "00000000"
+        path.write_text(json.dumps(content))
+        assert "nothing to restore" in tool_here("restore", *address, path).out
+        assert "no setting" in tool_here("apply", *address, "--set", "0x2000:1=1", code=2).err
+        tool_here("read", *address, "Calibration")
+        tool_here("tare", *address, "--samples", 20)
+        tool_here("save", *address)
 
 
 def test_nothing_below_the_tool_and_the_server_writes_it() -> None:

@@ -1,80 +1,99 @@
-"""Readiness, watchdog, reload: what systemd and an administrator see of a real server."""
+"""Readiness, watchdog, reload: what systemd and an administrator see of a server, in simulated time.
+
+Of a real one, with real signals: see test_end_to_end.py.
+"""
 
 from __future__ import annotations
 
-import signal
-import socket
-import time
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from ethercat_server.daemon.options import parse_options
+from ethercat_server.daemon.service import Policy, Service
 from ethercat_server.process.notify import Notifier
-from tests.server.commands import command
-from tests.server.running import Server, needs_bus, server, virtual_sensor, wait_until
-
-pytestmark = [pytest.mark.bus, needs_bus]
-
-
-class Manager:
-    """Stands for systemd: the notify socket, and what came through it."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.socket.bind(str(path))
-        self.socket.setblocking(False)
-        self.told: list[str] = []
-
-    def receive(self) -> list[str]:
-        while True:
-            try:
-                self.told.append(self.socket.recv(4096).decode())
-            except BlockingIOError:
-                return self.told
-
-    def wait(self, text: str) -> None:
-        wait_until(lambda: any(text in told for told in self.receive()), f"{text} in {self.told}")
+from ethercat_server.serving.sensor_actions import SensorActions
+from ethercat_server.virtual_sensor.options import SensorOptions
+from tests.server.manager import WATCHDOG_US, Manager
+from tests.simulation import Simulation
 
 
 @pytest.fixture
-def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager]:
-    made = Manager(tmp_path / "notify")
-    monkeypatch.setenv("NOTIFY_SOCKET", str(made.path))
-    monkeypatch.setenv("WATCHDOG_USEC", "600000")
-    monkeypatch.delenv("WATCHDOG_PID", raising=False)
-    with made.socket:
-        yield made
+def manager(tmp_path: Path) -> Iterator[Manager]:
+    with contextlib.closing(Manager(tmp_path)) as found, found.environment():
+        yield found
 
 
-def test_systemd_is_told_ready_status_watchdog_and_stopping(manager: Manager) -> None:
-    with server("virtual") as running:
-        manager.wait("READY=1")
-        assert running.said().count("streaming"), "not before it streams"
-        manager.wait("STATUS=streaming 1 of 1 sensors; 0 clients")
-        fed = manager.receive().count("WATCHDOG=1")
-        wait_until(lambda: manager.receive().count("WATCHDOG=1") >= fed + 4, "the watchdog is fed on")
-        with running.connect() as client:
-            client.ask("subscribe")
-            manager.wait("1 clients")
-        running.signal(signal.SIGTERM)
-        assert running.wait() == 0
-    manager.wait("STOPPING=1")
-    assert manager.told.index("READY=1") < manager.told.index("STOPPING=1")
+class Administered:
+    """A server with a configuration file and a log, and a client that has subscribed."""
+
+    def __init__(self, directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+        self.simulation = simulation = Simulation(SensorOptions(signal="rest"))
+        self._file, self._log = directory / "c.toml", caplog
+        self._file.write_text("[server]\n")
+        arguments = ["memory", "1", "--config", str(self._file)]
+        actions = SensorActions(
+            simulation.bus, simulation.hub, simulation.recovery,
+            simulation.jobs, simulation.sensors, simulation.streams,
+        )  # fmt: skip
+        self.notifier = Notifier()
+        policy = Policy(parse_options(arguments))
+        self.service = Service(arguments, policy, simulation.hub, actions, self.notifier)
+        self.client = simulation.connect()
+        self.client.ask("subscribe")
+        simulation.cycle._watchdog = self.notifier
+        caplog.set_level("INFO")
+        self.service.ready()
+
+    def reload(self, text: str, *expected: str) -> None:
+        """Change the file, and reload it until the log says what is expected."""
+        self._log.clear()
+        self._file.write_text(text)
+        self.service.reload()
+        self.service.every_second()
+        reading = self.service._reading
+        assert reading is not None, "the loop does not wait for it"
+        reading.join()
+        self.service.every_second()
+        self.simulation.run_until(lambda: all(words in self._log.text for words in expected), str(expected))
+        assert "Traceback" not in self._log.text
 
 
-def test_the_watchdog_starves_when_the_loop_is_stuck(manager: Manager) -> None:
-    with server("virtual") as running:
-        manager.wait("WATCHDOG=1")
-        running.signal(signal.SIGSTOP)
-        time.sleep(0.1)
-        manager.receive()
-        fed = len(manager.told)
-        time.sleep(1.0)
-        assert manager.receive()[fed:] == []
-        running.signal(signal.SIGCONT)
-        wait_until(lambda: len(manager.receive()) > fed, "fed again")
+@pytest.fixture
+def server(tmp_path: Path, caplog: pytest.LogCaptureFixture, manager: Manager) -> Iterator[Administered]:
+    found = Administered(tmp_path, caplog)
+    assert found.notifier._socket is not None
+    with found.notifier._socket:
+        yield found
+
+
+def test_systemd_is_told_ready_and_a_status_that_changes(server: Administered, manager: Manager) -> None:
+    assert manager.told == ["READY=1", "STATUS=streaming 1 of 1 sensors; 1 clients"]
+    server.service.every_second()
+    assert len(manager.told) == 2, "it has not changed"
+    server.simulation.connect().ask("describe")
+    server.simulation.command("power off")
+    server.client.wait_event("sensor_lost")
+    server.service.every_second()
+    assert "STATUS=streaming 0 of 1 sensors, lost: 0; 2 clients" in manager.told
+    server.notifier.stopping()
+    assert manager.told[-1] == "STOPPING=1"
+
+
+def test_the_watchdog_is_fed_by_the_loop_and_starves_when_that_is_stuck(
+    server: Administered, manager: Manager
+) -> None:
+    feed_s = WATCHDOG_US * 1e-6 / 3
+    for _ in range(4):
+        fed = manager.told.count("WATCHDOG=1")
+        server.simulation.run(3 * feed_s)
+        assert 2 <= manager.told.count("WATCHDOG=1") - fed <= 4
+    fed = manager.told.count("WATCHDOG=1")
+    server.simulation.on_serve = lambda _: server.simulation.clock.stall(20 * feed_s * 1e9)
+    server.simulation.run(20 * feed_s)
+    assert manager.told.count("WATCHDOG=1") <= fed + 2
 
 
 def test_without_systemd_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,77 +106,73 @@ def test_without_systemd_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> Non
     assert notifier.feed_every_ns > 10**15, "the watchdog is another process's"
 
 
-def reload(running: Server, expected: str) -> None:
-    before = len(running.said())
-    running.signal(signal.SIGHUP)
-    wait_until(lambda: expected in running.said()[before:], f"{expected!r} in {running.said()!r}")
+def test_a_reload_puts_in_force_what_can_be_and_names_the_rest(server: Administered) -> None:
+    server.reload("[server]\n", "configuration reloaded: [server]: no changes")
+    idle = server.simulation.connect()
+    server.reload(
+        "[server]\nidle_timeout_s = 0.2\nrt_priority = 3\n[sensor]\nfir = true\n",
+        "changed idle_timeout_s",
+        "a change of [server] rt_priority requires a restart",
+        "sensor 0: applied fir = True",
+        "has sent no request for 0.2 s",
+    )
+    server.simulation.run_until(lambda: idle.at_end, "the idle client closed")
+    assert not server.client.at_end, "this one has subscribed"
+    assert server.client.ask("describe")["sensors"][0]["settings"]["fir"] is True
 
 
-def test_sighup_puts_in_force_what_can_be_and_names_the_rest(tmp_path: Path) -> None:
-    file = tmp_path / "c.toml"
-    file.write_text("[server]\n")
-    with server("virtual", "--config", str(file)) as running, running.connect() as client:
-        client.ask("subscribe")
-        reload(running, "configuration reloaded: [server]: no changes")
-        file.write_text("[server]\nidle_timeout_s = 0.2\nrt_priority = 3\n[sensor]\nfir = true\n")
-        with running.connect() as idle:
-            reload(running, "changed idle_timeout_s")
-            assert "a change of [server] rt_priority requires a restart" in running.said()
-            wait_until(lambda: "sensor 0: applied fir = True" in running.said(), "the sensor's setting")
-            wait_until(lambda: "has sent no request for 0.2 s" in running.said(), "the idle client closed")
-            idle.receive_all()
-        file.write_text("[server]\ncontrol_users = ['no-such-user']\n")
-        reload(running, "reload failed, the configuration is unchanged")
-        assert "no-such-user: there is no such user" in running.said()
-        file.write_text("[server\n")
-        reload(running, "not valid TOML")
-        frames = client.fresh(400)
-        assert len(frames) == 400, "the stream goes on"
+def test_a_reload_that_fails_changes_nothing(server: Administered) -> None:
+    unchanged = "reload failed, the configuration is unchanged: "
+    hub = server.simulation.hub
+    before = hub.limits, hub.permissions.control_uids
+    server.reload(
+        "[server]\ncontrol_users = ['no-such-user']\n", unchanged, "no-such-user: there is no such user"
+    )
+    server.reload("[server\n", unchanged, "not valid TOML")
+    server.reload(
+        "[server]\nidle_timeout_s = 5\n[sensor]\nfir = true\nimu_active = 3\n"
+        "[sensor.BFT-SENS-ECAT-M8]\nfir = false\n[sensor.0]\nfast = true\n",
+        unchanged + "the settings for sensor 0",
+    )
+    assert (hub.limits, hub.permissions.control_uids) == before
+    settings = server.client.ask("describe")["sensors"][0]["settings"]
+    assert (settings["fir"], settings["imu_active"]) == (False, 1)
+    assert len(server.client.fresh(50)) == 50, "the stream goes on"
+    server.reload("[server]\nidle_timeout_s = 5\n", "changed idle_timeout_s")
+    assert hub.limits.idle_ns == 5e9
 
 
-def test_sighup_refuses_tables_that_contradict_one_another_and_the_stream_goes_on(tmp_path: Path) -> None:
-    file = tmp_path / "c.toml"
-    file.write_text("[server]\n")
-    with server("virtual", "--config", str(file)) as running, running.connect() as client:
-        client.ask("subscribe")
-        file.write_text(
-            "[server]\nidle_timeout_s = 5\n[sensor]\nfir = true\nimu_active = 3\n"
-            "[sensor.BFT-SENS-ECAT-M8]\nfir = false\n[sensor.0]\nfast = true\n"
-        )
-        reload(running, "reload failed, the configuration is unchanged: the settings for sensor 0")
-        assert "Traceback" not in running.said()
-        assert len(client.fresh(400)) == 400
-        assert client.ask("describe")["sensors"][0]["settings"]["imu_active"] == 1, (
-            "nothing of it is in force"
-        )
-        file.write_text("[server]\nidle_timeout_s = 5\n")
-        reload(running, "changed idle_timeout_s")
+def test_a_reload_gives_rights_and_takes_them(server: Administered) -> None:
+    nobody = server.simulation.connect(4711)
+    assert nobody.ask("configure", settings={"fir": True})["error"]["code"] == "denied"
+    server.reload("[server]\ncontrol_users = ['4711']\n", "changed control_users")
+    assert nobody.ask("configure", settings={"imu_active": 3})["ok"]
+    server.reload("[server]\n", "changed control_users")
+    assert nobody.ask("configure", settings={"imu_active": 1})["error"]["code"] == "denied"
 
 
-def test_sighup_tries_again_what_could_not_be_put_in_force(tmp_path: Path) -> None:
-    file = tmp_path / "c.toml"
-    file.write_text("[server]\n")
-    with virtual_sensor() as (veth, sensor), server(veth.near, "--config", str(file)) as running:
-        command(sensor, "power off")
-        running.wait_for("is lost")
-        file.write_text("[sensor]\nsinc_length = 128\n")
-        reload(running, "sensor 0: could not apply sinc_length = 128, the next reload tries again")
-        file.write_text("[sensor]\nsinc_length = 256\nfir = true\n")
-        reload(running, "sensor 0: could not apply sinc_length = 256, fir = True, the")
-        command(sensor, "power on")
-        running.wait_for("is back")
-        reload(running, "sensor 0: applied sinc_length = 256, fir = True")
-        with running.connect() as client:
-            found = client.ask("describe")["sensors"][0]
-            assert (found["rate_hz"], found["settings"]["fir"]) == (200, True)
-        file.write_text("[sensor]\nsinc_length = 256\n")
-        reload(running, "sensor 0: applied fir = False\n")
+def test_a_reload_tries_again_what_could_not_be_put_in_force(server: Administered) -> None:
+    server.simulation.command("power off")
+    server.client.wait_event("sensor_lost")
+    server.reload(
+        "[sensor]\nsinc_length = 128\n",
+        "sensor 0: could not apply sinc_length = 128, the next reload tries again",
+    )
+    wanted = "[sensor]\nsinc_length = 256\nfir = true\n"
+    server.reload(wanted, "sensor 0: could not apply sinc_length = 256, fir = True, the")
+    server.simulation.command("power on")
+    server.client.wait_event("sensor_back")
+    server.reload(wanted, "sensor 0: applied sinc_length = 256, fir = True")
+    found = server.client.ask("describe")["sensors"][0]
+    assert (found["rate_hz"], found["settings"]["fir"]) == (200, True)
+    server.reload("[sensor]\nsinc_length = 256\n", "sensor 0: applied fir = False\n")
 
 
-def test_sighup_tells_of_a_table_that_no_sensor_has_and_puts_the_rest_in_force(tmp_path: Path) -> None:
-    file = tmp_path / "c.toml"
-    file.write_text("[server]\n")
-    with server("virtual", "--config", str(file)) as running:
-        file.write_text("[sensor]\nimu_active = 3\n[sensor.4]\nfir = true\n[sensor.5]\nfir = true\n")
-        reload(running, "sensor 0: applied imu_active = 3")
-        assert "settings for sensor 4, 5, but the bus has only 0: BFT-SENS-ECAT-M8" in running.said()
+def test_a_reload_names_a_table_that_no_sensor_has_and_puts_the_rest_in_force(
+    server: Administered,
+) -> None:
+    server.reload(
+        "[sensor]\nimu_active = 3\n[sensor.4]\nfir = true\n[sensor.5]\nfir = true\n",
+        "sensor 0: applied imu_active = 3",
+        "settings for sensor 4, 5, but the bus has only 0: BFT-SENS-ECAT-M8",
+    )

@@ -143,13 +143,17 @@ def test_what_the_eeprom_does_not_say(slave: tuple[int, int, int, str], complain
     assert re.search(complaint, refused(Odd()))
 
 
-def test_process_data_of_another_size() -> None:
+@pytest.mark.parametrize(
+    ("size", "complaint"),
+    [(65, "maps process data of 65 bytes: .* 61 or 77"), (0, "did not answer what it maps")],
+)
+def test_process_data_of_another_size(size: int, complaint: str) -> None:
     class Odd(MemoryBackend):
         def map_process_data(self) -> list[int]:
             super().map_process_data()
-            return [65]
+            return [size]
 
-    assert re.search("sensor 0 .BFT-SENS.* maps process data of 65 bytes: .* 61 or 77", refused(Odd()))
+    assert re.search(f"sensor 0 .BFT-SENS-ECAT-M8. {complaint}", refused(Odd()))
 
 
 def test_models_and_their_names() -> None:
