@@ -7,8 +7,10 @@ a process is for what others do to it.
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from unittest import mock
 
@@ -25,10 +27,10 @@ __all__ = [
     "Recorder",
     "RecorderProcess",
     "Replay",
-    "ReplayProcess",
     "free_port",
     "recording",
     "replaying",
+    "signalled",
     "wait_until",
 ]
 
@@ -44,6 +46,26 @@ class NoSignals(Signals):
         self.asked = True
         if self._stop is not None:
             self._stop()
+
+
+def signalled(
+    main: Callable[[Sequence[str]], int], number: int, ready: Callable[[], bool], *argv: object
+) -> int:
+    """The exit code of a program that runs here until it is `ready` and gets a signal."""
+
+    def give() -> None:
+        wait_until(ready, "the program")
+        os.kill(os.getpid(), number)
+
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    giver = threading.Thread(target=give)
+    giver.start()
+    try:
+        return main([*map(str, argv)])
+    finally:
+        giver.join()
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
 
 
 class Replay:
@@ -88,18 +110,6 @@ def replaying(*arguments: str | Path, port: int = 0) -> Iterator[Replay]:
         yield running
     finally:
         running.close()
-
-
-class ReplayProcess(Program):
-    """`ethercat-replay` of a file on a free port, as a process."""
-
-    def __init__(self, *arguments: str | Path) -> None:
-        self.port = free_port()
-        super().__init__("clients.replay.cli", [*map(str, arguments), str(self.port)])
-
-    def wait_listening(self) -> ReplayProcess:
-        self.wait_for("replaying")
-        return self
 
 
 class Recorder:

@@ -6,12 +6,10 @@ It is a process where it is stopped or killed from outside, which nothing else c
 from __future__ import annotations
 
 import contextlib
-import os
 import random
 import signal
 import socket
 import subprocess
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -40,6 +38,7 @@ from tests.clients.running import (
     free_port,
     recording,
     replaying,
+    signalled,
     wait_until,
 )
 from tests.served_simulation import served
@@ -143,19 +142,7 @@ def test_one_sensor_of_two(endless: Replay, out: Path, run: Run) -> None:
 def test_a_signal_ends_it_cleanly(
     endless: Replay, out: Path, number: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def give() -> None:
-        wait_until(lambda: frames_in(out) > 50, "frames")
-        os.kill(os.getpid(), number)
-
-    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
-    giver = threading.Thread(target=give)
-    giver.start()
-    try:
-        assert cli.main([str(out), str(endless.port)]) == 0
-    finally:
-        giver.join()
-        for each, handler in handlers.items():
-            signal.signal(each, handler)
+    assert signalled(cli.main, number, lambda: frames_in(out) > 50, out, endless.port) == 0
     assert "nothing was lost" in capsys.readouterr().err
     with open_recording(out) as opened:
         assert opened.cut_off is None
