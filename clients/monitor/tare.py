@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from protocol.address import Address
 from protocol.client import Client
-from protocol.errors import NoReplyError, ProtocolError, RefusedError
+from protocol.errors import ConnectionFailedError, ProtocolError, RefusedError
 from protocol.text.untrusted import number
 
 _TIMEOUT_S: Final = 60.0
@@ -28,11 +28,12 @@ def tare(address: Address, position: int) -> tuple[str, bool]:
     """Tare the sensor; a message, and whether it is an error."""
     try:
         with Client(address.port, address.host) as client:
-            reply = client.ask("tare", _TIMEOUT_S, sensor=position)
+            try:
+                reply = client.ask("tare", _TIMEOUT_S, sensor=position)
+            except ConnectionFailedError as error:
+                return f"It is unknown whether sensor {position} was tared: {error}", True
     except RefusedError as error:
         return f"Sensor {position} was not tared: {error}", True
-    except NoReplyError as error:
-        return f"It is unknown whether sensor {position} was tared: {error}", True
     except ProtocolError as error:
         return f"Sensor {position} was not tared: no connection to the server ({error})", True
     return f"Sensor {position} was tared{_residual(reply.get('residual'))}", False

@@ -1,18 +1,22 @@
-"""Runs `ethercat-replay` in a thread, and `ethercat-record` and `ethercat-replay` as processes.
+"""Runs `ethercat-replay` and `ethercat-record` in threads and as processes.
 
-A replay is a server that needs no bus. A thread is enough wherever a test is about what it sends; a process
-is for signals and exit codes.
+A replay is a server that needs no bus. A thread is enough wherever a test is about what is sent or written;
+a process is for what others do to it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from unittest import mock
 
 from clients.program import Signals
+from clients.record import program as record
+from clients.recording.reader import RecordingError, open_recording
 from clients.replay import program
 from tests.server.running import PATIENCE_S, Client, Program, free_port, wait_until
 
@@ -21,10 +25,12 @@ __all__ = [
     "NoSignals",
     "Program",
     "Recorder",
+    "RecorderProcess",
     "Replay",
-    "ReplayProcess",
     "free_port",
+    "recording",
     "replaying",
+    "signalled",
     "wait_until",
 ]
 
@@ -40,6 +46,26 @@ class NoSignals(Signals):
         self.asked = True
         if self._stop is not None:
             self._stop()
+
+
+def signalled(
+    main: Callable[[Sequence[str]], int], number: int, ready: Callable[[], bool], *argv: object
+) -> int:
+    """The exit code of a program that runs here until it is `ready` and gets a signal."""
+
+    def give() -> None:
+        wait_until(ready, "the program")
+        os.kill(os.getpid(), number)
+
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    giver = threading.Thread(target=give)
+    giver.start()
+    try:
+        return main([*map(str, argv)])
+    finally:
+        giver.join()
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
 
 
 class Replay:
@@ -86,24 +112,57 @@ def replaying(*arguments: str | Path, port: int = 0) -> Iterator[Replay]:
         running.close()
 
 
-class ReplayProcess(Program):
-    """`ethercat-replay` of a file on a free port, as a process."""
-
-    def __init__(self, *arguments: str | Path) -> None:
-        self.port = free_port()
-        super().__init__("clients.replay.cli", [*map(str, arguments), str(self.port)])
-
-    def wait_listening(self) -> ReplayProcess:
-        self.wait_for("replaying")
-        return self
-
-
-class Recorder(Program):
-    """`ethercat-record` of what is on `port`."""
+class Recorder:
+    """`ethercat-record` of what is on `port`, in a thread."""
 
     def __init__(self, path: Path, port: int, *arguments: str) -> None:
         self.path = path
-        super().__init__("clients.record.cli", [*arguments, str(path), str(port)])
+        self._argv = [*arguments, str(path), str(port)]
+        self._signals = NoSignals()
+        self._codes: list[int] = []
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
 
-    def size(self) -> int:
-        return self.path.stat().st_size if self.path.exists() else 0
+    def _run(self) -> None:
+        self._codes.append(record.run(self._argv, self._signals))
+
+    def wait_for_frames(self, count: int) -> None:
+        """Until so many more are in the file."""
+        enough = frames_in(self.path) + count
+        wait_until(lambda: frames_in(self.path) >= enough, "frames")
+
+    def wait(self) -> int:
+        """The exit code, once it has ended."""
+        self._thread.join(PATIENCE_S)
+        return self._codes[0]
+
+    def stop(self) -> int:
+        """As by a signal; the exit code."""
+        self._signals.give()
+        return self.wait()
+
+
+@contextlib.contextmanager
+def recording(path: Path, port: int, *arguments: str) -> Iterator[Recorder]:
+    """A recorder until the end of the block, or until it is stopped."""
+    running = Recorder(path, port, *arguments)
+    try:
+        yield running
+    finally:
+        running.stop()
+
+
+def frames_in(path: Path) -> int:
+    """The number of frames in a recording, which may be being written."""
+    try:
+        with open_recording(path) as opened:
+            return sum(1 for _ in opened.frames())
+    except RecordingError:
+        return 0
+
+
+class RecorderProcess(Program):
+    """`ethercat-record` of what is on `port`, as a process."""
+
+    def __init__(self, path: Path, port: int, *arguments: str) -> None:
+        super().__init__("clients.record.cli", [*arguments, str(path), str(port)])

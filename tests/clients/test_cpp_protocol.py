@@ -276,7 +276,7 @@ def compare(seed: int, count: int) -> None:
 
 
 def test_hostile_messages_come_out_as_in_python() -> None:
-    compare(SEED, 10_000)
+    compare(SEED, 4_000)
 
 
 @pytest.mark.long
@@ -286,11 +286,14 @@ def test_half_a_million_hostile_messages_come_out_as_in_python() -> None:
     compare(SEED, 500_000)
 
 
-@pytest.mark.parametrize("text", HOSTILE_TEXTS, ids=range(len(HOSTILE_TEXTS)))
-def test_each_hostile_text(text: bytes) -> None:
-    streams = [[framed(text)], [framed(text)[:9], framed(text)[9:]], [framed(text), *FRAMED[:2]]]
+def compare_each(streams: Sequence[Stream]) -> None:
     for stream, cpp in zip(streams, in_cpp(streams), strict=True):
         assert_same(cpp, in_python(stream), stream)
+
+
+def test_each_hostile_text() -> None:
+    wires = [framed(text) for text in HOSTILE_TEXTS]
+    compare_each([stream for wire in wires for stream in ([wire], [wire[:9], wire[9:]], [wire, *FRAMED[:2]])])
 
 
 def test_a_text_that_ends_anywhere() -> None:
@@ -302,17 +305,16 @@ def test_a_text_that_ends_anywhere() -> None:
     assert [decoded[0][0] for decoded in found[:-1]] == ["refused"] * len(text)
 
 
-@pytest.mark.parametrize(
-    "number",
-    ["1e308", "1.7976931348623157e308", "1.7976931348623158e308", "1.7976931348623159e308", "1e309", "-1e309",
-     "1e-400", "0e999999999999", "0.0e99999", "0." + "0" * 400 + "1e700", "0." + "0" * 400 + "1e800",
-     "1" + "0" * 400 + "e-100", "1" + "0" * 400 + "e-92", "1" + "0" * 400 + ".0", "9" * 4300, "9" * 4301,
-     "-" + "9" * 4300, "-" + "9" * 4301, "1e99999999999999999999", "1e-99999999999999999999", "4.9e-324"],
+NUMBERS = (
+    "1e308", "1.7976931348623157e308", "1.7976931348623158e308", "1.7976931348623159e308", "1e309", "-1e309",
+    "1e-400", "0e999999999999", "0.0e99999", "0." + "0" * 400 + "1e700", "0." + "0" * 400 + "1e800",
+    "1" + "0" * 400 + "e-100", "1" + "0" * 400 + "e-92", "1" + "0" * 400 + ".0", "9" * 4300, "9" * 4301,
+    "-" + "9" * 4300, "-" + "9" * 4301, "1e99999999999999999999", "1e-99999999999999999999", "4.9e-324",
 )  # fmt: skip
-def test_numbers_at_the_edge(number: str) -> None:
-    stream = [framed(b'{"a":' + number.encode() + b"}")]
-    (cpp,) = in_cpp([stream])
-    assert_same(cpp, in_python(stream), stream)
+
+
+def test_numbers_at_the_edge() -> None:
+    compare_each([[framed(b'{"a":' + number.encode() + b"}")] for number in NUMBERS])
 
 
 # -- the header's own tables

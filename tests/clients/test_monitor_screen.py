@@ -33,8 +33,9 @@ def plain(state: State, look: Look | None = None, width: int = 80, height: int =
 @pytest.mark.parametrize("look", [Look(), Look(help=True), Look(glyphs=ASCII), Look(question="x" * 300)])
 def test_every_size_is_filled_and_never_exceeded(name: str, look: Look) -> None:
     state = STATES[name]()
-    for width in (1, 10, 24, 40, 55, 56, 60, 75, 76, 80, 109, 110, 200):
-        for height in (1, 5, 8, 12, 15, 23, 24, 36, 44, 90):
+    heights = (1, 5, 8, 12, 15, 23, 24, 36, 44, 90)
+    for number, width in enumerate((1, 10, 24, 40, 55, 56, 60, 75, 76, 80, 109, 110, 200)):
+        for height in heights if look == Look() else heights[number % 3 :: 3]:
             rows = render(state, look, width, height)
             assert len(rows) == height
             assert max(row.cell_len for row in rows) <= width
@@ -195,7 +196,7 @@ def test_whatever_a_sensor_sends_is_shown() -> None:
     noise = random.Random(1)
     model = Model(made.ADDRESS)
     model.connected(made.description(), made.OWN_PEER, made.START_S)
-    for k in range(300):
+    for k in range(120):
         data = noise.randbytes(77)
         sequence, stamp_ns, monotonic_ns = (noise.getrandbits(64) for _ in range(3))
         odd = DataMessage(sequence, stamp_ns, monotonic_ns, 0, noise.getrandbits(3), 0xFFFF, data)

@@ -1,4 +1,4 @@
-"""The monitor against a real server with two virtual sensors: as a program, in a terminal and in pipes."""
+"""The monitor on a server with two virtual sensors: as a program, in a terminal and in pipes."""
 
 from __future__ import annotations
 
@@ -15,56 +15,66 @@ import termios
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from clients.monitor import cli
+from clients.monitor import cli, program
 from clients.monitor.model.server import Model
 from clients.monitor.model.state import State
 from clients.monitor.options import parse
 from clients.monitor.reader import Reader
 from clients.monitor.tare import tare
 from clients.recording.reader import RecordingError, open_recording
+from ethercat_server.serving.transport.in_memory import ManualClock
+from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.address import Address
-from tests.clients.recordings import frame, record
-from tests.clients.running import replaying
+from tests.bridge.scripted_server import ScriptedServer
+from tests.served_simulation import ServedSimulation, served
 from tests.server.as_another_user import NO_OTHER_USER
-from tests.server.running import PATIENCE_S, Server, free_port, needs_bus, wait_until
+from tests.server.running import PATIENCE_S, free_port, wait_until
+from tests.simulated_links import simulated_bus, simulated_server
 
-pytestmark = [pytest.mark.bus, needs_bus]
-
-VIRTUAL = (
-    "--virtual", "--signal poses --sensors 2 --model BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8 --pdo 77",
-    "--set", "sinc_length=512",
-)  # fmt: skip
-"""At 100 Hz, because nothing here is about the rate."""
+SENSORS = [SensorOptions(model=model, pdo_size=77) for model in ("BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8")]
 COMMAND = (sys.executable, "-m", "clients.monitor.cli")
 LEAVE_ALTERNATE_SCREEN = b"\x1b[?1049l"
 SHOW_CURSOR = b"\x1b[?25h"
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Server]:
-    running = Server("virtual", *VIRTUAL)
-    try:
-        yield running.wait_streaming()
-    finally:
-        running.close()
+def shared() -> Iterator[ServedSimulation]:
+    """At 100 Hz, because nothing here is about the rate."""
+    with served(*SENSORS, sinc_length=512) as server:
+        yield server
 
 
 Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Iterator[Run]:
-    """Runs the program here: its exit code, output and errors."""
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+    """Runs the program here, where a second is over when there are samples: exit code, output and errors."""
     handler = signal.getsignal(signal.SIGTERM)
+    models: list[Model] = []
+
+    def model(*arguments: Any) -> Model:
+        models.append(Model(*arguments))
+        return models[-1]
+
+    def sleep(_: float) -> None:
+        before = samples(models[-1])
+        wait_until(lambda: samples(models[-1]) > before + 20, "samples")
 
     def running(*arguments: str) -> tuple[int, str, str]:
         code = cli.main(arguments)
         return code, *capsys.readouterr()
 
+    monkeypatch.setattr(program, "Model", model)
+    monkeypatch.setattr(
+        program, "time", SimpleNamespace(sleep=sleep, monotonic=time.monotonic, time=time.time)
+    )
+    monkeypatch.setattr(program, "_ANSWER_S", PATIENCE_S)
     yield running
     signal.signal(signal.SIGTERM, handler)
 
@@ -122,7 +132,7 @@ class Terminal:
         return back and termios.tcgetattr(self.far) == self.before
 
 
-def test_once_prints_both_sensors_and_says_fine(shared: Server, run: Run) -> None:
+def test_once_prints_both_sensors_and_says_fine(shared: ServedSimulation, run: Run) -> None:
     code, out, err = run("--once", str(shared.port))
     assert (code, err) == (0, ""), out
     assert "BFT-SENS-ECAT-M8" in out
@@ -160,12 +170,21 @@ def test_wrong_usage_is_exit_2(arguments: list[str]) -> None:
     assert ended.value.code == 2
 
 
-def test_json_has_a_line_a_second_with_the_documented_keys(shared: Server, run: Run) -> None:
-    code, out, _ = run("--json", "--seconds", "2", str(shared.port))
+def test_a_line_a_second_until_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = ManualClock()
+    monotonic = lambda: clock.now_ns * 1e-9  # noqa: E731
+    monkeypatch.setattr(program, "time", SimpleNamespace(sleep=clock.sleep, monotonic=monotonic))
+    times = []
+    for _ in program._seconds(4.0):
+        times.append(round(monotonic() - 1.0, 3))
+        clock.sleep(1.8 if len(times) == 1 else 0.3)  # whoever is late does not hurry afterwards
+    assert times == [1.0, 2.8, 3.8]
+
+
+def test_json_has_the_documented_keys(shared: ServedSimulation, run: Run) -> None:
+    code, out, _ = run("--json", "--seconds", "1", str(shared.port))
     assert code == 0
-    lines = [json.loads(line) for line in out.splitlines()]
-    assert len(lines) == 2
-    line = lines[-1]
+    [line] = [json.loads(line) for line in out.splitlines()]
     assert line["connected"] is True
     assert line["server"]["missed_deadlines"] >= 0
     sensor = line["sensors"][1]
@@ -194,7 +213,7 @@ def documented_keys() -> set[str]:
     return listed - {"severity", "text", "remedy"}  # of alerts: there are none here
 
 
-def test_a_reader_that_goes_is_no_traceback(shared: Server) -> None:
+def test_a_reader_that_goes_is_no_traceback(shared: ServedSimulation) -> None:
     command = f"set -o pipefail; {' '.join(COMMAND)} --json {shared.port} | head -n 1"
     done = subprocess.run(
         ["bash", "-c", command], check=False, capture_output=True, text=True, timeout=PATIENCE_S
@@ -204,7 +223,7 @@ def test_a_reader_that_goes_is_no_traceback(shared: Server) -> None:
     assert done.returncode == 0
 
 
-def test_a_dumb_terminal_gets_lines_and_no_escape_sequences(shared: Server) -> None:
+def test_a_dumb_terminal_gets_lines_and_no_escape_sequences(shared: ServedSimulation) -> None:
     with Terminal(str(shared.port), "--seconds", "1", TERM="dumb", PYTHONIOENCODING="ascii") as terminal:
         assert terminal.end() == 0
         seen = terminal.read().decode("ascii")
@@ -214,14 +233,10 @@ def test_a_dumb_terminal_gets_lines_and_no_escape_sequences(shared: Server) -> N
     assert "\x1b" not in seen
 
 
-@pytest.mark.parametrize("way", ["Ctrl-C", "SIGTERM"])
-def test_the_terminal_is_as_it_was_and_had_no_color(shared: Server, way: str) -> None:
+def test_the_terminal_is_as_it_was_and_had_no_color(shared: ServedSimulation) -> None:
     with Terminal(str(shared.port), NO_COLOR="1") as terminal:
         terminal.wait_for("BFT-SENS-ECAT-M8")
-        if way == "SIGTERM":
-            terminal.process.send_signal(signal.SIGTERM)
-        else:
-            terminal.type("\x03")
+        terminal.process.send_signal(signal.SIGTERM)
         assert terminal.end() == 0
         assert terminal.is_as_it_was()
         assert b"Traceback" not in terminal.read()
@@ -233,7 +248,7 @@ def test_the_terminal_is_as_it_was_and_had_no_color(shared: Server, way: str) ->
 
 
 @pytest.mark.parametrize("way", ["the terminal closes", "SIGKILL"])
-def test_a_recording_ends_with_the_monitor(shared: Server, way: str, tmp_path: Path) -> None:
+def test_a_recording_ends_with_the_monitor(shared: ServedSimulation, way: str, tmp_path: Path) -> None:
     with Terminal(str(shared.port), cwd=tmp_path) as terminal:
         terminal.wait_for("BFT-SENS-ECAT-M8")
         terminal.type("r")
@@ -274,7 +289,7 @@ def samples(model: Model) -> int:
     return min((sensor.stream.samples for sensor in state(model).sensors), default=0)
 
 
-def test_rate_jitter_age_and_the_own_row_among_the_clients_are_known(shared: Server) -> None:
+def test_rate_jitter_age_and_the_own_row_among_the_clients_are_known(shared: ServedSimulation) -> None:
     with reading(shared.port) as model:
         wait_until(lambda: samples(model) > 50 and bool(state(model).clients), "samples and a status")
         found = state(model)
@@ -289,22 +304,35 @@ def test_rate_jitter_age_and_the_own_row_among_the_clients_are_known(shared: Ser
         assert sensor.peaks is not None
 
 
-def test_tare_says_what_is_left(shared: Server) -> None:
-    with shared.connect() as client:  # it averages hundreds of samples, in a pose of three seconds
-        assert client.ask("configure", sensor=1, settings={"sinc_length": 64})["ok"]
-        try:
-            for _ in range(30):  # the virtual tool is moved from pose to pose
-                text, bad = tare(Address("localhost", shared.port), 1)
-                if not bad:
-                    break
-                assert "not at rest" in text
-        finally:
-            assert client.ask("configure", sensor=1, settings={"sinc_length": 512})["ok"]
+def test_tare_says_what_is_left() -> None:
+    with simulated_bus("--signal", "rest") as bus, simulated_server(bus):
+        text, bad = tare(Address("localhost", 1), 0)
     assert not bad
-    assert re.fullmatch(r"Sensor 1 was tared; residual at most [0-9.]+ N and [0-9.]+ Nm", text)
+    assert re.fullmatch(r"Sensor 0 was tared; residual at most [0-9.]+ N and [0-9.]+ Nm", text)
 
 
-def test_tare_of_another_user_says_the_servers_sentence(shared: Server) -> None:
+def test_tare_says_why_not() -> None:
+    with simulated_bus("--signal", "turn") as bus, simulated_server(bus) as server:
+        text, bad = tare(Address("localhost", 1), 0)
+        assert bad
+        assert re.match("Sensor 0 was not tared: .*not at rest", text)
+        server.hangs = True
+        text, bad = tare(Address("localhost", 1), 0)
+        assert bad
+        assert re.match("Sensor 0 was not tared: no connection .*no reply to describe", text)
+
+
+@pytest.mark.parametrize("way", ["silent", "gone"])
+def test_a_tare_without_an_answer_is_not_known(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clients.monitor.tare._TIMEOUT_S", 0.05 if way == "silent" else PATIENCE_S)
+    with ScriptedServer() as server:
+        server.answers["tare"] = lambda _: server.drop() if way == "gone" else None
+        text, bad = tare(Address("localhost", server.port), 0)
+    assert bad
+    assert text.startswith("It is unknown whether sensor 0 was tared: ")
+
+
+def test_tare_of_another_user_says_the_servers_sentence(shared: ServedSimulation) -> None:
     if NO_OTHER_USER is not None:
         pytest.skip(NO_OTHER_USER)
     code = (
@@ -319,31 +347,25 @@ def test_tare_of_another_user_says_the_servers_sentence(shared: Server) -> None:
     assert done.stdout.endswith("True\n")
 
 
-def test_a_stopped_server_is_said_to_be_silent(shared: Server) -> None:
+def test_a_stopped_server_is_said_to_be_silent(shared: ServedSimulation) -> None:
     with reading(shared.port) as model:
         wait_until(lambda: samples(model) > 20, "samples")
-        shared.signal(signal.SIGSTOP)
-        try:
+        with shared.stopped():
             wait_until(lambda: state(model).server.silent, "silence")
             assert all(not sensor.alerts for sensor in state(model).sensors)
-        finally:
-            shared.signal(signal.SIGCONT)
         wait_until(lambda: not state(model).server.silent, "the server's voice")
         assert state(model).server.connected
 
 
-def test_a_restart_of_the_server_is_seen_and_survived(tmp_path: Path) -> None:
-    source, port = tmp_path / "source.mcap", free_port()
-    record(source, (frame(n // 2, sensor=n % 2) for n in range(400)), sensors=(0, 1))
-    with contextlib.ExitStack() as ends:
-        with replaying("--loop", source, port=port):
-            model = ends.enter_context(reading(port))
-            wait_until(lambda: samples(model) > 20, "samples")
+def test_a_restart_of_the_server_is_seen_and_survived() -> None:
+    with served(*SENSORS, sinc_length=512) as first, reading(first.port) as model:
+        wait_until(lambda: samples(model) > 20, "samples")
+        first.close()
         wait_until(lambda: not state(model).server.connected, "the end of the connection")
         gone = state(model).server
         assert gone.since_clock
         assert gone.reason
-        with replaying("--loop", source, port=port):
+        with served(*SENSORS, port=first.port, sinc_length=512):
             wait_until(lambda: state(model).server.connected, "a new connection")
             wait_until(lambda: samples(model) > 20, "samples again")
             wait_until(lambda: not any(sensor.old_s for sensor in state(model).sensors), "fresh ones")

@@ -27,7 +27,7 @@ from protocol.pdo import SampleDecoder
 from tests.clients.recordings import START_NS, describe, frame, record, writer
 
 CHUNKS = 10
-PER_CHUNK = 100
+PER_CHUNK = 30
 
 
 @pytest.fixture
@@ -230,7 +230,7 @@ def test_no_flipped_byte_does_more_than_an_error(path: Path) -> None:
     record(path, (frame(number) for number in range(40)), 20)
     data = path.read_bytes()
     source, sentences = random.Random(3), []
-    for _ in range(600):
+    for _ in range(300):
         hostile = bytearray(data)
         for _ in range(source.choice((1, 1, 2, 8))):
             hostile[source.randrange(len(hostile))] = source.choice((0, 0xFF, 0x7F, source.randrange(256)))

@@ -1,6 +1,6 @@
 """`ethercat-record`: everything it receives is in the file, whatever happens to it.
 
-It is a process where it is stopped, killed or watched from outside.
+It is a process where it is stopped or killed from outside, which nothing else can do.
 """
 
 from __future__ import annotations
@@ -8,22 +8,40 @@ from __future__ import annotations
 import contextlib
 import random
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
 from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
-from clients.record import program
-from clients.recording.file_format import frame_topic
+from clients.record import cli, program
+from clients.record import parts as record_parts
+from clients.record.parts import Parts
+from clients.record.recorder import FLUSH_S, Recorder
+from clients.record.source import BATCH_S, Source
+from clients.recording.file_format import FORMAT_VERSION, frame_topic
 from clients.recording.reader import open_recording
+from protocol.address import Address
 from protocol.framing import DataFlag, DataMessage
 from tests.clients.recordings import frame, record
-from tests.clients.running import Client, NoSignals, Recorder, Replay, free_port, replaying, wait_until
+from tests.clients.running import (
+    NoSignals,
+    RecorderProcess,
+    Replay,
+    frames_in,
+    free_port,
+    recording,
+    replaying,
+    signalled,
+    wait_until,
+)
+from tests.served_simulation import served
 from tests.server.running import needs_bus, server
 
 Run = Callable[..., tuple[int, str]]
@@ -52,8 +70,8 @@ def out(tmp_path: Path) -> Path:
 
 
 def read(path: Path) -> list[DataMessage]:
-    with open_recording(path) as recording:
-        return list(recording.frames())
+    with open_recording(path) as opened:
+        return list(opened.frames())
 
 
 @pytest.fixture
@@ -102,81 +120,49 @@ def test_record_replay_record_gives_the_same_frames(
 def test_it_ends_by_itself_and_says_what_it_has(endless: Replay, out: Path, run: Run) -> None:
     code, said = run(out, endless.port, "--seconds", "0.5")
     assert code == 0
-    with open_recording(out) as recording:
-        assert recording.cut_off is None
-        assert recording.end is not None
-        assert recording.end["reason"] == "time is up"
-        assert [sensor.serial for sensor in recording.sensors] == [100, 101]
-        assert recording.metadata["server"] == f"localhost:{endless.port}"
-        assert f"{recording.frame_count} frames of 2 sensors" in said
-        assert is_whole(list(recording.frames()))
+    with open_recording(out) as opened:
+        assert opened.cut_off is None
+        assert opened.end is not None
+        assert opened.end["reason"] == "time is up"
+        assert [sensor.serial for sensor in opened.sensors] == [100, 101]
+        assert opened.metadata["server"] == f"localhost:{endless.port}"
+        assert f"{opened.frame_count} frames of 2 sensors" in said
+        assert is_whole(list(opened.frames()))
 
 
 def test_one_sensor_of_two(endless: Replay, out: Path, run: Run) -> None:
     code, _ = run(out, endless.port, "--sensor", "1", "--seconds", "0.3", "--ros")
     assert code == 0
-    with open_recording(out) as recording:
-        assert {item.sensor for item in recording.frames()} == {1}
-        assert recording.chosen == {1}
-
-
-def test_it_ends_with_its_standard_input(endless: Replay, out: Path) -> None:
-    recorder = Recorder(out, endless.port, "--until-eof")
-    try:
-        wait_until(lambda: recorder.size() > 5000, "frames")
-        assert recorder.process.stdin
-        recorder.process.stdin.write("this is not the end\n")
-        recorder.process.stdin.flush()
-        size = recorder.size()
-        wait_until(lambda: recorder.size() > size, "more frames")
-        recorder.process.stdin.close()
-        assert recorder.wait() == 0
-    finally:
-        recorder.close()
-    with open_recording(out) as recording:
-        assert recording.end is not None
-        assert recording.end["reason"] == "asked to stop"
+    with open_recording(out) as opened:
+        assert {item.sensor for item in opened.frames()} == {1}
+        assert opened.chosen == {1}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_cleanly(endless: Replay, out: Path, number: int) -> None:
-    recorder = Recorder(out, endless.port)
-    try:
-        recorder.wait_for("Ctrl-C ends it")
-        wait_until(lambda: recorder.size() > 5000, "data")
-        recorder.signal(number)
-        assert recorder.wait() == 0
-        assert "nothing was lost" in recorder.said()
-        assert "Traceback" not in recorder.said()
-    finally:
-        recorder.close()
-    with open_recording(out) as recording:
-        assert recording.cut_off is None
-        assert recording.end is not None
-        assert recording.end["reason"] == "asked to stop"
+def test_a_signal_ends_it_cleanly(
+    endless: Replay, out: Path, number: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert signalled(cli.main, number, lambda: frames_in(out) > 50, out, endless.port) == 0
+    assert "nothing was lost" in capsys.readouterr().err
+    with open_recording(out) as opened:
+        assert opened.cut_off is None
+        assert opened.end is not None
+        assert opened.end["reason"] == "asked to stop"
 
 
-def test_it_records_across_the_restart_of_the_server(source: Path, out: Path) -> None:
-    port = free_port()
-    with replaying("--loop", source, port=port):
-        recorder = Recorder(out, port)
-        recorder.wait_for("Ctrl-C ends it")
-        wait_until(lambda: recorder.size() > 5000, "data")
-    try:
-        recorder.wait_for("disconnected")
-        with replaying("--loop", source, port=port):
-            before = recorder.size()
-            wait_until(lambda: recorder.size() > before + 5000, "more data")
-            recorder.signal(signal.SIGINT)
-            assert recorder.wait() == 0
-            assert "nothing was lost" in recorder.said()
-    finally:
-        recorder.close()
-    with open_recording(out) as recording:
-        names = [event.name for event in recording.events]
+def test_it_records_across_the_restart_of_the_server(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with served(sinc_length=512) as first, recording(out, first.port) as recorder:
+        recorder.wait_for_frames(20)
+        first.close()
+        with served(port=first.port, sinc_length=512):
+            recorder.wait_for_frames(20)
+            assert recorder.stop() == 0
+    assert "nothing was lost" in capsys.readouterr().err
+    with open_recording(out) as opened:
+        names = [event.name for event in opened.events]
         assert names == ["connected", "shutting_down", "disconnected", "connected"]
-        assert [event.by_recorder for event in recording.events] == [True, False, True, True]
-        assert len(recording.descriptions) == 2
+        assert [event.by_recorder for event in opened.events] == [True, False, True, True]
+        assert len(opened.descriptions) == 2
 
 
 # -- what is lost
@@ -192,47 +178,74 @@ def test_what_the_server_withheld_is_said(out: Path, tmp_path: Path, run: Run) -
     assert "3 frames of sensor 0 not read in time" in said
 
 
-def test_nothing_is_lost_while_it_does_not_run_for_a_moment(endless: Replay, out: Path) -> None:
-    recorder = Recorder(out, endless.port)
-    try:
-        wait_until(lambda: recorder.size() > 5000, "data")
-        recorder.signal(signal.SIGSTOP)
-        before = len(read(out))
-        time.sleep(2)
-        recorder.signal(signal.SIGCONT)
-        wait_until(lambda: len(read(out)) > before + 2 * 2 * SECOND, "the frames of the two seconds")
-        recorder.signal(signal.SIGINT)
-        assert recorder.wait() == 0
-        assert "nothing was lost" in recorder.said()
-    finally:
-        recorder.signal(signal.SIGCONT)
-        recorder.close()
+def test_a_moment_without_running_and_the_end_of_its_input(out: Path) -> None:
+    """A process, to be stopped by SIGSTOP and to have a standard input."""
+    with served(sinc_length=512) as server:
+        recorder = RecorderProcess(out, server.port, "--until-eof")
+        try:
+            wait_until(lambda: frames_in(out) > 20, "frames")
+            recorder.signal(signal.SIGSTOP)
+            before = frames_in(out)
+            time.sleep(0.5)
+            recorder.signal(signal.SIGCONT)
+            wait_until(lambda: frames_in(out) > before + 100, "the frames of that time, and more")
+            assert recorder.process.stdin
+            recorder.process.stdin.write("this is not the end\n")
+            recorder.process.stdin.flush()
+            before = frames_in(out)
+            wait_until(lambda: frames_in(out) > before, "more frames")
+            recorder.process.stdin.close()
+            assert recorder.wait() == 0
+            assert "nothing was lost" in recorder.said()
+        finally:
+            recorder.signal(signal.SIGCONT)
+            recorder.close()
     assert is_whole(read(out))
+    with open_recording(out) as opened:
+        assert opened.end is not None
+        assert opened.end["reason"] == "asked to stop"
 
 
-def killed(endless: Replay, out: Path, after_s: float) -> None:
-    """Kill a recorder; everything up to a second before is there."""
-    recorder = Recorder(out, endless.port, "--force")
+def test_seconds_of_frames_have_room_in_the_kernel(endless: Replay) -> None:
+    source = Source(Address("localhost", endless.port), None)
+    source.connect()
+    assert source._client is not None
+    room = source._client.connection.sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    source.close()
+    most = int(Path("/proc/sys/net/core/rmem_max").read_text())
+    assert room >= min(4 * 1024 * 1024, 2 * most)
+
+
+def test_frames_get_into_the_file_before_it_ends(out: Path) -> None:
+    assert BATCH_S + FLUSH_S < 0.5, "a machine that is busy may double it"
+    recorder = Recorder(
+        Parts(out, size=None, seconds=None, overwrite=False), "test", {"format": FORMAT_VERSION}, {}
+    )
+    try:
+        recorder.put([frame(number) for number in range(10)])
+        wait_until(lambda: frames_in(out) == 10, "the frames, though no more come")
+    finally:
+        recorder.stop("")
+
+
+def killed(endless: Replay, out: Path, frames: int) -> None:
+    """Kill a recorder once there are so many frames; all of them are there."""
+    recorder = RecorderProcess(out, endless.port, "--force")
     try:
         recorder.wait_for("Ctrl-C ends it")
-        wait_until(lambda: recorder.size() > 0, "data")
-        time.sleep(after_s)
+        wait_until(lambda: frames_in(out) > frames, "frames")
+        before = frames_in(out)
         recorder.signal(signal.SIGKILL)
-        at_ns = time.time_ns()
         recorder.wait()
     finally:
         recorder.close()
-    frames = read(out)
-    assert is_whole(frames)
-    assert {item.sensor for item in frames} == {0, 1}
-    for sensor in (0, 1):
-        last = max(item.stamp_ns for item in frames if item.sensor == sensor)
-        assert at_ns - last < 1_000_000_000
+    assert len(read(out)) >= before
+    assert is_whole(read(out))
+    assert {item.sensor for item in read(out)} == {0, 1}
 
 
-def test_killed_it_leaves_everything_up_to_a_second_before(endless: Replay, out: Path) -> None:
-    for number in range(3):
-        killed(endless, out, 0.3 + 0.31 * number)
+def test_killed_it_leaves_what_was_there(endless: Replay, out: Path) -> None:
+    killed(endless, out, 500)
 
 
 @pytest.mark.long
@@ -240,7 +253,7 @@ def test_killed_it_leaves_everything_up_to_a_second_before(endless: Replay, out:
 def test_killed_twenty_times_it_leaves_everything_twenty_times(endless: Replay, out: Path) -> None:
     source = random.Random(4)
     for _ in range(20):
-        killed(endless, out, source.uniform(0.1, 3))
+        killed(endless, out, source.randrange(200, 5000))
 
 
 @pytest.fixture
@@ -276,19 +289,23 @@ def test_a_full_disk_ends_it_with_what_was_written_whole(endless: Replay, small_
 # -- files
 
 
-def test_rotation_loses_nothing_between_the_files(endless: Replay, out: Path, run: Run) -> None:
-    code, said = run(out, endless.port, "--seconds", "3.4", "--rotate-seconds", "1")
-    assert code == 0, said
+def test_rotation_loses_nothing_between_the_files(
+    endless: Replay, out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record_parts, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic()))
+    with recording(out, endless.port, "--rotate-seconds", "1") as recorder:
+        wait_until(lambda: len(list(out.parent.glob("out_*.mcap"))) >= 3, "three files")
+        assert recorder.stop() == 0
+    said = capsys.readouterr().err
     parts = sorted(out.parent.glob("out_*.mcap"))
-    assert len(parts) >= 3
     assert not out.exists()
     frames: list[DataMessage] = []
     for number, part in enumerate(parts):
-        with open_recording(part) as recording:
-            assert recording.metadata["part"] == str(number)
-            assert recording.cut_off is None
-            assert [sensor.serial for sensor in recording.sensors] == [100, 101]
-            frames += recording.frames()
+        with open_recording(part) as opened:
+            assert opened.metadata["part"] == str(number)
+            assert opened.cut_off is None
+            assert [sensor.serial for sensor in opened.sensors] == [100, 101]
+            frames += opened.frames()
     assert is_whole(frames)
     assert f"{len(frames)} frames" in said
 
@@ -305,14 +322,11 @@ def test_nothing_is_overwritten_unasked(endless: Replay, out: Path, run: Run) ->
 
 
 def test_two_recorders_do_not_write_to_one_file(endless: Replay, out: Path, run: Run) -> None:
-    recorder = Recorder(out, endless.port)
-    try:
-        wait_until(lambda: recorder.size() > 0, "data")
+    with recording(out, endless.port) as recorder:
+        recorder.wait_for_frames(1)
         code, said = run(out, endless.port, "--force", "--seconds", "0.3")
         assert code == 1
         assert "another ethercat-record is writing to it" in said
-    finally:
-        recorder.close()
     assert is_whole(read(out))
 
 
@@ -360,27 +374,21 @@ def test_without_a_server_it_makes_no_file(out: Path, run: Run) -> None:
     assert not out.exists()
 
 
-def test_it_waits_for_a_server_if_it_is_told_to(source: Path, out: Path) -> None:
+def test_it_waits_for_a_server_if_it_is_told_to(
+    source: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     port = free_port()
-    recorder = Recorder(out, port, "--wait", "--no-reconnect")
-    try:
-        recorder.wait_for("waiting for a server")
+    with recording(out, port, "--wait", "--no-reconnect") as recorder:
+        wait_until(lambda: "waiting for a server" in capsys.readouterr().err, "a word")
         with replaying("--speed", "max", source, port=port):
             assert recorder.wait() == 0
-    finally:
-        recorder.close()
     assert len(read(out)) == SECOND
 
 
-def test_a_signal_ends_the_wait(out: Path) -> None:
-    recorder = Recorder(out, free_port(), "--wait")
-    try:
-        recorder.wait_for("waiting for a server")
-        recorder.signal(signal.SIGINT)
-        assert recorder.wait() == 0
-        assert "nothing was recorded" in recorder.said()
-    finally:
-        recorder.close()
+def test_the_wait_can_be_ended(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with recording(out, free_port(), "--wait") as recorder:
+        assert recorder.stop() == 0
+    assert "nothing was recorded" in capsys.readouterr().err
 
 
 def test_a_sensor_that_is_not_there_is_said_by_the_server(endless: Replay, out: Path, run: Run) -> None:
@@ -398,26 +406,25 @@ def test_a_folder_that_is_not_there_is_said(out: Path, run: Run) -> None:
 # -- with a server
 
 
-@pytest.mark.bus
-@needs_bus
 def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
-    with server("virtual") as running, Client(running.port) as client:
-        recorder = Recorder(out, running.port, "--ros")
-        try:
-            wait_until(lambda: recorder.size() > 0, "data")
-            assert client.ask("configure", sensor=0, settings={"sinc_length": 128})["ok"]
-            recorder.wait_for("reconfigured 0")
-            size = recorder.size()
-            wait_until(lambda: recorder.size() > size, "samples at the new rate")
-            recorder.signal(signal.SIGINT)
-            assert recorder.wait() == 0
-        finally:
-            recorder.close()
-    with open_recording(out) as recording:
-        (sensor,) = recording.sensors
-        assert sensor.settings["sinc_length"] == 64
-        assert (sensor.history[-1].values["sinc_length"], sensor.history[-1].rate_hz) == (128, 400)
-        assert is_whole(list(recording.frames()))
+    def last_setting() -> tuple[object, float]:
+        with open_recording(out) as opened:
+            (sensor,) = opened.sensors
+            return sensor.history[-1].values["sinc_length"], sensor.history[-1].rate_hz
+
+    with (
+        served(sinc_length=512) as server,
+        server.client() as client,
+        recording(out, server.port, "--ros") as recorder,
+    ):
+        recorder.wait_for_frames(1)
+        assert client.ask("configure", sensor=0, settings={"sinc_length": 256})["ok"]
+        wait_until(lambda: last_setting() == (256, 200), "the new settings")
+        recorder.wait_for_frames(20)
+        assert recorder.stop() == 0
+    with open_recording(out) as opened:
+        assert opened.sensors[0].settings["sinc_length"] == 512
+        assert is_whole(list(opened.frames()))
 
 
 @pytest.mark.long
@@ -429,7 +436,7 @@ def test_two_sensors_at_1600_hz_for_a_minute(out: Path, ros: tuple[str, ...], mo
     """Nothing lost between server and file, under 15 % of a core; with three ROS messages a frame, 25 %."""
     seconds = 60
     with server("virtual", "--virtual", "--sensors 2", "--set", "sinc_length=32") as running:
-        recorder = Recorder(out, running.port, "--seconds", str(seconds), *ros)
+        recorder = RecorderProcess(out, running.port, "--seconds", str(seconds), *ros)
         used = psutil.Process(recorder.process.pid)
         spent = 0.0
         try:

@@ -1,6 +1,6 @@
 """`ethercat-replay`: a client cannot tell it from a server, except by its `describe`.
 
-It runs in a thread, except where signals, exit codes and imports are what a test is about.
+It runs in a thread, except where its imports are what a test is about.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import pytest
 
 from bridge.stream.connection import Connection
 from clients.recording.reader import Event, open_recording
-from clients.replay import program
+from clients.replay import cli, program
 from clients.replay.sensors import ReplayedSensors
 from protocol.client import connect
 from protocol.control import ErrorCode
 from protocol.errors import RefusedError
 from protocol.framing import DataMessage
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
-from tests.clients.running import Client, NoSignals, ReplayProcess, replaying
+from tests.clients.running import Client, NoSignals, free_port, replaying, signalled
 
 COUNT = 400
 
@@ -281,15 +281,11 @@ def test_a_port_that_is_taken_is_said(path: Path, frames: list[DataMessage], run
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_before_anybody_came(path: Path, frames: list[DataMessage], number: int) -> None:
+def test_a_signal_ends_it_before_anybody_came(
+    path: Path, frames: list[DataMessage], number: int, capsys: pytest.CaptureFixture[str]
+) -> None:
     del frames
-    served = ReplayProcess(path).wait_listening()
-    try:
-        served.signal(number)
-        assert served.wait() == 0
-        assert "Traceback" not in served.said()
-    finally:
-        served.close()
+    assert signalled(cli.main, number, lambda: "replaying" in capsys.readouterr().err, path, free_port()) == 0
 
 
 def test_a_damaged_recording_ends_it_with_a_sentence(path: Path, frames: list[DataMessage]) -> None:
