@@ -185,19 +185,24 @@ _STARVED = (
     "is lost: no frame comes back",
 )
 """What it says at start where a busy machine lets the virtual sensor's process wait for too long."""
-_ATTEMPTS = 3
+ATTEMPTS = 3
+
+
+def starved(said: str) -> bool:
+    """Whether the sensor may have been."""
+    return any(words in said for words in _STARVED)
 
 
 def _streaming(ifname: str, *arguments: str) -> Server:
     """A server that streams; started again where the sensor was starved."""
-    for attempt in range(_ATTEMPTS):
+    for attempt in range(ATTEMPTS):
         running = Server(ifname, *arguments)
         try:
             return running.wait_streaming()
         except BaseException:
             said = running.said()
             running.close()
-            if attempt == _ATTEMPTS - 1 or not any(words in said for words in _STARVED):
+            if attempt == ATTEMPTS - 1 or not starved(said):
                 raise
     raise AssertionError("unreachable")
 
