@@ -49,7 +49,7 @@ class Stage:
             self.prefix / "bin" / "ethercat-server",
             self.prefix / "bridge" / "bin" / "bridge-client",
         ):
-            program.parent.mkdir(parents=True)
+            program.parent.mkdir(parents=True, exist_ok=True)
             program.write_text("#!/bin/sh\n")
             program.chmod(0o755)
 

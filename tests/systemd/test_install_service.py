@@ -18,11 +18,25 @@ from tests.systemd.staging import ROOT, Stage, install_service, need_systemd, st
 __all__ = ["stage"]
 
 CONFIGURATION = "/etc/ethercat-server/default.toml"
+RECORD = "/var/lib/ethercat-server/installed"
 
 
-def test_everything_gets_its_place(stage: Stage) -> None:
-    said = stage.install("--bridge", "ens5", "13000")
-    files = stage.files()
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Stage, str]:
+    """A whole installation, and what was said; not to be changed."""
+    need_systemd()
+    made = Stage(tmp_path_factory.mktemp("installed") / "stage")
+    return made, made.install("--bridge", "ens5", "13000")
+
+
+@pytest.fixture
+def copied(installed: tuple[Stage, str], tmp_path: Path) -> Stage:
+    """The same, to be changed."""
+    return Stage(Path(shutil.copytree(installed[0].path, tmp_path / "stage")))
+
+
+def test_everything_gets_its_place(installed: tuple[Stage, str]) -> None:
+    files, said = installed[0].files(), installed[1]
     assert set(files) == {
         CONFIGURATION,
         "/etc/ethercat-server/bridge.yaml",
@@ -32,22 +46,21 @@ def test_everything_gets_its_place(stage: Stage) -> None:
         "/etc/systemd/system/ethercat-bridge.service",
         "/etc/systemd/system/ethercat-server@.service",
         "/etc/sysusers.d/ethercat-server.conf",
-        "/var/lib/ethercat-server/installed",
+        RECORD,
     }
     assert "\nPORT=13000\n" in files["/etc/ethercat-server/ens5.env"]
-    for path in set(files) - {"/var/lib/ethercat-server/installed"}:
+    for path in set(files) - {RECORD}:
         assert f"wrote {path}\n" in said
 
 
-def test_network_managers_leave_the_interface_alone(stage: Stage) -> None:
-    stage.install("enp3s0")
-    files = stage.files()
+def test_network_managers_leave_the_interface_alone(installed: tuple[Stage, str]) -> None:
+    files = installed[0].files()
     manager, networkd = configparser.ConfigParser(), configparser.ConfigParser()
-    manager.read_string(files["/etc/NetworkManager/conf.d/90-ethercat-server-enp3s0.conf"])
-    section = manager["device-ethercat-enp3s0"]
-    assert (section["match-device"], section["managed"]) == ("interface-name:enp3s0", "0")
-    networkd.read_string(files["/etc/systemd/network/05-ethercat-server-enp3s0.network"])
-    assert (networkd["Match"]["Name"], networkd["Link"]["Unmanaged"]) == ("enp3s0", "yes")
+    manager.read_string(files["/etc/NetworkManager/conf.d/90-ethercat-server-ens5.conf"])
+    section = manager["device-ethercat-ens5"]
+    assert (section["match-device"], section["managed"]) == ("interface-name:ens5", "0")
+    networkd.read_string(files["/etc/systemd/network/05-ethercat-server-ens5.network"])
+    assert (networkd["Match"]["Name"], networkd["Link"]["Unmanaged"]) == ("ens5", "yes")
 
 
 def test_a_virtual_sensor_needs_no_network_manager_told(stage: Stage) -> None:
@@ -55,83 +68,61 @@ def test_a_virtual_sensor_needs_no_network_manager_told(stage: Stage) -> None:
     assert not [path for path in stage.files() if "etwork" in path]
 
 
-def test_a_name_with_a_dash_is_escaped_for_systemd_only(stage: Stage) -> None:
-    stage.install("--bridge", "enp3s0-1")
+def test_units_name_their_folder_and_an_interface_with_a_dash_is_escaped_for_systemd_only(
+    stage: Stage,
+) -> None:
+    stage.prefix.rename(stage.path / "opt" / "elsewhere")
+    stage.install("--prefix", "/opt/elsewhere", "--bridge", "enp3s0-1")
     files = stage.files()
+    for path, text in files.items():
+        assert not path.endswith(".service") or "/opt/ethercat-server" not in text, path
     unit = files["/etc/systemd/system/ethercat-bridge.service"]
     assert "Wants=ethercat-server@enp3s0\\x2d1.service\n" in unit
     assert "/etc/ethercat-server/enp3s0-1.env" in files
 
 
-def test_units_name_the_folder_they_are_installed_in(stage: Stage) -> None:
-    stage.prefix.rename(stage.path / "opt" / "elsewhere")
-    stage.install("--prefix", "/opt/elsewhere", "--bridge", "ens5")
-    for path, text in stage.files().items():
-        assert not path.endswith(".service") or "/opt/ethercat-server" not in text, path
-
-
-def test_a_second_time_changes_nothing(stage: Stage) -> None:
-    stage.install("--bridge", "ens5", "13000")
-    before = stage.files()
-    said = stage.install("--bridge", "ens5")
-    after = stage.files()
-    record = "/var/lib/ethercat-server/installed"
-    assert sorted(before.pop(record).splitlines()) == sorted(after.pop(record).splitlines())
+def test_a_second_time_changes_nothing(copied: Stage) -> None:
+    before = copied.files()
+    said = copied.install("--bridge", "ens5")
+    after = copied.files()
+    assert sorted(before.pop(RECORD).splitlines()) == sorted(after.pop(RECORD).splitlines())
     assert before == after
     assert "wrote" not in said
 
 
-def test_a_second_interface_joins_the_first(stage: Stage) -> None:
-    stage.install("ens5", "13000")
-    stage.install("ens6", "13001")
-    files = stage.files()
-    assert "\nPORT=13000\n" in files["/etc/ethercat-server/ens5.env"]
-    assert "\nPORT=13001\n" in files["/etc/ethercat-server/ens6.env"]
+def test_another_port_and_a_second_interface_and_the_end_of_all(copied: Stage) -> None:
+    copied.install("ens5", "13001")
+    copied.install("ens6", "13002")
+    files = copied.files()
+    assert "\nPORT=13001\n" in files["/etc/ethercat-server/ens5.env"]
+    assert "\nPORT=13002\n" in files["/etc/ethercat-server/ens6.env"]
+    (copied.prefix / "pyvenv.cfg").touch()
+    edited = copied.path / CONFIGURATION[1:]
+    edited.write_text(edited.read_text() + "# mine\n")
+    said = copied.run("--uninstall")
+    assert set(copied.files()) == {CONFIGURATION}
+    assert f"kept {CONFIGURATION}, which was edited" in said
+    assert not copied.prefix.exists()
+    assert "nothing is installed" in copied.run("--uninstall")
 
 
-def test_another_port_is_taken_over(stage: Stage) -> None:
-    stage.install("ens5", "13000")
-    stage.install("ens5", "13001")
-    assert "\nPORT=13001\n" in stage.files()["/etc/ethercat-server/ens5.env"]
-
-
-def test_edited_configuration_is_kept_and_an_old_unit_is_not(stage: Stage) -> None:
-    stage.install("ens5")
-    edited = stage.path / CONFIGURATION[1:]
+def test_edited_configuration_is_kept_and_an_old_unit_is_not(copied: Stage) -> None:
+    edited = copied.path / CONFIGURATION[1:]
     edited.write_text("[sensor]\nfir = true\n")
-    unit = stage.path / "etc/systemd/system/ethercat-server@.service"
+    unit = copied.path / "etc/systemd/system/ethercat-server@.service"
     new_unit = unit.read_text()
     unit.write_text("[Service]\n")
-    assert f"{CONFIGURATION} was edited and is kept" in stage.install("ens5")
+    assert f"{CONFIGURATION} was edited and is kept" in copied.install("ens5")
     assert edited.read_text() == "[sensor]\nfir = true\n"
     assert unit.read_text() == new_unit
 
 
-def test_uninstall_leaves_only_what_was_edited(stage: Stage) -> None:
-    stage.install("--bridge", "ens5")
-    stage.install("ens6")
-    (stage.prefix / "pyvenv.cfg").touch()
-    edited = stage.path / CONFIGURATION[1:]
-    edited.write_text(edited.read_text() + "# mine\n")
-    said = stage.run("--uninstall")
-    assert set(stage.files()) == {CONFIGURATION}
-    assert f"kept {CONFIGURATION}, which was edited" in said
-    assert not stage.prefix.exists()
-    assert "nothing is installed" in stage.run("--uninstall")
-
-
-def test_uninstall_leaves_nothing_if_nothing_was_edited(stage: Stage) -> None:
-    stage.install("ens5")
-    stage.run("--uninstall")
-    assert not stage.files()
-    assert not (stage.path / "etc/ethercat-server").exists()
-
-
-def test_a_folder_that_is_something_else_is_not_touched(stage: Stage) -> None:
-    (stage.prefix / "precious").touch()
-    stage.install("ens5")
-    stage.run("--uninstall")
-    assert (stage.prefix / "precious").exists()
+def test_uninstall_leaves_nothing_that_was_not_edited_and_touches_no_folder_of_others(copied: Stage) -> None:
+    (copied.prefix / "precious").touch()
+    copied.run("--uninstall")
+    assert not copied.files()
+    assert not (copied.path / "etc/ethercat-server").exists()
+    assert (copied.prefix / "precious").exists()
 
 
 @pytest.mark.parametrize(
