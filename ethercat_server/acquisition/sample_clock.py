@@ -162,7 +162,7 @@ class SampleClock:
         looking = _HALF * self._least_flight_ns
         if unwatched < _NARROW * period:
             self.steps = max(0, 1 + round(((after + received_ns) / 2 - expected) / period))
-        elif self._doubtful and self.locked and received_ns - looking < self._low:
+        elif self._doubtful and self.locked and received_ns - looking < self._low - _NEAR_TO_HOLD * period:
             self.steps = 0  # too early for the next one: what was uncertain was the one before it
         else:
             # Several samples may lie in a wide bracket: the newest is the last one due before the exchange.
