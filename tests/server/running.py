@@ -169,8 +169,8 @@ class Server(Program):
 
 
 @contextlib.contextmanager
-def server(ifname: str, *arguments: str) -> Iterator[Server]:
-    running = _streaming(ifname, *arguments)
+def server(ifname: str, *arguments: str, port: int = 0) -> Iterator[Server]:
+    running = _streaming(ifname, *arguments, port=port)
     try:
         yield running
     finally:
@@ -183,9 +183,11 @@ _STARVED = (
     "did not answer",
     "does not answer in",
     "is lost: no frame comes back",
+    "does not reach",  # after a lost frame of SOEM's set-up
+    "maps process data of",  # as much of it as SOEM could read in its time
 )
 """What it says at start where a busy machine lets the virtual sensor's process wait for too long."""
-ATTEMPTS = 3
+ATTEMPTS = 5
 
 
 def starved(said: str) -> bool:
@@ -193,10 +195,10 @@ def starved(said: str) -> bool:
     return any(words in said for words in _STARVED)
 
 
-def _streaming(ifname: str, *arguments: str) -> Server:
+def _streaming(ifname: str, *arguments: str, port: int) -> Server:
     """A server that streams; started again where the sensor was starved."""
     for attempt in range(ATTEMPTS):
-        running = Server(ifname, *arguments)
+        running = Server(ifname, *arguments, port=port)
         try:
             return running.wait_streaming()
         except BaseException:

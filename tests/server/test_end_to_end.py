@@ -135,9 +135,7 @@ def test_killed_and_started_again_at_once_on_the_same_port_beside_another(shared
         killed.wait()
         client.receive_all()
 
-        again = Server("virtual", port=killed.port)
-        stack.callback(again.close)
-        again.wait_streaming()
+        again = stack.enter_context(server("virtual", port=killed.port))
         wait_until(lambda: not interface_exists(killed.ifname), "the virtual bus to be gone")
         with Client(killed.port) as client:
             assert client.ask("subscribe")["ok"]
