@@ -199,7 +199,7 @@ def test_without_rights_it_says_what_it_skipped(bench: Bench) -> None:
     """Another user's rights, as the kernel grants them."""
     veth, sensor = bench
     before = command(sensor, "stats")
-    ended = doctor_of_nobody(veth.near, *QUICK)
+    ended = doctor_of_nobody(veth.near, "--json", "--seconds", "0.02")
     assert not ended.json["root"]
     assert ended.findings("bus")["slaves"]["found"] == (
         "not checked: CAP_NET_RAW and CAP_NET_ADMIN missing; run with sudo"
@@ -229,7 +229,7 @@ def test_another_user_sees_that_an_interface_is_in_use_but_not_by_whom(bench: Be
 
 def test_virtual_brings_a_bus_of_its_own_and_takes_it_away() -> None:
     """A network namespace and its interfaces."""
-    ended = doctor("virtual", *QUICK)
+    ended = doctor_here("virtual", *QUICK)
     assert ended.findings("bus")["slave 0"]["found"].startswith("BFT-SENS-ECAT-M8, serial 1")
     assert ended.findings("measurement")["age of data"]["values"]["p50"] > 0
     assert ended.json["interface"] == "virtual"
