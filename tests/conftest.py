@@ -29,8 +29,8 @@ _choose_domain()
 if "TEST_NAMESPACE" in os.environ:  # scripts/test made a network namespace, in which loopback is down
     loopback_up()
 # Without a deadline: how long an example takes is no property of the code, the machine may be busy.
-settings.register_profile("fixed", deadline=None, derandomize=True)
-settings.register_profile("fresh", deadline=None, print_blob=True)
+settings.register_profile("fixed", deadline=None, derandomize=True, max_examples=40)
+settings.register_profile("fresh", deadline=None, print_blob=True, max_examples=300)
 settings.load_profile("fresh" if "TEST_SEED" in os.environ else "fixed")
 
 

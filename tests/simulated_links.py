@@ -26,6 +26,8 @@ from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.doctor.bus import measurement
 from ethercat_server.doctor.bus.receiver import MESSAGE
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.slave.coe import finish
+from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
 from ethercat_server.links import direct
 from ethercat_server.links.remote import ServerLink
 from ethercat_server.process import realtime
@@ -93,12 +95,21 @@ class SimulatedBus:
         return [(row["index"], row["subindex"], row["hex"]) for row in self.stats(position)["sdo_writes"]]
 
 
+def _read_image(backend: MemoryBackend, position: int) -> bytes:
+    """The SII for the master's scan, most of which would be spent on it; nothing else reads it like this."""
+    finish(read_sii(ByPosition(backend._bus), position, 0, 4), clock=backend.clock)
+    life = backend.sensors.sensors[position].life
+    assert life is not None
+    return life.esc.sii.image
+
+
 @contextlib.contextmanager
 def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterator[SimulatedBus]:
     """Sensors as `ethercat-virtual-sensor IFACE arguments...` simulates; nobody writes their calibration."""
     options = options_from(build_parser().parse_args(["lo", *map(str, arguments)]))
     bus = SimulatedBus(MemoryBackend(*options.sensors, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MemoryBackend, "_read_image", _read_image)
         patch.setattr(direct, "open_bus", lambda _ifname, _cleanup: Bus(bus.backend))
         patch.setattr(realtime, "prepare", lambda _priority, _cpu: None)
         patch.setattr(measurement, "_client", _client)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
+import functools
 import gzip
+import os
+import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,20 +68,52 @@ GOOD: Files = {
 """Nothing to mend."""
 
 
+def write(root: Path, files: Files) -> None:
+    for name, content in files.items():
+        if content is not None:
+            path = root / name.lstrip("/")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+@functools.cache
+def good_root() -> Path:
+    """The good machine's files, written once."""
+    root = Path(tempfile.mkdtemp(prefix="ethercat-machine-"))
+    atexit.register(shutil.rmtree, root)
+    write(root, GOOD)
+    return root
+
+
+@dataclass
+class MadeUp(Machine):
+    """Its files are those below `root`, and where there is none, the good machine's."""
+
+    gone: frozenset[str] = frozenset()
+    """Files that are not there."""
+
+    def path(self, name: str) -> Path:
+        own = super().path(name)
+        return own if os.path.lexists(own) or name in self.gone else good_root() / name.lstrip("/")
+
+    def names(self, name: str) -> list[str]:
+        good = [
+            file.removeprefix(f"{name}/") for file in GOOD.keys() - self.gone if file.startswith(f"{name}/")
+        ]
+        return sorted({*super().names(name), *(file.partition("/")[0] for file in good)})
+
+
 def machine(
     root: Path,
     files: Files | None = None,
     facts: InterfaceFacts = FACTS,
     **more: Any,
 ) -> Machine:
-    """The good machine below `root` but for these files (None: not there) and facts."""
-    for name, content in {**GOOD, **(files or {})}.items():
-        path = root / name.lstrip("/")
-        if content is None:
-            continue
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return Machine("ens5", facts=facts, root=root, release="6.12.0-rt-amd64", **more)
+    """The good machine but for these files (None: not there), which are below `root`, and facts."""
+    files = files or {}
+    write(root, files)
+    gone = frozenset(name for name, content in files.items() if content is None)
+    return MadeUp("ens5", facts=facts, root=root, release="6.12.0-rt-amd64", gone=gone, **more)
 
 
 def but(**changes: Any) -> InterfaceFacts:

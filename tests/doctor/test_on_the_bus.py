@@ -146,7 +146,7 @@ def test_a_sensor_that_goes_away_while_it_measures(single: SimulatedBus, tmp_pat
 def test_interfaces_where_no_frame_is_sent(
     single: SimulatedBus, tmp_path: Path, changes: dict[str, Any], why: str
 ) -> None:
-    found = examined(single, tmp_path, facts=but(**changes))
+    found = examined(single, tmp_path, 0.02, facts=but(**changes))
     assert found.of("bus")["slaves"].level is Level.SKIPPED
     assert why in found.of("bus")["slaves"].found
     assert found.of("measurement")["wake-ups"].values["wake_ups"] > 0
@@ -156,7 +156,7 @@ def test_interfaces_where_no_frame_is_sent(
 
 def test_without_rights_it_says_what_it_skipped(single: SimulatedBus, tmp_path: Path) -> None:
     status = "Name:\tpython\nCapEff:\t0000000000000000\n"
-    found = examined(single, tmp_path, files={"/proc/self/status": status})
+    found = examined(single, tmp_path, 0.02, files={"/proc/self/status": status})
     skipped = found.of("bus")["slaves"]
     assert skipped.found == "not checked: CAP_NET_RAW and CAP_NET_ADMIN missing; run with sudo"
     assert found.of("measurement")["wake-ups"].values["wake_ups"] > 0

@@ -18,7 +18,7 @@ import pytest
 from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.machine.facts import Link, Routes, collect
 from ethercat_server.links.holder import find_holder
-from tests.doctor.running import MODULE, doctor, doctor_here, doctor_of_nobody, levels
+from tests.doctor.running import ATTEMPTS, MODULE, STARVED, doctor, doctor_here, doctor_of_nobody, levels
 from tests.server import readable
 from tests.server.as_another_user import NOBODY
 from tests.server.commands import command, stats
@@ -35,8 +35,6 @@ from tests.server.running import (
 pytestmark = [pytest.mark.bus, needs_bus]
 Bench = tuple[Veth, Program]
 QUICK = ("--json", "--seconds", "0.2")
-_ATTEMPTS = 3
-_STARVED = ("no EtherCAT slave answers", "does not answer")
 LOOK = ("--json", "--seconds", "0")
 
 
@@ -150,14 +148,14 @@ def measuring(ifname: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
     Started again where a busy machine let the virtual sensor's process wait for too long.
     """
-    for _ in range(_ATTEMPTS):
+    for _ in range(ATTEMPTS):
         command = [sys.executable, "-m", MODULE, ifname, "--seconds", "600"]
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as running:
             assert running.stdout is not None
             said = ""
             try:
-                while not any(words in said for words in ("slave 1 errors", *_STARVED)):
+                while not any(words in said for words in ("slave 1 errors", *STARVED)):
                     line = running.stdout.readline()
                     assert line, said
                     said += line
@@ -199,7 +197,7 @@ def test_without_rights_it_says_what_it_skipped(bench: Bench) -> None:
     """Another user's rights, as the kernel grants them."""
     veth, sensor = bench
     before = command(sensor, "stats")
-    ended = doctor_of_nobody(veth.near, *QUICK)
+    ended = doctor_of_nobody(veth.near, "--json", "--seconds", "0.02")
     assert not ended.json["root"]
     assert ended.findings("bus")["slaves"]["found"] == (
         "not checked: CAP_NET_RAW and CAP_NET_ADMIN missing; run with sudo"
@@ -229,7 +227,7 @@ def test_another_user_sees_that_an_interface_is_in_use_but_not_by_whom(bench: Be
 
 def test_virtual_brings_a_bus_of_its_own_and_takes_it_away() -> None:
     """A network namespace and its interfaces."""
-    ended = doctor("virtual", *QUICK)
+    ended = doctor_here("virtual", *QUICK)
     assert ended.findings("bus")["slave 0"]["found"].startswith("BFT-SENS-ECAT-M8, serial 1")
     assert ended.findings("measurement")["age of data"]["values"]["p50"] > 0
     assert ended.json["interface"] == "virtual"

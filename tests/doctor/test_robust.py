@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -36,7 +37,8 @@ def test_garbage_in_every_file(tmp_path: Path, number: int) -> None:
     st.dictionaries(st.sampled_from(sorted(GOOD)), st.one_of(st.text(max_size=40), st.binary(max_size=40)))
 )
 def test_any_text_in_any_file(tmp_path: Path, files: dict[str, str | bytes]) -> None:
-    assert faults(machine(tmp_path, {**GOOD, **files})) == []
+    with tempfile.TemporaryDirectory(dir=tmp_path) as folder:
+        assert faults(machine(Path(folder), files)) == []
 
 
 def test_no_files_at_all(tmp_path: Path) -> None:
@@ -57,12 +59,10 @@ def test_files_that_are_folders(tmp_path: Path) -> None:
 
 
 def test_an_endless_file_is_not_read_to_its_end(tmp_path: Path) -> None:
-    here = machine(tmp_path)
-    (tmp_path / "proc/version").unlink()
-    (tmp_path / "proc/version").symlink_to("/dev/zero")
-    (tmp_path / "proc/config.gz").unlink()
-    (tmp_path / "proc/config.gz").symlink_to("/dev/zero")
-    assert faults(here) == []
+    (tmp_path / "proc").mkdir()
+    for name in ("version", "config.gz"):
+        (tmp_path / "proc" / name).symlink_to("/dev/zero")
+    assert faults(machine(tmp_path)) == []
 
 
 @pytest.mark.parametrize(

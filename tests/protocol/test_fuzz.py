@@ -139,18 +139,17 @@ def test_any_object_is_a_checked_request_or_a_refusal_with_a_code(message: JsonO
     assert (request.has_id, request.id) == ("id" in message, message.get("id"))
 
 
-@pytest.mark.parametrize("text", HOSTILE_TEXTS, ids=range(len(HOSTILE_TEXTS)))
-def test_whatever_is_understood_can_be_answered_and_the_answer_read(text: bytes) -> None:
-    if len(text) > LIMIT:
-        pytest.fail("the server would not read it")
-    message = None
-    try:
-        message = parse_json_object(text)
-        answer = reply(parse_request(message))
-    except ProtocolError as error:
-        answer = error_reply(message, ErrorCode.BAD_REQUEST, str(error))
-    assert outcomes(FrameDecoder(), [encode_json(answer)]) == [answer]
-    assert outcomes(BareJsonDecoder(), [encode_bare_json(answer)]) == [answer]
+def test_whatever_is_understood_can_be_answered_and_the_answer_read() -> None:
+    for text in HOSTILE_TEXTS:
+        assert len(text) <= LIMIT, "the server would not read it"
+        message = None
+        try:
+            message = parse_json_object(text)
+            answer = reply(parse_request(message))
+        except ProtocolError as error:
+            answer = error_reply(message, ErrorCode.BAD_REQUEST, str(error))
+        assert outcomes(FrameDecoder(), [encode_json(answer)]) == [answer], text
+        assert outcomes(BareJsonDecoder(), [encode_bare_json(answer)]) == [answer], text
 
 
 @pytest.mark.parametrize(("make", "poison"), [(client_side, b"\xff" * 5), (bare_side, b"x" * (LIMIT + 1))])
@@ -196,7 +195,7 @@ def storm(count: int, seed: int) -> None:
 
 
 def test_a_storm_of_mutations() -> None:
-    storm(5_000, SEED)
+    storm(2_000, SEED)
 
 
 @pytest.mark.long

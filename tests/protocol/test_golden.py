@@ -45,31 +45,27 @@ def outcomes(chunks: Sequence[bytes]) -> list[Outcome]:
     return found
 
 
-def name(vector: Vector) -> str:
-    return vector.name
+def test_each_alone() -> None:
+    for vector in (*DATA, *JSON, *BROKEN):
+        assert outcomes([vector.wire]) == [vector.outcome], vector.name
 
 
-@pytest.mark.parametrize("vector", [*DATA, *JSON, *BROKEN], ids=name)
-def test_each_alone(vector: Vector) -> None:
-    assert outcomes([vector.wire]) == [vector.outcome]
+def test_samples() -> None:
+    for vector in DATA:
+        message = vector.outcome
+        assert isinstance(message, DataMessage)
+        assert encode_data(*message) == vector.wire, vector.name
+        for units, sample in ((ImuUnits.G_DPS, vector.sample), (ImuUnits.SI, vector.sample_si)):
+            assert sample is not None
+            decoded = SampleDecoder(len(message.process_data), units).decode(message.process_data)
+            assert same_sample(decoded, sample), (vector.name, decoded)
 
 
-@pytest.mark.parametrize("vector", DATA, ids=name)
-def test_samples(vector: Vector) -> None:
-    message = vector.outcome
-    assert isinstance(message, DataMessage)
-    assert encode_data(*message) == vector.wire
-    for units, sample in ((ImuUnits.G_DPS, vector.sample), (ImuUnits.SI, vector.sample_si)):
-        assert sample is not None
-        decoded = SampleDecoder(len(message.process_data), units).decode(message.process_data)
-        assert same_sample(decoded, sample), decoded
-
-
-@pytest.mark.parametrize("vector", BROKEN, ids=name)
-def test_what_follows_is_read_or_not(vector: Vector) -> None:
-    after = expected([vector, JSON[0]])
-    assert len(after) == (2 if vector.outcome == "refused" else 1)
-    assert outcomes([vector.wire + JSON[0].wire]) == after
+def test_what_follows_is_read_or_not() -> None:
+    for vector in BROKEN:
+        after = expected([vector, JSON[0]])
+        assert len(after) == (2 if vector.outcome == "refused" else 1), vector.name
+        assert outcomes([vector.wire + JSON[0].wire]) == after, vector.name
 
 
 @pytest.mark.parametrize("vectors", STREAMS.values(), ids=STREAMS)
@@ -80,31 +76,36 @@ def test_streams_cut_at_every_byte(vectors: list[Vector]) -> None:
     assert outcomes([bytes((byte,)) for byte in wire]) == expected(vectors)
 
 
-@pytest.mark.parametrize("stream", ACCOUNTED, ids=[stream.name for stream in ACCOUNTED])
-def test_accounting(stream: AccountedStream) -> None:
+def accounting_of(stream: AccountedStream) -> StreamAccounting:
     accounting = StreamAccounting(every=stream.every, fresh_only=stream.fresh_only)
     accounting.rate_hz = stream.rate_hz
-    for step in stream.steps:
-        if step is None:
-            accounting.begin()
-        else:
-            *head, kind = step
-            assert accounting.take(*head).name == kind.upper(), step
-    assert accounting.counts == StreamCounts(**stream.counts)
+    return accounting
 
 
-@pytest.mark.parametrize("stream", ACCOUNTED, ids=[stream.name for stream in ACCOUNTED])
-def test_selecting_new_frames_counts_the_same(stream: AccountedStream) -> None:
-    accounting = StreamAccounting(every=stream.every, fresh_only=stream.fresh_only)
-    accounting.rate_hz = stream.rate_hz
-    for step in stream.steps:
-        if step is None:
-            accounting.begin()
-            continue
-        sequence, monotonic_ns, flags, kind = step
-        frames = [DataMessage(sequence, 0, monotonic_ns, sensor, flags, 3, b"") for sensor in (6, 5, 7)]
-        assert accounting.select_new(frames, sensor=5) == ([frames[1]] if kind == "new" else [])
-    assert accounting.counts == StreamCounts(**stream.counts)
+def test_accounting() -> None:
+    for stream in ACCOUNTED:
+        accounting = accounting_of(stream)
+        for step in stream.steps:
+            if step is None:
+                accounting.begin()
+            else:
+                *head, kind = step
+                assert accounting.take(*head).name == kind.upper(), (stream.name, step)
+        assert accounting.counts == StreamCounts(**stream.counts), stream.name
+
+
+def test_selecting_new_frames_counts_the_same() -> None:
+    for stream in ACCOUNTED:
+        accounting = accounting_of(stream)
+        for step in stream.steps:
+            if step is None:
+                accounting.begin()
+                continue
+            sequence, monotonic_ns, flags, kind = step
+            frames = [DataMessage(sequence, 0, monotonic_ns, sensor, flags, 3, b"") for sensor in (6, 5, 7)]
+            found = accounting.select_new(frames, sensor=5)
+            assert found == ([frames[1]] if kind == "new" else []), (stream.name, step)
+        assert accounting.counts == StreamCounts(**stream.counts), stream.name
 
 
 def test_the_words_are_those_of_the_documentation() -> None:

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from ethercat_server.tool.cli import main
 from tests.ended import Result, run, run_here
+from tests.server.running import ATTEMPTS, starved
 
 MODULE = "ethercat_server.tool.cli"
 
 
-_STARVED = ("is lost: no frame comes back", "no EtherCAT slave answers")
-"""What it says too when a busy machine lets the virtual sensor's process wait for too long."""
-_ATTEMPTS = 3
-
-
 def tool(*arguments: object, code: int | None = 0) -> Result:
     """Run `ethercat-sensor arguments...` as a process; it must end with `code` (None: any)."""
-    for _ in range(_ATTEMPTS):
+    for _ in range(ATTEMPTS):
         result = run(MODULE, *arguments)
-        if not any(words in result.err for words in _STARVED):
+        if not starved(result.err):
             break
     assert code is None or result.code == code, result
     return result

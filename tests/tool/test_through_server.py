@@ -155,7 +155,7 @@ def test_a_sensor_that_is_out_does_not_hide_the_other(bench: Bench) -> None:
 def test_watch_tells_of_a_sensor_that_is_lost_and_comes_back(bench: Bench) -> None:
     bus, _ = bench
     bus.at(1.0, "power cycle 0.5 @1")
-    shown = tool_here("watch", *SERVER, "--seconds", 6)
+    shown = tool_here("watch", *SERVER, "--seconds", 4)
     assert re.search(r"^ethercat-sensor: .*sensor 1 is lost", shown.err, re.MULTILINE)
     assert re.search(r"^ethercat-sensor: sensor 1 is back after [0-9.]+ s$", shown.err, re.MULTILINE)
 
