@@ -278,7 +278,7 @@ class SimulatedNode:
         self._lines = logs[0].lines
         self._arrays = self.hear("/diagnostics")
         self.node.reader.start()
-        self._turns.settle()
+        self.settle()
 
     def __enter__(self) -> SimulatedNode:
         return self
@@ -312,13 +312,14 @@ class SimulatedNode:
             self._agenda.remove(due)
             due[1]()
         self._server.step()
-        self._turns.settle()
+        self.settle()
         if self._server.monotonic_ns() >= self._tick_ns:
             self._tick_ns = self._server.monotonic_ns() + round(TICK_S * 1e9)
             self.node.monitor.tick()
-        self._execute()
 
-    def _execute(self) -> None:
+    def settle(self) -> None:
+        """Let the node do what there is to do now."""
+        self._turns.settle()
         while self._triggered and not self._is_busy:
             self._triggered.pop(0)()
 
@@ -346,8 +347,7 @@ class SimulatedNode:
             response = service.callback(request, service.srv_type.Response())
         finally:
             self._is_busy = False
-        self._turns.settle()
-        self._execute()
+        self.settle()
         return response
 
     def trigger(self, name: str) -> tuple[bool, str]:
