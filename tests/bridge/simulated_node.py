@@ -19,7 +19,6 @@ import threading
 import uuid
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Protocol
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -240,7 +239,7 @@ class Guard:
 class SimulatedNode:
     """A node that is connected to `server` as soon as time passes. StartError if it cannot start."""
 
-    def __init__(self, server: World, *, params_file: Path | None = None, **parameters: object) -> None:
+    def __init__(self, server: World, *arguments: str, **parameters: object) -> None:
         self.name = f"/test_{uuid.uuid4().hex}/bridge"
         self.topics: dict[str, Topic] = {}
         self._turns, self._triggered = Turns(), list[Callable[[], object]]()
@@ -271,10 +270,8 @@ class SimulatedNode:
                 return Guard(callback, bench._triggered)
 
         options = [word for item in parameters.items() for word in ("-p", "{}:={}".format(*item))]
-        if params_file is not None:
-            options += ["--params-file", str(params_file)]
         namespace = self.name.removesuffix("/bridge")
-        self.node = Bridge.create(["--ros-args", "-r", f"__ns:={namespace}", *options])
+        self.node = Bridge.create(["--ros-args", "-r", f"__ns:={namespace}", *arguments, *options])
         self._lines = logs[0].lines
         self._arrays = self.hear("/diagnostics")
         self.node.reader.start()
@@ -289,7 +286,7 @@ class SimulatedNode:
     def close(self) -> None:
         assert self.node.exit_code != 1, self.log
         self._turns.end()
-        assert self.node.reader.stop()
+        assert self.node.reader.stop(PATIENCE_S)
         assert self.node.compensation.close()
         for service in list(self.node.services):
             self.node.destroy_service(service)

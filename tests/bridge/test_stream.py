@@ -13,6 +13,7 @@ import pytest
 from protocol.framing import DataFlag
 from protocol.pdo import encode
 from tests.bridge.conftest import (
+    PATIENCE_S,
     Listener,
     NodeProcess,
     NodeThread,
@@ -44,7 +45,7 @@ def _streaming(node: NodeProcess, server: ScriptedServer, listener: Listener) ->
 
 def test_twelve_labelled_values_in_si_units(server: ScriptedServer, listener: Listener) -> None:
     server.send_sample(3.0)
-    message = listener.messages.get(timeout=20)
+    message = listener.messages.get(timeout=PATIENCE_S)
     raw = [3.0 + i / 16 for i in range(12)]
     expected = [*raw[:6], *(v * 9.80665 for v in raw[6:9]), *(math.radians(v) for v in raw[9:])]
     assert list(message.data) == pytest.approx(expected, rel=1e-12)
