@@ -19,7 +19,6 @@ import threading
 import uuid
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Protocol
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -240,7 +239,7 @@ class Guard:
 class SimulatedNode:
     """A node that is connected to `server` as soon as time passes. StartError if it cannot start."""
 
-    def __init__(self, server: World, *, params_file: Path | None = None, **parameters: object) -> None:
+    def __init__(self, server: World, *arguments: str, **parameters: object) -> None:
         self.name = f"/test_{uuid.uuid4().hex}/bridge"
         self.topics: dict[str, Topic] = {}
         self._turns, self._triggered = Turns(), list[Callable[[], object]]()
@@ -271,14 +270,12 @@ class SimulatedNode:
                 return Guard(callback, bench._triggered)
 
         options = [word for item in parameters.items() for word in ("-p", "{}:={}".format(*item))]
-        if params_file is not None:
-            options += ["--params-file", str(params_file)]
         namespace = self.name.removesuffix("/bridge")
-        self.node = Bridge.create(["--ros-args", "-r", f"__ns:={namespace}", *options])
+        self.node = Bridge.create(["--ros-args", "-r", f"__ns:={namespace}", *arguments, *options])
         self._lines = logs[0].lines
         self._arrays = self.hear("/diagnostics")
         self.node.reader.start()
-        self._turns.settle()
+        self.settle()
 
     def __enter__(self) -> SimulatedNode:
         return self
@@ -289,7 +286,7 @@ class SimulatedNode:
     def close(self) -> None:
         assert self.node.exit_code != 1, self.log
         self._turns.end()
-        assert self.node.reader.stop()
+        assert self.node.reader.stop(PATIENCE_S)
         assert self.node.compensation.close()
         for service in list(self.node.services):
             self.node.destroy_service(service)
@@ -312,13 +309,14 @@ class SimulatedNode:
             self._agenda.remove(due)
             due[1]()
         self._server.step()
-        self._turns.settle()
+        self.settle()
         if self._server.monotonic_ns() >= self._tick_ns:
             self._tick_ns = self._server.monotonic_ns() + round(TICK_S * 1e9)
             self.node.monitor.tick()
-        self._execute()
 
-    def _execute(self) -> None:
+    def settle(self) -> None:
+        """Let the node do what there is to do now."""
+        self._turns.settle()
         while self._triggered and not self._is_busy:
             self._triggered.pop(0)()
 
@@ -346,8 +344,7 @@ class SimulatedNode:
             response = service.callback(request, service.srv_type.Response())
         finally:
             self._is_busy = False
-        self._turns.settle()
-        self._execute()
+        self.settle()
         return response
 
     def trigger(self, name: str) -> tuple[bool, str]:

@@ -101,7 +101,7 @@ def test_the_file_is_one_that_the_node_starts_with(started: SimulatedNode, take:
     done, text = started.trigger("identify/solve")
     assert done, text
     assert started.set_parameter("identify.file", "auto") == (True, "")
-    with SimulatedNode(SimulatedServer(), params_file=path) as other:
+    with SimulatedNode(SimulatedServer(), "--params-file", str(path)) as other:
         mass, bias = other.parameters("tool_mass", "bias")
     assert mass == pytest.approx(TOOL.mass, abs=1e-4)
     assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)

@@ -80,7 +80,7 @@ def test_settings(node: SimulatedNode, server: WholeServer) -> None:
 
 
 def test_tare(node: SimulatedNode) -> None:
-    refused = []
+    refused: list[str] = []
     while True:  # between its poses the wrist turns
         done, text = node.trigger("sensor_tare")
         if done and refused:
