@@ -106,7 +106,7 @@ class InMemoryStream:
         self.other._ended = True
 
     def reset(self) -> None:
-        """Close both sides; the other end finds the connection reset, whatever it has not read yet is gone."""
+        """Close both sides; the other end finds the connection reset, and what it has not read is gone."""
         self.closed = self.other._reset = self.other._ended = True
 
     @property
