@@ -56,6 +56,9 @@ class VirtualBus:
         assert self._process.stdout is not None
         ready, _, _ = select.select((self._process.stdout,), (), (), _START_TIMEOUT_S)
         if not ready or not self._process.stdout.readline():
+            if ready:  # its standard output has ended, and it is about to
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(_START_TIMEOUT_S)
             code = self._process.poll()
             self.__exit__(None, None, None)
             raise ServerError(
