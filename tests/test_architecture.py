@@ -112,10 +112,19 @@ def imports(path: Path) -> set[str]:
     return names_in(tree(path))
 
 
+def statements(tree: ast.AST) -> Iterator[ast.stmt]:
+    """All of them, at any depth."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.stmt):
+            yield node
+        if isinstance(node, ast.stmt | ast.excepthandler | ast.match_case):
+            yield from statements(node)
+
+
 def names_in(tree: ast.AST) -> set[str]:
     """What a part of a file imports."""
     found: set[str] = set()
-    for node in ast.walk(tree):
+    for node in statements(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

@@ -51,9 +51,8 @@ def copy() -> Path:
         spec = importlib.util.find_spec(name)
         assert spec is not None
         assert spec.origin is not None
-        shutil.copytree(Path(spec.origin).parent, made / name)
-    for path in made.rglob("*"):
-        path.chmod(0o755 if path.is_dir() else 0o644)
+        subprocess.run(["cp", "-a", Path(spec.origin).parent, made], check=True)
+    subprocess.run(["chmod", "-R", "u=rwX,go=rX", made], check=True)
     return made
 
 
