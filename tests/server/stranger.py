@@ -75,7 +75,7 @@ GOING: Sequence[Callable[[socket.socket], None]] = (
 
 
 def hit(host: str, port: int, messages: Sequence[dict[str, object]]) -> None:
-    for number, (message, go) in enumerate(itertools.product(messages, GOING * HITS)):
+    for number, (message, go, _) in enumerate(itertools.product(messages, GOING, range(HITS))):
         encode = encode_bare_json if number % 3 == 0 else encode_json
         with contextlib.suppress(OSError):  # the server may be rid of it already
             sock = socket.create_connection((host, port), timeout=20)

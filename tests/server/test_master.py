@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pytest
@@ -18,6 +18,7 @@ from ethercat_server.ethercat.nic import claimed
 from ethercat_server.ethercat.raw_socket import packet_sockets
 from ethercat_server.ethercat.soem import SoemBackend
 from ethercat_server.sensor.sensor import Sensor
+from protocol.settings import SettingValue
 from tests.server.commands import command, stats
 from tests.server.running import (
     ATTEMPTS,
@@ -43,9 +44,11 @@ def bench() -> Iterator[Bench]:
 
 
 def started(
-    ifname: str, check_interrupt: CheckInterrupt = lambda: None, *, backend: type[SoemBackend] = SoemBackend,
-    **settings: int,
-) -> list[Sensor]:  # fmt: skip
+    ifname: str,
+    check_interrupt: CheckInterrupt = lambda: None,
+    settings: Mapping[str, SettingValue] = {},
+    backend: type[SoemBackend] = SoemBackend,
+) -> list[Sensor]:
     """Start and end; again where the sensor's process had to wait for too long."""
     for attempt in range(ATTEMPTS):
         with contextlib.closing(backend(ifname)) as opened:
@@ -58,10 +61,10 @@ def started(
     raise AssertionError("unreachable")
 
 
-def complaint(ifname: str, **settings: int) -> str:
+def complaint(ifname: str, settings: Mapping[str, SettingValue] = {}) -> str:
     """Why a start fails."""
     with pytest.raises(BusError) as info:
-        started(ifname, **settings)
+        started(ifname, settings=settings)
     return str(info.value)
 
 
@@ -117,7 +120,7 @@ def test_an_object_that_aborts_is_named(bench: Bench) -> None:
     """An SDO abort as pysoem raises it; INIT as it asks for it."""
     veth, sensor = bench
     command(sensor, "abort 0x8006 1 0x06090030")
-    said = complaint(veth.near, sinc_length=128)
+    said = complaint(veth.near, {"sinc_length": 128})
     assert "sinc_length = 128 did not take" in said
     assert "0x06090030" in said
     wait_until(lambda: stats(sensor)["al_state"] == "INIT", "INIT")
@@ -179,7 +182,7 @@ def test_a_start_is_given_up_between_two_transfers(bench: Bench, last: str) -> N
             raise StopRequestedError("asked to stop while starting")
 
     with pytest.raises(StopRequestedError):
-        started(bench[0].near, check_interrupt, backend=Noted, fir=True)
+        started(bench[0].near, check_interrupt, {"fir": True}, Noted)
     assert transfers.index(last) == len(transfers) - 1, "nothing after it"
 
 
