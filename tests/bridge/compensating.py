@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-import queue
-import time
 from collections.abc import Sequence
 from typing import Any
 
-from geometry_msgs.msg import WrenchStamped
-
 from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
 from protocol.pdo import encode
-from tests.bridge.conftest import PATIENCE_S, Listener
-from tests.bridge.streaming import Stream
+from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.compensation.making import TOOL, load
 
 UP, SIDE, OVER = (0, 0, 1), (1, 0, 0), (0, 0, -1)
@@ -22,11 +17,6 @@ QUICK: dict[str, object] = {
     "rest.duration": 0.3,
     "bias_ramp_time": 0.0,
     "accelerometer.time_constant": 0.05,
-    # This machine may be busy: ages and rates are judged elsewhere.
-    "diagnostics.age_warn": 10.0,
-    "diagnostics.age_error": 20.0,
-    "diagnostics.rate_tolerance": 1.0,
-    "diagnostics.lost_warn": 1000,
 }
 
 
@@ -47,34 +37,41 @@ def sensed(
     return encode(size, values)
 
 
-def hold(stream: Stream, up: Sequence[float], **changes: Any) -> None:
+def hold(server: SimulatedServer, up: Sequence[float], **changes: Any) -> None:
     """From now on the sensor rests so."""
-    stream.changes = {"process_data": sensed(up, **changes)}
+    server.changes = {"process_data": sensed(up, **changes)}
 
 
 class Stages:
-    """Subscriptions to `wrench_compensated` and what was subtracted."""
+    """What the node publishes of the compensation."""
 
-    def __init__(self, listener: Listener) -> None:
-        # On a busy machine the listener falls behind: it is to go on with what is recent.
-        self.final = listener.subscribe(WrenchStamped, "wrench_compensated", depth=20)
-        self.bias = listener.subscribe(WrenchStamped, "compensation/bias", depth=20)
-        self.gravity = listener.subscribe(WrenchStamped, "compensation/gravity", depth=20)
-        self.inertia = listener.subscribe(WrenchStamped, "compensation/inertia", depth=20)
+    def __init__(self, node: SimulatedNode) -> None:
+        self._node = node
+        names = ("wrench_compensated", "compensation/bias", "compensation/gravity", "compensation/inertia")
+        self.all = self.final, self.bias, self.gravity, self.inertia = [node.hear(name) for name in names]
 
     def forget(self) -> None:
-        for messages in (self.final, self.bias, self.gravity, self.inertia):
-            forget(messages)
+        for messages in self.all:
+            messages.clear()
+
+    def first(self) -> list[float]:
+        """The first compensated wrench since `forget`."""
+        self._node.run_until(lambda: self.final, "wrench_compensated")
+        return six(self.final[0])
 
     def settle(self, wanted: Sequence[float], within: float = 1e-3) -> None:
         """Wait until the compensated wrench is so."""
         self.forget()
-        settle(self.final, wanted, within)
+        self._node.run_until(
+            lambda: self.final and is_near(self.final[-1], wanted, within),
+            lambda: f"{wanted}; last: {six(self.final[-1]) if self.final else None}",
+        )
 
-
-def forget(messages: queue.Queue[Any]) -> None:
-    while not messages.empty():
-        messages.get()
+    def are_silent(self) -> bool:
+        """Whether nothing is published for a while."""
+        self.forget()
+        self._node.run(0.5)
+        return not any(self.all)
 
 
 def six(message: Any) -> list[float]:
@@ -90,27 +87,6 @@ def stamp_ns(message: Any) -> int:
 
 def is_near(message: Any, wanted: Sequence[float], within: float = 1e-3) -> bool:
     return all(abs(a - b) <= within for a, b in zip(six(message), wanted, strict=True))
-
-
-def settle(messages: queue.Queue[Any], wanted: Sequence[float], within: float = 1e-3) -> Any:
-    """The first message that is so."""
-    deadline = time.monotonic() + PATIENCE_S
-    while True:
-        message = messages.get(timeout=PATIENCE_S)
-        if is_near(message, wanted, within):
-            return message
-        assert time.monotonic() < deadline, f"waited in vain for {wanted}; last: {six(message)}"
-
-
-def comes_to_rest(messages: queue.Queue[Any], seconds: float = 0.4) -> None:
-    """Wait until no message comes any more."""
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        forget(messages)
-        time.sleep(seconds)
-        if messages.empty():
-            return
-    raise AssertionError("messages go on coming")
 
 
 def weight(up: Sequence[float], payload: Payload = TOOL) -> list[float]:

@@ -24,6 +24,7 @@ import pytest
 from tests.bridge.scripted_server import ScriptedServer
 
 PATIENCE_S = 45.0
+ASK_AGAIN_S = 5.0
 AHEAD_NS = 60 * 10**9
 """Longer than any test waits."""
 
@@ -89,22 +90,26 @@ class Listener:
         self._node.create_subscription(message_type, f"/{self.tag}/{topic}", messages.put, depth)
         return messages
 
-    def _ask(self, client: Any, request: Any) -> queue.Queue[Any]:
-        assert client.wait_for_service(PATIENCE_S), f"no service {client.srv_name}"
+    def call(
+        self, service_type: Any, name: str, request: Any = None, until: Callable[[], object] = lambda: False
+    ) -> Any:
+        """The response of one of the node's services, or None once `until` holds.
+
+        Asked again now and then: a service that is new may be seen before it sees whoever asks.
+        """
+        client = self._node.create_client(service_type, f"/{self.tag}/bridge/{name}")
         answer: queue.Queue[Any] = queue.Queue()
-        client.call_async(request).add_done_callback(lambda future: answer.put(future.result()))
-        return answer
-
-    def ask(self, service_type: Any, name: str) -> queue.Queue[Any]:
-        """Ask one of the node's services and do not wait; the response comes into the queue, if ever."""
-        client = self._node.create_client(service_type, f"/{self.tag}/bridge/{name}")
-        return self._ask(client, service_type.Request())
-
-    def call(self, service_type: Any, name: str, request: Any = None) -> Any:
-        """The response of one of the node's services."""
-        client = self._node.create_client(service_type, f"/{self.tag}/bridge/{name}")
+        deadline, next_ask = time.monotonic() + PATIENCE_S, 0.0
         try:
-            return self._ask(client, request or service_type.Request()).get(timeout=PATIENCE_S)
+            assert client.wait_for_service(PATIENCE_S), f"no service {client.srv_name}"
+            while answer.empty() and not until():
+                assert time.monotonic() < deadline, f"no answer of {client.srv_name}"
+                if time.monotonic() > next_ask:
+                    next_ask = time.monotonic() + ASK_AGAIN_S
+                    future = client.call_async(request or service_type.Request())
+                    future.add_done_callback(lambda future: answer.put(future.result()))
+                time.sleep(0.005)
+            return None if answer.empty() else answer.get()
         finally:
             self._node.destroy_client(client)
 

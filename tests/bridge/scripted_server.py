@@ -12,8 +12,8 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
 from protocol.control import PROTOCOL_VERSION
 from protocol.errors import ProtocolError
@@ -39,22 +39,78 @@ def process_data(number: float, size: int = 61) -> bytes:
     return encode(size, {name: number + i / 16 for i, name in enumerate(names)})
 
 
-class ScriptedServer:
-    """Listens on a free port of the loopback; one connection after the other, one at a time."""
+class Clock(Protocol):
+    """What samples are dated by: the module `time`, or a simulated one."""
 
-    def __init__(self, port: int = 0) -> None:
-        self._listener = socket.create_server(("127.0.0.1", port))
-        self.port: int = self._listener.getsockname()[1]
+    def monotonic_ns(self) -> int: ...
+
+    def time_ns(self) -> int: ...
+
+
+class Script:
+    """What the server says; how is for those below."""
+
+    def __init__(self, clock: Clock = time) -> None:
+        self.clock = clock
         self.requests: list[JsonObject] = []
         self.connections = 0
         self.description = description()
         self.answers: dict[str, Answer] = {}
         self.on_subscribe: Callable[[], None] = lambda: None
         self.subscribed = threading.Event()
-        self.disconnected = threading.Event()
         self.sequence = 0
         self.ahead_ns = 0
         """How far ahead samples are dated: a node that is starved finds none too old to publish."""
+
+    def send_raw(self, data: bytes) -> None:
+        """Send these bytes."""
+        raise NotImplementedError
+
+    def send_json(self, message: JsonObject) -> None:
+        """Send a JSON message."""
+        self.send_raw(encode_json(message))
+
+    def send_sample(self, number: float, flags: int = 0, **changes: Any) -> None:
+        """Send the next frame of sensor 0."""
+        self.send_raw(self.frame(number, flags, **changes))
+
+    def frame(self, number: float, flags: int = 0, **changes: Any) -> bytes:
+        """The next frame of sensor 0, encoded."""
+        self.sequence += 1
+        moment = self.clock.monotonic_ns() + self.ahead_ns
+        message = DataMessage(self.sequence, self.clock.time_ns(), moment, 0, flags, 3, process_data(number))
+        return encode_data(*message._replace(**changes))
+
+    def receive(self, decoder: FrameDecoder, data: bytes) -> None:
+        """Answer the requests that these bytes end."""
+        decoder.feed(data)
+        for message in decoder:
+            assert isinstance(message, dict)
+            self.requests.append(message)
+            self._answer(message)
+
+    def _answer(self, message: JsonObject) -> None:
+        action = str(message["action"])
+        reply: JsonObject | None = {"ok": True}
+        if action in {"describe", "subscribe"}:
+            reply = {"ok": True, **self.description}
+        if action in self.answers:
+            reply = self.answers[action](message)
+        if reply is not None:
+            self.send_json({"reply": action, "id": message.get("id"), **reply})
+        if action == "subscribe" and reply is not None and reply["ok"]:
+            self.on_subscribe()
+            self.subscribed.set()
+
+
+class ScriptedServer(Script):
+    """Listens on a free port of the loopback; one connection after the other, one at a time."""
+
+    def __init__(self, port: int = 0) -> None:
+        super().__init__()
+        self._listener = socket.create_server(("127.0.0.1", port))
+        self.port: int = self._listener.getsockname()[1]
+        self.disconnected = threading.Event()
         self._peer: socket.socket | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -83,24 +139,8 @@ class ScriptedServer:
                 self._peer.shutdown(socket.SHUT_RDWR)
 
     def send_raw(self, data: bytes) -> None:
-        """Send these bytes."""
         assert self._peer is not None
         self._peer.sendall(data)
-
-    def send_json(self, message: JsonObject) -> None:
-        """Send a JSON message."""
-        self.send_raw(encode_json(message))
-
-    def send_sample(self, number: float, flags: int = 0, **changes: Any) -> None:
-        """Send the next frame of sensor 0."""
-        self.send_raw(self.frame(number, flags, **changes))
-
-    def frame(self, number: float, flags: int = 0, **changes: Any) -> bytes:
-        """The next frame of sensor 0, encoded."""
-        self.sequence += 1
-        moment = time.monotonic_ns() + self.ahead_ns
-        message = DataMessage(self.sequence, time.time_ns(), moment, 0, flags, 3, process_data(number))
-        return encode_data(*message._replace(**changes))
 
     def _serve(self) -> None:
         while not self._closing:
@@ -110,32 +150,11 @@ class ScriptedServer:
                 return
             self.connections += 1
             with self._peer, contextlib.suppress(OSError, ProtocolError):
-                for message in self._messages(self._peer):
-                    self.requests.append(message)
-                    self._answer(message)
+                decoder = FrameDecoder()
+                while data := self._peer.recv(65536):
+                    self.receive(decoder, data)
             self.subscribed.clear()
             self.disconnected.set()
-
-    def _messages(self, peer: socket.socket) -> Iterator[JsonObject]:
-        decoder = FrameDecoder()
-        while data := peer.recv(65536):
-            decoder.feed(data)
-            for message in decoder:
-                assert isinstance(message, dict)
-                yield message
-
-    def _answer(self, message: JsonObject) -> None:
-        action = str(message["action"])
-        reply: JsonObject | None = {"ok": True}
-        if action in {"describe", "subscribe"}:
-            reply = {"ok": True, **self.description}
-        if action in self.answers:
-            reply = self.answers[action](message)
-        if reply is not None:
-            self.send_json({"reply": action, "id": message.get("id"), **reply})
-        if action == "subscribe" and reply is not None and reply["ok"]:
-            self.on_subscribe()
-            self.subscribed.set()
 
 
 def stream(port: int, rate_hz: float) -> None:

@@ -8,19 +8,12 @@ import pytest
 
 from tests.bridge.conftest import Listener
 from tests.bridge.scripted_server import ScriptedServer
-from tests.bridge.streaming import Stream, streaming
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[ScriptedServer]:
     with ScriptedServer() as scripted:
         yield scripted
-
-
-@pytest.fixture(scope="module")
-def stream(server: ScriptedServer) -> Iterator[Stream]:
-    with streaming(server) as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import queue
-import threading
 import time
-from collections.abc import Iterator
 from typing import Any
 
 from protocol.text.json_text import JsonObject
 from tests.bridge.conftest import PATIENCE_S, Listener
-from tests.bridge.scripted_server import ScriptedServer, description
+from tests.bridge.scripted_server import description
 
 RATE_HZ = 100
 SETTINGS: JsonObject = {"sinc_length": 512, "fir": False, "acceleration_range_g": 2}
@@ -34,56 +31,6 @@ def status(lost_samples: int = 0, mode: str = "locked") -> JsonObject:
         "last_10s": {"wake_us": spread, "exchange_us": spread, "age_us": [spread]},
         "sensors": [{"sensor": 0, "lost_samples": lost_samples, "recoveries": 1, "clock": clock}],
     }  # fmt: skip
-
-
-class Stream:
-    """Sends RATE_HZ samples a second. `flags` and `fields` are the next frames'; `paused` sends none."""
-
-    def __init__(self, server: ScriptedServer) -> None:
-        self.server = server
-        self.changes: dict[str, Any] = {}
-        self.paused = False
-        self.sent = 0
-        self._once: queue.Queue[dict[str, Any]] = queue.Queue()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def once(self, **changes: Any) -> None:
-        """The next frame, and no other, is so."""
-        self._once.put(changes)
-
-    def forget_once(self) -> None:
-        """Forget what was to come once."""
-        with contextlib.suppress(queue.Empty):
-            while True:
-                self._once.get_nowait()
-
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        due = time.monotonic()
-        while not self._stop.wait(max(due - time.monotonic(), 0)):
-            due += 1 / RATE_HZ
-            if self.paused or not self.server.subscribed.is_set():
-                continue
-            changes = self.changes if self._once.empty() else self._once.get()
-            with contextlib.suppress(OSError):
-                self.server.send_sample(float(self.sent), **changes)
-                self.sent += 1
-
-
-@contextlib.contextmanager
-def streaming(server: ScriptedServer) -> Iterator[Stream]:
-    server.description = streaming_description()
-    server.answers["status"] = lambda _: status()
-    stream = Stream(server)
-    try:
-        yield stream
-    finally:
-        stream.close()
 
 
 class Diagnostics:

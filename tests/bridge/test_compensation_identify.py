@@ -1,4 +1,4 @@
-"""The services ~/identify/...: from the first pose to a parameter file. One node for all tests."""
+"""The services ~/identify/... in simulated time: from the first pose to a parameter file."""
 
 from __future__ import annotations
 
@@ -10,13 +10,9 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, sensed
-from tests.bridge.conftest import Listener, NodeThread, starter
-from tests.bridge.scripted_server import ScriptedServer
-from tests.bridge.shared import listener, server, stream
-from tests.bridge.streaming import Stream
-from tests.compensation.making import AXES, BIAS, TOOL, load, written_parameters
+from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
+from tests.compensation.making import AXES, BIAS, TOOL, written_parameters
 
-__all__ = ["listener", "server", "stream"]
 pytestmark = pytest.mark.ros
 Take = Callable[..., str]
 
@@ -27,45 +23,36 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def node(server: ScriptedServer, stream: Stream, listener: Listener, folder: Path) -> Iterator[NodeThread]:
-    hold(stream, UP, bias=BIAS)
-    with starter(listener) as start:
-        yield start(server.port, **QUICK, bias_directory=folder / "deeper")
+def server() -> SimulatedServer:
+    return SimulatedServer()
 
 
 @pytest.fixture(scope="module")
-def stages(listener: Listener, node: NodeThread) -> Stages:
-    return Stages(listener)
-
-
-@pytest.fixture(autouse=True)
-def _whole(node: NodeThread, stages: Stages, stream: Stream) -> Iterator[None]:
-    stages.forget()
-    assert stages.final.get(timeout=20)
-    yield
-    stream.forget_once()
-    assert node.is_running
-    assert "Traceback" not in node.log
+def node(_ros: None, server: SimulatedServer, folder: Path) -> Iterator[SimulatedNode]:
+    with SimulatedNode(server, **QUICK, bias_directory=folder / "deeper") as started:
+        yield started
 
 
 @pytest.fixture
-def started(listener: Listener) -> Listener:
-    done, text = listener.trigger("identify/start")
+def started(node: SimulatedNode, server: SimulatedServer) -> SimulatedNode:
+    server.forget_once()
+    hold(server, UP, bias=BIAS)
+    node.run(0.1)
+    done, text = node.trigger("identify/start")
     assert done
     assert "gravity is known by accelerometer" in text
     assert "turn the sensor so that its +z axis points up" in text
-    return listener
+    return node
 
 
 @pytest.fixture
-def take(started: Listener, stream: Stream, stages: Stages) -> Take:
+def take(started: SimulatedNode, server: SimulatedServer) -> Take:
     """Holds the sensor so, one after the other, and adds the poses; what the last one said."""
 
     def take_poses(*ups: tuple[float, float, float]) -> str:
         text = ""
         for up in ups:
-            hold(stream, up, bias=BIAS)
-            stages.settle(load(up).values)
+            hold(server, up, bias=BIAS)
             done, text = started.trigger("identify/add_pose")
             assert done, text
         return text
@@ -74,7 +61,7 @@ def take(started: Listener, stream: Stream, stages: Stages) -> Take:
 
 
 def test_from_six_poses_to_a_compensated_wrench(
-    started: Listener, take: Take, stream: Stream, stages: Stages, folder: Path
+    started: SimulatedNode, take: Take, server: SimulatedServer, folder: Path
 ) -> None:
     text = take(*AXES)
     assert "pose 6 taken (up is -1.00, 0.00, 0.00 in the sensor's frame)" in text
@@ -101,33 +88,28 @@ def test_from_six_poses_to_a_compensated_wrench(
     assert mass == pytest.approx(TOOL.mass, abs=1e-4)
     assert list(center) == pytest.approx(TOOL.center, abs=1e-5)
     assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)
-    hold(stream, (1, -2, 1.5), bias=BIAS, force_z=-5.0)
-    stages.settle([0.0, 0.0, -5.0, 0.0, 0.0, 0.0], within=2e-3)
+    hold(server, (1, -2, 1.5), bias=BIAS, force_z=-5.0)
+    Stages(started).settle([0.0, 0.0, -5.0, 0.0, 0.0, 0.0], within=2e-3)
     assert started.set_parameter("tool_mass", 0.0)[0]
     assert started.trigger("clear_tare")[0]
 
 
-def test_the_file_is_one_that_the_node_starts_with(started: Listener, take: Take, folder: Path) -> None:
+def test_the_file_is_one_that_the_node_starts_with(started: SimulatedNode, take: Take, folder: Path) -> None:
     path = folder / "mine.yaml"
     assert started.set_parameter("identify.file", str(path)) == (True, "")
     take(*AXES)
     done, text = started.trigger("identify/solve")
     assert done, text
     assert started.set_parameter("identify.file", "auto") == (True, "")
-    other = Listener()
-    try:
-        node = NodeThread("--ros-args", "-r", f"__ns:=/{other.tag}", "--params-file", str(path))
-        try:
-            mass, bias = other.parameters("tool_mass", "bias")
-            assert mass == pytest.approx(TOOL.mass, abs=1e-4)
-            assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)
-        finally:
-            node.close()
-    finally:
-        other.close()
+    with SimulatedNode(SimulatedServer(), "--params-file", str(path)) as other:
+        mass, bias = other.parameters("tool_mass", "bias")
+    assert mass == pytest.approx(TOOL.mass, abs=1e-4)
+    assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)
 
 
-def test_poses_that_do_not_suffice_are_refused_with_what_is_missing(started: Listener, take: Take) -> None:
+def test_poses_that_do_not_suffice_are_refused_with_what_is_missing(
+    started: SimulatedNode, take: Take
+) -> None:
     done, text = started.trigger("identify/solve")
     assert not done
     assert "there is no pose yet" in text
@@ -148,14 +130,16 @@ def test_poses_that_do_not_suffice_are_refused_with_what_is_missing(started: Lis
     assert started.trigger("identify/solve")[0]
 
 
-def test_a_pose_that_is_no_good_is_not_taken(started: Listener, take: Take, stream: Stream) -> None:
+def test_a_pose_that_is_no_good_is_not_taken(
+    started: SimulatedNode, take: Take, server: SimulatedServer
+) -> None:
     take(UP)
-    for position in range(1000):  # for longer than the call may take
-        stream.once(process_data=sensed(UP, force_x=9.0 * (position % 2)))
+    for position in range(100):
+        server.once(process_data=sensed(UP, force_x=9.0 * (position % 2)))
     done, text = started.trigger("identify/add_pose")
     assert not done
     assert "the sensor is not stationary: force x moved by" in text
-    stream.forget_once()
+    server.forget_once()
     assert "pose 2 taken" in take(SIDE)
     done, text = started.trigger("identify/drop_pose")
     assert done
@@ -163,14 +147,14 @@ def test_a_pose_that_is_no_good_is_not_taken(started: Listener, take: Take, stre
     assert "pose 2 taken" in take(OVER)
 
 
-def test_a_result_is_of_the_poses_that_there_are(started: Listener, take: Take) -> None:
+def test_a_result_is_of_the_poses_that_there_are(started: SimulatedNode, take: Take) -> None:
     take(UP, SIDE, OVER, (0, 1, 0))
     assert started.trigger("identify/solve")[0]
     take((0, -1, 0))
     assert not started.trigger("identify/apply")[0]
 
 
-def test_cancel_changes_nothing(started: Listener, take: Take) -> None:
+def test_cancel_changes_nothing(started: SimulatedNode, take: Take) -> None:
     take(UP, SIDE)
     assert started.trigger("identify/cancel") == (
         True, "identification cancelled, 2 poses dropped; nothing was changed",
@@ -183,7 +167,7 @@ def test_cancel_changes_nothing(started: Listener, take: Take) -> None:
     assert list(started.parameters("bias")[0]) == ZERO6
 
 
-def test_starting_again_drops_what_was_there(started: Listener, take: Take) -> None:
+def test_starting_again_drops_what_was_there(started: SimulatedNode, take: Take) -> None:
     take(UP, SIDE)
     done, text = started.trigger("identify/start")
     assert done
@@ -191,15 +175,15 @@ def test_starting_again_drops_what_was_there(started: Listener, take: Take) -> N
     assert "pose 1 taken" in take(UP)
 
 
-def test_it_does_not_start_without_an_orientation(listener: Listener) -> None:
-    assert listener.set_parameter("orientation_source", "none") == (True, "")
-    done, text = listener.trigger("identify/start")
+def test_it_does_not_start_without_an_orientation(node: SimulatedNode) -> None:
+    assert node.set_parameter("orientation_source", "none") == (True, "")
+    done, text = node.trigger("identify/start")
     assert not done
     assert "orientation_source is none" in text
-    assert listener.set_parameter("orientation_source", "accelerometer") == (True, "")
+    assert node.set_parameter("orientation_source", "accelerometer") == (True, "")
 
 
-def test_a_file_that_cannot_be_written(started: Listener, take: Take) -> None:
+def test_a_file_that_cannot_be_written(started: SimulatedNode, take: Take) -> None:
     assert started.set_parameter("identify.file", "/proc/no/such.yaml") == (True, "")
     take(*AXES)
     done, text = started.trigger("identify/solve")

@@ -1,4 +1,7 @@
-"""Orientation from a topic and from TF: taken, refused, stale, back again. One node for the topics."""
+"""Orientation from a topic and from TF: taken, refused, stale, back again. The node is in simulated time.
+
+The topics are real, and so is the thread that listens to them.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,9 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 import rclpy
-from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped, TransformStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped, TransformStamped
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
-from std_srvs.srv import Trigger
 
 from bridge.compensating.gravity_sources import ListenerSource, Oriented, SensorSource
 from bridge.compensating.orientation_listener import OrientationListener
@@ -30,29 +32,17 @@ from bridge.compensating.orientation_messages import (
     multiply,
     unit,
 )
+from bridge.node import StartError
 from bridge.parameters.compensation import CompensationParameters, OrientationParameters
 from bridge.parameters.row import ParameterError
 from ft_compensation.quantities import length
 from protocol.text.json_text import JsonObject
-from tests.bridge.compensating import (
-    OVER,
-    QUICK,
-    SIDE,
-    UP,
-    ZERO6,
-    Stages,
-    comes_to_rest,
-    hold,
-    settle,
-    weight,
-)
-from tests.bridge.conftest import PATIENCE_S, Listener, NodeThread, starter, wait_until
-from tests.bridge.scripted_server import ScriptedServer
-from tests.bridge.shared import listener, server, stream
-from tests.bridge.streaming import Diagnostics, Stream, values
+from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, is_near, weight
+from tests.bridge.conftest import retire, wait_until
+from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
+from tests.bridge.streaming import values
 from tests.compensation.making import BIAS, TOOL, sample
 
-__all__ = ["listener", "server", "stream"]
 pytestmark = pytest.mark.ros
 OK, WARN, ERROR, STALE = range(4)
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -62,109 +52,107 @@ TILTED = (0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5))
 """A quarter of a turn about -y: the sensor's x axis points up."""
 
 
-class Robot:
-    """Publishes an orientation 50 times a second."""
+class Robot(SimulatedServer):
+    """Publishes an orientation ten times a simulated second, and waits until it is taken in."""
 
-    def __init__(self, listener: Listener) -> None:
-        self._node = listener.node
-        self.quaternion = UPRIGHT
-        self.offset_s = 0.0
-        """What is added to the stamps; None: they are 0."""
-        self.stamped = self.sending = True
-        self.change: Callable[[Any], None] = lambda message: None
-        self._target: tuple[Any, Any] | None = None
-        """Message type and publisher; one attribute, because the thread reads it while a test sets it."""
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
+    def __init__(self) -> None:
+        super().__init__()
+        self.taken = threading.Event()
+        self._node = rclpy.create_node("robot", start_parameter_services=False)
+        self._publisher: Any = None
+        self.restore()
 
     def use(self, message_type: Any, topic: str) -> None:
-        self._target = None
-        self._target = message_type, self._node.create_publisher(message_type, topic, 10)
+        """Publish on this topic from now on, and on no other."""
+        if self._publisher is not None:
+            self._node.destroy_publisher(self._publisher)
+        self._publisher = self._node.create_publisher(message_type, topic, 10)
 
     def restore(self) -> None:
         self.quaternion, self.offset_s, self.stamped, self.sending = UPRIGHT, 0.0, True, True
-        self.change = lambda message: None
+        self.change: Callable[[Any], None] = lambda message: None
+        # The sensor's own accelerometer says something else.
+        hold(self, UP, acceleration_x=3.0)
 
     def close(self) -> None:
-        self._stop.set()
-        self._thread.join()
+        retire(self._node)
 
-    def _run(self) -> None:
-        while not self._stop.wait(0.02):
-            target = self._target
-            if target is None or not self.sending:
-                continue
-            message_type, publisher = target
-            message = message_type()
-            if self.stamped:
-                stamp = message.header.stamp
-                stamp.sec, stamp.nanosec = divmod(time.time_ns() + int(self.offset_s * 1e9), 10**9)
-            x, y, z, w = self.quaternion
-            quaternion = Quaternion(x=x, y=y, z=z, w=w)
-            if message_type is PoseStamped:
-                message.pose.orientation = quaternion
-            elif message_type is Imu:
-                message.orientation = quaternion
-            else:
-                message.quaternion = quaternion
-            self.change(message)
-            publisher.publish(message)
+    def step(self) -> None:
+        super().step()
+        if self.sending and self.sent % 10 == 0:
+            self._send(self._publisher)
 
-
-@pytest.fixture(scope="module")
-def node(server: ScriptedServer, stream: Stream, listener: Listener) -> Iterator[NodeThread]:
-    hold(stream, UP)
-    with starter(listener) as start:
-        yield start(
-            server.port,
-            tool_mass=TOOL.mass,
-            tool_center_of_gravity=[*TOOL.center],
-            orientation_source="topic_pose",
-            # Patient: this machine may be busy.
-            **{**QUICK, "orientation.stale_after": 0.5, "orientation.topic": "arm/pose"},
-        )
+    def _send(self, publisher: Any) -> None:
+        message = publisher.msg_type()
+        if self.stamped:
+            stamp = message.header.stamp
+            stamp.sec, stamp.nanosec = divmod(self.time_ns() + int(self.offset_s * 1e9), 10**9)
+        x, y, z, w = self.quaternion
+        quaternion = Quaternion(x=x, y=y, z=z, w=w)
+        if isinstance(message, PoseStamped):
+            message.pose.orientation = quaternion
+        elif isinstance(message, Imu):
+            message.orientation = quaternion
+        else:
+            message.quaternion = quaternion
+        self.change(message)
+        self.taken.clear()
+        publisher.publish(message)
+        wait_until(lambda: self.taken.wait(0.1) or publisher.publish(message), "the orientation to be taken")
 
 
 @pytest.fixture(scope="module")
-def _robot(listener: Listener, node: NodeThread) -> Iterator[Robot]:
-    robot = Robot(listener)
-    yield robot
+def _robot(_ros: None) -> Iterator[Robot]:
+    robot = Robot()
+    take = OrientationListener._take
+
+    def taken(self: OrientationListener, read: Callable[[], Oriented]) -> None:
+        take(self, read)
+        robot.taken.set()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OrientationListener, "_take", taken)
+        yield robot
     robot.close()
 
 
 @pytest.fixture(scope="module")
-def stages(listener: Listener, node: NodeThread) -> Stages:
-    return Stages(listener)
+def node(_robot: Robot) -> Iterator[SimulatedNode]:
+    given = {
+        "tool_mass": TOOL.mass,
+        "tool_center_of_gravity": [*TOOL.center],
+        "orientation_source": "topic_pose",
+        "orientation.topic": "arm/pose",
+        "orientation.stale_after": 0.5,
+    }
+    with SimulatedNode(_robot, **QUICK, **given) as started:
+        yield started
 
 
 @pytest.fixture(scope="module")
-def _diagnostics(listener: Listener, node: NodeThread) -> Diagnostics:
-    return Diagnostics(listener)
+def stages(node: SimulatedNode) -> Stages:
+    return Stages(node)
+
+
+def listen(node: SimulatedNode, source: str, topic: str) -> str:
+    """Have the node listen there; the topic's whole name."""
+    assert node.set_parameter("orientation.topic", topic) == (True, "")
+    assert node.set_parameter("orientation_source", source) == (True, "")
+    return node.name.replace("bridge", topic)
 
 
 @pytest.fixture
-def diagnostics(_diagnostics: Diagnostics) -> Diagnostics:
-    _diagnostics.forget()
-    return _diagnostics
-
-
-@pytest.fixture
-def robot(
-    _robot: Robot, stream: Stream, listener: Listener, stages: Stages, node: NodeThread
-) -> Iterator[Robot]:
-    """The robot says where the sensor is; the sensor's own accelerometer would say something else."""
+def robot(_robot: Robot, node: SimulatedNode, stages: Stages) -> Robot:
     _robot.restore()
-    hold(stream, UP, acceleration_x=3.0)
-    yield _robot
-    assert node.is_running
-    assert "Traceback" not in node.log
+    _robot.use(PoseStamped, listen(node, "topic_pose", "arm/pose"))
+    return _robot
 
 
-def test_before_anything_has_come(robot: Robot, diagnostics: Diagnostics, listener: Listener) -> None:
-    words = f"no orientation from topic /{listener.tag}/arm/pose: nothing has come"
-    diagnostics.until(words, compensation=ERROR)
-    done, text = listener.trigger("tare")
+def test_before_anything_has_come(robot: Robot, node: SimulatedNode) -> None:
+    robot.sending = False
+    topic = listen(node, "topic_pose", "arm/other")
+    node.until(f"no orientation from topic {topic}: nothing has come", compensation=ERROR)
+    done, text = node.trigger("tare")
     assert not done
     assert "nothing has come" in text
 
@@ -174,37 +162,32 @@ def test_before_anything_has_come(robot: Robot, diagnostics: Diagnostics, listen
     [("topic_quaternion", QuaternionStamped), ("topic_imu", Imu), ("topic_pose", PoseStamped)],
 )
 def test_each_kind_of_message(
-    robot: Robot, stream: Stream, stages: Stages, listener: Listener, source: str, message_type: Any
+    robot: Robot, stages: Stages, node: SimulatedNode, source: str, message_type: Any
 ) -> None:
-    topic = f"arm/{source}"
-    assert listener.set_parameter("orientation.topic", topic) == (True, "")
-    assert listener.set_parameter("orientation_source", source) == (True, "")
-    robot.use(message_type, f"/{listener.tag}/{topic}")
+    robot.use(message_type, listen(node, source, f"arm/{source}"))
     for quaternion, up in ((UPRIGHT, UP), (ROLLED, OVER), (TILTED, SIDE)):
         robot.quaternion = quaternion
-        hold(stream, up, acceleration_y=3.0)
+        hold(robot, up, acceleration_y=3.0)
         stages.settle(ZERO6)
 
 
-def test_a_source_that_falls_silent_and_comes_back(
-    robot: Robot, stages: Stages, diagnostics: Diagnostics, stream: Stream, listener: Listener
-) -> None:
+def test_a_source_that_falls_silent_and_comes_back(robot: Robot, stages: Stages, node: SimulatedNode) -> None:
     stages.settle(ZERO6)
-    diagnostics.until(compensation=OK)
-    measured = listener.subscribe(WrenchStamped, "wrench", depth=20)
+    node.until(compensation=OK)
+    measured = node.hear("wrench")
     robot.sending = False
-    diagnostics.until("older than the sample (limit 0.5 s): it has stopped", compensation=ERROR)
-    comes_to_rest(stages.final)
-    for others in (stages.bias, stages.gravity, stages.inertia):
-        comes_to_rest(others, 0.1)
+    node.run(0.3)
+    assert not stages.are_silent(), "the last one holds for half a second"
+    node.until("older than the sample (limit 0.5 s): it has stopped", compensation=ERROR)
+    assert stages.are_silent()
     robot.quaternion = ROLLED  # it has moved in the meantime
-    hold(stream, OVER)
-    settle(measured, weight(OVER))
+    hold(robot, OVER)
+    node.run(0.2)
+    assert is_near(measured[-1], weight(OVER))
     robot.sending = True
-    message = stages.final.get(timeout=20)
-    assert settle(stages.final, ZERO6)
-    assert [message.wrench.force.z] == pytest.approx([0.0], abs=1e-3)  # never with the old pose
-    diagnostics.until(compensation=OK)
+    stages.forget()
+    assert stages.first() == pytest.approx(ZERO6, abs=1e-3)  # never with the old pose
+    node.until(compensation=OK)
 
 
 @pytest.mark.parametrize(
@@ -221,95 +204,88 @@ def test_a_source_that_falls_silent_and_comes_back(
     ],
 )
 def test_what_cannot_be_used(
-    robot: Robot, stages: Stages, diagnostics: Diagnostics, spoil: dict[str, Any], words: str
+    robot: Robot, stages: Stages, node: SimulatedNode, spoil: dict[str, Any], words: str
 ) -> None:
     stages.settle(ZERO6)
     for name, value in spoil.items():
         setattr(robot, name, value)
-    diagnostics.until(words, compensation=ERROR)
-    comes_to_rest(stages.final)
+    node.until(words, compensation=ERROR)
+    assert stages.are_silent()
     robot.restore()
     stages.settle(ZERO6)
-    diagnostics.until(compensation=OK)
+    node.until(compensation=OK)
 
 
-def test_an_imu_without_orientation(
-    robot: Robot, stages: Stages, diagnostics: Diagnostics, listener: Listener
-) -> None:
-    assert listener.set_parameter("orientation_source", "topic_imu") == (True, "")
-    assert listener.set_parameter("orientation.topic", "arm/imu") == (True, "")
+def test_an_imu_without_orientation(robot: Robot, stages: Stages, node: SimulatedNode) -> None:
+    topic = listen(node, "topic_imu", "arm/imu")
 
     def unknown(message: Any) -> None:
         message.orientation_covariance[0] = -1.0
 
     robot.change = unknown
-    robot.use(Imu, f"/{listener.tag}/arm/imu")
-    words = f"no orientation from topic /{listener.tag}/arm/imu: its messages say that they have none"
-    diagnostics.until(words, compensation=ERROR)
+    robot.use(Imu, topic)
+    node.until(f"no orientation from topic {topic}: its messages say that they have none", compensation=ERROR)
     robot.restore()
     stages.settle(ZERO6)
 
 
-def test_a_sensor_mounted_askew(robot: Robot, stages: Stages, stream: Stream, listener: Listener) -> None:
+def test_a_sensor_mounted_askew(robot: Robot, stages: Stages, node: SimulatedNode) -> None:
     """The arm hangs down and the sensor is turned about its own z axis in it."""
     quarter = [0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
     robot.quaternion = TILTED  # the arm's x axis points up; that is the sensor's -y
-    hold(stream, (0, -1, 0))
-    assert listener.set_parameter("orientation.mounting", quarter) == (True, "")
+    hold(robot, (0, -1, 0))
+    assert node.set_parameter("orientation.mounting", quarter) == (True, "")
     stages.settle(ZERO6)
-    assert listener.set_parameter("orientation.mounting", [0, 0, 0, 1]) == (True, "")
+    assert node.set_parameter("orientation.mounting", [0, 0, 0, 1]) == (True, "")
 
 
-def test_gravity_in_a_base_that_is_mounted_askew(
-    robot: Robot, stages: Stages, stream: Stream, listener: Listener
-) -> None:
-    hold(stream, SIDE)
-    assert listener.set_parameter("gravity", [-9.80665, 0.0, 0.0]) == (True, "")
+def test_gravity_in_a_base_that_is_mounted_askew(robot: Robot, stages: Stages, node: SimulatedNode) -> None:
+    hold(robot, SIDE)
+    assert node.set_parameter("gravity", [-9.80665, 0.0, 0.0]) == (True, "")
     stages.settle(ZERO6)
-    assert listener.set_parameter("gravity", [0.0, 0.0, -9.80665]) == (True, "")
+    assert node.set_parameter("gravity", [0.0, 0.0, -9.80665]) == (True, "")
 
 
-def test_a_tare_goes_by_the_topic(robot: Robot, stages: Stages, stream: Stream, listener: Listener) -> None:
+def test_a_tare_goes_by_the_topic(robot: Robot, stages: Stages, node: SimulatedNode) -> None:
     robot.quaternion = ROLLED
-    hold(stream, OVER, bias=BIAS, acceleration_x=0.3)
+    hold(robot, OVER, bias=BIAS, acceleration_x=0.3)
     stages.settle(list(BIAS.values))
-    done, text = listener.trigger("tare")
+    done, text = node.trigger("tare")
     assert done, text
     stages.settle(ZERO6)
     robot.quaternion = TILTED
-    hold(stream, SIDE, bias=BIAS)
+    hold(robot, SIDE, bias=BIAS)
     stages.settle(ZERO6)
-    assert listener.trigger("clear_tare")[0]
+    assert node.trigger("clear_tare")[0]
 
 
 def test_the_orientation_is_taken_in_while_a_service_waits(
-    robot: Robot, stages: Stages, server: ScriptedServer, stream: Stream, listener: Listener
+    robot: Robot, stages: Stages, node: SimulatedNode
 ) -> None:
     stages.settle(ZERO6)
     asked: list[JsonObject] = []
-    server.answers["tare"] = asked.append  # the reply is kept back
-    response = listener.ask(Trigger, "sensor_tare")
-    wait_until(lambda: asked, "the request")
-    time.sleep(0.8)  # longer than an orientation holds
-    stages.forget()
-    robot.quaternion = ROLLED
-    hold(stream, OVER)
-    stages.settle(ZERO6)
-    assert response.empty()
-    refused = {"ok": False, "error": {"code": "denied", "message": "no"}}
-    server.send_json({"reply": "tare", "id": asked[0]["id"], **refused})
-    assert response.get(timeout=PATIENCE_S).message == "no (denied)"
-    del server.answers["tare"]
+    robot.answers["tare"] = asked.append  # the reply is kept back
+
+    def turn() -> None:
+        robot.quaternion = ROLLED
+        hold(robot, OVER)
+
+    def reply() -> None:
+        stages.settle(ZERO6)
+        refused = {"ok": False, "error": {"code": "denied", "message": "no"}}
+        robot.send_json({"reply": "tare", "id": asked[0]["id"], **refused})
+
+    node.at(0.8, turn)  # longer than an orientation holds
+    node.at(1.6, reply)
+    assert node.trigger("sensor_tare") == (False, "no (denied)")
+    assert is_near(stages.gravity[-1], weight(OVER))
+    del robot.answers["tare"]
 
 
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        (
-            "orientation.topic",
-            "no such name!",
-            "'no such name!': topic name must not contain",
-        ),
+        ("orientation.topic", "no such name!", "'no such name!': topic name must not contain"),
         (
             "orientation.topic",
             "wrench",
@@ -319,41 +295,39 @@ def test_the_orientation_is_taken_in_while_a_service_waits(
     ],
 )
 def test_a_source_that_cannot_be_had(
-    robot: Robot, stages: Stages, listener: Listener, name: str, value: str, words: str
-) -> None:
-    before = listener.parameters(name)
-    done, reason = listener.set_parameter(name, value)
+    robot: Robot, stages: Stages, node: SimulatedNode, monkeypatch: pytest.MonkeyPatch,
+    name: str, value: str, words: str,
+) -> None:  # fmt: skip
+    monkeypatch.setitem(sys.modules, "tf2_ros", None)
+    before = node.parameters(name)
+    done, reason = node.set_parameter(name, value)
     assert not done
     assert words in reason
-    assert listener.parameters(name) == before
+    assert node.parameters(name) == before
     stages.settle(ZERO6)
 
 
-def test_nothing_listens_where_no_source_is_chosen(
-    robot: Robot, stream: Stream, diagnostics: Diagnostics, listener: Listener
-) -> None:
-    hidden = ("_bridge_orientation", f"/{listener.tag}")
+def test_nothing_listens_where_no_source_is_chosen(robot: Robot, stages: Stages, node: SimulatedNode) -> None:
+    hidden = ("_bridge_orientation", node.node.get_namespace())
 
     def is_there() -> bool:
-        return hidden in listener.node.get_node_names_and_namespaces()
+        return hidden in node.node.get_node_names_and_namespaces()
 
     wait_until(is_there, "the hidden node")
-    assert listener.set_parameter("orientation_source", "accelerometer") == (True, "")
+    assert node.set_parameter("orientation_source", "accelerometer") == (True, "")
     wait_until(lambda: not is_there(), "the hidden node's end")
-    hold(stream, UP)
-    wait_until(
-        lambda: values(diagnostics.next()["compensation"])["orientation_source"] == "accelerometer",
-        "the accelerometer in the diagnostics",
-    )
-    diagnostics.until(compensation=OK)
+    robot.sending = False
+    hold(robot, UP)
+    stages.settle(ZERO6)
+    status = node.until(compensation=OK)["compensation"]
+    assert values(status)["orientation_source"] == "accelerometer"
 
 
-def test_tf_that_is_missing_ends_the_node_with_a_sentence(listener: Listener) -> None:
-    with starter(listener) as start:
-        node = start(1, orientation_source="tf")
-        assert node.ends() == 2
-        assert "parameter orientation_source is 'tf': it needs tf2_ros" in node.log
-        assert "Traceback" not in node.log
+@pytest.mark.usefixtures("_ros")
+def test_tf_that_is_missing_is_told_at_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tf2_ros", None)
+    with pytest.raises(StartError, match="parameter orientation_source is 'tf': it needs tf2_ros"):
+        SimulatedNode(SimulatedServer(), orientation_source="tf")
 
 
 # TF, by a buffer that is handed in: tf2_ros is not on PyPI.
@@ -368,8 +342,7 @@ class FakeBuffer:
 
     def __init__(self) -> None:
         self.quaternion = UPRIGHT
-        self.stamp_ns: int | None = None
-        """None: the time of the lookup."""
+        self.stamp_ns = 0
         self.error: str | None = "frame does not exist"
         self.asked: list[tuple[str, str, Any]] = []
 
@@ -378,8 +351,7 @@ class FakeBuffer:
         if self.error:
             raise FakeTfError(self.error)
         found = TransformStamped()
-        stamp_ns = time.time_ns() if self.stamp_ns is None else self.stamp_ns
-        found.header.stamp.sec, found.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        found.header.stamp.sec, found.header.stamp.nanosec = divmod(self.stamp_ns, 10**9)
         r = found.transform.rotation
         r.x, r.y, r.z, r.w = self.quaternion
         return found
@@ -417,21 +389,26 @@ def test_the_source_tf(ros_node: Node) -> None:
     )
     try:
         source = ListenerSource(CompensationParameters(orientation=chosen), opened)
+
+        def gravity(time_s: float) -> Any:
+            return source.gravity(sample(), time_s)
+
         wait_until(lambda: buffer.asked, "a lookup")
-        assert source.gravity(sample(), time.time()) is None
+        assert gravity(1000.0) is None
         words = "no orientation from TF from world to ft: TF has none of ft in world: frame does not exist"
-        wait_until(lambda: source.why_none(time.time()) == words, words)
-        buffer.error, buffer.quaternion = None, TILTED
-        wait_until(lambda: source.gravity(sample(), time.time()) is not None, "gravity")
-        # The frames say all, so `mounting` is not for TF.
-        assert source.gravity(sample(), time.time()) == pytest.approx((-9.80665, 0.0, 0.0))
-        buffer.stamp_ns = time.time_ns()
-        wait_until(lambda: source.gravity(sample(), time.time()) is None, "an old transform")
-        assert "older than the sample (limit 0.5 s)" in source.why_none(time.time())
-        buffer.error, buffer.stamp_ns = "the tree fell apart", None
-        wait_until(lambda: "the tree fell apart" in source.why_none(time.time()), "the reason")
+        wait_until(lambda: source.why_none(1000.0) == words, words)
+        buffer.quaternion, buffer.stamp_ns = TILTED, 1000 * 10**9
         buffer.error = None
-        wait_until(lambda: source.gravity(sample(), time.time()) is not None, "gravity again")
+        wait_until(lambda: gravity(1000.0) is not None, "gravity")
+        # The frames say all, so `mounting` is not for TF.
+        assert gravity(1000.0) == pytest.approx((-9.80665, 0.0, 0.0))
+        assert gravity(1000.6) is None
+        assert "older than the sample (limit 0.5 s)" in source.why_none(1000.6)
+        buffer.error = "the tree fell apart"
+        wait_until(lambda: "the tree fell apart" in source.why_none(1000.6), "the reason")
+        buffer.stamp_ns = 1001 * 10**9
+        buffer.error = None
+        wait_until(lambda: gravity(1001.0) is not None, "gravity again")
     finally:
         assert opened.close()
     assert not failures

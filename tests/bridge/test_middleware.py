@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 from bridge.middleware import PROFILES, use_own_profiles
-from tests.bridge.conftest import StartProcess
+from tests.bridge.conftest import PATIENCE_S, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 
 pytestmark = pytest.mark.ros
@@ -39,11 +40,15 @@ def test_nothing_is_repeated_later_for_it() -> None:
 def test_fast_dds_understands_it(
     server: ScriptedServer, start_process: StartProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In processes: the middleware reads its profiles once."""
+    """In processes: the middleware reads its profiles once. And a signal ends one as it should."""
     monkeypatch.delenv(NAME, raising=False)
     node = start_process(server.port)
     node.says("connected to")
     assert "XMLPARSER" not in node.log
+    node.send_signal(signal.SIGTERM)
+    assert node.ends() == 0
+    assert "Traceback" not in node.log
+    assert server.disconnected.wait(PATIENCE_S)
     wrong = tmp_path / "wrong.xml"
     wrong.write_text(PROFILES.read_text().replace("nackSupressionDuration", "nackDuration"))
     monkeypatch.setenv(NAME, str(wrong))

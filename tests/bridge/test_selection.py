@@ -159,11 +159,11 @@ def test_a_limit_takes_the_newest() -> None:
 @pytest.mark.parametrize("rate_hz", [800, 801, 997, 1000, 1333, 1600, 1700])
 def test_a_limit_below_the_streams_rate_is_kept_and_reached(limit_hz: float, rate_hz: int) -> None:
     limit = RateLimit(limit_hz)
-    passed = sum(limit.allows(i * 1_000_000_000 // rate_hz) for i in range(10 * rate_hz))
-    assert 10 * limit_hz - 1 <= passed <= 10 * limit_hz + 2
+    passed = sum(limit.allows(i * 1_000_000_000 // rate_hz) for i in range(3 * rate_hz))
+    assert 3 * limit_hz - 1 <= passed <= 3 * limit_hz + 2
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_limit_equal_to_the_streams_rate_lets_all_pass(seed: int) -> None:
     limit = RateLimit(800.0)
     jitter = random.Random(seed).randint

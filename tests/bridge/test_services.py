@@ -1,9 +1,8 @@
-"""Services and the settings as parameters: granted, refused, unanswered; the stream goes on meanwhile."""
+"""Services and the settings as parameters, in simulated time: granted, refused, unanswered."""
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,46 +10,47 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
+from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from bridge.stream.requests import CONFIGURE_TIMEOUT_S
 from protocol.control import ErrorCode, Event, event
 from protocol.settings import SETTINGS as TABLE
 from protocol.text.json_text import JsonObject
-from tests.bridge.conftest import PATIENCE_S, Listener, NodeThread, starter, wait_until
+from tests.bridge.conftest import Listener, Start
 from tests.bridge.scripted_server import ScriptedServer
-from tests.bridge.shared import listener, server, stream
-from tests.bridge.streaming import SETTINGS, Stream
+from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
+from tests.bridge.streaming import SETTINGS
 
-__all__ = ["listener", "server", "stream"]
 pytestmark = pytest.mark.ros
 NAMES = ("settings.sinc_length", "settings.fir", "settings.acceleration_range_g", "settings.chop")
 
 
-@pytest.fixture(scope="module")
-def _node(server: ScriptedServer, stream: Stream, listener: Listener) -> Iterator[NodeThread]:
-    with starter(listener) as start:
-        yield start(server.port, **{"settings.sinc_length": 64})
+@pytest.fixture
+def scripted() -> SimulatedServer:
+    return SimulatedServer()
 
 
-@pytest.fixture(autouse=True)
-def node(_node: NodeThread, listener: Listener) -> Iterator[NodeThread]:
-    wait_until(lambda: listener.parameters(*NAMES) == [512, False, 2, None], "the server's settings")
-    yield _node
-    assert _node.is_running
-    assert "Traceback" not in _node.log
+@pytest.fixture
+def node(_ros: None, scripted: SimulatedServer) -> Iterator[SimulatedNode]:
+    with SimulatedNode(scripted, **{"settings.sinc_length": 64}) as started:
+        started.run(0.1)
+        assert started.parameters(*NAMES) == [512, False, 2, None], "the server's settings"
+        yield started
 
 
 def refuse(message: str, code: str = ErrorCode.SENSOR) -> JsonObject:
     return {"ok": False, "error": {"code": str(code), "message": message}}
 
 
-def test_settings_given_at_start_are_not_taken_in_silence(node: NodeThread, server: ScriptedServer) -> None:
+def test_settings_given_at_start_are_not_taken_in_silence(
+    node: SimulatedNode, scripted: SimulatedServer
+) -> None:
     assert "settings given at start: sinc_length; call ~/apply_settings" in node.log
-    assert not [r for r in server.requests if r["action"] == "configure"]
+    assert not [r for r in scripted.requests if r["action"] == "configure"]
 
 
-def configures(server: ScriptedServer) -> list[Any]:
+def configures(scripted: SimulatedServer) -> list[Any]:
     """From now on every setting is taken and told; what is asked for comes into the list."""
     held = dict(SETTINGS)
     asked: list[Any] = []
@@ -58,37 +58,37 @@ def configures(server: ScriptedServer) -> list[Any]:
     def answer(message: JsonObject) -> JsonObject:
         asked.append(message["settings"])
         held.update(message["settings"])
-        server.send_json(event(Event.RECONFIGURED, sensor=0, settings=held))
+        scripted.send_json(event(Event.RECONFIGURED, sensor=0, settings=held))
         return {"ok": True, "settings": held}
 
-    server.answers["configure"] = answer
+    scripted.answers["configure"] = answer
     return asked
 
 
 def test_settings_given_at_start_or_set_since_are_applied_together(
-    node: NodeThread, server: ScriptedServer, listener: Listener
+    node: SimulatedNode, scripted: SimulatedServer
 ) -> None:
-    asked = configures(server)
-    done, text = listener.trigger("apply_settings")
+    asked = configures(scripted)
+    done, text = node.trigger("apply_settings")
     assert done, text
     assert '"sinc_length": 64' in text
-    assert listener.set_parameter("settings.fir", True) == (True, "")
-    assert listener.trigger("apply_settings")[0]
+    assert node.set_parameter("settings.fir", True) == (True, "")
+    assert node.trigger("apply_settings")[0]
     assert asked == [{"sinc_length": 64}, {"fir": True}, {"sinc_length": 64, "fir": True}]
-    server.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
-    assert listener.trigger("apply_settings") == (False, "not for uid 7 (denied)")
-    server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS))
+    scripted.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
+    assert node.trigger("apply_settings") == (False, "not for uid 7 (denied)")
+    scripted.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS))
 
 
-def test_tare(server: ScriptedServer, listener: Listener) -> None:
+def test_tare(node: SimulatedNode, scripted: SimulatedServer) -> None:
     asked: list[JsonObject] = []
 
     def answer(message: JsonObject) -> JsonObject:
         asked.append(message)
         return {"ok": True, "old_offset": [1, 2, 3, 4, 5, 6], "new_offset": [0.5] * 6, "residual": [1e-3] * 6}
 
-    server.answers["tare"] = answer
-    done, text = listener.trigger("sensor_tare")
+    scripted.answers["tare"] = answer
+    done, text = node.trigger("sensor_tare")
     assert done
     assert "old offset Fx 1.0000 Fy 2.0000" in text
     assert "new offset Fx 0.5000" in text
@@ -96,35 +96,32 @@ def test_tare(server: ScriptedServer, listener: Listener) -> None:
     assert (asked[0]["sensor"], asked[0]["samples"]) == (0, 50)  # half a second
 
 
-def test_a_refusal_in_the_servers_own_words(server: ScriptedServer, listener: Listener) -> None:
-    server.answers["tare"] = lambda _: refuse("sensor 0 is not at rest: hold it still", ErrorCode.NOT_READY)
-    assert listener.trigger("sensor_tare") == (False, "sensor 0 is not at rest: hold it still (not_ready)")
-    server.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
-    assert listener.set_parameter("settings.fir", True) == (False, "not for uid 7 (denied)")
-    assert listener.parameters("settings.fir") == [False]
-    assert listener.trigger("save_settings") == (False, "not for uid 7 (denied)")
+def test_a_refusal_in_the_servers_own_words(node: SimulatedNode, scripted: SimulatedServer) -> None:
+    scripted.answers["tare"] = lambda _: refuse("sensor 0 is not at rest: hold it still", ErrorCode.NOT_READY)
+    assert node.trigger("sensor_tare") == (False, "sensor 0 is not at rest: hold it still (not_ready)")
+    scripted.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
+    assert node.set_parameter("settings.fir", True) == (False, "not for uid 7 (denied)")
+    assert node.parameters("settings.fir") == [False]
+    assert node.trigger("save_settings") == (False, "not for uid 7 (denied)")
 
 
 def test_parameters_refused_together_leave_the_sensor_alone(
-    server: ScriptedServer, listener: Listener
+    node: SimulatedNode, scripted: SimulatedServer
 ) -> None:
-    from rcl_interfaces.srv import SetParametersAtomically
-    from rclpy.parameter import Parameter
-
     asked: list[JsonObject] = []
-    server.answers["configure"] = asked.append
+    scripted.answers["configure"] = asked.append
     for wrong in (Parameter("gravity", value=[0.0, 0.0, 0.0]), Parameter("tool_mass", value=-1.0)):
         both = [Parameter("settings.sinc_length", value=128), wrong]
         request = SetParametersAtomically.Request(parameters=[one.to_parameter_msg() for one in both])
-        result = listener.call(SetParametersAtomically, "set_parameters_atomically", request).result
+        result = node.call("set_parameters_atomically", request).result
         assert not result.successful
         assert wrong.name in result.reason
     assert not asked
-    del server.answers["configure"]
+    del scripted.answers["configure"]
 
 
-def test_settings_are_shown_and_saved(server: ScriptedServer, listener: Listener) -> None:
-    done, text = listener.trigger("get_settings")
+def test_settings_are_shown_and_saved(node: SimulatedNode, scripted: SimulatedServer) -> None:
+    done, text = node.trigger("get_settings")
     assert done
     assert json.loads(text) == {**SETTINGS, "rate_hz": 100.0}
     asked: list[JsonObject] = []
@@ -133,18 +130,18 @@ def test_settings_are_shown_and_saved(server: ScriptedServer, listener: Listener
         asked.append(message)
         return {"ok": True, "settings": SETTINGS, "saved": True}
 
-    server.answers["configure"] = answer
-    done, text = listener.trigger("save_settings")
+    scripted.answers["configure"] = answer
+    done, text = node.trigger("save_settings")
     assert done, text
     assert asked[0]["save"] is True
     assert asked[0]["settings"].items() <= SETTINGS.items()
 
 
-def test_a_setting_is_set(server: ScriptedServer, listener: Listener) -> None:
-    asked = configures(server)
+def test_a_setting_is_set(node: SimulatedNode, scripted: SimulatedServer) -> None:
+    asked = configures(scripted)
     for value in (64, SETTINGS["sinc_length"]):
-        assert listener.set_parameter("settings.sinc_length", value) == (True, "")
-        assert listener.parameters("settings.sinc_length") == [value]
+        assert node.set_parameter("settings.sinc_length", value) == (True, "")
+        assert node.parameters("settings.sinc_length") == [value]
     assert asked == [{"sinc_length": 64}, {"sinc_length": 512}]
 
 
@@ -159,90 +156,88 @@ def test_a_setting_is_set(server: ScriptedServer, listener: Listener) -> None:
         ("no_such", 1, "undeclared"),
     ],
 )
-def test_a_value_that_cannot_be(listener: Listener, name: str, value: Any, words: str) -> None:
-    done, reason = listener.set_parameter(f"settings.{name}", value)
+def test_a_value_that_cannot_be(node: SimulatedNode, name: str, value: Any, words: str) -> None:
+    done, reason = node.set_parameter(f"settings.{name}", value)
     assert not done
     assert words in reason
 
 
-def test_a_change_that_did_not_take(server: ScriptedServer, listener: Listener) -> None:
-    server.answers["configure"] = lambda _: {"ok": True, "settings": SETTINGS}
-    done, reason = listener.set_parameter("settings.fir", True)
+def test_a_change_that_did_not_take(node: SimulatedNode, scripted: SimulatedServer) -> None:
+    scripted.answers["configure"] = lambda _: {"ok": True, "settings": SETTINGS}
+    done, reason = node.set_parameter("settings.fir", True)
     assert (done, reason) == (False, "fir is still False: the server did not apply True")
 
 
-def test_the_parameters_follow_what_others_change(server: ScriptedServer, listener: Listener) -> None:
+def test_the_parameters_follow_what_others_change(node: SimulatedNode, scripted: SimulatedServer) -> None:
     changed = {**SETTINGS, "sinc_length": 128, "chop": True, "odd": 1, "fir": "x"}
-    server.send_json(event(Event.RECONFIGURED, sensor=1, settings={"sinc_length": 99}))
-    server.send_json(event(Event.RECONFIGURED, sensor=0, settings=changed))
-    wait_until(lambda: listener.parameters(*NAMES) == [128, None, 2, True], "the changed settings")
-    server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS))
+    scripted.send_json(event(Event.RECONFIGURED, sensor=1, settings={"sinc_length": 99}))
+    scripted.send_json(event(Event.RECONFIGURED, sensor=0, settings=changed))
+    node.run(0.1)
+    assert node.parameters(*NAMES) == [128, None, 2, True]
 
 
-def test_an_unanswered_request_holds_up_neither_stream_nor_node(
-    server: ScriptedServer, listener: Listener, stream: Stream
+def test_an_unanswered_request_holds_up_neither_stream_nor_diagnostics(
+    node: SimulatedNode, scripted: SimulatedServer
 ) -> None:
-    answer = server.answers.pop("describe", None)
-    server.answers["describe"] = lambda _: None
-    began = time.monotonic()
-    response = listener.ask(Trigger, "get_settings")
-    time.sleep(0.3)
-    listener.numbers()
-    numbers = [listener.next_number() for _ in range(50)]
-    assert numbers == sorted(set(numbers))
-    assert "did not answer describe: no reply within 3 s" in response.get(timeout=PATIENCE_S).message
-    assert time.monotonic() - began > 2.5
-    del server.answers["describe"]
-    if answer is not None:
-        server.answers["describe"] = answer
-    assert listener.trigger("get_settings")[0]
+    scripted.answers["describe"] = lambda _: None
+    samples, arrays = node.hear("/sensone_sensor_data"), node.hear("/diagnostics")
+    node.run(0.2)
+    samples.clear()
+    arrays.clear()
+    began_ns = scripted.monotonic_ns()
+    done, text = node.trigger("get_settings")
+    assert not done
+    assert "did not answer describe: no reply within 3 s" in text
+    assert (scripted.monotonic_ns() - began_ns) / 1e9 == pytest.approx(3.0, abs=0.02)
+    assert len(samples) in range(299, 303)
+    assert len(arrays) >= 2
+    del scripted.answers["describe"]
+    assert node.trigger("get_settings")[0]
 
 
-def test_without_a_server(server: ScriptedServer, listener: Listener, stream: Stream) -> None:
-    description, server.description = server.description, {**server.description, "sensors": []}
-    try:
-        server.drop()
-        wait_until(lambda: listener.parameters(*NAMES) == [None] * 4, "no settings")
-        for done, text in (
-            listener.trigger("sensor_tare"),
-            listener.trigger("get_settings"),
-            listener.set_parameter("settings.sinc_length", 64),
-        ):
-            assert not done
-            # Just dropped, or connected to again, which is of no use without the sensor.
-            assert "there is no server at localhost:" in text or "has no sensor 0" in text
-        assert not listener.trigger("save_settings")[0]
-    finally:
-        server.description = description
+def test_a_connection_that_ends_before_the_reply(node: SimulatedNode, scripted: SimulatedServer) -> None:
+    scripted.answers["tare"] = lambda _: scripted.drop()
+    done, text = node.trigger("sensor_tare")
+    assert not done
+    assert "the server at localhost:12001 is gone: the connection ended before the reply" in text
 
 
-def test_every_setting_is_a_parameter_that_describes_itself(listener: Listener) -> None:
-    from rcl_interfaces.srv import DescribeParameters
+def test_without_a_server(node: SimulatedNode, scripted: SimulatedServer) -> None:
+    scripted.listens = False
+    scripted.drop()
+    node.run(0.1)
+    assert node.parameters(*NAMES) == [None] * 4
+    refused = "there is no server at localhost:12001"
+    for done, text in (
+        node.trigger("sensor_tare"),
+        node.trigger("get_settings"),
+        node.set_parameter("settings.sinc_length", 64),
+        node.trigger("save_settings"),
+    ):
+        assert not done
+        assert refused in text
+    scripted.listens = True
+    scripted.description["sensors"] = []
+    node.run(1.0)
+    assert "the server has no sensor 0" in node.trigger("sensor_tare")[1]
 
+
+def test_every_setting_is_a_parameter_that_describes_itself(node: SimulatedNode) -> None:
     names = [f"settings.{name}" for name in TABLE]
-    response = listener.call(
-        DescribeParameters, "describe_parameters", DescribeParameters.Request(names=names)
-    )
+    response = node.call("describe_parameters", DescribeParameters.Request(names=names))
     assert [row.name for row in response.descriptors] == names
     assert all(row.description for row in response.descriptors)
 
 
 def test_the_node_ends_while_a_service_waits(
-    server: ScriptedServer, listener: Listener, stream: Stream
+    server: ScriptedServer, listener: Listener, start: Start
 ) -> None:
-    other = Listener()
-    try:
-        with ScriptedServer() as mute, starter(other) as start:
-            node = start(mute.port)
-            mute.answers["tare"] = lambda _: None
-            assert mute.subscribed.wait(20)
-            other.parameters("server_port")  # its services are there
-            other.ask(Trigger, "sensor_tare")
-            wait_until(lambda: any(r["action"] == "tare" for r in mute.requests), "the request")
-            began = time.monotonic()
-            node.finish()
-            assert node.ends() == 0
-            assert time.monotonic() - began < CONFIGURE_TIMEOUT_S  # it did not wait for the reply
-            assert "Traceback" not in node.log
-    finally:
-        other.close()
+    """In real time: it is told so by another thread."""
+    server.answers["tare"] = lambda _: None
+    node = start(server.port)
+    node.says("connected to")
+    listener.call(Trigger, "sensor_tare", until=lambda: "tare" in [r["action"] for r in server.requests])
+    node.finish()
+    assert node.ends() == 0
+    node.says("did not answer tare: the node ends")
+    assert "Traceback" not in node.log

@@ -71,7 +71,7 @@ def test_nothing_is_kept_of_what_was_handled(bench: Bench) -> None:
     bench.thread.start()
     bench.count(100)
     before = functions()
-    bench.count(1000)
+    bench.count(500)
     assert functions() - before < 100
     bench.spinner.stop()
     assert bench.ends()

@@ -20,6 +20,7 @@ from protocol.pdo import encode
 from tests.bridge.conftest import PATIENCE_S, Listener, NodeThread, establish, starter, wait_until
 from tests.bridge.scripted_server import ScriptedServer, process_data
 from tests.bridge.shared import listener, server
+from tests.bridge.streaming import Diagnostics
 
 __all__ = ["listener", "server"]
 pytestmark = pytest.mark.ros
@@ -110,12 +111,14 @@ def test_wrench(server: ScriptedServer, listener: Listener) -> None:
     messages: queue.Queue[Any] = queue.Queue()
     profile = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
     listener.node.create_subscription(WrenchStamped, f"/{listener.tag}/wrench", messages.put, profile)
-    wait_until(lambda: _sent(server) and not messages.empty(), "a wrench")
     stamp = 1_234_567_890_123_456_789
-    server.send_sample(7.0, stamp_ns=stamp)
+
+    def sent() -> bool:
+        server.send_sample(7.0, stamp_ns=stamp)
+        return True
+
+    wait_until(lambda: sent() and not messages.empty(), "a wrench")
     message = get(messages)
-    while vector(message.wrench.force)[0] != 7.0:
-        message = get(messages)
     assert vector(message.wrench.force) == (7.0, 7.0625, 7.125)
     assert vector(message.wrench.torque) == (7.1875, 7.25, 7.3125)
     assert message.header.frame_id == "left_ft"
@@ -168,11 +171,39 @@ def test_what_is_not_finite_stays_away_from_its_topic(
     assert got == pytest.approx([0.0, 0.0, 4.0 * 9.80665])
 
 
-def test_a_late_subscriber_gets_only_what_is_new(server: ScriptedServer, listener: Listener) -> None:
+def test_a_late_subscriber_gets_only_what_is_new(
+    server: ScriptedServer, topics: Topics, listener: Listener
+) -> None:
     for number in range(50):
         server.send_sample(float(number))
-    time.sleep(0.05)
+    while get(topics.imu).linear_acceleration.x != pytest.approx((49 + 6 / 16) * 9.80665):
+        pass
     late = listener.subscribe(Imu, "imu/data_raw")
     began_ns = time.time_ns()
     wait_until(lambda: _sent(server) and not late.empty(), "a message for the late subscriber")
     assert stamp_ns(get(late)) > began_ns
+
+
+def test_parameters_services_and_what_follows_from_them(
+    server: ScriptedServer, topics: Topics, listener: Listener
+) -> None:
+    """By ROS's own means; what they do is tested in simulated time."""
+    from rcl_interfaces.srv import DescribeParameters
+
+    bias = [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]
+    compensated = listener.subscribe(WrenchStamped, "wrench_compensated")
+    assert listener.set_parameter("bias_ramp_time", 0.0) == (True, "")
+    assert listener.set_parameter("bias", bias) == (True, "")
+    assert list(listener.parameters("bias")[0]) == bias
+    done, reason = listener.set_parameter("tool_mass", -1.0)
+    assert not done
+    assert "tool_mass" in reason
+    wait_until(lambda: _sent(server) and not compensated.empty(), "wrench_compensated")
+    while vector(get(compensated).wrench.force) != (-2.0, -2.9375, -3.875):
+        server.send_sample(-1.0)
+    assert listener.trigger("clear_tare") == (True, "the bias is zero")
+    assert list(listener.parameters("bias")[0]) == [0.0] * 6
+    request = DescribeParameters.Request(names=["settings.sinc_length"])
+    (described,) = listener.call(DescribeParameters, "describe_parameters", request).descriptors
+    assert described.description
+    assert set(Diagnostics(listener).next()) == {"link", "stream", "sensor", "clock", "compensation"}
