@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Final
 
 from clients.arguments import add_imu_units, number, parser, position
-from ft_compensation.still import StillLimits
+from ft_compensation.stationary import StationaryLimits
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
 
-_LIMITS: Final = tuple(field.name for field in fields(StillLimits))
+_LIMITS: Final = tuple(field.name for field in fields(StationaryLimits))
 
 
 class IdentifyOptions(argparse.Namespace):
@@ -24,7 +24,7 @@ class IdentifyOptions(argparse.Namespace):
     gravity: float | None
     """m/s², if given."""
     least_seconds: float
-    limits: StillLimits
+    limits: StationaryLimits
     confidence: float
     one_axis: bool
     yaml: Path | None
@@ -58,7 +58,7 @@ def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
     add("--yaml", type=Path, metavar="OUT", help="write the result as parameters of the ROS 2 node")
     add("--json", action="store_true", help="print everything as JSON instead of a table")
     options = made.parse_args(argv, IdentifyOptions())
-    options.limits = replace(StillLimits(), **dict(options.limit))
+    options.limits = replace(StationaryLimits(), **dict(options.limit))
     return options
 
 

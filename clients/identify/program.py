@@ -12,7 +12,7 @@ from rich.console import Console
 from clients.errors import RecordingError
 from clients.identify.options import IdentifyOptions, parse_options
 from clients.identify.report import as_json, show_poses, show_result
-from clients.identify.stills import Still, Stills, find_stills
+from clients.identify.stationary_periods import StationaryPeriod, StationaryPeriods, find_stationary_periods
 from clients.program import discard_output, say
 from clients.recording.columns import columns
 from clients.recording.reader import RecordedSensor, Recording, open_recording
@@ -48,14 +48,14 @@ def _identify(options: IdentifyOptions) -> int:
         if recording.cut_off is not None:
             _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
         data = columns(recording, sensor.sensor, options.imu_units)
-    found = find_stills(data, options.least_seconds, options.limits)
-    if len(found.stills) > MOST_POSES:
-        longest = sorted(found.stills, key=lambda still: -still.seconds)[:MOST_POSES]
-        found = found._replace(stills=tuple(sorted(longest)))
+    found = find_stationary_periods(data, options.least_seconds, options.limits)
+    if len(found.periods) > MOST_POSES:
+        longest = sorted(found.periods, key=lambda period: -period.seconds)[:MOST_POSES]
+        found = found._replace(periods=tuple(sorted(longest)))
         _say(f"there are more than {MOST_POSES} poses: the longest are used")
     result, error, taken, poses = _solve(found, options)
     if options.json:
-        answer = as_json(found._replace(stills=tuple(taken)), poses, result, error)
+        answer = as_json(found._replace(periods=tuple(taken)), poses, result, error)
         sys.stdout.write(json.dumps(answer, indent=1) + "\n")
         sys.stdout.flush()
     else:
@@ -99,15 +99,15 @@ def _choose(recording: Recording, position: int | None) -> RecordedSensor:
 
 
 def _solve(
-    found: Stills, options: IdentifyOptions
-) -> tuple[Identified | None, str | None, list[Still], list[Pose]]:
+    found: StationaryPeriods, options: IdentifyOptions
+) -> tuple[Identified | None, str | None, list[StationaryPeriod], list[Pose]]:
     """The result or why there is none, and the stationary periods that are poses."""
     taken, poses = [], []
     reason = None
-    for still in found.stills:
+    for period in found.periods:
         try:
-            poses.append(pose_of(still.means, magnitude=options.gravity or STANDARD_GRAVITY))
-            taken.append(still)
+            poses.append(pose_of(period.means, magnitude=options.gravity or STANDARD_GRAVITY))
+            taken.append(period)
         except CompensationError as error:
             reason = str(error)
     try:

@@ -8,26 +8,26 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from clients.identify.stills import Still, Stills
+from clients.identify.stationary_periods import StationaryPeriod, StationaryPeriods
 from ft_compensation.identification.payload import Identified
 from ft_compensation.identification.poses import Pose
 from ft_compensation.quantities import Wrench
 
 
 def show_poses(
-    console: Console, stills: Sequence[Still], poses: Sequence[Pose], result: Identified | None
+    console: Console, periods: Sequence[StationaryPeriod], poses: Sequence[Pose], result: Identified | None
 ) -> None:
     """The poses with their residuals."""
     table = Table(title="poses", title_justify="left")
     for head in ("", "at s", "for s", "samples", "up x", "up y", "up z", "residual N", "residual Nm"):
         table.add_column(head, justify="right")
-    for number, (still, pose) in enumerate(zip(stills, poses, strict=True)):
+    for number, (period, pose) in enumerate(zip(periods, poses, strict=True)):
         left = ["", ""]
         if result is not None:
             residual = result.residuals[number]
             left = [f"{_length(residual.force):.3f}", f"{_length(residual.torque):.5f}"]
         table.add_row(
-            str(number + 1), f"{still.begin_s:.1f}", f"{still.seconds:.1f}", str(pose.samples),
+            str(number + 1), f"{period.begin_s:.1f}", f"{period.seconds:.1f}", str(pose.samples),
             *(f"{round(part, 2) + 0.0:.2f}" for part in pose.up), *left,
         )  # fmt: skip
     console.print(table)
@@ -61,16 +61,16 @@ def _add_bias(table: Table, bias: Wrench, interval: Wrench) -> None:
 
 
 def as_json(
-    found: Stills, poses: Sequence[Pose], result: Identified | None, error: str | None
+    found: StationaryPeriods, poses: Sequence[Pose], result: Identified | None, error: str | None
 ) -> dict[str, Any]:
     """Everything, in SI units; `ok` is whether there is a result."""
     rows = [
         {
-            "begin_s": still.begin_s, "seconds": still.seconds, "samples": pose.samples,
+            "begin_s": period.begin_s, "seconds": period.seconds, "samples": pose.samples,
             "force": pose.wrench.force, "torque": pose.wrench.torque, "gravity": pose.gravity,
             "force_spread": pose.force_spread, "torque_spread": pose.torque_spread,
         }
-        for still, pose in zip(found.stills, poses, strict=True)
+        for period, pose in zip(found.periods, poses, strict=True)
     ]  # fmt: skip
     if result is None:
         return {"ok": False, "error": error, "poses": rows, "rejected": list(found.rejected)}

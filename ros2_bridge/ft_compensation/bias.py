@@ -18,7 +18,7 @@ from ft_compensation.quantities import (
     Wrench,
     length,
 )
-from ft_compensation.still import StillMeans
+from ft_compensation.stationary import StationaryMeans
 from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 GRAVITY_TOLERANCE: Final = 0.5
@@ -43,14 +43,14 @@ def gravity_of(acceleration: Vector3, magnitude: float = STANDARD_GRAVITY) -> Ve
 
 
 def estimate_bias(
-    means: StillMeans,
+    means: StationaryMeans,
     payload: Payload = NO_PAYLOAD,
     gravity: Vector3 | None = None,
 ) -> Wrench:
     """The bias that makes the compensated wrench of this window zero.
 
     Args:
-        means: of a stationary window (`StillWindow.means`).
+        means: of a stationary window (`StationaryWindow.means`).
         payload: what hangs on the sensor; its weight is not counted as bias. Without one everything is.
         gravity: in the sensor's frame, m/s². None: from the window's own accelerometer.
     """

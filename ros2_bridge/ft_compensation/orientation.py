@@ -44,7 +44,7 @@ class AccelerometerGravity:
             stale_after_s: without a sample that counts for this long, there is no answer.
             gyroscope: whether the measured angular rate rotates the estimate. Without it the answer lags
                 behind a steady turn by the time constant.
-            angular_rate_offset: what the gyroscope reads at rest, rad/s (`StillMeans.angular_rate`);
+            angular_rate_offset: what the gyroscope reads at rest, rad/s (`StationaryMeans.angular_rate`);
                 subtracted. What is
                 left of it tilts the estimate by `time_constant_s` times it.
         """

@@ -17,7 +17,7 @@ from bridge.publishing.messages import Outputs, make_stages
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import ZERO
-from ft_compensation.still import StillLimits
+from ft_compensation.stationary import StationaryLimits
 from tests.compensation.making import BIAS, TOOL
 
 pytestmark = pytest.mark.ros
@@ -39,7 +39,7 @@ def test_nothing_is_done_while_nobody_wants_it(output: CompensatedOutput) -> Non
     outputs = Outputs([output])
     outputs.refresh()
     assert list(outputs.wanted) == []  # the reader does not even call it
-    output.window = RestWindow(1.0, StillLimits(), _SOURCE)
+    output.window = RestWindow(1.0, StationaryLimits(), _SOURCE)
     outputs.refresh()
     assert list(outputs.wanted) == [output]
     output.window = None

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from clients.identify.program import run
-from clients.identify.stills import find_stills
+from clients.identify.stationary_periods import find_stationary_periods
 from clients.recording.columns import columns
 from clients.recording.reader import open_recording
 from ethercat_server.virtual_sensor.measurement import scene
@@ -67,10 +67,10 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 def test_it_finds_the_poses_by_itself(recording: Path) -> None:
     with open_recording(recording) as opened:
-        found = find_stills(columns(opened))
-    assert len(found.stills) == len(POSES)
+        found = find_stationary_periods(columns(opened))
+    assert len(found.periods) == len(POSES)
     assert found.rejected == ()
-    for number, still in enumerate(found.stills):
+    for number, still in enumerate(found.periods):
         assert number * CYCLE <= still.begin_s <= number * CYCLE + 0.3
         assert POSE_LENGTH - 0.5 <= still.seconds <= POSE_LENGTH + 0.2
 
@@ -175,8 +175,8 @@ def test_a_gap_or_a_restarted_server_ends_a_rest(tmp_path: Path) -> None:
     path = tmp_path / "gaps.mcap"
     record(path, [*one, *later, *before])
     with open_recording(path) as opened:
-        found = find_stills(columns(opened), least_seconds=0.5)
-    assert len(found.stills) == 3
+        found = find_stationary_periods(columns(opened), least_seconds=0.5)
+    assert len(found.periods) == 3
 
 
 def test_the_wrong_units_are_noticed(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

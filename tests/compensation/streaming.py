@@ -11,7 +11,7 @@ from ethercat_server.virtual_sensor.measurement import scene
 from ethercat_server.virtual_sensor.measurement.motion import MOVE_LENGTH, POSE_LENGTH, POSES
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ft_compensation.identification.session import IdentificationSession
-from ft_compensation.still import StillMeans, StillWindow
+from ft_compensation.stationary import StationaryMeans, StationaryWindow
 from protocol.pdo import Sample, SampleDecoder
 
 Stream = Iterable[tuple[float, Sample]]
@@ -48,13 +48,13 @@ def samples(signal: str, seconds: float, seed: int = 0, sinc: int = SINC) -> Ite
         yield time_s, decode(data)
 
 
-def windows_of_poses(stream: Stream, seconds: float = 1.5) -> Iterator[StillMeans]:
+def windows_of_poses(stream: Stream, seconds: float = 1.5) -> Iterator[StationaryMeans]:
     """What a user takes of the signal `poses`: a window in each pose, a moment after the move has ended."""
-    window: StillWindow | None = None
+    window: StationaryWindow | None = None
     for time_s, sample in stream:
         within = time_s % (POSE_LENGTH + MOVE_LENGTH)
         if within < _SETTLE:
-            window = StillWindow(seconds)
+            window = StationaryWindow(seconds)
         elif window is not None and window.add(sample, time_s):
             yield window.means()
             window = None

@@ -20,7 +20,7 @@ from ft_compensation.compensator import Compensator
 from ft_compensation.identification.payload import Identified
 from ft_compensation.orientation import AccelerometerGravity
 from ft_compensation.quantities import Payload, Wrench
-from ft_compensation.still import NotStillError, StillWindow
+from ft_compensation.stationary import NotStationaryError, StationaryWindow
 from protocol.pdo import Sample, SampleDecoder
 from tests.compensation.streaming import (
     OFFSET,
@@ -143,16 +143,16 @@ def test_contacts_of_the_scene_show_up_undistorted(
 
 
 def test_the_bias_can_be_taken_with_the_tool_on_in_any_pose_and_not_while_it_sways() -> None:
-    window = StillWindow(1.0)
+    window = StationaryWindow(1.0)
     for time_s, sample in samples("poses", 2.0):
         if window.add(sample, time_s):
             break
     assert estimate_bias(window.means(), TOOL).force == pytest.approx(OFFSET[:3], abs=0.05)
-    window = StillWindow(1.0)
+    window = StationaryWindow(1.0)
     for time_s, sample in samples("scene", 2.0):
         if window.add(sample, time_s):
             break
-    with pytest.raises(NotStillError, match=r"not stationary|turns"):
+    with pytest.raises(NotStationaryError, match=r"not stationary|turns"):
         window.means()
 
 
@@ -193,7 +193,7 @@ def check_turn(bench: Bench, payload: Payload, bias: Wrench, seconds: float) -> 
 
 
 def test_through_the_server_bias_contact_and_the_beginning_of_a_turn() -> None:
-    bench, window = Bench(), StillWindow(1.0)
+    bench, window = Bench(), StationaryWindow(1.0)
     for time_s, sample in bench.stream("poses", 2.5):
         if window.add(sample, time_s):
             break

@@ -13,7 +13,7 @@ import pytest
 from ft_compensation.bias import BiasRamp, estimate_bias, gravity_of
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import NO_WRENCH, CompensationError, Wrench
-from ft_compensation.still import NotStillError, StillLimits, StillMeans, StillWindow
+from ft_compensation.stationary import NotStationaryError, StationaryLimits, StationaryMeans, StationaryWindow
 from protocol.framing import DataFlag
 from protocol.pdo import STANDARD_GRAVITY, Sample
 from protocol.sensor.warnings_register import WarningFlag
@@ -23,17 +23,17 @@ RATE = 800
 
 
 def window(
-    make: Callable[[int], Sample], seconds: float = 1.0, limits: StillLimits | None = None
-) -> StillWindow:
+    make: Callable[[int], Sample], seconds: float = 1.0, limits: StationaryLimits | None = None
+) -> StationaryWindow:
     """A window that was fed until it was complete."""
-    collected = StillWindow(seconds, limits)
+    collected = StationaryWindow(seconds, limits)
     for number in range(100_000):
         if collected.add(make(number), number / RATE):
             return collected
     raise AssertionError("the window never ended")
 
 
-def at_rest(up: tuple[float, float, float] = (0, 0, 1), seed: int = 0, **changed: Any) -> StillMeans:
+def at_rest(up: tuple[float, float, float] = (0, 0, 1), seed: int = 0, **changed: Any) -> StationaryMeans:
     noise = random.Random(seed)
     wrench = load(up)
     return window(lambda _: noisy(noise, wrench, up, **changed)).means()
@@ -78,13 +78,13 @@ Moved = Callable[[float, random.Random], dict[str, Any]]
 def test_a_refusal_says_what_moved_by_how_much_and_what_the_limit_is(moved: Moved, message: str) -> None:
     noise = random.Random(1)
     collected = window(lambda k: noisy(noise, BIAS, **moved(k / RATE, noise)))
-    with pytest.raises(NotStillError, match=message):
+    with pytest.raises(NotStationaryError, match=message):
         collected.means()
 
 
 def test_limits_can_be_widened() -> None:
     noise = random.Random(1)
-    limits = StillLimits(angular_rate=0.3)
+    limits = StationaryLimits(angular_rate=0.3)
     window(lambda _: noisy(noise, BIAS, angular_rate=(0.0, 0.0, 0.2)), limits=limits).means()
 
 
@@ -102,49 +102,49 @@ def test_limits_can_be_widened() -> None:
     ],
 )
 def test_one_bad_sample_spoils_the_window(bad: dict[str, Any], flags: int, message: str) -> None:
-    collected = StillWindow(1.0)
+    collected = StationaryWindow(1.0)
     for number in range(30):
         assert not collected.add(sample(), number / RATE)
     assert collected.add(sample(**bad), 30 / RATE, flags), "a spoiled window is complete"
     assert collected.add(sample(), 31 / RATE), "and stays so"
-    with pytest.raises(NotStillError, match=f"spoiled: .*{message}"):
+    with pytest.raises(NotStationaryError, match=f"spoiled: .*{message}"):
         collected.means()
 
 
 def test_other_warnings_and_gaps_do_not_spoil_it() -> None:
     warm = sample(warnings=int(WarningFlag.OVERTEMPERATURE))
-    collected = StillWindow(1.0)
+    collected = StationaryWindow(1.0)
     for number in range(RATE):
         collected.add(warm, number / RATE, int(DataFlag.GAP))
     assert collected.means().samples == RATE
 
 
 def test_repeated_frames_are_no_samples() -> None:
-    collected = StillWindow(1.0)
+    collected = StationaryWindow(1.0)
     for number in range(1, RATE):
         collected.add(sample(), number / RATE, int(DataFlag.REPEATED))
     assert collected.add(sample(), 1.1), "time passes all the same"
-    with pytest.raises(NotStillError, match=r"only 1 new samples came in 1\.1 s, at least 20"):
+    with pytest.raises(NotStationaryError, match=r"only 1 new samples came in 1\.1 s, at least 20"):
         collected.means()
 
 
 def test_nothing_at_all_is_refused() -> None:
-    with pytest.raises(NotStillError, match="only 0 new samples"):
-        StillWindow().means()
+    with pytest.raises(NotStationaryError, match="only 0 new samples"):
+        StationaryWindow().means()
 
 
 def test_a_sensor_without_imu_cannot_say_that_it_rests() -> None:
     silent = sample(acceleration=(0.0, 0.0, 0.0))
-    with pytest.raises(NotStillError, match=r"only zeros.*imu_active"):
+    with pytest.raises(NotStationaryError, match=r"only zeros.*imu_active"):
         window(lambda _: silent).means()
 
 
 def test_a_clock_that_jumps_back_ends_the_window() -> None:
-    collected = StillWindow(1.0)
+    collected = StationaryWindow(1.0)
     for number in range(30):
         assert not collected.add(sample(), 100.0 + number / RATE)
     assert collected.add(sample(), 99.0)
-    with pytest.raises(NotStillError, match="clock of the samples was set back"):
+    with pytest.raises(NotStationaryError, match="clock of the samples was set back"):
         collected.means()
 
 

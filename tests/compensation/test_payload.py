@@ -18,7 +18,7 @@ from ft_compensation.identification.poses import Pose, coverage, pose_of
 from ft_compensation.identification.session import IdentificationSession, summary
 from ft_compensation.identification.student import two_sided
 from ft_compensation.quantities import CompensationError, Payload, Wrench
-from ft_compensation.still import StillMeans
+from ft_compensation.stationary import StationaryMeans
 from tests.compensation import equations
 from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, pose, written_parameters
 
@@ -279,9 +279,9 @@ def test_the_worst_seen_direction_is_named() -> None:
 # A session, step by step.
 
 
-def still(up: Up) -> StillMeans:
+def still(up: Up) -> StationaryMeans:
     x, y, z = (-part for part in gravity_for(up))
-    return StillMeans(load(up), (x, y, z), (0.0,) * 3, (0.3,) * 3, (0.007,) * 3, 800, 1.0)
+    return StationaryMeans(load(up), (x, y, z), (0.0,) * 3, (0.3,) * 3, (0.007,) * 3, 800, 1.0)
 
 
 def test_a_session_tells_after_every_pose_what_is_missing() -> None:

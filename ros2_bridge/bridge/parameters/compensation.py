@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 from bridge.parameters.row import ParameterError, Row
 from ft_compensation.quantities import DEFAULT_GRAVITY, ZERO, Payload, Wrench, length
-from ft_compensation.still import StillLimits
+from ft_compensation.stationary import StationaryLimits
 from protocol.pdo import Vector3
 
 Quaternion = tuple[float, float, float, float]
@@ -20,7 +20,7 @@ AUTO: Final = "auto"
 TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
 SOURCES: Final = ("none", "accelerometer", "sensor", *TOPIC_SOURCES, "tf")
 _LEAST_GRAVITY: Final = 0.1
-_REST: Final = StillLimits()
+_REST: Final = StationaryLimits()
 
 _TABLE: Final = (
     Row("tool_mass", 0.0, "Mass of what hangs on the sensor, kg; 0 = gravity is not compensated", 0, 1000),
@@ -103,7 +103,7 @@ class CompensationParameters(NamedTuple):
     orientation: OrientationParameters = OrientationParameters()
     accelerometer: AccelerometerParameters = AccelerometerParameters()
     rest_duration: float = 1.0
-    rest: StillLimits = _REST
+    rest: StationaryLimits = _REST
     identify_file: str = AUTO
 
 
@@ -140,6 +140,6 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
         orientation=OrientationParameters(values["orientation_source"], **orientation),
         accelerometer=AccelerometerParameters(**group("accelerometer.")),
         rest_duration=duration,
-        rest=StillLimits(**rest),
+        rest=StationaryLimits(**rest),
         identify_file=values["identify.file"],
     )

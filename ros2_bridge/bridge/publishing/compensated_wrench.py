@@ -14,7 +14,7 @@ from bridge.compensating.gravity_sources import NoSource, Source
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import ZERO, CompensationError
-from ft_compensation.still import StillLimits, StillMeans, StillWindow
+from ft_compensation.stationary import StationaryLimits, StationaryMeans, StationaryWindow
 from protocol.pdo import Sample, Vector3
 
 
@@ -31,10 +31,10 @@ class Plan(NamedTuple):
 class RestWindow:
     """Samples of some time at rest, and where gravity pointed meanwhile."""
 
-    def __init__(self, seconds: float, limits: StillLimits, source: Source) -> None:
+    def __init__(self, seconds: float, limits: StationaryLimits, source: Source) -> None:
         self.source = source
         self.done = threading.Event()
-        self._still = StillWindow(seconds, limits)
+        self._window = StationaryWindow(seconds, limits)
         self._fewest = limits.least_samples
         self._gravity = ZERO
         self._count = 0
@@ -48,9 +48,9 @@ class RestWindow:
             self._count += 1
         elif self._blind is None:
             self._blind = self.source.why_none(time_s)
-        still = self._still
+        window = self._window
         # Too few samples, as of a slow sensor or a busy machine, make it longer.
-        if not still.add(sample, time_s) or not (still.count >= self._fewest or still.spoiled):
+        if not window.add(sample, time_s) or not (window.count >= self._fewest or window.spoiled):
             return False
         self.done.set()
         return True
@@ -58,11 +58,11 @@ class RestWindow:
     @property
     def count(self) -> int:
         """Samples so far."""
-        return self._still.count
+        return self._window.count
 
-    def means(self) -> StillMeans:
+    def means(self) -> StationaryMeans:
         """What was read; CompensationError if the sensor did not rest."""
-        return self._still.means()
+        return self._window.means()
 
     def gravity(self) -> Vector3 | None:
         """Mean gravity in the sensor's frame, m/s²; None: from the means' own acceleration.

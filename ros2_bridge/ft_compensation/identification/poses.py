@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ft_compensation.bias import gravity_of
 from ft_compensation.quantities import ZERO, CompensationError, Wrench, length
-from ft_compensation.still import StillMeans
+from ft_compensation.stationary import StationaryMeans
 from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 LEAST_POSES: Final = 4
@@ -46,7 +46,9 @@ class Pose(NamedTuple):
         return -x / size, -y / size, -z / size
 
 
-def pose_of(means: StillMeans, gravity: Vector3 | None = None, magnitude: float = STANDARD_GRAVITY) -> Pose:
+def pose_of(
+    means: StationaryMeans, gravity: Vector3 | None = None, magnitude: float = STANDARD_GRAVITY
+) -> Pose:
     """A pose from a stationary window.
 
     `gravity` (in the sensor's frame, m/s²) is from the window's own accelerometer, with length `magnitude`,

@@ -8,7 +8,7 @@ from __future__ import annotations
 from ft_compensation.identification.payload import Identified, identify
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage, pose_of
 from ft_compensation.quantities import CompensationError
-from ft_compensation.still import StillMeans
+from ft_compensation.stationary import StationaryMeans
 from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 
@@ -25,7 +25,7 @@ class IdentificationSession:
         """What the poses have seen."""
         return coverage(self.poses)
 
-    def add(self, means: StillMeans, gravity: Vector3 | None = None) -> str:
+    def add(self, means: StationaryMeans, gravity: Vector3 | None = None) -> str:
         """Add a pose; returns a sentence: what it saw, what is missing, what to do next.
 
         `gravity` (m/s², the sensor's frame) is from the window's accelerometer unless it is given.

@@ -20,7 +20,7 @@ from bridge.publishing.messages import make_stages
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import ZERO, Payload, Wrench
-from ft_compensation.still import StillLimits
+from ft_compensation.stationary import StationaryLimits
 from protocol.pdo import Sample, SampleDecoder, encode
 from scripts.benchmarks.chain import Setup
 from scripts.demonstration.program import DemoError
@@ -37,7 +37,7 @@ Costs = dict[str, dict[str, float]]
 
 
 def frames() -> Iterator[bytes]:
-    """Process data of a sensor that lies still, upright, with its noise."""
+    """Process data of a sensor that lies stationary, upright, with its noise."""
     noise = random.Random(1)
     for _ in range(SAMPLES):
         yield encode(
@@ -76,7 +76,7 @@ def costs(setup: Setup) -> Costs:
             output.plan = Plan(
                 source, Compensator(_TOOL, inertia=inertia), BiasRamp(_BIAS), needs_gravity=True
             )
-            output.window = RestWindow(1e9, StillLimits(), source) if window else None
+            output.window = RestWindow(1e9, StationaryLimits(), source) if window else None
             before = output.published
             found[name] = took(lambda number: output.publish(samples[number], _START_NS + number * step_ns))
             if output.published - before != SAMPLES:

@@ -20,7 +20,7 @@ from protocol.sensor.warnings_register import WarningFlag
 
 _MOST_SAMPLES: Final = 200_000
 _BLOCKS: Final = 4
-_WANDER_ALLOWANCE: Final = 5.0
+_DRIFT_ALLOWANCE: Final = 5.0
 """Means of blocks of noise rarely differ by more than this many of their standard errors."""
 BAD_WRENCH: Final = (
     WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.ADC_OUT_OF_SYNC | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE
@@ -28,12 +28,12 @@ BAD_WRENCH: Final = (
 """Warnings with which force and torque must not be used."""
 
 
-class NotStillError(CompensationError):
+class NotStationaryError(CompensationError):
     """The sensor was not stationary: what moved, by how much, and the limit."""
 
 
 @dataclass(frozen=True, slots=True)
-class StillLimits:
+class StationaryLimits:
     """What counts as stationary.
 
     `..._spread` is the standard deviation of any one axis, `..._wander` the drift of its mean.
@@ -60,7 +60,7 @@ class StillLimits:
     least_samples: int = 20
 
 
-class StillMeans(NamedTuple):
+class StationaryMeans(NamedTuple):
     """What the stationary sensor read: means over the window, and standard deviations of single samples."""
 
     wrench: Wrench
@@ -77,13 +77,13 @@ class StillMeans(NamedTuple):
     seconds: float
 
 
-class StillWindow:
+class StationaryWindow:
     """Collects the samples of one window. `add` until it is true, then `means`."""
 
-    def __init__(self, seconds: float = 1.0, limits: StillLimits | None = None) -> None:
+    def __init__(self, seconds: float = 1.0, limits: StationaryLimits | None = None) -> None:
         """The window lasts `seconds` of the samples' own time."""
         self.seconds = seconds
-        self.limits = limits or StillLimits()
+        self.limits = limits or StationaryLimits()
         self.spoiled: str | None = None
         self._rows: list[tuple[float, ...]] = []
         self._first_s: float | None = None
@@ -114,17 +114,17 @@ class StillWindow:
             or len(self._rows) >= _MOST_SAMPLES
         )
 
-    def means(self) -> StillMeans:
-        """The means over the window; NotStillError if the sensor was not stationary throughout."""
+    def means(self) -> StationaryMeans:
+        """The means over the window; NotStationaryError if the sensor was not stationary throughout."""
         if self.spoiled is not None:
-            raise NotStillError(f"the window is spoiled: {self.spoiled}")
+            raise NotStationaryError(f"the window is spoiled: {self.spoiled}")
         seconds = 0.0 if self._first_s is None else self._last_s - self._first_s
         if len(self._rows) < max(2, self.limits.least_samples):
-            raise NotStillError(
+            raise NotStationaryError(
                 f"only {len(self._rows)} new samples came in {seconds:.2g} s, at least "
                 f"{self.limits.least_samples} are needed"
             )
-        return still_means(np.array(self._rows), seconds, self.limits)
+        return stationary_means(np.array(self._rows), seconds, self.limits)
 
 
 class _Reading(NamedTuple):
@@ -143,11 +143,14 @@ _READINGS: Final = (
 )
 
 
-def still_means(rows: NDArray[np.float64], seconds: float, limits: StillLimits) -> StillMeans:
-    """The means of `rows` (n, 12): force, torque, acceleration, angular rate; NotStillError if they moved."""
+def stationary_means(rows: NDArray[np.float64], seconds: float, limits: StationaryLimits) -> StationaryMeans:
+    """The means of `rows` (n, 12): force, torque, acceleration, angular rate.
+
+    NotStationaryError if the sensor moved.
+    """
     mean, spread = rows.mean(axis=0), rows.std(axis=0, ddof=1)
     if not rows[:, 6:].any():
-        raise NotStillError(
+        raise NotStationaryError(
             "the sensor's IMU reads only zeros, so it is unknown whether the sensor moves: switch the IMU on "
             "(imu_active)"
         )
@@ -155,11 +158,11 @@ def still_means(rows: NDArray[np.float64], seconds: float, limits: StillLimits) 
         _check(rows[:, reading.columns], spread[reading.columns], reading, limits)
     rate = float(np.linalg.norm(mean[9:12]))
     if rate > limits.angular_rate:
-        raise NotStillError(
+        raise NotStationaryError(
             f"the sensor turns: its mean angular rate is {rate:.2g} rad/s, the limit is "
             f"{limits.angular_rate:g} rad/s"
         )
-    return StillMeans(
+    return StationaryMeans(
         Wrench(_triple(mean[0:3]), _triple(mean[3:6])),
         _triple(mean[6:9]),
         _triple(mean[9:12]),
@@ -171,12 +174,12 @@ def still_means(rows: NDArray[np.float64], seconds: float, limits: StillLimits) 
 
 
 def _check(
-    rows: NDArray[np.float64], spread: NDArray[np.float64], reading: _Reading, limits: StillLimits
+    rows: NDArray[np.float64], spread: NDArray[np.float64], reading: _Reading, limits: StationaryLimits
 ) -> None:
     axis = int(spread.argmax())
     limit = getattr(limits, reading.spread)
     if spread[axis] > limit:
-        raise NotStillError(
+        raise NotStationaryError(
             f"the sensor is not stationary: {reading.name} {'xyz'[axis]} moved by {spread[axis]:.2g} "
             f"{reading.unit} (standard deviation), the limit is {limit:g} {reading.unit}"
         )
@@ -187,10 +190,10 @@ def _check(
     means = np.array([block.mean(axis=0) for block in blocks])
     # The noise within the blocks, which a drifting mean does not raise.
     noise = np.sqrt(np.mean([block.var(axis=0, ddof=1) for block in blocks], axis=0))
-    excess = np.ptp(means, axis=0) - _WANDER_ALLOWANCE * noise / math.sqrt(len(blocks[-1]))
+    excess = np.ptp(means, axis=0) - _DRIFT_ALLOWANCE * noise / math.sqrt(len(blocks[-1]))
     axis = int(excess.argmax())
     if excess[axis] > limit:
-        raise NotStillError(
+        raise NotStationaryError(
             f"the sensor is not stationary: {reading.name} {'xyz'[axis]} drifted by "
             f"{np.ptp(means, axis=0)[axis]:.2g} {reading.unit} within the window, the limit is "
             f"{limit:g} {reading.unit}"

@@ -16,7 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from clients.recording.columns import Columns
-from ft_compensation.still import BAD_WRENCH, NotStillError, StillLimits, StillMeans, still_means
+from ft_compensation.stationary import (
+    BAD_WRENCH,
+    NotStationaryError,
+    StationaryLimits,
+    StationaryMeans,
+    stationary_means,
+)
 
 _BLOCK_S: Final = 0.1
 _BLOCK_SAMPLES: Final = 8
@@ -29,34 +35,36 @@ Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 
-class Still(NamedTuple):
+class StationaryPeriod(NamedTuple):
     """A stationary period."""
 
     begin_s: float
     """s from the beginning of the recording."""
     seconds: float
-    means: StillMeans
+    means: StationaryMeans
 
 
-class Stills(NamedTuple):
+class StationaryPeriods(NamedTuple):
     """The stationary periods of a recording."""
 
-    stills: tuple[Still, ...]
+    periods: tuple[StationaryPeriod, ...]
     rejected: tuple[str, ...]
     """Sentences about periods that were nearly stationary, and why they were rejected."""
 
 
-def find_stills(columns: Columns, least_seconds: float = 1.0, limits: StillLimits | None = None) -> Stills:
+def find_stationary_periods(
+    columns: Columns, least_seconds: float = 1.0, limits: StationaryLimits | None = None
+) -> StationaryPeriods:
     """The stationary periods of at least `least_seconds`, in order."""
-    limits = limits or StillLimits()
+    limits = limits or StationaryLimits()
     fresh = columns.where(columns.fresh)
     if len(fresh) < _BLOCK_SAMPLES:
-        return Stills((), ())
+        return StationaryPeriods((), ())
     rows = np.hstack([fresh.force, fresh.torque, fresh.acceleration, fresh.angular_rate])
     good = _good(fresh, rows)
     times = (fresh.monotonic_ns - fresh.monotonic_ns[0]) * 1e-9
     rows = np.where(good[:, np.newaxis], rows, 0.0)
-    stills, rejected = [], []
+    periods, rejected = [], []
     for part in _parts(times):
         for begin, end in _stretches(times[part], rows[part], good[part], limits):
             first, last = part.start + begin, part.start + end
@@ -64,12 +72,12 @@ def find_stills(columns: Columns, least_seconds: float = 1.0, limits: StillLimit
             if seconds < least_seconds:
                 continue
             try:
-                means = still_means(rows[first:last], seconds, limits)
-            except NotStillError as error:
+                means = stationary_means(rows[first:last], seconds, limits)
+            except NotStationaryError as error:
                 rejected.append(f"{times[first]:.1f} s to {times[last - 1]:.1f} s: {error}")
             else:
-                stills.append(Still(float(times[first]), seconds, means))
-    return Stills(tuple(stills), tuple(rejected))
+                periods.append(StationaryPeriod(float(times[first]), seconds, means))
+    return StationaryPeriods(tuple(periods), tuple(rejected))
 
 
 def _good(columns: Columns, rows: Floats) -> Bools:
@@ -90,7 +98,9 @@ def _parts(times: Floats) -> Iterator[slice]:
             yield slice(begin, end)
 
 
-def _stretches(times: Floats, rows: Floats, good: Bools, limits: StillLimits) -> Iterator[tuple[int, int]]:
+def _stretches(
+    times: Floats, rows: Floats, good: Bools, limits: StationaryLimits
+) -> Iterator[tuple[int, int]]:
     """First row and the row after the last one of every period, without its first and last block."""
     period = float(times[-1] - times[0]) / (len(times) - 1)
     size = max(_BLOCK_SAMPLES, round(_BLOCK_S / period))
@@ -107,7 +117,7 @@ def _stretches(times: Floats, rows: Floats, good: Bools, limits: StillLimits) ->
         start = number
 
 
-def _quiet(mean: Floats, deviation: Floats, limits: StillLimits) -> Bools:
+def _quiet(mean: Floats, deviation: Floats, limits: StationaryLimits) -> Bools:
     quiet: Bools = (
         (deviation[:, 0:3].max(axis=1) <= limits.force_spread)
         & (deviation[:, 3:6].max(axis=1) <= limits.torque_spread)
@@ -119,7 +129,13 @@ def _quiet(mean: Floats, deviation: Floats, limits: StillLimits) -> Bools:
 
 
 def _goes_on(
-    mean: Floats, deviation: Floats, quiet: Bools, start: int, number: int, size: int, limits: StillLimits
+    mean: Floats,
+    deviation: Floats,
+    quiet: Bools,
+    start: int,
+    number: int,
+    size: int,
+    limits: StationaryLimits,
 ) -> bool:
     """Whether block `number` belongs to the period that began with block `start`."""
     if not (quiet[start] and quiet[number]):
