@@ -28,7 +28,7 @@ def _choose_domain() -> None:
 
 _choose_domain()
 # A tenth of the time goes into looking for cycles among what was imported and collected, which all stays.
-gc.set_threshold(20_000, 20, 50)
+gc.set_threshold(20_000, 10, 10)
 if "TEST_NAMESPACE" in os.environ:  # scripts/test made a network namespace, in which loopback is down
     loopback_up()
 # Without a deadline: how long an example takes is no property of the code, the machine may be busy.
