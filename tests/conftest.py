@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import random
 import re
@@ -26,6 +27,8 @@ def _choose_domain() -> None:
 
 
 _choose_domain()
+# A tenth of the time goes into looking for cycles among what was imported and collected, which all stays.
+gc.set_threshold(20_000, 10, 10)
 if "TEST_NAMESPACE" in os.environ:  # scripts/test made a network namespace, in which loopback is down
     loopback_up()
 # Without a deadline: how long an example takes is no property of the code, the machine may be busy.
@@ -44,6 +47,10 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         return None
     text = str(collection_path).lower() + collection_path.read_text(encoding="utf-8").lower()
     return not any(word in text for word in words) or None
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -39,14 +40,16 @@ def frames(stream: Iterable[tuple[float, int, bytes]], sensor: int = 0) -> list[
     return made
 
 
-POSED = frames(process_data("poses", POSES_TAKE, sinc=SINC))
-"""Six poses, moves between."""
+@functools.cache
+def posed() -> list[DataMessage]:
+    """Six poses, moves between."""
+    return frames(process_data("poses", POSES_TAKE, sinc=SINC))
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("identify") / "poses.mcap"
-    record(path, POSED)
+    record(path, posed())
     return path
 
 
@@ -126,7 +129,7 @@ def test_other_frames_and_bad_samples_do_not_matter(
     """Repeated frames, another sensor, and a saturated sample within a pose."""
     noise = random.Random(1)
     mixed = []
-    for number, frame in enumerate(POSED):
+    for number, frame in enumerate(posed()):
         mixed.append(frame)
         if noise.random() < 0.1:
             mixed.append(frame._replace(flags=int(DataFlag.REPEATED)))
@@ -151,7 +154,7 @@ def test_too_few_poses_are_refused_with_what_to_do_and_the_poses_are_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "few.mcap"
-    record(path, [frame for frame in POSED if frame.monotonic_ns < 4 * CYCLE * 1e9])
+    record(path, [frame for frame in posed() if frame.monotonic_ns < 4 * CYCLE * 1e9])
     code, answer, said = asked(capsys, path)
     assert code == 1
     assert len(answer["poses"]) == 4
@@ -169,7 +172,7 @@ def test_a_recording_that_never_rests_is_refused(tmp_path: Path, capsys: pytest.
 
 
 def test_a_gap_or_a_restarted_server_ends_a_rest(tmp_path: Path) -> None:
-    one = [frame for frame in POSED if frame.monotonic_ns < 1.2e9]
+    one = [frame for frame in posed() if frame.monotonic_ns < 1.2e9]
     later = [frame._replace(monotonic_ns=frame.monotonic_ns + 10 * 10**9) for frame in one]
     before = [frame._replace(monotonic_ns=frame.monotonic_ns + 5 * 10**9) for frame in one]
     path = tmp_path / "gaps.mcap"
@@ -246,15 +249,15 @@ def test_what_is_not_installed_is_said(tmp_path: Path) -> None:
 def test_a_sensor_that_was_exchanged_meanwhile_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path, half = tmp_path / "swapped.mcap", len(POSED) // 2
+    path, half = tmp_path / "swapped.mcap", len(posed()) // 2
     made = writer(path)
     description = describe(0)
     made.describe(START_NS, description)
-    for frame in POSED[:half]:
+    for frame in posed()[:half]:
         made.frame(frame)
     other = {**description, "sensors": [{**description["sensors"][0], "serial": 7}]}
-    made.describe(POSED[half].stamp_ns, other)
-    for frame in POSED[half:]:
+    made.describe(posed()[half].stamp_ns, other)
+    for frame in posed()[half:]:
         made.frame(frame)
     made.finish({})
     assert "sensor 0 was replaced during it (serial numbers 100, 7)" in refused(capsys, path)
