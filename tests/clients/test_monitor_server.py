@@ -172,7 +172,10 @@ def test_wrong_usage_is_exit_2(arguments: list[str]) -> None:
 
 def test_a_line_a_second_until_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = ManualClock()
-    monotonic = lambda: clock.now_ns * 1e-9  # noqa: E731
+
+    def monotonic() -> float:
+        return clock.now_ns * 1e-9
+
     monkeypatch.setattr(program, "time", SimpleNamespace(sleep=clock.sleep, monotonic=monotonic))
     times = []
     for _ in program._seconds(4.0):
