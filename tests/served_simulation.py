@@ -87,14 +87,16 @@ class ServedSimulation(Simulation):
     def stopped(self) -> Iterator[None]:
         """As by SIGSTOP."""
         self._goes_on.clear()
-        yield
-        self._goes_on.set()
+        try:
+            yield
+        finally:
+            self._goes_on.set()
 
     def close(self) -> None:
-        """As by SIGTERM."""
-        if self._end():
-            self.hub.broadcast(event(Event.SHUTTING_DOWN))
-            super().close()
+        """As by SIGTERM; nothing more once it has ended."""
+        self._end()
+        self.hub.broadcast(event(Event.SHUTTING_DOWN))
+        super().close()
 
     def kill(self) -> None:
         """As by SIGKILL: its connections end without a word."""
@@ -104,13 +106,10 @@ class ServedSimulation(Simulation):
         self.hub.connections.clear()
         self.hub.close()
 
-    def _end(self) -> bool:
-        """End the thread; whether it still ran."""
-        ran = self._thread.is_alive()
+    def _end(self) -> None:
         self.cycle.stop()
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
-        return ran
 
     def client(self) -> Client:
         return Client(self.port)

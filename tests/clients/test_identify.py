@@ -21,13 +21,12 @@ from clients.identify.stationary_periods import find_stationary_periods
 from clients.recording.columns import columns
 from clients.recording.reader import open_recording
 from ethercat_server.virtual_sensor.measurement import scene
-from ethercat_server.virtual_sensor.measurement.motion import MOVE_LENGTH, POSE_LENGTH, POSES
+from ethercat_server.virtual_sensor.measurement.motion import POSE_LENGTH, POSES
 from protocol.framing import DataFlag, DataMessage
 from tests.clients.recordings import START_NS, describe, record, writer
 from tests.compensation.making import written_parameters
-from tests.compensation.streaming import OFFSET, POSES_TAKE, process_data
+from tests.compensation.streaming import CYCLE, OFFSET, POSES_TAKE, process_data
 
-CYCLE = POSE_LENGTH + MOVE_LENGTH
 SINC = 512
 
 

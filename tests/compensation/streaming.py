@@ -17,18 +17,24 @@ from protocol.pdo import Sample, SampleDecoder
 Stream = Iterable[tuple[float, Sample]]
 """Samples with their times, s since the signal began."""
 
-SINC = 256
-"""200 Hz: quick to simulate."""
+SINC = 512
+"""100 Hz: quick to simulate."""
 OFFSET = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)
 """What the sensor adds to its readings (object 0x8000): the bias that is to be found. N, Nm."""
-POSES_TAKE = len(POSES) * (POSE_LENGTH + MOVE_LENGTH)
+CYCLE = POSE_LENGTH + MOVE_LENGTH
+POSES_TAKE = len(POSES) * CYCLE
+STILL = 0.4
+"""The part of a cycle that `windows_of_poses` looks at."""
 _SETTLE = 0.3
 
 
 def process_data(
-    signal: str, seconds: float, seed: int = 0, sinc: int = SINC
+    signal: str, seconds: float, seed: int = 0, sinc: int = SINC, part: float = 1.0
 ) -> Iterator[tuple[float, int, bytes]]:
-    """Time since the signal began (s), number and process data of every sample."""
+    """Time since the signal began (s), number and process data of every sample.
+
+    `part` of the samples of each pose and the move after it, the first ones.
+    """
     options = SensorOptions(signal=signal, seed=seed)
     flash = Flash()
     flash.entries[0x8006, 1] = struct.pack("<H", sinc)
@@ -38,13 +44,16 @@ def process_data(
         firmware.write(0x8000, number, struct.pack("<f", offset))
     for number in range(int(seconds * 51200 / sinc)):
         now = firmware.sampler.clock.instant(number)
-        yield now * 1e-9, number, firmware.inputs()
+        if now * 1e-9 % CYCLE < part * CYCLE:
+            yield now * 1e-9, number, firmware.inputs()
 
 
-def samples(signal: str, seconds: float, seed: int = 0, sinc: int = SINC) -> Iterator[tuple[float, Sample]]:
+def samples(
+    signal: str, seconds: float, seed: int = 0, sinc: int = SINC, part: float = 1.0
+) -> Iterator[tuple[float, Sample]]:
     """The same, decoded."""
     decode = SampleDecoder(61).decode
-    for time_s, _, data in process_data(signal, seconds, seed, sinc):
+    for time_s, _, data in process_data(signal, seconds, seed, sinc, part):
         yield time_s, decode(data)
 
 
@@ -52,7 +61,7 @@ def windows_of_poses(stream: Stream, seconds: float = 1.5) -> Iterator[Stationar
     """What a user takes of the signal `poses`: a window in each pose, a moment after the move has ended."""
     window: StationaryWindow | None = None
     for time_s, sample in stream:
-        within = time_s % (POSE_LENGTH + MOVE_LENGTH)
+        within = time_s % CYCLE
         if within < _SETTLE:
             window = StationaryWindow(seconds)
         elif window is not None and window.add(sample, time_s):

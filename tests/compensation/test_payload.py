@@ -85,7 +85,7 @@ def test_it_is_the_least_squares_answer_of_the_stacked_problem() -> None:
 @pytest.mark.parametrize("confidence", [0.8])
 def test_the_intervals_cover_the_truth_as_often_as_they_say(confidence: float) -> None:
     noise = random.Random(3)
-    runs, hits = 200, np.zeros(10)
+    runs, hits = 120, np.zeros(10)
     truth = [TOOL.mass, *TOOL.center, *BIAS.values]
     for _ in range(runs):
         found = identify([pose(up, noise=noise) for up in AXES], confidence=confidence)

@@ -208,19 +208,18 @@ def test_a_tare_that_is_stopped_at_any_moment_is_done_or_not_begun() -> None:
 def stopped_tare(seconds: float) -> int:
     """The exit code of a tare that is stopped then."""
     with simulated_bus("--signal", "rest") as bus:
-        running = True
+        codes: list[int] = []
 
-        def interrupt() -> None:
-            if running:
+        def stop() -> None:
+            if not codes:
                 signal.raise_signal(signal.SIGINT)
 
-        bus.at(seconds, interrupt)
-        ended = tool_here("tare", bus.near, "--samples", 20, *TARGET, code=None)
-        running = False
+        bus.at(seconds, stop)
+        codes.append(tool_here("tare", bus.near, "--samples", 20, *TARGET, code=None).code)
         read = tool_here("read", bus.near, "Force/Torque Offset", "--json").json["sensors"][0]["objects"]
         new = [row["value"] for row in read[1:]]
-        assert new == [0.0] * 6 if ended.code else 0.0 not in new
-        return ended.code
+        assert new == [0.0] * 6 if codes[0] else 0.0 not in new
+        return codes[0]
 
 
 @pytest.mark.parametrize(
