@@ -1,7 +1,7 @@
 """The sensor's settings by name: type, allowed values, start-up default, meaning.
 
 One table for the command line, the configuration file, the control channel and the ROS parameters. Their
-objects are in `ethercat_server.sensor.dictionary`.
+objects are in `ethercat_server.sensor.objects.dictionary`.
 """
 
 from __future__ import annotations

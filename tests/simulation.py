@@ -52,6 +52,7 @@ class Asked:
     """What command line and configuration ask of the sensors; see `start_up.Wanted`."""
 
     sensor_name: str | None = None
+    force = False
 
     def __init__(self, settings: Mapping[str, SettingValue] = {}) -> None:
         self._settings = dict(settings)

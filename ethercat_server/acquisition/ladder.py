@@ -17,8 +17,8 @@ from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
 from ethercat_server.ethercat.slave.sii import OF_FIRMWARE, OF_MASTER, ByPosition, read_sii
-from ethercat_server.sensor.dictionary import PRODUCT_CODE, VENDOR_ID
 from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.sensor.objects.dictionary import PRODUCT_CODE, VENDOR_ID
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.sensor.set_up import identify, put_right, set_up
 

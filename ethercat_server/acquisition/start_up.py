@@ -14,8 +14,9 @@ from ethercat_server.ethercat.backend import CheckInterrupt, SlaveIdentity
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave.coe import BlockingSdo, Sdo, finish
 from ethercat_server.ethercat.slave.sii import has_coe
-from ethercat_server.sensor import dictionary
 from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.sensor.objects import dictionary
+from ethercat_server.sensor.scan import scan
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState, is_known_model
 from ethercat_server.sensor.set_up import identify, read_offset, set_up
 from protocol.errors import PdoSizeError
@@ -32,6 +33,10 @@ class Wanted(Protocol):
     def sensor_name(self) -> str | None:
         """The model that the first sensor must be; None for any."""
 
+    @property
+    def force(self) -> bool:
+        """Whether to take over a bus that is in use."""
+
     def wanted_settings(self, position: int, name: str, serial: int, /) -> dict[str, SettingValue]:
         """The settings to be in force in a sensor."""
 
@@ -46,6 +51,9 @@ class AsFound:
     """Nothing is asked: the sensors stay set as they are."""
 
     sensor_name = None
+
+    def __init__(self, *, force: bool = False) -> None:
+        self.force = force
 
     def wanted_settings(self, _position: int, _name: str, _serial: int) -> dict[str, SettingValue]:
         """See `Wanted`."""
@@ -75,7 +83,7 @@ def bring_up(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> list[
 
 def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> list[Sensor]:
     """Find the sensors on the open `bus`, in PREOP, and ask them who they are; nothing is written."""
-    slaves = bus.scan(check_interrupt)
+    slaves = scan(bus, check_interrupt, force=wanted.force)
     for position, slave in enumerate(slaves):
         _check_vendor(bus.ifname, position, slave)
     bus.backend.check_preop(check_interrupt)

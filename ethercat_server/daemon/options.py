@@ -33,6 +33,8 @@ class ServerOptions:
     port: int
     sensor_name: str | None = None
     virtual_arguments: str = ""
+    force: bool = False
+    """Whether to take over a bus that is in use."""
     server: Mapping[str, Any] = field(
         default_factory=lambda: {name: setting.default for name, setting in SERVER_SETTINGS.items()}
     )
@@ -116,6 +118,10 @@ def build_parser() -> argparse.ArgumentParser:
         help="network interface ('virtual' for a simulated sensor), model of the first sensor, TCP port",
     )  # fmt: skip
     parser.add_argument(
+        "--force", action="store_true",
+        help="take every slave on IFACE to INIT, even if another master is using the bus",
+    )  # fmt: skip
+    parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",
         help="set a setting of every sensor at start-up; repeatable",
     )  # fmt: skip
@@ -158,6 +164,7 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
         ifname=arguments[0],
         port=_port(arguments[-1]),
         sensor_name=arguments[1] if len(arguments) == 3 else None,
+        force=parsed.force,
         virtual_arguments=parsed.virtual,
         server={
             name: _first_given(getattr(parsed, name), config.server.get(name), setting)

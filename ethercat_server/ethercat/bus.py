@@ -83,11 +83,7 @@ class Bus:
         slaves = self.backend.scan(check_interrupt)
         self.stations = []
         for position in range(len(slaves)):
-            data = self._attempt(functools.partial(self.read_at, position, reg.STATION_ADDRESS, 2))
-            if data is None:
-                raise BusError(
-                    f"a slave on {self.ifname} stopped answering during the scan: check cable and power"
-                )
+            data = self.read_surely_at(position, reg.STATION_ADDRESS, 2)
             self.stations.append(_U16.unpack(data)[0])
         return slaves
 
@@ -210,14 +206,34 @@ class Bus:
 
         Needs no scan and changes nothing, so it also serves to measure the round trip of such a frame.
         """
-        answer = self._datagram(Command.BRD, 0, 0, bytes(size), timeout_s)
+        answer = self.read_all(0, size, timeout_s)
         return -1 if answer is None else answer[0]
+
+    def read_all(self, address: int, size: int, timeout_s: float) -> tuple[int, bytes] | None:
+        """How many slaves answer a broadcast read, and what they have there, ORed; None if it is lost."""
+        return self._datagram(Command.BRD, 0, address, bytes(size), timeout_s)
+
+    def listen(self, seconds: float) -> int:
+        """The number of frames that arrive from others in this time; nothing is sent."""
+        until_ns, count = self._monotonic_ns() + int(seconds * 1e9), 0
+        while (left_ns := until_ns - self._monotonic_ns()) > 0:
+            count += self._receive(left_ns * 1e-9) is not None
+        return count
 
     def read_surely(self, position: int, address: int, size: int) -> bytes:
         """Read ESC registers of a scanned slave; BusError if it does not answer."""
         data = self._attempt(functools.partial(self.read_register, position, address, size))
         if data is None:
             raise BusError(f"sensor {position} does not answer: check cable and power")
+        return data
+
+    def read_surely_at(self, position: int, address: int, size: int) -> bytes:
+        """Read ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
+        data = self._attempt(functools.partial(self.read_at, position, address, size))
+        if data is None:
+            raise BusError(
+                f"a slave on {self.ifname} stopped answering during the scan: check cable and power"
+            )
         return data
 
     def check_answers(self, position: int) -> None:

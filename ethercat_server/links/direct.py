@@ -24,6 +24,7 @@ from ethercat_server.process import realtime
 from ethercat_server.process.notify import Notifier
 from ethercat_server.sensor.configuration import Change, save
 from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.sensor.scan import scan
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.sensor.set_up import identify, set_up
 from ethercat_server.sensor.tare import LATER, tare
@@ -50,23 +51,23 @@ def open_bus(ifname: str, cleanup: contextlib.ExitStack) -> Bus:
     return Bus(backend)
 
 
-def scan_only(ifname: str, cleanup: contextlib.ExitStack) -> tuple[Bus, list[SlaveIdentity]]:
+def scan_only(ifname: str, cleanup: contextlib.ExitStack, *, force: bool) -> tuple[Bus, list[SlaveIdentity]]:
     """The bus and all its slaves, of any vendor."""
     bus = open_bus(ifname, cleanup)
-    return bus, bus.scan(_no_check)
+    return bus, scan(bus, _no_check, force=force)
 
 
 class DirectLink(Link):
     """All sensors in PREOP; `watch` and `tare` take them to OP with their present settings."""
 
-    def __init__(self, ifname: str, *, any_slave: bool = False) -> None:
+    def __init__(self, ifname: str, *, any_slave: bool = False, force: bool = False) -> None:
         with contextlib.ExitStack() as cleanup:
             self._bus = open_bus(ifname, cleanup)
             self.clock = self._bus.clock
             if any_slave:
-                self.sensors = _identify_all(self._bus)
+                self.sensors = _identify_all(self._bus, force=force)
             else:
-                found = find_sensors(self._bus, AsFound(), _no_check)
+                found = find_sensors(self._bus, AsFound(force=force), _no_check)
                 self.sensors = [Found(sensor.position, sensor.identity) for sensor in found]
             self._cleanup = cleanup.pop_all()
         self.used = f"the interface {ifname}"
@@ -234,10 +235,10 @@ def _change(sdo: Sdo, sensor: Sensor, change: Change, and_save: bool) -> Steps[N
         yield from save(sdo, sensor)
 
 
-def _identify_all(bus: Bus) -> list[Found]:
+def _identify_all(bus: Bus, *, force: bool) -> list[Found]:
     """All slaves of any vendor, with what they say of themselves."""
     found = []
-    slaves = bus.scan(_no_check)
+    slaves = scan(bus, _no_check, force=force)
     for position, slave in enumerate(slaves):
         check_sii(bus.ifname, position, slave)
     bus.backend.check_preop(_no_check)

@@ -12,8 +12,8 @@ from typing import Any, Final, NamedTuple
 from ethercat_server.errors import BusError, SdoAbortError, UsageError
 from ethercat_server.ethercat.clock import Clock
 from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
-from ethercat_server.sensor.dictionary import BY_SETTING, SAMPLING_RATE
 from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.sensor.objects.dictionary import BY_SETTING, SAMPLING_RATE
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.sensor.set_up import read_settings
 from protocol.framing import DataMessage

@@ -10,17 +10,19 @@ from ethercat_server.links.remote import ServerLink
 from protocol.address import Address
 
 
-def open_link(ifname: str | None, server: str | None, *, any_slave: bool = False) -> Link:
+def open_link(
+    ifname: str | None, server: str | None, *, any_slave: bool = False, force: bool = False
+) -> Link:
     """The link to the sensors on `ifname`, or behind `server`; UsageError unless exactly one is given.
 
     If a server uses the interface, the link goes through that server, with a note. With `any_slave`, slaves
-    that are not sensors are included, for read-only commands.
+    that are not sensors are included, for read-only commands; with `force`, a bus in use is taken over.
     """
     link = find_server(ifname, server)
     if link is not None:
         return link
     assert ifname is not None
-    return DirectLink(ifname, any_slave=any_slave)
+    return DirectLink(ifname, any_slave=any_slave, force=force)
 
 
 def find_server(ifname: str | None, server: str | None) -> ServerLink | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ethercat_server.errors import ForbiddenWriteError
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
-from ethercat_server.sensor.dictionary import FACTORY_CALIBRATION
+from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
 
 
 class GuardedSdo:

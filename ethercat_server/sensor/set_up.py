@@ -14,7 +14,7 @@ from typing import Final
 from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
-from ethercat_server.sensor import dictionary
+from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.sensor import Identity, Sensor
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue
 from protocol.text.visible import visible

@@ -25,14 +25,22 @@ class Command(NamedTuple):
     """Returns the exit code; raises ServerError."""
 
 
-def add_link_arguments(parser: argparse.ArgumentParser, *, all_if_none: bool = False) -> None:
-    """IFACE or --server, and --sensor."""
+def add_link_arguments(
+    parser: argparse.ArgumentParser, *, all_if_none: bool = False, take_over: bool = True
+) -> None:
+    """IFACE or --server, and --sensor; `--force` to take over a bus in use, unless it has another meaning."""
     parser.add_argument(
         "iface", nargs="?", metavar="IFACE",
         help="interface the sensors are connected to ('virtual' for a virtual sensor); "
         "through the server that uses it, if there is one",
     )  # fmt: skip
     parser.add_argument("--server", metavar="HOST:PORT", help="connect to this server instead of IFACE")
+    if take_over:
+        parser.add_argument(
+            "--force", action="store_true", dest="take_over",
+            help="take every slave on IFACE to INIT, even if another master is using the bus",
+        )  # fmt: skip
+    parser.set_defaults(take_over=False)
     default = "all" if all_if_none else "the only one"
     parser.add_argument(
         "--sensor",
@@ -44,7 +52,7 @@ def add_link_arguments(parser: argparse.ArgumentParser, *, all_if_none: bool = F
 @contextlib.contextmanager
 def link(args: argparse.Namespace, *, any_slave: bool = False) -> Iterator[Link]:
     """The link given by the arguments (see `open_link`); closed at the end."""
-    opened = open_link(args.iface, args.server, any_slave=any_slave)
+    opened = open_link(args.iface, args.server, any_slave=any_slave, force=args.take_over)
     try:
         yield opened
     finally:

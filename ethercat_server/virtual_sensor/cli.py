@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 
 from ethercat_server import __version__
-from ethercat_server.sensor.dictionary import MODELS
+from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor import link
 from ethercat_server.virtual_sensor.control import ControlError
 from ethercat_server.virtual_sensor.faults.command import CommandError, real, whole

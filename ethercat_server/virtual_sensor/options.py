@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ethercat_server.sensor.dictionary import MODELS
+from ethercat_server.sensor.objects.dictionary import MODELS
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from ethercat_server.sensor.dictionary import FACTORY_CALIBRATION
+from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
 from ethercat_server.virtual_sensor.firmware.al import AlState
 from ethercat_server.virtual_sensor.firmware.firmware import Firmware
 from ethercat_server.virtual_sensor.firmware.flash import Address, Flash

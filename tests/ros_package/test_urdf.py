@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from ethercat_server.sensor.dictionary import MODELS
+from ethercat_server.sensor.objects.dictionary import MODELS
 from tests.ros_package.package_files import PACKAGE
 
 xacro = pytest.importorskip("xacro", reason="xacro is missing: pip install xacro, or source ROS 2")

@@ -18,8 +18,8 @@ from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, finish
-from ethercat_server.sensor.dictionary import BY_SETTING
-from ethercat_server.sensor.object_access import write
+from ethercat_server.sensor.objects.access import write
+from ethercat_server.sensor.objects.dictionary import BY_SETTING
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
 from ethercat_server.sensor.set_up import read_offset, read_settings, write_offset
 from ethercat_server.sensor.tare import tare

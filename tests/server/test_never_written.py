@@ -12,8 +12,8 @@ import pytest
 from ethercat_server.errors import ForbiddenWriteError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.slave.coe import finish
-from ethercat_server.sensor.dictionary import BY_SETTING, FACTORY_CALIBRATION
 from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.sensor.objects.dictionary import BY_SETTING, FACTORY_CALIBRATION
 from protocol.sensor.sdo_types import SDO_TYPE_NAMES
 from tests.server.bench import Bench
 from tests.simulated_links import SimulatedServer, simulated_bus, simulated_server

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from ethercat_server.sensor.dictionary import BY_SETTING, FACTORY_CALIBRATION, OBJECTS, Access, ObjectType
-from ethercat_server.sensor.dictionary_search import (
+from ethercat_server.sensor.objects.dictionary import (
+    BY_SETTING,
+    FACTORY_CALIBRATION,
+    OBJECTS,
+    Access,
+    ObjectType,
+)
+from ethercat_server.sensor.objects.search import (
     BY_ADDRESS,
     KNOWN_OBJECTS,
     NOTE_NAMES,

@@ -13,8 +13,8 @@ from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.slave.coe import Steps, finish
 from ethercat_server.links.holder import find_holder
 from ethercat_server.links.link import sinc_length_in_force
-from ethercat_server.sensor.dictionary import FACTORY_CALIBRATION
 from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
 from ethercat_server.tool.commands.snapshot_file import RESTORABLE
 from tests.server.running import needs_bus
 from tests.tool.running import one_sentence, tool_here

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ethercat_server.sensor.dictionary import BY_SETTING
+from ethercat_server.sensor.objects.dictionary import BY_SETTING
 from ethercat_server.tool.cli import COMMANDS
 from protocol.sensor.filters import FORCE_TORQUE_FILTERS
 from protocol.sensor.meaning import value_meaning

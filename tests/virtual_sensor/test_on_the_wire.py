@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import pytest
 
-from ethercat_server.sensor.dictionary import Access
+from ethercat_server.sensor.objects.dictionary import Access
 from ethercat_server.virtual_sensor.firmware.dictionary import entries_of
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
 from protocol.pdo import encode

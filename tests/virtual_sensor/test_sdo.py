@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from ethercat_server.sensor.dictionary import BY_SETTING, OBJECTS, Access
+from ethercat_server.sensor.objects.dictionary import BY_SETTING, OBJECTS, Access
 from ethercat_server.virtual_sensor.firmware.coe import CoeServer
 from ethercat_server.virtual_sensor.firmware.dictionary import entries_of
 from ethercat_server.virtual_sensor.firmware.sdo_information import SdoInformation

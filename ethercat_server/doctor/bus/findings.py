@@ -8,7 +8,7 @@ from typing import Any, Final
 from ethercat_server.doctor.bus.slaves import MOST_PORTS, ErrorCounters, Slave
 from ethercat_server.doctor.finding import Finding, bad, note, ok, warning
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.sensor import dictionary
+from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.sensor import is_known_model
 
 _WATCHDOG_CODE: Final = 0x001B
@@ -30,6 +30,13 @@ def answers(ifname: str, count: int) -> Iterator[Finding]:
 def identity(slave: Slave) -> Iterator[Finding]:
     """Identity, and whether the server supports it."""
     values = slave.as_json()
+    if slave.at_work:
+        yield bad(
+            f"not a Bota sensor, and in {slave.al.state.name}: another master controls it",
+            "the server does not start on this bus; use the interface that the sensor is connected to",
+            **values,
+        )
+        return
     if slave.sii_problem:
         yield warning(f"unknown: {slave.sii_problem}", "its EEPROM does not answer", **values)
         return

@@ -25,6 +25,7 @@ from ethercat_server.ethercat.slave.registers import (
     WATCHDOG_COUNTER,
 )
 from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
+from ethercat_server.sensor.scan import may_be_read
 
 MOST_PORTS: Final = 4
 _ATTEMPTS: Final = 10
@@ -78,6 +79,8 @@ class Slave:
     name: str = ""
     sii_problem: str = ""
     """Why its SII, and so its identity, could not be read."""
+    at_work: bool = False
+    """It is no Bota sensor and in SAFEOP or OP: its SII was left alone."""
 
     def as_json(self) -> dict[str, Any]:
         """Its JSON form."""
@@ -101,6 +104,8 @@ def look(bus: Bus, position: int) -> Slave:
         "position": position, "al": al, "counters": counters, "watchdogs": watchdogs,
         "links": tuple(bool(links >> (4 + port) & 1) for port in range(MOST_PORTS)),
     }  # fmt: skip
+    if not may_be_read(bus, position, al):
+        return Slave(**found, at_work=True)
     try:
         image = sii_content.decode(_read_sii(bus, position))
     except BusError as error:

@@ -73,7 +73,7 @@ def _images(args: argparse.Namespace) -> dict[int, bytes | BusError]:
                 sensor.position: _image(functools.partial(link.sii, sensor.position))
                 for sensor in link.chosen(args.sensor)
             }
-        bus, slaves = scan_only(args.iface, cleanup)
+        bus, slaves = scan_only(args.iface, cleanup, force=args.take_over)
 
         def read(position: int, word: int, words: int) -> bytes:
             return finish(read_sii(bus, position, word, words), pause_s=0, clock=bus.clock)

@@ -11,8 +11,8 @@ from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError, Usag
 from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
 from ethercat_server.links.link import Found, Link, note
 from ethercat_server.process.command_line import FAILED
-from ethercat_server.sensor.dictionary import FACTORY_CALIBRATION, ObjectEntry
-from ethercat_server.sensor.dictionary_search import KNOWN_OBJECTS, find_objects, similar_names
+from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION, ObjectEntry
+from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, find_objects, similar_names
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.show import columns, say, say_json, value_text
 from protocol.sensor.meaning import value_meaning

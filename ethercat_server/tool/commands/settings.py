@@ -12,8 +12,8 @@ from ethercat_server.daemon.options import ServerOptions, parse_assignments
 from ethercat_server.errors import BusError, UsageError
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.links.link import Found, Link, signals_held_back
-from ethercat_server.sensor import dictionary
 from ethercat_server.sensor.configuration import Change, save
+from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.sensor import Sensor
 from ethercat_server.tool.command import CHANGES, DONE, Command, add_link_arguments, link
 from ethercat_server.tool.show import columns, report, value_text

@@ -12,7 +12,7 @@ from typing import Any
 from ethercat_server.errors import BusError, SdoAbortError, ServerError
 from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
 from ethercat_server.links.link import Found, Link, failed_change, note, signals_held_back
-from ethercat_server.sensor.dictionary_search import BY_ADDRESS, KNOWN_OBJECTS
+from ethercat_server.sensor.objects.search import BY_ADDRESS, KNOWN_OBJECTS
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.commands.objects import read_object
@@ -29,13 +29,13 @@ from ethercat_server.tool.show import columns, report, value_text
 from protocol.settings import SettingValue
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_link_arguments(parser)
+def _arguments(parser: argparse.ArgumentParser, *, take_over: bool = True) -> None:
+    add_link_arguments(parser, take_over=take_over)
     parser.add_argument("file", type=Path, metavar="FILE", help="JSON file")
 
 
 def _restore_arguments(parser: argparse.ArgumentParser) -> None:
-    _arguments(parser)
+    _arguments(parser, take_over=False)
     add_save(parser)
     parser.add_argument("--force", action="store_true", help="accept a file of another sensor")
 

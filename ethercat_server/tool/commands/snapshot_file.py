@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from ethercat_server.errors import UsageError
-from ethercat_server.sensor.dictionary import OBJECTS, Access, ObjectEntry
-from ethercat_server.sensor.dictionary_search import BY_ADDRESS
+from ethercat_server.sensor.objects.dictionary import OBJECTS, Access, ObjectEntry
+from ethercat_server.sensor.objects.search import BY_ADDRESS
 from ethercat_server.sensor.sensor import Identity
 from protocol.errors import SettingError
 from protocol.settings import SettingValue, check_settings

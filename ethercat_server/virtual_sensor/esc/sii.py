@@ -22,7 +22,7 @@ from ethercat_server.ethercat.slave.sii_content import (
     MailboxProtocol,
     checksum,
 )
-from ethercat_server.sensor.dictionary import PRODUCT_CODE, REVISION, VENDOR_ID
+from ethercat_server.sensor.objects.dictionary import PRODUCT_CODE, REVISION, VENDOR_ID
 from ethercat_server.virtual_sensor.esc import registers as reg
 from ethercat_server.virtual_sensor.firmware.layout import (
     RXPDO,

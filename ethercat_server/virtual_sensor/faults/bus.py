@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from ethercat_server.sensor.dictionary import MODELS
+from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor.bus import Damage
 from ethercat_server.virtual_sensor.faults.command import Call, CommandError, FaultCommand, real, whole
 

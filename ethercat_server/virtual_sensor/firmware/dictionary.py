@@ -1,6 +1,6 @@
 """The object dictionary of one sensor: values, access rules, ranges, and the flash.
 
-The rows are those of `ethercat_server.sensor.dictionary`, plus the objects that describe the PDO mapping.
+The rows are those of `ethercat_server.sensor.objects.dictionary`, plus the objects of the PDO mapping.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from ethercat_server.ethercat.slave.abort_codes import AbortCode, abort_meaning
-from ethercat_server.sensor.dictionary import (
+from ethercat_server.sensor.objects.dictionary import (
     BY_SETTING,
     CONTROL_COMMAND,
     CONTROL_STATUS,
@@ -24,7 +24,7 @@ from ethercat_server.sensor.dictionary import (
     ObjectEntry,
     ObjectType,
 )
-from ethercat_server.sensor.dictionary_search import TITLES
+from ethercat_server.sensor.objects.search import TITLES
 from ethercat_server.virtual_sensor.firmware.al import AlState
 from ethercat_server.virtual_sensor.firmware.flash import Address, Flash
 from ethercat_server.virtual_sensor.firmware.layout import RXPDO, SYNC_MANAGERS, TXPDO

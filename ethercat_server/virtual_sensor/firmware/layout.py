@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from ethercat_server.sensor.dictionary import BY_ADDRESS, ObjectEntry
+from ethercat_server.sensor.objects.dictionary import BY_ADDRESS, ObjectEntry
 from protocol.pdo import INPUT_OBJECT, LAYOUTS
 
 

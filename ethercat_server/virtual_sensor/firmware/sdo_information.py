@@ -10,7 +10,7 @@ import struct
 from typing import Final
 
 from ethercat_server.ethercat.slave.abort_codes import AbortCode
-from ethercat_server.sensor.dictionary import Access, ObjectEntry
+from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry
 from ethercat_server.virtual_sensor.firmware.dictionary import OBJECT_NAMES, Dictionary, SdoAbortError
 from ethercat_server.virtual_sensor.firmware.layout import RXPDO
 from ethercat_server.virtual_sensor.firmware.mailbox import MailboxError, MailboxRequestError

@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
-from ethercat_server.sensor.dictionary import OBJECTS, Access, ObjectEntry, ObjectType
+from ethercat_server.sensor.objects.dictionary import OBJECTS, Access, ObjectEntry, ObjectType
 
 
 def _highest_subindices() -> Iterator[ObjectEntry]:

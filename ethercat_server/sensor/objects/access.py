@@ -7,9 +7,9 @@ from typing import Any, Final
 
 from ethercat_server.errors import CutOffError, extended
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
-from ethercat_server.sensor import dictionary
-from ethercat_server.sensor.dictionary import ObjectEntry
-from ethercat_server.sensor.dictionary_search import find_objects, full_name
+from ethercat_server.sensor.objects import dictionary
+from ethercat_server.sensor.objects.dictionary import ObjectEntry
+from ethercat_server.sensor.objects.search import find_objects, full_name
 from ethercat_server.sensor.sensor import Sensor
 from ethercat_server.sensor.set_up import read_offset
 from protocol.control import MAX_SDO_BYTES, ErrorCode

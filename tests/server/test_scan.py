@@ -1,0 +1,99 @@
+"""What is looked at before a bus is scanned, and that looking changes nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+from ethercat_server.acquisition.start_up import AsFound, bring_up, find_sensors
+from ethercat_server.errors import BusError
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.wire import Command, build
+from ethercat_server.sensor.scan import scan
+from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.virtual_sensor.options import SensorOptions
+from tests.foreign_drive import become_drive, registers, watchdog_off
+from tests.simulation import Asked
+
+
+def no_check() -> None:
+    pass
+
+
+def in_op(*pdo_sizes: int) -> MemoryBackend:
+    """A bus that a master took to OP and left like that."""
+    backend = MemoryBackend(*(SensorOptions(pdo_size=size) for size in pdo_sizes))
+    bring_up(Bus(backend), Asked(), no_check)
+    watchdog_off(backend)
+    backend.clock.sleep(1.0)
+    backend._images = []
+    return backend
+
+
+@pytest.mark.parametrize("drive", [0, 1, 2])
+def test_a_drive_at_work_is_not_touched(drive: int) -> None:
+    backend = in_op(61, 61, 61)
+    become_drive(backend, drive)
+    before = registers(backend)
+    with pytest.raises(BusError, match=rf"no Bota sensors \(position {drive} in OP\).*--force"):
+        bring_up(Bus(backend), Asked(), no_check)
+    backend.close()
+    assert registers(backend) == before
+
+
+def test_force_takes_it_over() -> None:
+    backend = in_op(61, 61)
+    become_drive(backend, 1)
+    with pytest.raises(BusError, match="not a Bota Gen-0 sensor"):
+        find_sensors(Bus(backend), AsFound(force=True), no_check)
+    assert [image[0x0130] & 0x0F for image in registers(backend)] == [AlState.PREOP] * 2
+
+
+@pytest.mark.parametrize("pdo_size", [61, 77])
+def test_a_sensor_left_in_op_is_no_obstacle(pdo_size: int) -> None:
+    backend = in_op(pdo_size, 61)
+    sensors = bring_up(Bus(backend), Asked(), no_check)
+    assert [sensor.streams for sensor in sensors] == [True, True]
+
+
+def test_a_drive_that_is_not_at_work_may_be_scanned() -> None:
+    backend = in_op(61, 61)
+    become_drive(backend, 1)
+    backend._bus.write_at(1, 0x0120, AlState.PREOP.request())
+    slaves = scan(Bus(backend), no_check)
+    assert [slave.vendor for slave in slaves] == [0xB07A, 2]
+
+
+class OthersFrames(MemoryBackend):
+    """Frames of another master come by, one each `every_s`."""
+
+    def __init__(self, every_s: float, limit: int) -> None:
+        super().__init__(SensorOptions())
+        self._every_s, self._left = every_s, limit
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        if not self._on_the_wire and self._left and timeout_s >= self._every_s:
+            self._left -= 1
+            self.clock.sleep(self._every_s)
+            return bytes(build((Command.LRW, 0, 0, bytes(20))))
+        return super().receive(timeout_s)
+
+
+def test_another_master_is_left_alone() -> None:
+    backend = OthersFrames(0.01, 1000)
+    before = registers(backend)
+    with pytest.raises(BusError, match=r"another EtherCAT master is sending on .*: stop it"):
+        scan(Bus(backend), no_check)
+    assert registers(backend) == before
+
+
+def test_the_last_frames_of_a_killed_master_are_no_obstacle() -> None:
+    assert len(scan(Bus(OthersFrames(0.001, 2)), no_check)) == 1
+
+
+def test_a_bus_that_loses_frames_is_looked_at_all_the_same() -> None:
+    backend = in_op(61, 61)
+    become_drive(backend, 1)
+    backend.command("lose 2")
+    with pytest.raises(BusError, match="position 1 in OP"):
+        scan(Bus(backend), no_check)
