@@ -184,14 +184,9 @@ def test_the_protocol_is_sans_io_but_for_its_client() -> None:
 @functools.cache
 def imports_on_top(module: str) -> set[str]:
     """What a module imports, but for what a function imports."""
-<<<<<<< HEAD
     nodes = tree(MODULES[module]).body
     top: list[ast.stmt] = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
     return names_in(ast.Module(top, []))
-=======
-    body = tree(MODULES[module]).body
-    return names_in(ast.Module([node for node in body if isinstance(node, ast.Import | ast.ImportFrom)], []))
->>>>>>> hb
 
 
 def reached(module: str) -> set[str]:
