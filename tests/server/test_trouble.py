@@ -27,6 +27,7 @@ from tests.ended import run_here
 from tests.server.commands import command
 from tests.server.running import (
     ATTEMPTS,
+    Program,
     Server,
     Veth,
     free_port,
@@ -247,12 +248,20 @@ def test_a_virtual_sensor_that_does_not_start(caplog: pytest.LogCaptureFixture) 
     assert said.startswith("the virtual sensor did not start (exit code 2): see its message above")
 
 
-def stop_when(condition: Callable[[Server], bool], ifname: str) -> str:
-    """Start a server and send it SIGTERM when `condition` holds; returns what it said."""
+def stop_in_time(ifname: str, sensor: Program | None = None) -> str:
+    """Start a server; SIGTERM as soon as its virtual bus is there, or `sensor` says something.
+
+    Returns what it said.
+    """
     for _ in range(ATTEMPTS):
-        running = Server(ifname)
+        before, running = sensor and sensor.said(), Server(ifname)
+
+        def due(before: str | None = before, running: Server = running) -> bool:
+            come = sensor.said() != before if sensor else running.ifname in interfaces()
+            return come or running.process.poll() is not None
+
         try:
-            wait_until(lambda: condition(running) or running.process.poll() is not None, "the moment")  # noqa: B023
+            wait_until(due, "the moment")
             running.signal(signal.SIGTERM)
             code = running.wait()
             if not starved(said := running.said()):
@@ -268,9 +277,7 @@ def stop_when(condition: Callable[[Server], bool], ifname: str) -> str:
 @needs_bus
 def test_stopped_while_starting() -> None:
     """A real signal: when there is no bus yet, and while a sensor does not do what it is told."""
-    assert "Traceback" not in stop_when(lambda running: running.ifname in interfaces(), "virtual")
+    assert "Traceback" not in stop_in_time("virtual")
     with virtual_sensor(module="tests.server.odd_sensor") as (veth, sensor):
         command(sensor, "ignore 4")
-        before = sensor.said()
-        said = stop_when(lambda _: sensor.said() != before, veth.near)
-        assert said.endswith("stopped during start-up\n")
+        assert stop_in_time(veth.near, sensor).endswith("stopped during start-up\n")
