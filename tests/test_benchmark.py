@@ -38,6 +38,7 @@ from scripts.benchmarks.processes import client, floor, polling  # noqa: E402
 from scripts.benchmarks.records import Recording, began, write  # noqa: E402
 from scripts.benchmarks.report import rows  # noqa: E402
 from scripts.benchmarks.statistics import Arrivals, Counts, Ints  # noqa: E402
+from tests.clients.running import signalled  # noqa: E402
 from tests.served_simulation import served  # noqa: E402
 from tests.server.running import PATIENCE_S, free_port, needs_bus, wait_until  # noqa: E402
 
@@ -349,8 +350,25 @@ def test_a_short_run(tmp_path: Path) -> None:
     assert (tmp_path / "b.png").exists() == (find_spec("matplotlib") is not None)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_can_be_stopped(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, measuring = tmp_path / "made", threading.Event()
+
+    def measure(*_: object) -> None:
+        made.mkdir()
+        measuring.set()
+        time.sleep(PATIENCE_S)
+
+    monkeypatch.setenv("DEMO_DIRECTORY", str(made))
+    monkeypatch.setattr(benchmark, "run", measure)
+    monkeypatch.setattr(sys, "argv", ["benchmark"])
+    assert signalled(lambda _: benchmark.main(), number, measuring.is_set) == 130
+    assert not made.exists()
+
+
 @needs_bus
 @pytest.mark.bus
+@pytest.mark.long
 def test_it_can_be_stopped_at_any_time(tmp_path: Path) -> None:
     running = run(tmp_path, "--soak", "10")
     wait_until(

@@ -42,22 +42,25 @@ class Script:
 
 @functools.cache
 def simulate(
-    seconds: float, *commands: str, script: Script = Script(), **options: Any
+    seconds: float, *commands: str, script: Script = Script(), begin: float = 0.0, **options: Any
 ) -> tuple[DataMessage, ...]:
-    """The frames of so many seconds; `commands` are given at the start, `options` are `SensorOptions`'."""
+    """The frames of so many seconds from `begin` on, when `commands` are given.
+
+    `options` are `SensorOptions`'. In the signal `scene` there is a contact 5 s after power-on.
+    """
     sensor = SensorOptions(**{"sinc_length": 64, **options})
     bus = Bus(BusOptions((sensor,)), START_NS)
     todo = sorted([*((0.0, line) for line in commands), *script.commands])
     chance = random.Random(sensor.seed)
-    now = START_NS
+    now = start = START_NS + round(begin * 1e9)
     clock = SimpleNamespace(monotonic_ns=lambda: now, time_ns=lambda: now - START_NS + STARTED_AT_NS)
     life = bus.sensors[0].life
     assert life is not None
     wire = list[bytes]()
-    end = START_NS + round(seconds * 1e9)
+    end = start + round(seconds * 1e9)
     stream = SensorStream(0, life.sampler.clock.sinc_length * 1e9 / 51200, cast(Clock, clock))
     while now < end:
-        while todo and now >= START_NS + todo[0][0] * 1e9:
+        while todo and now >= start + todo[0][0] * 1e9:
             answer = obey(bus, todo.pop(0)[1])
             assert answer == "ok", answer
         sent = max(now, int(stream.clock.next_poll_ns())) + round(chance.expovariate(1 / 8_000))

@@ -65,7 +65,8 @@ def frames() -> tuple[DataMessage, ...]:
 @pytest.mark.parametrize(
     ("sinc_length", "seconds", "options"),
     [
-        (51, 4.2, {"seed": 2, "ppm": 150.0}), (64, 6, {"seed": 4, "ppm": -80.0, "pdo_size": 77}),
+        (51, 4.2, {"begin": 2.0, "seed": 2, "ppm": 150.0}),
+        (64, 4.2, {"begin": 2.0, "seed": 4, "ppm": -80.0, "pdo_size": 77}),
         (256, 20, {"seed": 7, "ppm": 200.0}), (1024, 40, {"seed": 8}),
     ],
 )  # fmt: skip
@@ -140,8 +141,10 @@ def test_a_little_noise_that_comes_and_goes_is_pointed_out() -> None:
     ],
 )
 def test_no_window_of_a_sensor_that_moves_and_touches_things_is_noisy(signal: str, sinc_length: int) -> None:
-    seconds = {32: 5.7, 128: 6, 512: 10}.get(sinc_length, 20)
-    examination = examine(sensor(seconds, signal=signal, sinc_length=sinc_length, pdo_size=77, seed=2))
+    seconds = {32: 4.2, 128: 5, 512: 10}.get(sinc_length, 20)
+    begin = 2.0 if signal == "scene" else 0.0
+    given = sensor(seconds, signal=signal, sinc_length=sinc_length, pdo_size=77, seed=2, begin=begin)
+    examination = examine(given)
     assert not wrong(examination)
     assert examination.noise.noisy.sum() == 0
 

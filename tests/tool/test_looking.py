@@ -139,11 +139,12 @@ def test_every_row_of_table_iii_1_is_read_by_name(bench: SimulatedBus) -> None:
 
 
 def test_objects_of_a_chain_by_place_serial_and_name(chain: SimulatedBus) -> None:
-    assert len(tool_here("objects", chain.near, "--json").json["sensors"]) == 2
+    sensors = tool_here("objects", chain.near, "--json").json["sensors"]
+    assert len(sensors) == 2
+    assert not [row for row in sensors[1]["objects"] if row["index"] == "0x6000" and "error" in row]
     for which in ("1", "20", "serial:20", "BFT-ROKS-ECAT-M8"):
-        sensors = tool_here("objects", chain.near, "--sensor", which, "--json").json["sensors"]
-        assert [row["serial"] for row in sensors] == [20]
-        assert not [row for row in sensors[0]["objects"] if row["index"] == "0x6000" and "error" in row]
+        read = tool_here("read", chain.near, "Sampling rate", "--sensor", which, "--json")
+        assert [row["serial"] for row in read.json["sensors"]] == [20]
     assert "no sensor matches" in one_sentence(tool_here("objects", chain.near, "--sensor", "7", code=2))
 
 
