@@ -92,10 +92,11 @@ class Wire(Connection):
 
     def __init__(self, world: World, turns: Turns, clock: SimulatedClock) -> None:
         self._replies, self._ids, self._send_lock = {}, itertools.count(1), threading.Lock()
-        self._decoder, self.sock = FrameDecoder(), socket.socket()
+        self._decoder = FrameDecoder()
         self.clock, self._turns = clock, turns
         self._arrived, self._ended = bytearray(), False
         self._send = world.accept(self)
+        self.sock = socket.socket()  # only to be closed; not left behind by a server that does not listen
 
     def feed(self, data: bytes) -> None:
         self._arrived += data
