@@ -27,6 +27,7 @@ from protocol.errors import RefusedError
 from protocol.framing import DataMessage
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
 from tests.clients.running import Client, NoSignals, free_port, replaying, signalled
+from tests.server.running import PATIENCE_S
 
 COUNT = 400
 
@@ -144,7 +145,7 @@ def test_describe_says_that_it_is_a_replay(path: Path, frames: list[DataMessage]
 def test_status_has_what_a_server_s_has(path: Path, frames: list[DataMessage]) -> None:
     del frames
     with replaying("--loop", path) as served, connect(served.port) as client:
-        client.receive(2)
+        client.receive(PATIENCE_S)
         status = client.ask("status")
     assert {
         "cycles",
@@ -180,7 +181,7 @@ def test_what_needs_a_sensor_is_refused_in_a_sentence(
         with pytest.raises(RefusedError, match="this is a replay of a recording") as refused:
             client.ask(action, **values)
         assert refused.value.code == ErrorCode.NOT_READY
-        assert client.receive(2)
+        assert client.receive(PATIENCE_S)
 
 
 def test_the_node_takes_it_for_a_server(path: Path, frames: list[DataMessage]) -> None:
