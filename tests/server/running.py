@@ -184,7 +184,7 @@ _STARVED = (
     "does not answer in",
     "is lost: no frame comes back",
     "cannot be read",
-    "product 0x00000000",
+    "0x00000000",  # vendor or product
     "does not end",
     "does not reach",  # after a lost frame of SOEM's set-up
     "maps process data of",  # as much of it as SOEM could read in its time

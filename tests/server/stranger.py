@@ -32,7 +32,7 @@ def ask(sock: socket.socket, messages: Sequence[dict[str, object]]) -> None:
     while replies < len(messages):
         decoder.feed(sock.recv(65536) or sys.exit("the server closed the connection"))
         for answer in decoder:
-            if isinstance(answer, dict):
+            if isinstance(answer, dict) and "reply" in answer:
                 print(json.dumps(answer))
                 replies += 1
 

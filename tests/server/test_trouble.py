@@ -254,9 +254,9 @@ def stop_in_time(ifname: str, sensor: Program | None = None) -> str:
     Returns what it said.
     """
     for _ in range(ATTEMPTS):
-        before, running = sensor.said() if sensor else None, Server(ifname)
+        before, running = sensor.said() if sensor else "", Server(ifname)
 
-        def due(before: str | None = before, running: Server = running) -> bool:
+        def due(before: str = before, running: Server = running) -> bool:
             come = sensor.said() != before if sensor else running.ifname in interfaces()
             return come or running.process.poll() is not None
 
