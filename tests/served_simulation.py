@@ -55,7 +55,7 @@ class _Transport(SocketTransport):
 
 
 class ServedSimulation(Simulation):
-    """A server on `port` that streams from `start` to `close`."""
+    """A server that streams on `port` until `close`."""
 
     def __init__(self, *sensors: SensorOptions, settings: Mapping[str, SettingValue], port: int = 0) -> None:
         self.port = port or free_port()
@@ -80,8 +80,10 @@ class ServedSimulation(Simulation):
     def command(self, line: str) -> str:
         """As that of `Simulation`, from another thread."""
         answer = Future[str]()
-        self._todo.put(lambda: answer.set_result(Simulation.command(self, line)))
-        return answer.result(PATIENCE_S)
+        self._todo.put(lambda: answer.set_result(self.backend.command(line)))
+        said = answer.result(PATIENCE_S)
+        assert said.startswith("ok"), said
+        return said[3:]
 
     @contextlib.contextmanager
     def stopped(self) -> Iterator[None]:
