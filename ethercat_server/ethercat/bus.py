@@ -101,6 +101,9 @@ class Bus:
             self.fmmus.append(self.read_surely(position, reg.FMMU, count * reg.FMMU_SIZE))
             rows = (_FMMU.unpack_from(self.fmmus[-1], at * reg.FMMU_SIZE) for at in range(count))
             areas.append([_Area(row[0], row[0] + row[1], row[6]) for row in rows if row[7] & 1])
+            if {area.kind for area in areas[-1]} != {_FMMU_READ, _FMMU_WRITE}:
+                # SOEM writes them once, and does not look whether that worked.
+                raise BusError(f"sensor {position} did not answer when it was mapped: check cable and power")
         self._counters = [_working_counter(each) for each in areas]
         self._lay_out_frames(areas)
 

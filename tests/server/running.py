@@ -185,6 +185,7 @@ _STARVED = (
     "is lost: no frame comes back",
     "cannot be read",
     "0x00000000",  # vendor or product
+    "cannot be mapped",
     "does not end",
     "does not reach",  # after a lost frame of SOEM's set-up
     "maps process data of",  # as much of it as SOEM could read in its time

@@ -21,6 +21,7 @@ from ethercat_server.errors import ServerError
 from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.backend import CheckInterrupt, SlaveIdentity
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.ended import run_here
@@ -161,6 +162,19 @@ def test_process_data_of_another_size(size: int, complaint: str) -> None:
             return [size]
 
     assert re.search(f"sensor 0 .BFT-SENS-ECAT-M8. {complaint}", refused(Odd()))
+
+
+@pytest.mark.parametrize("unit", [0, 1])
+def test_an_fmmu_that_was_not_written(unit: int) -> None:
+    """SOEM does not notice; without outputs the sensor's watchdog would take it out of OP again and again."""
+
+    class Odd(MemoryBackend):
+        def map_process_data(self) -> list[int]:
+            sizes = super().map_process_data()
+            self._write(0, FMMU + unit * FMMU_SIZE, bytes(FMMU_SIZE))
+            return sizes
+
+    assert "sensor 0 did not answer when it was mapped" in refused(Odd())
 
 
 def test_models_and_their_names() -> None:
