@@ -38,6 +38,9 @@ _SHORTEST_FRAME: Final = 60
 _U16: Final = struct.Struct("<H")
 _FMMU: Final = struct.Struct("<IHBBHBBB3x")
 _FMMU_READ, _FMMU_WRITE = 1, 2
+_SYNC_MANAGER: Final = struct.Struct("<2xHBxBx")
+"""Length, control, activation."""
+_SM_WRITE, _SM_MAILBOX = 0x04, 0x02
 
 
 class _Area(NamedTuple):
@@ -101,11 +104,22 @@ class Bus:
             self.fmmus.append(self.read_surely(position, reg.FMMU, count * reg.FMMU_SIZE))
             rows = (_FMMU.unpack_from(self.fmmus[-1], at * reg.FMMU_SIZE) for at in range(count))
             areas.append([_Area(row[0], row[0] + row[1], row[6]) for row in rows if row[7] & 1])
-            if {area.kind for area in areas[-1]} != {_FMMU_READ, _FMMU_WRITE}:
+            if {area.kind for area in areas[-1]} != self._kinds(position):
                 # SOEM writes them once, and does not look whether that worked.
                 raise BusError(f"sensor {position} did not answer when it was mapped: check cable and power")
         self._counters = [_working_counter(each) for each in areas]
         self._lay_out_frames(areas)
+
+    def _kinds(self, position: int) -> set[int]:
+        """What a slave has according to its sync managers: inputs, outputs, or both."""
+        count = self.read_surely(position, reg.FMMU_AND_SM_COUNT, 2)[1]
+        data = self.read_surely(position, reg.SYNC_MANAGER, count * reg.SYNC_MANAGER_SIZE)
+        rows = [_SYNC_MANAGER.unpack_from(data, at * reg.SYNC_MANAGER_SIZE) for at in range(count)]
+        return {
+            _FMMU_WRITE if control & _SM_WRITE else _FMMU_READ
+            for length, control, active in rows
+            if length and active & 1 and not control & _SM_MAILBOX
+        }
 
     def _lay_out_frames(self, areas: list[list[_Area]]) -> None:
         spans: list[list[int]] = []
