@@ -50,6 +50,15 @@ NO_BUS = why_no_bus()
 needs_bus = pytest.mark.skipif(NO_BUS is not None, reason=NO_BUS or "")
 
 
+def has_ipv6() -> bool:
+    """Whether this machine has the address ::1."""
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
+
+
 def _ports() -> Iterator[int]:
     """This worker's, below those that the kernel gives to whoever asks for any: nobody else takes one."""
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.server.manager import Manager
-from tests.server.running import Client, Server, Veth, needs_bus, server, wait_until
+from tests.server.running import Client, Server, Veth, has_ipv6, needs_bus, server, wait_until
 from tests.simulation import reading
 
 pytestmark = [pytest.mark.bus, needs_bus]
@@ -82,7 +82,7 @@ def test_status_counts_what_happened(shared: Shared) -> None:
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 def test_bare_json_works_with_a_plain_socket(shared: Shared, host: str) -> None:
-    if host == "::1" and not (socket.has_ipv6 and Path("/proc/net/if_inet6").exists()):
+    if host == "::1" and not has_ipv6():
         pytest.skip("no IPv6 on this machine")
     with socket.create_connection((host, shared.running.port), timeout=30) as sock:
         sock.sendall(b'{"action":"subscribe"}{"action":"status","id":"me"}')
