@@ -90,7 +90,8 @@ class SampleClock:
         """Whether more may have been lost than `steps` says: the sensor may have looked at its data early or
         late in a slow exchange. The samples after it tell, and their `steps` put it right."""
         self._doubtful = False
-        """Whether the bracket may be another sample's: one was `uncertain`, and none was watched since."""
+        """Whether the bracket may be another sample's: one was `uncertain`, or a frame was lost before the
+        rate was known, and no sample was watched since."""
         self._quality = 0.0
         self._learned = 0
         self._hits = 0
@@ -222,7 +223,7 @@ class SampleClock:
         self._expect_next()
 
     def missed(self, sent_ns: int) -> None:
-        """An exchange brought nothing valid: it counts for when to poll next, and for nothing else."""
+        """An exchange brought nothing valid: nothing is learned from it, but the next poll counts from it."""
         self._tried_ns = sent_ns
         self._doubtful |= self._learned < _PERIOD_LEARNING  # the rate is not known well enough to bridge it
 

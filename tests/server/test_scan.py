@@ -8,7 +8,7 @@ from ethercat_server.acquisition.start_up import AsFound, bring_up, find_sensors
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.ethercat.wire import Command, build
+from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build
 from ethercat_server.sensor.scan import scan
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -89,6 +89,19 @@ def test_another_master_is_left_alone() -> None:
 
 def test_the_last_frames_of_a_killed_master_are_no_obstacle() -> None:
     assert len(scan(Bus(OthersFrames(0.001, 2)), no_check)) == 1
+
+
+def test_a_slave_that_stops_answering_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = in_op(61)
+    send = backend.send
+
+    def lose_single_reads(frame: bytes | bytearray) -> None:
+        if frame[DATAGRAM_INDEX - 1] != Command.APRD:
+            send(frame)
+
+    monkeypatch.setattr(backend, "send", lose_single_reads)
+    with pytest.raises(BusError, match="stopped answering during the scan: check cable and power"):
+        scan(Bus(backend), no_check)
 
 
 def test_a_bus_that_loses_frames_is_looked_at_all_the_same() -> None:
