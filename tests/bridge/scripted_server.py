@@ -1,15 +1,13 @@
 """A server that does as a test tells it: speaks the wire protocol from `protocol`, knows no sensor.
 
 `ScriptedServer` answers describe, subscribe and shutdown by itself and sends what `send_sample` and
-`send_raw` are given. `python scripted_server.py PORT RATE` streams by itself, for measurements.
+`send_raw` are given.
 """
 
 from __future__ import annotations
 
 import contextlib
-import math
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -155,19 +153,3 @@ class ScriptedServer(Script):
                     self.receive(decoder, data)
             self.subscribed.clear()
             self.disconnected.set()
-
-
-def stream(port: int, rate_hz: float) -> None:
-    """Serve a sine on `port` at `rate_hz` for ever."""
-    with ScriptedServer(port) as server:
-        due = time.monotonic()
-        while True:
-            due += 1 / rate_hz
-            time.sleep(max(due - time.monotonic(), 0))
-            if server.subscribed.is_set():
-                with contextlib.suppress(OSError):
-                    server.send_sample(math.sin(due))
-
-
-if __name__ == "__main__":
-    stream(int(sys.argv[1]), float(sys.argv[2]))
