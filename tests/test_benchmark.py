@@ -21,26 +21,24 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from rich.console import Console
 
-np = pytest.importorskip("numpy")
-
-from rich.console import Console  # noqa: E402
-
-from ethercat_server.virtual_sensor.options import SensorOptions  # noqa: E402
-from protocol.control import request  # noqa: E402
-from protocol.framing import encode_json  # noqa: E402
-from protocol.pdo import encode  # noqa: E402
-from scripts.benchmarks import chains, statistics  # noqa: E402
-from scripts.benchmarks import program as benchmark  # noqa: E402
-from scripts.benchmarks.modes.soak import Tally, slope_kb_per_hour  # noqa: E402
-from scripts.benchmarks.processes import client, floor, polling  # noqa: E402
-from scripts.benchmarks.records import Recording, began, write  # noqa: E402
-from scripts.benchmarks.report import rows  # noqa: E402
-from scripts.benchmarks.statistics import Arrivals, Counts, Ints  # noqa: E402
-from tests.clients.running import signalled  # noqa: E402
-from tests.served_simulation import served  # noqa: E402
-from tests.server.running import PATIENCE_S, free_port, needs_bus, wait_until  # noqa: E402
+from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.control import request
+from protocol.framing import encode_json
+from protocol.pdo import encode
+from scripts.benchmarks import chains, statistics
+from scripts.benchmarks import program as benchmark
+from scripts.benchmarks.modes.soak import Tally, slope_kb_per_hour
+from scripts.benchmarks.processes import client, floor, polling
+from scripts.benchmarks.records import Recording, began, write
+from scripts.benchmarks.report import rows
+from scripts.benchmarks.statistics import Arrivals, Counts, Ints
+from tests.clients.running import signalled
+from tests.served_simulation import served
+from tests.server.running import PATIENCE_S, free_port, needs_bus, wait_until
 
 ROOT = Path(__file__).parent.parent
 PERIOD = 1_250_000

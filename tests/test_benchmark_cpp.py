@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("numpy")
-
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.modes import cpp
 from scripts.benchmarks.modes.cpp import build, figures, run

@@ -9,6 +9,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 
 from tests.ros_package.package_files import PACKAGE
 
@@ -118,7 +119,6 @@ def test_foxglove_shows_the_diagnostics() -> None:
 
 
 def test_rviz_shows_the_wrenches() -> None:
-    yaml = pytest.importorskip("yaml", reason="PyYAML is missing")
     manager = yaml.safe_load((CONFIG / "wrench.rviz").read_text())["Visualization Manager"]
     wrenches = [
         display for display in manager["Displays"] if display["Class"] == "rviz_default_plugins/Wrench"

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
-import pytest
+from catkin_pkg.package import parse_package
 
 from tests.ros_package.package_files import PACKAGE
 
@@ -53,8 +53,7 @@ def test_no_dependency_is_named_twice() -> None:
 
 
 def test_catkin_pkg_finds_nothing_wrong() -> None:
-    catkin_pkg = pytest.importorskip("catkin_pkg.package", reason="catkin_pkg, which colcon uses, is missing")
     warnings: list[str] = []
-    package = catkin_pkg.parse_package(str(PACKAGE), warnings=warnings)
+    package = parse_package(str(PACKAGE), warnings=warnings)
     assert not warnings
     assert package.get_build_type() == "ament_python"

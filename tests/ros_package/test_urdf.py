@@ -5,11 +5,10 @@ from __future__ import annotations
 from xml.etree import ElementTree
 
 import pytest
+import xacro
 
 from ethercat_server.sensor.objects.dictionary import MODELS
 from tests.ros_package.package_files import PACKAGE
-
-xacro = pytest.importorskip("xacro", reason="xacro is missing: pip install xacro, or source ROS 2")
 
 URDF = PACKAGE / "urdf"
 # From the mounting face to the wrench's origin and to the IMU, in mm.

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
+import pysoem
 import pytest
 
 from ethercat_server.sensor.objects.dictionary import Access
@@ -20,7 +21,6 @@ from ethercat_server.virtual_sensor.measurement.signals import decode_clock
 from protocol.pdo import encode
 from tests.virtual_sensor.conftest import SensorProcess
 
-pysoem = pytest.importorskip("pysoem", reason="pysoem is not installed")
 pytestmark = pytest.mark.bus
 
 Start = Callable[..., SensorProcess]
