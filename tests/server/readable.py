@@ -14,6 +14,8 @@ from typing import Final
 
 import pytest
 
+from tests.server.as_another_user import NO_OTHER_USER
+
 _PACKAGES: Final = ("ethercat_server", "protocol", "pyroute2", "pysoem")
 """The server and all that it needs."""
 
@@ -87,4 +89,4 @@ def need(*command: str) -> None:
     """Skip where `under` and `command`, such as `setpriv ...`, can start nothing at all."""
     tried = subprocess.run([*under(), *command, "true"], check=False, capture_output=True, text=True)
     if tried.returncode:
-        pytest.skip(f"nothing can be started as another user here: {tried.stderr.strip()}")
+        pytest.skip(NO_OTHER_USER or f"no other user can be started (run it as root): {tried.stderr.strip()}")
