@@ -4,6 +4,7 @@ ServerError
 +-- UsageError        wrong arguments or configuration (exit code 2)
 +-- InterfaceError    the network interface cannot be used
 +-- BusError          the bus or a sensor on it does not do what it must
+|   +-- SetUpError         setting up failed in a way that lost frames explain
 |   +-- SdoAbortError      the sensor refused an SDO, with its abort code
 |   +-- CutOffError        the sensor was lost in the middle of work on it
 +-- ForbiddenWriteError      a write that is never done
@@ -31,6 +32,10 @@ class InterfaceError(ServerError):
 
 class BusError(ServerError):
     """The bus, or a sensor on it, does not do what it must."""
+
+
+class SetUpError(BusError):
+    """Setting a sensor up went wrong in a way that lost frames explain: worth another attempt."""
 
 
 class SdoAbortError(BusError):

@@ -156,7 +156,7 @@ def _object_name(value: object) -> str:
     raise ValueError(f"a text of 1 to {_LONGEST_NAME} characters, such as 'Sampling rate'")
 
 
-_SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(position=0))
+_SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(number=0))
 _INDEX: Final = _object_number(0xFFFF)
 _SUBINDEX: Final = _object_number(0xFF)
 _ENTRY: Final = {

@@ -1,4 +1,4 @@
-"""Selects one sensor of a chain: by position on the bus, serial number or name."""
+"""Selects one sensor of a chain: by number, serial number or name."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Final, NamedTuple
 MOST_PLACES: Final = 256
 _SERIAL: Final = "serial:"
 
-MEANING: Final = 'a position such as 0, "serial:1234", or a name such as "BFT-SENS-ECAT-M8"'
+MEANING: Final = 'a number such as 0, "serial:1234", or a name such as "BFT-SENS-ECAT-M8"'
 
 
 class SensorChoice(NamedTuple):
     """Exactly one field is set."""
 
-    position: int | None = None
+    number: int | None = None
     serial: int | None = None
     name: str | None = None
 
@@ -23,7 +23,7 @@ class SensorChoice(NamedTuple):
         if isinstance(value, str) and value.isdecimal():
             value = int(value)
         if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < MOST_PLACES:
-            return cls(position=value)
+            return cls(number=value)
         if isinstance(value, str) and value.startswith(_SERIAL):
             number = value.removeprefix(_SERIAL)
             if number.isdecimal() and int(number) < 1 << 32:
@@ -32,21 +32,21 @@ class SensorChoice(NamedTuple):
             return cls(name=value)
         raise ValueError(MEANING)
 
-    def matches(self, position: int, name: str, serial: int) -> bool:
-        """Whether it selects the sensor at `position` with this name and serial number."""
-        if self.position is not None:
-            return self.position == position
+    def matches(self, number: int, name: str, serial: int) -> bool:
+        """Whether it selects the sensor `number` with this name and serial number."""
+        if self.number is not None:
+            return self.number == number
         if self.serial is not None:
             return self.serial == serial
         return self.name == name
 
     @property
     def precedence(self) -> int:
-        """Settings for a position override those for a serial number, and those override a name's."""
-        return 2 if self.position is not None else 1 if self.serial is not None else 0
+        """Settings for a number override those for a serial number, and those override a name's."""
+        return 2 if self.number is not None else 1 if self.serial is not None else 0
 
     def __str__(self) -> str:
         """As written on a command line."""
-        if self.position is not None:
-            return str(self.position)
+        if self.number is not None:
+            return str(self.number)
         return f"{_SERIAL}{self.serial}" if self.serial is not None else str(self.name)

@@ -31,6 +31,8 @@ from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
 from ethercat_server.links import direct
 from ethercat_server.links.remote import ServerLink
 from ethercat_server.process import realtime
+from ethercat_server.sensor import look
+from ethercat_server.sensor.others import Others
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.sensor_actions import SensorActions
@@ -95,12 +97,15 @@ class SimulatedBus:
         return [(row["index"], row["subindex"], row["hex"]) for row in self.stats(position)["sdo_writes"]]
 
 
-def _read_image(backend: MemoryBackend, position: int) -> bytes:
-    """The SII for the master's scan, most of which would be spent on it; nothing else reads it like this."""
-    finish(read_sii(ByPosition(backend._bus), position, 0, 4), clock=backend.clock)
-    life = backend.sensors.sensors[position].life
-    assert life is not None
-    return life.esc.sii.image
+_READ_IMAGE = look.read_image
+
+
+def _read_image(bus: Bus, position: int) -> bytes:
+    """The SII, on which most of a start would be spent; nothing else reads it like this."""
+    finish(read_sii(ByPosition(bus), position, 0, 4), clock=bus.clock)
+    assert isinstance(bus.backend, MemoryBackend)
+    life = bus.backend.sensors.sensors[position].life
+    return _READ_IMAGE(bus, position) if life is None else life.esc.sii.image
 
 
 @contextlib.contextmanager
@@ -109,7 +114,7 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     options = options_from(build_parser().parse_args(["lo", *map(str, arguments)]))
     bus = SimulatedBus(MemoryBackend(*options.sensors, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MemoryBackend, "_read_image", _read_image)
+        patch.setattr(look, "read_image", _read_image)
         patch.setattr(direct, "open_bus", lambda _ifname, _cleanup: Bus(bus.backend))
         patch.setattr(realtime, "prepare", lambda _priority, _cpu: None)
         patch.setattr(measurement, "_client", _client)
@@ -129,11 +134,11 @@ class SimulatedServer:
         self.hangs = False
         """Whether it is stopped by somebody."""
         ethercat = Bus(bus.backend)
-        sensors = bring_up(ethercat, Asked({"sinc_length": SINC_LENGTH}), lambda: None)
-        self.streams = [SensorStream(sensor.position, sensor.period_ns, bus.clock) for sensor in sensors]
+        sensors = bring_up(ethercat, Asked({"sinc_length": SINC_LENGTH}), lambda: None).sensors
+        self.streams = [SensorStream(sensor.number, sensor.period_ns, bus.clock) for sensor in sensors]
         self.transport = InMemoryTransport(bus.clock)
         self.hub = Hub(self.transport, bus.clock.monotonic_ns)
-        self.recovery = Recovery(ethercat, sensors, self.streams, self._announce)
+        self.recovery = Recovery(ethercat, sensors, self.streams, self._announce, Others(ethercat, ()))
         self.jobs = Jobs(ethercat, sensors)
         self.cycle = Cycle(ethercat, sensors, self.streams, self, self.recovery, self.jobs, NoWatchdog())
         actions = SensorActions(ethercat, self.hub, self.recovery, self.jobs, sensors, self.streams)

@@ -26,6 +26,7 @@ from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.sensor.others import Others
 from ethercat_server.sensor.sensor import Identity
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
@@ -91,14 +92,15 @@ class Simulation:
         self.transport = InMemoryTransport(self.clock)
         self.hub = Hub(self.listen(), self.clock.monotonic_ns)
         self.bus = Bus(self.backend)
-        self.sensors = bring_up(self.bus, Asked(settings), lambda: None)
-        self.streams = [SensorStream(s.position, s.period_ns, self.clock) for s in self.sensors]
+        self.sensors, slaves = bring_up(self.bus, Asked(settings), lambda: None)
+        self.others = Others(self.bus, slaves)
+        self.streams = [SensorStream(s.number, s.period_ns, self.clock) for s in self.sensors]
         self.events: list[JsonObject] = []
-        self.recovery = Recovery(self.bus, self.sensors, self.streams, self._announce)
+        self.recovery = Recovery(self.bus, self.sensors, self.streams, self._announce, self.others)
         self.jobs = Jobs(self.bus, self.sensors)
         self.cycle = Cycle(self.bus, self.sensors, self.streams, self, self.recovery, self.jobs, NoWatchdog())
         actions = SensorActions(self.bus, self.hub, self.recovery, self.jobs, self.sensors, self.streams)
-        self.hub.start(Actions(self.hub, self.cycle, actions).handle)
+        self.hub.start(Actions(self.hub, self.cycle, actions, {"others": self.others.rows}).handle)
         self.clients: list[Client] = []
         self.frames: list[DataMessage] = []
         self.published_ns: list[int] = []
@@ -190,7 +192,7 @@ class Simulation:
     def close(self) -> None:
         """The server ends, as by SIGTERM: the sensors go to INIT, the clients are disconnected."""
         self.hub.close()
-        self.backend.close()
+        self.bus.close()
 
 
 class Client:

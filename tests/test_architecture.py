@@ -59,7 +59,7 @@ ROOMS: Final[dict[str, set[str]]] = {
 """A room, and the rooms it may import. A room without a line of its own belongs to the one above it."""
 
 PACKAGES: Final[dict[str, set[str]]] = {
-    "pysoem": {f"{S}.ethercat.soem"},
+    "pysoem": {f"{S}.ethercat.master.soem"},
     "pyroute2": {S},
     "numpy": {"ft_compensation", "bridge", "clients"},
     "matplotlib": {"clients.report"},

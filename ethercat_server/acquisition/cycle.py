@@ -36,8 +36,8 @@ _MAX_LEAD_NS: Final = 200_000.0
 class Outlet(Protocol):
     """Where the samples go: the server's `Hub`, or a tool that wants them in its own process."""
 
-    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
-        """Take a DATA frame of the sensor at `position`; `now_ns` is when its exchange was back."""
+    def publish(self, frame: bytes, number: int, flags: int, now_ns: int) -> None:
+        """Take a DATA frame of the sensor `number`; `now_ns` is when its exchange was back."""
         ...
 
     def serve(self, until_ns: int) -> None:
@@ -130,9 +130,9 @@ class Cycle:
             complete = wkc >= recovery.alive_wkc
             for sensor, stream in each:
                 valid = complete and sensor.state is SensorState.STREAMING
-                position = stream.position
-                if made := stream.take(bus.process_data(position), wkc, valid, sent, back):
-                    hub.publish(made[0], position, made[1], back)
+                number = stream.number
+                if made := stream.take(bus.process_data(number), wkc, valid, sent, back):
+                    hub.publish(made[0], number, made[1], back)
             for stream in streams:
                 stream.learn()
             recovery.attend(wkc, back)

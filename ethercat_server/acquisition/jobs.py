@@ -53,34 +53,34 @@ class Jobs:
 
     def start(
         self,
-        position: int,
+        number: int,
         steps: Steps[Any],
         done: Done,
         *,
         changes: bool = False,
         most: int = _MOST_WAITING,
     ) -> None:
-        """Have `steps` done on the sensor at `position`; `changes` is for `is_changing`.
+        """Have `steps` done on the sensor `number`; `changes` is for `is_changing`.
 
         If the sensor is lost meanwhile, CutOffError is raised in `steps`: nothing more can be done on it.
         RequestError if it is lost already, or if `most` jobs wait for it.
         """
-        self.check_present(position)
-        if len(self._queues[position]) >= most:
+        self.check_present(number)
+        if len(self._queues[number]) >= most:
             raise RequestError(
-                ErrorCode.BUSY, f"sensor {position} has {most} requests to do already: ask again later"
+                ErrorCode.BUSY, f"sensor {number} has {most} requests to do already: ask again later"
             )
-        self._queues[position].append(_Job(steps, done, changes))
+        self._queues[number].append(_Job(steps, done, changes))
         self.waiting += 1
 
-    def is_changing(self, position: int) -> bool:
-        """Whether a job that changes the sensor at `position` is under way or waits."""
-        return any(job.changes for job in self._queues[position])
+    def is_changing(self, number: int) -> bool:
+        """Whether a job that changes the sensor `number` is under way or waits."""
+        return any(job.changes for job in self._queues[number])
 
-    def check_present(self, position: int) -> None:
-        """RequestError if the sensor at `position` cannot be talked to."""
-        if not self._sensors[position].streams:
-            raise RequestError(ErrorCode.NOT_READY, f"sensor {position} {_AWAY}: ask again when it is back")
+    def check_present(self, number: int) -> None:
+        """RequestError if the sensor `number` cannot be talked to."""
+        if not self._sensors[number].streams:
+            raise RequestError(ErrorCode.NOT_READY, f"sensor {number} {_AWAY}: ask again when it is back")
 
     def step(self, until_ns: int) -> None:
         """Take a step if there is time for one before `until_ns`. To be called only while jobs wait."""
@@ -94,17 +94,17 @@ class Jobs:
                 self._step(self._turn, until_ns)
                 return
 
-    def _step(self, position: int, until_ns: int) -> None:
-        steps, done, _ = self._queues[position][0]
+    def _step(self, number: int, until_ns: int) -> None:
+        steps, done, _ = self._queues[number][0]
         result: Any = None
         error: RequestError | None = None
         try:
-            if self._sensors[position].streams:
+            if self._sensors[number].streams:
                 with self._bus.in_time(until_ns):
                     next(steps)
                 return
-            steps.throw(CutOffError(f"sensor {position} {_AWAY}"))
-            raise CutOffError(f"sensor {position} {_AWAY}")
+            steps.throw(CutOffError(f"sensor {number} {_AWAY}"))
+            raise CutOffError(f"sensor {number} {_AWAY}")
         except StopIteration as stop:
             result = stop.value
         except RequestError as refused:
@@ -113,12 +113,12 @@ class Jobs:
         except BusError as failed:
             error = refusal(failed)
         except Exception:  # a defect in one request must not stop the acquisition
-            log.exception("a request to sensor %d failed", position)
+            log.exception("a request to sensor %d failed", number)
             error = RequestError(
                 ErrorCode.INTERNAL, "the request failed by a fault of this program: see its log"
             )
         steps.close()
-        self._queues[position].popleft()
+        self._queues[number].popleft()
         self.waiting -= 1
         done(result, error)
 

@@ -14,15 +14,15 @@ from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.slave import registers as reg
-from ethercat_server.ethercat.slave.al import AlState, AlStatus
+from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
 from ethercat_server.ethercat.slave.sii import OF_FIRMWARE, OF_MASTER, ByPosition, read_sii
+from ethercat_server.ethercat.slave.states import StateMachine
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import PRODUCT_CODE, VENDOR_ID
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.sensor.set_up import identify, put_right, set_up
 
-_STATE_TIMEOUT_S: Final = 2.0
 _ABSENT_PAUSE_S: Final = 0.005
 _REFUSED_PAUSE_S: Final = 0.1
 _REMOVED_READS: Final = 3
@@ -32,12 +32,8 @@ _SII_IDENTITY: Final = 0x08
 """First of four words: vendor ID, product code."""
 
 
-class GoneError(Exception):
-    """The sensor stopped answering in the middle: begin again."""
-
-
 class DifferentSensorError(Exception):
-    """Another sensor is in the position of the one that was lost."""
+    """Another sensor is in the place of the one that was lost."""
 
     def __init__(self, found: Identity) -> None:
         super().__init__(str(found))
@@ -50,13 +46,13 @@ class Ladder:
     def __init__(self, bus: Bus, sensor: Sensor) -> None:
         self._bus = bus
         self._sensor = sensor
-        self._position = sensor.position
-        count = bus.read_surely(sensor.position, reg.FMMU_AND_SM_COUNT, 2)[1]
+        self.states = StateMachine(bus, sensor.number)
+        count = min(bus.read_surely(sensor.number, reg.FMMU_AND_SM_COUNT, 2)[1], reg.MOST_SYNC_MANAGERS)
         self._sync_managers = rows = bus.read_surely(
-            sensor.position, reg.SYNC_MANAGER, count * reg.SYNC_MANAGER_SIZE
+            sensor.number, reg.SYNC_MANAGER, count * reg.SYNC_MANAGER_SIZE
         )
         out, back = struct.unpack_from("<HH", rows), struct.unpack_from("<HH", rows, reg.SYNC_MANAGER_SIZE)
-        self.sdo = GuardedSdo(MailboxSdo(bus, sensor.position, (out, back)))
+        self.sdo = GuardedSdo(MailboxSdo(bus, sensor.number, (out, back)))
         """SDO transfers in steps. One for all: the slave drops a request that reuses the last counter."""
 
     def bring_back(self, pause_s: float = 0.0) -> Steps[bool]:
@@ -67,7 +63,7 @@ class Ladder:
         yield from self._pause(pause_s)
         left_op = False
         while True:
-            status = self.al_status()
+            status = self.states.status()
             if status is None:
                 if not (yield from self._restore_station()):
                     yield from self._pause(_ABSENT_PAUSE_S)
@@ -77,7 +73,7 @@ class Ladder:
                 return left_op
             elif status.state is AlState.SAFEOP:
                 left_op = True
-                yield from self._go(AlState.OP)
+                yield from self.states.go(AlState.OP)
             else:
                 left_op = True
                 yield from self._set_up_anew()
@@ -87,21 +83,16 @@ class Ladder:
         """Leave a refused sensor in INIT until it is taken away, then bring back the one that comes."""
         unanswered = 0
         while unanswered < _REMOVED_READS:
-            unanswered = 0 if self.al_status() is not None else unanswered + 1
+            unanswered = 0 if self.states.status() is not None else unanswered + 1
             yield from self._pause(_REFUSED_PAUSE_S)
         return (yield from self.bring_back())
 
     def reconfigure(self) -> Steps[bool]:
         """Take the sensor to PREOP, write what is wanted, and back to OP; raises as `bring_back`."""
-        yield from self._go(AlState.PREOP)
+        yield from self.states.go(AlState.PREOP)
         yield from set_up(self.sdo, self._sensor)
         yield from self._go_op()
         return True
-
-    def al_status(self) -> AlStatus | None:
-        """The sensor's AL status; None if it does not answer."""
-        data = self._bus.read_register(self._position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
-        return AlStatus.parse(data) if data is not None else None
 
     def _restore_station(self) -> Steps[bool]:
         """Give a sensor that lost its station address with its power the address again; whether it has it.
@@ -109,12 +100,12 @@ class Ladder:
         One that has another slave's address, or is no Bota sensor, is left alone; which sensor it is remains
         to be asked.
         """
-        bus, position = self._bus, self._position
+        bus, number, position = self._bus, self._sensor.number, self._sensor.position
         data = bus.read_at(position, reg.STATION_ADDRESS, 2)
         if data is None:
             return False
         if int.from_bytes(data, "little") in bus.stations:
-            return bool(int.from_bytes(data, "little") == bus.stations[position])
+            return bool(int.from_bytes(data, "little") == bus.stations[number])
         yield
         try:
             words = yield from read_sii(ByPosition(bus), position, _SII_IDENTITY, 4, OF_MASTER)
@@ -122,65 +113,27 @@ class Ladder:
             return False
         if struct.unpack("<II", words) != (VENDOR_ID, PRODUCT_CODE):
             return False
-        return bus.write_at(position, reg.STATION_ADDRESS, bus.stations[position].to_bytes(2, "little"))
+        return bus.write_at(position, reg.STATION_ADDRESS, bus.stations[number].to_bytes(2, "little"))
 
     def _set_up_anew(self) -> Steps[None]:
         sensor, rows = self._sensor, self._sync_managers
-        yield from self._go(AlState.INIT)
-        self._write(reg.SII_OWNER, OF_FIRMWARE)  # the sensor reads its SII on the way to PREOP
-        self._write(reg.SYNC_MANAGER, rows[:_MAILBOXES_END])
-        yield from self._go(AlState.PREOP)
+        yield from self.states.go(AlState.INIT)
+        self.states.write(reg.SII_OWNER, OF_FIRMWARE)  # the sensor reads its SII on the way to PREOP
+        self.states.write(reg.SYNC_MANAGER, rows[:_MAILBOXES_END])
+        yield from self.states.go(AlState.PREOP)
         found = yield from identify(self.sdo, sensor.identity.name)
         if (found.name, found.serial) != (sensor.identity.name, sensor.identity.serial):
-            yield from self._go(AlState.INIT)
+            yield from self.states.go(AlState.INIT)
             raise DifferentSensorError(found)
         yield from set_up(self.sdo, sensor)
         yield from self._go_op()
 
     def _go_op(self) -> Steps[None]:
         """From PREOP: the process data's sync managers and FMMUs as they were, then SAFEOP and OP."""
-        self._write(reg.SYNC_MANAGER + _MAILBOXES_END, self._sync_managers[_MAILBOXES_END:])
-        self._write(reg.FMMU, self._bus.fmmus[self._position])
-        yield from self._go(AlState.SAFEOP)
-        yield from self._go(AlState.OP)
-
-    def _go(self, state: AlState) -> Steps[None]:
-        """Request an AL state and wait for it; an error is acknowledged first."""
-        status = self.al_status()
-        if status is not None and status.error:
-            yield from self._acknowledge(status)
-        self._write(reg.AL_CONTROL, state.request())
-        deadline = Deadline(self._bus.clock, _STATE_TIMEOUT_S)
-        while True:
-            status = yield from self._next_status()
-            if status.state is state and not status.error:
-                return
-            if status.error or deadline.passed:
-                raise BusError(f"sensor {self._position} does not go to {state.name}: it is in {status}")
-
-    def _acknowledge(self, status: AlStatus) -> Steps[None]:
-        """Acknowledge an error and wait until it is gone: a request before would overwrite the acknowledge.
-
-        The sensor looks at AL control when it comes to it, and sees only what was written last.
-        """
-        self._write(reg.AL_CONTROL, status.acknowledge())
-        deadline = Deadline(self._bus.clock, _STATE_TIMEOUT_S)
-        while (now := (yield from self._next_status())).error:
-            if deadline.passed:
-                raise BusError(
-                    f"sensor {self._position} keeps its error although it was acknowledged: it is in {now}"
-                )
-
-    def _next_status(self) -> Steps[AlStatus]:
-        yield
-        status = self.al_status()
-        if status is None:
-            raise GoneError
-        return status
-
-    def _write(self, address: int, data: bytes) -> None:
-        if not self._bus.write_register(self._position, address, data):
-            raise GoneError
+        self.states.write(reg.SYNC_MANAGER + _MAILBOXES_END, self._sync_managers[_MAILBOXES_END:])
+        self.states.write(reg.FMMU, self._bus.fmmus[self._sensor.number])
+        yield from self.states.go(AlState.SAFEOP)
+        yield from self.states.go(AlState.OP)
 
     def _pause(self, seconds: float) -> Steps[None]:
         """Steps that take at least `seconds`."""

@@ -9,14 +9,18 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
-from ethercat_server.acquisition.ladder import DifferentSensorError, GoneError, Ladder
+from ethercat_server.acquisition.ladder import DifferentSensorError, Ladder
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError, extended
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.slave import times
+from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import Steps
+from ethercat_server.ethercat.slave.states import GoneError
 from ethercat_server.sensor.configuration import IN_FORCE, LATER, Change
 from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.sensor.others import Others
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
 from protocol.control import Event, event
 from protocol.settings import SettingValue
@@ -32,7 +36,7 @@ _SILENT_CHANGE_NS: Final = 1_000_000_000
 _WATCH_EVERY_NS: Final = 100_000_000
 """A sensor can leave OP and still be counted, so its AL status is read this often."""
 _FAILED_PAUSE_S: Final = 0.25
-_REVERT_S: Final = 2.0
+_REVERT_S: Final = times.STATE_S[AlState.OP]
 """Timeout for a sensor whose change failed to be back in OP."""
 
 log = logging.getLogger(__name__)
@@ -58,11 +62,13 @@ class Recovery:
         sensors: Sequence[Sensor],
         streams: Sequence[SensorStream],
         announce: Callable[[JsonObject], None],
+        others: Others,
     ) -> None:
         self._bus = bus
         self._sensors = sensors
         self._streams = streams
         self._announce = announce
+        self._others = others
         self._ladders = [Ladder(bus, sensor) for sensor in sensors]
         self._clock = bus.clock
         self._work: dict[int, Steps[bool]] = {}
@@ -81,24 +87,24 @@ class Recovery:
         """Whether no sensor is left to be read."""
         self._count_alive()
 
-    def reconfigure(self, position: int, change: Change, done: Callable[[BusError | None], None]) -> None:
+    def reconfigure(self, number: int, change: Change, done: Callable[[BusError | None], None]) -> None:
         """Take a sensor out of OP to change its settings. `done` is called once it gives samples again.
 
         If it fails the former settings come back into force, and `done` gets the reason; at once if the
         sensor is lost over it.
         """
-        sensor = self._sensors[position]
-        self._changing[position] = _Reconfiguration(sensor.wanted, sensor.asked, done)
+        sensor = self._sensors[number]
+        self._changing[number] = _Reconfiguration(sensor.wanted, sensor.asked, done)
         sensor.wanted, sensor.asked = change.wanted, sensor.asked | set(change.names)
-        self._take_out(position, SensorState.CHANGING, self._ladders[position].reconfigure())
+        self._take_out(number, SensorState.CHANGING, self._ladders[number].reconfigure())
 
-    def is_changing(self, position: int) -> bool:
-        """Whether the sensor at `position` is out of OP to have its settings changed."""
-        return position in self._changing
+    def is_changing(self, number: int) -> bool:
+        """Whether the sensor `number` is out of OP to have its settings changed."""
+        return number in self._changing
 
-    def sdo(self, position: int) -> GuardedSdo:
+    def sdo(self, number: int) -> GuardedSdo:
         """SDO transfers to a sensor that is not lost, in steps."""
-        return self._ladders[position].sdo
+        return self._ladders[number].sdo
 
     def attend(self, wkc: int, now_ns: int) -> None:
         """To be called after every exchange; almost always it has nothing to do.
@@ -112,13 +118,13 @@ class Recovery:
                     self._watch_ns = now_ns + _WATCH_EVERY_NS
                     self._bus.backend.check_present()
                     if now_ns - self._frame_ns > _SILENT_CHANGE_NS:
-                        for position in list(self._changing):
-                            self._lose_in_change(position, _SILENT)
+                        for number in list(self._changing):
+                            self._lose_in_change(number, _SILENT)
             elif self._missed_since_ns != self._frame_ns:
                 self._missed_since_ns = self._frame_ns  # one only: at a low rate the time alone says nothing
             elif now_ns - self._frame_ns > _SILENCE_NS:
-                for position in range(len(self._sensors)):
-                    self._lose(position, _SILENT)
+                for number in range(len(self._sensors)):
+                    self._lose(number, _SILENT)
             return
         self._frame_ns = now_ns
         self._short = self._short + 1 if wkc < self.alive_wkc else 0
@@ -126,145 +132,144 @@ class Recovery:
             self._short = 0
             self._look_for_lost()
         if self._work:
-            for position in list(self._work):
-                self._step(position)
+            for number in list(self._work):
+                self._step(number)
         if now_ns >= self._watch_ns:
             self._watch_ns = now_ns + _WATCH_EVERY_NS // len(self._sensors)
             self._watch_next()
+            self._others.look_at_next()
 
     def _watch_next(self) -> None:
         if alive := self._alive():
-            self._watched = next((position for position in alive if position > self._watched), alive[0])
+            self._watched = next((number for number in alive if number > self._watched), alive[0])
             # One that is out may be counted in place of one that is not there any more.
             self._look_at(self._watched, counted=not self._work)
 
     def _look_for_lost(self) -> None:
-        for position in self._alive():
-            self._look_at(position, counted=False)
+        for number in self._alive():
+            self._look_at(number, counted=False)
 
-    def _look_at(self, position: int, *, counted: bool) -> None:
-        status = self._ladders[position].al_status()
+    def _look_at(self, number: int, *, counted: bool) -> None:
+        status = self._ladders[number].states.status()
         if status is None:
             if counted:
                 return  # as long as the working counter is right, one datagram got lost
-            status = self._ladders[position].al_status()
+            status = self._ladders[number].states.status()
         if status is None:
-            self._lose(position, "it does not answer")
+            self._lose(number, "it does not answer")
         elif not status.is_op:
-            self._lose(position, f"it is in {status}")
+            self._lose(number, f"it is in {status}")
 
     def _alive(self) -> list[int]:
-        return [sensor.position for sensor in self._sensors if sensor.streams]
+        return [sensor.number for sensor in self._sensors if sensor.streams]
 
-    def _lose(self, position: int, reason: str) -> None:
-        if self._sensors[position].streams:
-            self._take_out(position, SensorState.LOST, self._ladders[position].bring_back())
-            self._report_lost(position, reason)
+    def _lose(self, number: int, reason: str) -> None:
+        if self._sensors[number].streams:
+            self._take_out(number, SensorState.LOST, self._ladders[number].bring_back())
+            self._report_lost(number, reason)
 
-    def _report_lost(self, position: int, reason: str) -> None:
-        sensor = self._sensors[position]
-        self._lost_at_ns[position] = self._clock.monotonic_ns()
-        log.warning("sensor %d (%s) is lost: %s", position, sensor.identity, reason)
+    def _report_lost(self, number: int, reason: str) -> None:
+        sensor = self._sensors[number]
+        self._lost_at_ns[number] = self._clock.monotonic_ns()
+        log.warning("sensor %d (%s) is lost: %s", number, sensor.identity, reason)
         self._announce(
             event(
                 Event.SENSOR_LOST,
-                sensor=position,
+                sensor=number,
                 reason=reason,
-                message=f"sensor {position} is lost: {reason}",
+                message=f"sensor {number} is lost: {reason}",
             )
         )
 
-    def _take_out(self, position: int, state: SensorState, steps: Steps[bool]) -> None:
-        self._sensors[position].enter(state)
-        self._work[position] = steps
+    def _take_out(self, number: int, state: SensorState, steps: Steps[bool]) -> None:
+        self._sensors[number].enter(state)
+        self._work[number] = steps
         self._count_alive()
 
     def _count_alive(self) -> None:
         alive = self._alive()
-        self.alive_wkc = sum(self._bus.working_counter(position) for position in alive)
+        self.alive_wkc = sum(self._bus.working_counter(number) for number in alive)
         self.all_lost = not alive
         self._bus.be_patient(self.all_lost)
 
-    def _step(self, position: int) -> None:
-        change = self._changing.get(position)
+    def _step(self, number: int) -> None:
+        change = self._changing.get(number)
         try:
-            next(self._work[position])
+            next(self._work[number])
             if change is not None and change.until is not None and change.until.passed:
-                self._lose_in_change(position, "it does not come back to OP")
+                self._lose_in_change(number, "it does not come back to OP")
         except StopIteration as stop:
-            self._bring_back(position, left_op=stop.value)
+            self._bring_back(number, left_op=stop.value)
         except GoneError:
             if change is not None:
-                self._lose_in_change(position, f"sensor {position} went away while its settings were changed")
+                self._lose_in_change(number, f"sensor {number} went away while its settings were changed")
             else:
-                self._work[position] = self._ladders[position].bring_back()
+                self._work[number] = self._ladders[number].bring_back()
         except BusError as error:
             if change is None:
-                log.warning("sensor %d is not back yet: %s", position, error)
-                self._work[position] = self._ladders[position].bring_back(_FAILED_PAUSE_S)
+                log.warning("sensor %d is not back yet: %s", number, error)
+                self._work[number] = self._ladders[number].bring_back(_FAILED_PAUSE_S)
             elif change.failed is not None:
-                self._lose_in_change(position, f"restoring the former settings failed too: {error}")
+                self._lose_in_change(number, f"restoring the former settings failed too: {error}")
             else:
-                self._work[position] = self._ladders[position].bring_back()
-                self._revert(position, error)
-                if self._ladders[position].al_status() is None:
-                    self._lose_in_change(position, "it does not answer any more")
+                self._work[number] = self._ladders[number].bring_back()
+                self._revert(number, error)
+                if self._ladders[number].states.status() is None:
+                    self._lose_in_change(number, "it does not answer any more")
         except DifferentSensorError as error:
-            self._refuse(position, error.found)
+            self._refuse(number, error.found)
 
-    def _revert(self, position: int, error: BusError) -> None:
+    def _revert(self, number: int, error: BusError) -> None:
         """The change failed: the former settings are what is wanted again."""
-        sensor, change = self._sensors[position], self._changing[position]
-        log.warning("sensor %d keeps its former settings: %s", position, error)
-        self._changing[position] = change._replace(failed=error, until=Deadline(self._clock, _REVERT_S))
+        sensor, change = self._sensors[number], self._changing[number]
+        log.warning("sensor %d keeps its former settings: %s", number, error)
+        self._changing[number] = change._replace(failed=error, until=Deadline(self._clock, _REVERT_S))
         sensor.enter(SensorState.REVERTING)
         sensor.wanted, sensor.asked = change.wanted, change.asked
 
-    def _lose_in_change(self, position: int, reason: str) -> None:
+    def _lose_in_change(self, number: int, reason: str) -> None:
         """The sensor has gone, or does not take its former settings either: whoever asked is told now."""
-        failed = self._changing[position].failed
+        failed = self._changing[number].failed
         if failed is None:
-            self._revert(position, BusError(reason))
+            self._revert(number, BusError(reason))
             error = BusError(reason)
         else:
             error = extended(failed, f"; {reason}")
-        change = self._changing.pop(position)
-        self._sensors[position].enter(SensorState.LOST)
-        self._work[position] = self._ladders[position].bring_back(_FAILED_PAUSE_S)
-        self._report_lost(position, reason)
+        change = self._changing.pop(number)
+        self._sensors[number].enter(SensorState.LOST)
+        self._work[number] = self._ladders[number].bring_back(_FAILED_PAUSE_S)
+        self._report_lost(number, reason)
         change.done(extended(error, LATER))
 
-    def _bring_back(self, position: int, *, left_op: bool) -> None:
-        sensor, stream = self._sensors[position], self._streams[position]
-        del self._work[position]
+    def _bring_back(self, number: int, *, left_op: bool) -> None:
+        sensor, stream = self._sensors[number], self._streams[number]
+        del self._work[number]
         sensor.enter(SensorState.STREAMING)
         self._count_alive()
-        stream.recover(sensor.period_ns if left_op else None, lost=position in self._lost_at_ns)
-        if (change := self._changing.pop(position, None)) is not None:
+        stream.recover(sensor.period_ns if left_op else None, lost=number in self._lost_at_ns)
+        if (change := self._changing.pop(number, None)) is not None:
             if change.failed is None:
-                self._announce(event(Event.RECONFIGURED, sensor=position, settings=dict(sensor.settings)))
+                self._announce(event(Event.RECONFIGURED, sensor=number, settings=dict(sensor.settings)))
             change.done(change.failed and extended(change.failed, IN_FORCE))
-        if position not in self._lost_at_ns:
+        if number not in self._lost_at_ns:
             return
-        lost_s = round((self._clock.monotonic_ns() - self._lost_at_ns.pop(position)) * 1e-9, 3)
-        log.info("sensor %d (%s) is back after %.3f s", position, sensor.identity, lost_s)
-        self._announce(
-            event(Event.SENSOR_BACK, sensor=position, lost_s=lost_s, settings=dict(sensor.settings))
-        )
+        lost_s = round((self._clock.monotonic_ns() - self._lost_at_ns.pop(number)) * 1e-9, 3)
+        log.info("sensor %d (%s) is back after %.3f s", number, sensor.identity, lost_s)
+        self._announce(event(Event.SENSOR_BACK, sensor=number, lost_s=lost_s, settings=dict(sensor.settings)))
 
-    def _refuse(self, position: int, found: Identity) -> None:
-        sensor = self._sensors[position]
+    def _refuse(self, number: int, found: Identity) -> None:
+        sensor = self._sensors[number]
         sensor.enter(SensorState.REFUSED)
-        self._lost_at_ns.setdefault(position, self._clock.monotonic_ns())
-        if (change := self._changing.pop(position, None)) is not None:
-            change.done(BusError(f"sensor {position} was replaced by a {found} meanwhile"))
+        self._lost_at_ns.setdefault(number, self._clock.monotonic_ns())
+        if (change := self._changing.pop(number, None)) is not None:
+            change.done(BusError(f"sensor {number} was replaced by a {found} meanwhile"))
         message = (
-            f"sensor {position} is now a {found}, not the {sensor.identity}: connect that one again, "
+            f"sensor {number} is now a {found}, not the {sensor.identity}: connect that one again, "
             "or restart the server to use the new one"
         )
         log.error("%s", message)
         who = {"name": found.name, "serial": found.serial}
         self._announce(
-            event(Event.SENSOR_LOST, sensor=position, reason="different_sensor", message=message, found=who)
+            event(Event.SENSOR_LOST, sensor=number, reason="different_sensor", message=message, found=who)
         )
-        self._work[position] = self._ladders[position].wait_for_removal()
+        self._work[number] = self._ladders[number].wait_for_removal()

@@ -28,10 +28,10 @@ REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INV
 
 
 class SensorStream:
-    """Numbers, stamps and marks the frames of the sensor at `position`, which samples every `period_ns`."""
+    """Numbers, stamps and marks the frames of the sensor `number`, which samples every `period_ns`."""
 
-    def __init__(self, position: int, period_ns: float, clock: Clock = SYSTEM_CLOCK) -> None:
-        self.position = position
+    def __init__(self, number: int, period_ns: float, clock: Clock = SYSTEM_CLOCK) -> None:
+        self.number = number
         self._monotonic_ns, self._time_ns = clock.monotonic_ns, clock.time_ns
         self.clock = SampleClock(period_ns, clock.monotonic_ns())
         self.process_data = b""
@@ -95,7 +95,7 @@ class SensorStream:
         sequence = self.sequence
         self.sequence += 1
         return encode_data(
-            sequence, stamp_ns, moment_ns, self.position, flags, max(wkc, 0), self._handed_out
+            sequence, stamp_ns, moment_ns, self.number, flags, max(wkc, 0), self._handed_out
         ), flags  # fmt: skip
 
     def learn(self) -> None:
@@ -137,7 +137,7 @@ class SensorStream:
             self._rate_reported = True
             log.warning(
                 "sensor %d samples every %.1f µs, %+.1f %% off what it is set to: check its settings",
-                self.position, self.clock.period_ns / 1000, 100 * pull,
+                self.number, self.clock.period_ns / 1000, 100 * pull,
             )  # fmt: skip
 
     def recover(self, period_ns: float | None, *, lost: bool = True) -> None:
@@ -151,7 +151,7 @@ class SensorStream:
     def status(self) -> dict[str, Any]:
         """The sensor's part of the `status` reply, but for the age."""
         return {
-            "sensor": self.position,
+            "sensor": self.number,
             "fresh": self.fresh,
             "repeated": self.repeated,
             "invalid": self.invalid,

@@ -51,29 +51,29 @@ class ServerOptions:
         """Whether to start a virtual bus."""
         return self.ifname == VIRTUAL_INTERFACE
 
-    def asked_settings(self, position: int, name: str, serial: int) -> dict[str, SettingValue]:
-        """The settings the user gave for the sensor at `position` with this name and serial number."""
+    def asked_settings(self, number: int, name: str, serial: int) -> dict[str, SettingValue]:
+        """The settings the user gave for the sensor `number` with this name and serial number."""
         asked: dict[str, SettingValue] = {}
-        for _, settings in self._sources(position, name, serial):
+        for _, settings in self._sources(number, name, serial):
             asked |= settings
         return asked
 
-    def wanted_settings(self, position: int, name: str, serial: int) -> dict[str, SettingValue]:
+    def wanted_settings(self, number: int, name: str, serial: int) -> dict[str, SettingValue]:
         """The start-up defaults overridden by these; UsageError if the result is inconsistent."""
-        wanted = {**start_up_defaults(), **self.asked_settings(position, name, serial)}
+        wanted = {**start_up_defaults(), **self.asked_settings(number, name, serial)}
         try:
             check_combination(wanted)
         except SettingError as error:
-            sources = ", ".join(source for source, _ in self._sources(position, name, serial))
+            sources = ", ".join(source for source, _ in self._sources(number, name, serial))
             raise UsageError(
-                f"the settings for sensor {position} ({name}, serial {serial}) are inconsistent: {error}; "
+                f"the settings for sensor {number} ({name}, serial {serial}) are inconsistent: {error}; "
                 f"correct one of {sources}"
             ) from None
         return wanted
 
-    def _sources(self, position: int, name: str, serial: int) -> list[tuple[str, dict[str, SettingValue]]]:
+    def _sources(self, number: int, name: str, serial: int) -> list[tuple[str, dict[str, SettingValue]]]:
         """Where settings for this sensor come from, and which; later ones override earlier ones."""
-        single = [choice for choice in self.sensor_settings if choice.matches(position, name, serial)]
+        single = [choice for choice in self.sensor_settings if choice.matches(number, name, serial)]
         single.sort(key=lambda choice: choice.precedence)
         sources = [
             ("[sensor]", self.common_settings),
@@ -83,14 +83,14 @@ class ServerOptions:
         return [(source, settings) for source, settings in sources if settings]
 
     def check_sensors(self, found: Mapping[int, Identity]) -> None:
-        """UsageError if there are settings for a sensor that is not among those `found`, by position."""
+        """UsageError if there are settings for a sensor that is not among those `found`, by number."""
         missing = [
             str(choice)
             for choice in self.sensor_settings
-            if not any(choice.matches(position, who.name, who.serial) for position, who in found.items())
+            if not any(choice.matches(number, who.name, who.serial) for number, who in found.items())
         ]
         if missing:
-            there = "; ".join(f"{position}: {who}" for position, who in found.items())
+            there = "; ".join(f"{number}: {who}" for number, who in found.items())
             raise UsageError(
                 f"the configuration has settings for sensor {', '.join(missing)}, but the bus has only "
                 f"{there}: connect that sensor, or correct the name of the table"

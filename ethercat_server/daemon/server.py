@@ -15,11 +15,12 @@ from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.daemon.service import Policy, Service
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.master.soem import SoemBackend
 from ethercat_server.ethercat.nic import claimed
-from ethercat_server.ethercat.soem import SoemBackend
 from ethercat_server.process import realtime
 from ethercat_server.process.notify import Notifier
 from ethercat_server.process.signals import Signals
+from ethercat_server.sensor.others import Others
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.sensor_actions import SensorActions
@@ -43,23 +44,24 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
             ifname = cleanup.enter_context(VirtualBus(options.virtual_arguments, priority)).ifname
         cleanup.enter_context(claimed(ifname))
         backend = SoemBackend(ifname)
-        cleanup.callback(backend.close)
-        backend.open()
         bus = Bus(backend)
-        sensors = bring_up(bus, options, signals.check)
+        cleanup.callback(bus.close)
+        backend.open()
+        sensors, slaves = bring_up(bus, options, signals.check)
         realtime.prepare(priority, options.server["cpu"])
-        streams = [SensorStream(sensor.position, sensor.period_ns) for sensor in sensors]
-        recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast), Jobs(bus, sensors)
+        streams = [SensorStream(sensor.number, sensor.period_ns) for sensor in sensors]
+        others = Others(bus, slaves)
+        recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast, others), Jobs(bus, sensors)
         cycle = Cycle(bus, sensors, streams, hub, recovery, jobs, notifier)
         on_sensors = SensorActions(bus, hub, recovery, jobs, sensors, streams)
         service = Service(argv, policy, hub, on_sensors, notifier)
         cycle.every_second = service.every_second
         signals.call(cycle.stop, service.reload)
-        hub.start(Actions(hub, cycle, on_sensors).handle)
+        hub.start(Actions(hub, cycle, on_sensors, {"others": others.rows}).handle)
         for sensor in sensors:
             log.info(
                 "sensor %d: %s, serial %d, firmware %s, %d bytes at %d Hz",
-                sensor.position, sensor.identity.name, sensor.identity.serial, sensor.identity.firmware,
+                sensor.number, sensor.identity.name, sensor.identity.serial, sensor.identity.firmware,
                 sensor.pdo_size, sensor.rate_hz,
             )  # fmt: skip
         for host in options.server["hosts"]:

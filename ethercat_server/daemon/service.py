@@ -64,7 +64,7 @@ class Service:
         self._reading: threading.Thread | None = None
         self._again = False
         self._pending: list[dict[str, SettingValue]] = [{} for _ in on_sensors.sensors]
-        """By position: settings that a reload could not apply; the next one tries again."""
+        """By number: settings that a reload could not apply; the next one tries again."""
 
     def ready(self) -> None:
         """The server streams."""
@@ -115,45 +115,45 @@ class Service:
         if later:
             log.warning("a change of %s requires a restart", ", ".join(later))
         try:
-            now.check_sensors({sensor.position: sensor.identity for sensor in self._on_sensors.sensors})
+            now.check_sensors({sensor.number: sensor.identity for sensor in self._on_sensors.sensors})
         except UsageError as error:
             log.warning("%s", error)  # the other sensors get their settings all the same
-        for position, settings in enumerate(changes):
-            self._configure(position, settings)
+        for number, settings in enumerate(changes):
+            self._configure(number, settings)
 
     def _changes(self, sensor: Sensor, now: ServerOptions) -> dict[str, SettingValue]:
         """The settings of this sensor that change; UsageError if `now` is inconsistent."""
-        who = (sensor.position, sensor.identity.name, sensor.identity.serial)
-        before, pending = self._policy.options.wanted_settings(*who), self._pending[sensor.position]
+        who = (sensor.number, sensor.identity.name, sensor.identity.serial)
+        before, pending = self._policy.options.wanted_settings(*who), self._pending[sensor.number]
         wanted = now.wanted_settings(*who)
         return {n: value for n, value in wanted.items() if n in pending or before.get(n) != value}
 
-    def _configure(self, position: int, changed: dict[str, SettingValue]) -> None:
+    def _configure(self, number: int, changed: dict[str, SettingValue]) -> None:
         if not changed:
             return
         names = ", ".join(f"{name} = {value}" for name, value in changed.items())
-        pending = self._pending[position]
+        pending = self._pending[number]
         pending.update(changed)
 
         def done(_: object, error: RequestError | None) -> None:
             if error is not None:
                 log.error(
-                    "sensor %d: could not apply %s, the next reload tries again: %s", position, names, error
+                    "sensor %d: could not apply %s, the next reload tries again: %s", number, names, error
                 )
                 return
-            log.info("sensor %d: applied %s", position, names)
+            log.info("sensor %d: applied %s", number, names)
             for name, value in changed.items():
                 if pending.get(name) == value:  # unless a later reload asked for another value meanwhile
                     del pending[name]
 
         try:
-            self._on_sensors.configure(position, changed, save_too=False, done=done)
+            self._on_sensors.configure(number, changed, save_too=False, done=done)
         except RequestError as error:
             done(None, error)
 
     def _update_status(self) -> None:
         sensors = self._on_sensors.sensors
-        lost = [sensor.position for sensor in sensors if not sensor.streams]
+        lost = [sensor.number for sensor in sensors if not sensor.streams]
         text = f"streaming {len(sensors) - len(lost)} of {len(sensors)} sensors"
         if lost:
             text += f", lost: {', '.join(map(str, lost))}"

@@ -9,22 +9,22 @@ from typing import Any, Final, TypeVar
 from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
-from ethercat_server.acquisition.start_up import AsFound, check_sii, enter_op, find_sensors
+from ethercat_server.acquisition.start_up import AsFound, enter_op, find_sensors
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError, ServerError, UsageError
-from ethercat_server.ethercat.backend import SlaveIdentity
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.master.soem import SoemBackend
 from ethercat_server.ethercat.nic import claimed
 from ethercat_server.ethercat.slave.coe import BlockingSdo, Sdo, Steps, finish
-from ethercat_server.ethercat.slave.sii import has_coe
-from ethercat_server.ethercat.soem import SoemBackend
 from ethercat_server.links.link import Found, Link, OnFrame, failed_change, signals_call, signals_held_back
 from ethercat_server.process import realtime
 from ethercat_server.process.notify import Notifier
+from ethercat_server.sensor import look
 from ethercat_server.sensor.configuration import Change, save
 from ethercat_server.sensor.guard import GuardedSdo
-from ethercat_server.sensor.scan import scan
+from ethercat_server.sensor.others import Others
+from ethercat_server.sensor.scan import look_safely, scan
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.sensor.set_up import identify, set_up
 from ethercat_server.sensor.tare import LATER, tare
@@ -46,15 +46,22 @@ def open_bus(ifname: str, cleanup: contextlib.ExitStack) -> Bus:
         ifname = cleanup.enter_context(VirtualBus()).ifname
     cleanup.enter_context(claimed(ifname))
     backend = SoemBackend(ifname)
-    cleanup.callback(backend.close)
+    bus = Bus(backend)
+    cleanup.callback(bus.close)
     backend.open()
-    return Bus(backend)
+    return bus
 
 
-def scan_only(ifname: str, cleanup: contextlib.ExitStack, *, force: bool) -> tuple[Bus, list[SlaveIdentity]]:
-    """The bus and all its slaves, of any vendor."""
+def read_images(ifname: str, cleanup: contextlib.ExitStack, *, force: bool) -> dict[int, bytes | BusError]:
+    """The SII of every slave on the wire, of any vendor, by position; all stay in the state they are in."""
     bus = open_bus(ifname, cleanup)
-    return bus, scan(bus, _no_check, force=force)
+    images: dict[int, bytes | BusError] = {}
+    for slave in look_safely(bus, _no_check, force=force):
+        try:
+            images[slave.position] = look.read_image(bus, slave.position)
+        except BusError as error:
+            images[slave.position] = error
+    return images
 
 
 class DirectLink(Link):
@@ -67,8 +74,8 @@ class DirectLink(Link):
             if any_slave:
                 self.sensors = _identify_all(self._bus, force=force)
             else:
-                found = find_sensors(self._bus, AsFound(force=force), _no_check)
-                self.sensors = [Found(sensor.position, sensor.identity) for sensor in found]
+                found = find_sensors(self._bus, AsFound(force=force), _no_check).sensors
+                self.sensors = [Found(sensor.number, sensor.identity) for sensor in found]
             self._cleanup = cleanup.pop_all()
         self.used = f"the interface {ifname}"
 
@@ -76,13 +83,13 @@ class DirectLink(Link):
         """Take the bus to INIT and release the interface."""
         self._cleanup.close()
 
-    def sdo(self, position: int) -> GuardedSdo:
+    def sdo(self, number: int) -> GuardedSdo:
         """See `Link`."""
-        return GuardedSdo(BlockingSdo(self._bus, position))
+        return GuardedSdo(BlockingSdo(self._bus, number))
 
-    def configure(self, position: int, settings: Mapping[str, SettingValue], save: bool) -> None:
+    def configure(self, number: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """See `Link`."""
-        sdo, sensor = self.sdo(position), self.in_force(self.sensors[position])
+        sdo, sensor = self.sdo(number), self.in_force(self.sensors[number])
         _check_rate_known(sensor)
         try:
             change = Change(sensor, settings)
@@ -91,19 +98,19 @@ class DirectLink(Link):
         with signals_held_back():
             finish(_change(sdo, sensor, change, save), clock=self.clock)
 
-    def tare(self, position: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
+    def tare(self, number: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
         """See `Link`."""
         running = _Running(self._bus, self._operational(), lambda _: True)
-        sdo = running.recovery.sdo(position)
+        sdo = running.recovery.sdo(number)
         return running.do(
-            position, tare(sdo, running.sensors[position], running.streams[position], samples, target)
+            number, tare(sdo, running.sensors[number], running.streams[number], samples, target)
         )
 
-    def watch(self, positions: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
+    def watch(self, numbers: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
         """See `Link`."""
 
         def wanted(frame: DataMessage) -> bool:
-            return frame.sensor not in positions or on_frame(frame)
+            return frame.sensor not in numbers or on_frame(frame)
 
         running = _Running(self._bus, self._operational(), wanted)
         running.on_idle = on_idle
@@ -124,8 +131,8 @@ class _Running:
         realtime.prepare(realtime.DEFAULT_PRIORITY, None)
         self.sensors = sensors
         self._clock = bus.clock
-        self.streams = [SensorStream(sensor.position, sensor.period_ns, bus.clock) for sensor in sensors]
-        self.recovery = Recovery(bus, sensors, self.streams, lambda _: None)
+        self.streams = [SensorStream(sensor.number, sensor.period_ns, bus.clock) for sensor in sensors]
+        self.recovery = Recovery(bus, sensors, self.streams, lambda _: None, Others(bus, ()))
         self.on_idle: Callable[[], bool] = lambda: True
         self._jobs = Jobs(bus, sensors)
         self._cycle = Cycle(bus, sensors, self.streams, self, self.recovery, self._jobs, Notifier())
@@ -133,7 +140,7 @@ class _Running:
         self._decoder = FrameDecoder()
         self._stopped = False
 
-    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:  # noqa: ARG002
+    def publish(self, frame: bytes, number: int, flags: int, now_ns: int) -> None:  # noqa: ARG002
         """See `Outlet`."""
         self._decoder.feed(frame)
         for message in self._decoder:
@@ -152,7 +159,7 @@ class _Running:
         if self._stopped:
             raise KeyboardInterrupt
 
-    def do(self, position: int, steps: Steps[T]) -> T:
+    def do(self, number: int, steps: Steps[T]) -> T:
         """Run until `steps` are done; returns their result. After a signal they undo what is half done."""
         results: list[T] = []
         errors: list[RequestError] = []
@@ -164,14 +171,14 @@ class _Running:
                 errors.append(error)
             self._cycle.stop()
 
-        self._jobs.start(position, self._stoppable(steps), done)
+        self._jobs.start(number, self._stoppable(steps), done)
         with signals_call(self._note_signal):
             self._cycle.run()
         if errors:
             kind = UsageError if errors[0].code == ErrorCode.BAD_REQUEST else BusError
             text = str(errors[0])
-            if self.sensors[position].unsettled:
-                text = text.removesuffix(LATER) + self._put_back(position)
+            if self.sensors[number].unsettled:
+                text = text.removesuffix(LATER) + self._put_back(number)
             raise kind(text)
         return results[0]
 
@@ -195,9 +202,9 @@ class _Running:
             except BusError as error:  # the sensor is lost: the steps may handle that
                 raised = error
 
-    def _put_back(self, position: int) -> str:
+    def _put_back(self, number: int) -> str:
         """Give a sensor that was lost in a tare the time to come back; returns what became of its offset."""
-        sensor, deadline = self.sensors[position], Deadline(self._clock, _BACK_S)
+        sensor, deadline = self.sensors[number], Deadline(self._clock, _BACK_S)
         self.on_idle = lambda: not sensor.streams and not deadline.passed
         self._cycle.stopping = False
         with signals_call(self._note_signal), contextlib.suppress(ServerError):
@@ -236,27 +243,23 @@ def _change(sdo: Sdo, sensor: Sensor, change: Change, and_save: bool) -> Steps[N
 
 
 def _identify_all(bus: Bus, *, force: bool) -> list[Found]:
-    """All slaves of any vendor, with what they say of themselves."""
+    """The sensors, or all slaves of any vendor if there are none, with what they say of themselves."""
     found = []
-    slaves = scan(bus, _no_check, force=force)
-    for position, slave in enumerate(slaves):
-        check_sii(bus.ifname, position, slave)
-    bus.backend.check_preop(_no_check)
-    for position, slave in enumerate(slaves):
-        try:
-            identity = finish(identify(GuardedSdo(BlockingSdo(bus, position)), slave.name), clock=bus.clock)
-        except BusError:
-            if finish(has_coe(bus, position), clock=bus.clock):
-                raise
-            found.append(Found(position, Identity(slave.name or "nameless", 0, "", ""), has_objects=False))
+    slaves = look_safely(bus, _no_check, force=force)
+    scan(bus, slaves, _no_check)
+    for number, position in enumerate(bus.positions):
+        slave = slaves[position]
+        if slave.has_coe:
+            sdo = GuardedSdo(BlockingSdo(bus, number))
+            found.append(Found(number, finish(identify(sdo, slave.name), clock=bus.clock)))
         else:
-            found.append(Found(position, identity))
+            found.append(Found(number, Identity(slave.name, 0, "", ""), has_objects=False))
     return found
 
 
 def _check_rate_known(sensor: Sensor) -> None:
     if "sinc_length" not in sensor.wanted:
-        raise BusError(f"sensor {sensor.position} does not report its sampling rate: power it off and on")
+        raise BusError(f"sensor {sensor.number} does not report its sampling rate: power it off and on")
 
 
 def _no_check() -> None:

@@ -25,18 +25,18 @@ from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue
 class Found(NamedTuple):
     """A sensor reached through a link."""
 
-    position: int
+    number: int
     identity: Identity
     has_objects: bool = True
     """False for a slave without a CoE mailbox."""
 
     def __str__(self) -> str:
         """Its description in messages."""
-        return f"sensor {self.position}: {self.identity.name}, serial {self.identity.serial}"
+        return f"sensor {self.number}: {self.identity.name}, serial {self.identity.serial}"
 
     def as_json(self) -> dict[str, Any]:
         """Its JSON form."""
-        return {"sensor": self.position, **self.identity._asdict()}
+        return {"sensor": self.number, **self.identity._asdict()}
 
 
 OnFrame = Callable[[DataMessage], bool]
@@ -53,19 +53,19 @@ class Link(ABC):
     """The time that passes on the bus, and waiting."""
 
     @abstractmethod
-    def sdo(self, position: int) -> GuardedSdo:
-        """The object dictionary of the sensor at `position`."""
+    def sdo(self, number: int) -> GuardedSdo:
+        """The object dictionary of the sensor `number`."""
 
     @abstractmethod
-    def configure(self, position: int, settings: Mapping[str, SettingValue], save: bool) -> None:
+    def configure(self, number: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """Change `settings` and verify them; on failure the former ones are restored."""
 
     @abstractmethod
-    def tare(self, position: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
+    def tare(self, number: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
         """Set the force/torque offset; returns the reply of the action `tare`. The last call on a link."""
 
     @abstractmethod
-    def watch(self, positions: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
+    def watch(self, numbers: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
         """Stream until `on_frame` or the periodic `on_idle` returns False. The last call on a link."""
 
     @abstractmethod
@@ -82,15 +82,15 @@ class Link(ABC):
 
     def in_force(self, found: Found) -> Sensor:
         """The sensor with its present settings, which are also the wanted ones."""
-        sensor = Sensor(found.position, found.identity, {})
-        finish(read_in_force(self.sdo(found.position), sensor), clock=self.clock)
+        sensor = Sensor(found.number, found.identity, {})
+        finish(read_in_force(self.sdo(found.number), sensor), clock=self.clock)
         return sensor
 
 
 def choose(sensors: Sequence[Found], wanted: str | None) -> Found:
     """The sensor that `wanted` selects, the only one if None; UsageError if it is not unique.
 
-    A number that is no position on the bus is taken as a serial number.
+    A number that no sensor has is taken as a serial number.
     """
     if wanted is None and len(sensors) == 1:
         return sensors[0]
@@ -103,9 +103,9 @@ def choose(sensors: Sequence[Found], wanted: str | None) -> Found:
         if not wanted.isdecimal():
             raise UsageError(f"--sensor {wanted}: it must be {error}") from None
         choice = SensorChoice(serial=int(wanted))
-    if choice.position is not None and choice.position >= len(sensors):
-        choice = SensorChoice(serial=choice.position)
-    found = [s for s in sensors if choice.matches(s.position, s.identity.name, s.identity.serial)]
+    if choice.number is not None and choice.number >= len(sensors):
+        choice = SensorChoice(serial=choice.number)
+    found = [s for s in sensors if choice.matches(s.number, s.identity.name, s.identity.serial)]
     if len(found) != 1:
         many = "more than one sensor" if found else "no sensor"
         raise UsageError(f"--sensor {wanted}: {many} matches (available: {there})")

@@ -74,24 +74,24 @@ class ServerLink(Link):
         except ConnectionFailedError as error:
             raise ServerError(f"{self._name} closed the connection ({error}): see its log") from None
 
-    def sdo(self, position: int) -> GuardedSdo:
+    def sdo(self, number: int) -> GuardedSdo:
         """See `Link`."""
-        return GuardedSdo(_ServerSdo(self, position))
+        return GuardedSdo(_ServerSdo(self, number))
 
-    def sii(self, position: int, word: int, words: int) -> bytes:
+    def sii(self, number: int, word: int, words: int) -> bytes:
         """`words` words of a sensor's SII from `word` on."""
-        return bytes.fromhex(self.ask("sii_read", sensor=position, word=word, words=words)["hex"])
+        return bytes.fromhex(self.ask("sii_read", sensor=number, word=word, words=words)["hex"])
 
-    def configure(self, position: int, settings: Mapping[str, SettingValue], save: bool) -> None:
+    def configure(self, number: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """See `Link`."""
         with signals_held_back():
-            self.ask("configure", sensor=position, settings=dict(settings), save=save)
+            self.ask("configure", sensor=number, settings=dict(settings), save=save)
 
-    def tare(self, position: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
+    def tare(self, number: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
         """See `Link`."""
         timeout_s = _ANSWER_TIMEOUT_S + samples * _SLOWEST_SAMPLE_S
         with signals_call(self._stay()):
-            return self.ask("tare", timeout_s, sensor=position, samples=samples, target=list(target))
+            return self.ask("tare", timeout_s, sensor=number, samples=samples, target=list(target))
 
     def _stay(self) -> Callable[[], None]:
         """Signal handler during a tare, which the server completes in any case."""
@@ -105,9 +105,9 @@ class ServerLink(Link):
 
         return hear
 
-    def watch(self, positions: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
+    def watch(self, numbers: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
         """See `Link`."""
-        self.ask("subscribe", sensors=list(positions))
+        self.ask("subscribe", sensors=list(numbers))
         while on_idle():
             try:
                 frames = self._client.receive(_IDLE_S)
@@ -120,21 +120,21 @@ class ServerLink(Link):
                 event = self._client.events.popleft()
                 if event["event"] == Event.SHUTTING_DOWN:
                     raise ServerError(f"{self._name} is shutting down")
-                if event.get("sensor") in positions:
+                if event.get("sensor") in numbers:
                     _tell(event)
 
 
 class _ServerSdo:
     """An `Sdo` through the actions `sdo_read` and `sdo_write`."""
 
-    def __init__(self, link: ServerLink, position: int) -> None:
-        self._link, self._position = link, position
+    def __init__(self, link: ServerLink, number: int) -> None:
+        self._link, self._number = link, number
         self.clock = link.clock
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """See `Sdo`."""
         yield from ()
-        keys = {"sensor": self._position, "index": index, "subindex": subindex}
+        keys = {"sensor": self._number, "index": index, "subindex": subindex}
         for _ in range(_READ_ATTEMPTS - 1):
             try:
                 return bytes.fromhex(self._link.ask("sdo_read", **keys)["hex"])
@@ -147,18 +147,18 @@ class _ServerSdo:
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """See `Sdo`."""
         yield from ()
-        self._link.ask("sdo_write", sensor=self._position, index=index, subindex=subindex, hex=data.hex())
+        self._link.ask("sdo_write", sensor=self._number, index=index, subindex=subindex, hex=data.hex())
 
 
 def _tell(event: JsonObject) -> None:
     """Print an event of a watched sensor."""
-    position = event["sensor"]
+    number = event["sensor"]
     if event.get("event") == Event.SENSOR_LOST:
-        note(str(event.get("message", f"sensor {position} is lost")))
+        note(str(event.get("message", f"sensor {number} is lost")))
     elif event.get("event") == Event.SENSOR_BACK:
-        note(f"sensor {position} is back after {event.get('lost_s')} s")
+        note(f"sensor {number} is back after {event.get('lost_s')} s")
     elif event.get("event") == Event.RECONFIGURED:
-        note(f"the settings of sensor {position} have changed")
+        note(f"the settings of sensor {number} have changed")
 
 
 def _found(row: Mapping[str, Any]) -> Found:

@@ -84,6 +84,6 @@ def save(sdo: Sdo, sensor: Sensor) -> Steps[None]:
             error, "; whether it saved all, some or none of its settings is not known: save again"
         ) from None
     raise BusError(
-        f"sensor {sensor.position} did not save its settings (status {answer}): they are in force until its "
+        f"sensor {sensor.number} did not save its settings (status {answer}): they are in force until its "
         "power goes; save again"
     )

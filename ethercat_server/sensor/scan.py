@@ -1,80 +1,98 @@
-"""Looks at a bus before it is scanned: a scan takes every slave to INIT, whosever it is.
-
-Looking changes nothing on the bus: frames of other masters are counted, registers are read. Not even the SII
-(EEPROM) of a slave in SAFEOP or OP is read, for that takes writes to its controller; what is Bota's is told
-from the sync managers.
-"""
+"""Scans a bus: finds the sensors, leaves the others alone, and takes the sensors to PREOP."""
 
 from __future__ import annotations
 
-import struct
+import logging
+from collections.abc import Sequence
 from typing import Final
 
 from ethercat_server.errors import BusError
-from ethercat_server.ethercat.backend import CheckInterrupt, SlaveIdentity
+from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.master.datagrams import DatagramMaster
 from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.slave import times
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
-from protocol.pdo import LAYOUTS
+from ethercat_server.sensor.look import Slave, check_no_master, look, read_slave
 
-_LISTEN_S: Final = 0.1
-_MASTER_FRAMES: Final = 3
-"""Frames in this time that are a master's cycle; fewer may be the last ones of a server that was killed."""
-_TIMEOUT_S: Final = 0.02
-_ATTEMPTS: Final = 3
-_MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
-"""Start and length of a Bota sensor's sync managers 0 to 2."""
-_INPUTS: Final = 0x1180
-_SYNC_MANAGER: Final = struct.Struct("<HH4x")
+_PAUSE_S: Final = 0.002
+_ACKNOWLEDGE: Final = 0x10
 _ABOVE_PREOP: Final = AlState.SAFEOP | AlState.OP
+_MAILBOX_BYTES: Final = range(16, 1487)
+
+log = logging.getLogger(__name__)
 
 
-def scan(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = False) -> list[SlaveIdentity]:
-    """Find the slaves and take them to PREOP (see `Bus.scan`).
+def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = False) -> list[Slave]:
+    """All slaves on the wire.
 
-    BusError if that would stop somebody else's machine, unless `force`: if another master is sending, or a
-    slave that is not Bota's is in SAFEOP or OP.
+    BusError if using the bus would stop somebody else's machine: if another master is sending, or a slave
+    that is not Bota's is in SAFEOP or OP. With `force`, such slaves are taken to PREOP instead.
     """
     if not force:
-        _check_no_master(bus)
+        check_no_master(bus)
+    check_interrupt()
+    slaves = look(bus, check_interrupt)
+    at_work = [slave for slave in slaves if slave.at_work]
+    if not at_work:
+        return slaves
+    if not force:
+        where = ", ".join(f"{slave.position} in {slave.status.state.name}" for slave in at_work)
+        raise BusError(
+            f"{bus.ifname} has slaves at work that are no Bota sensors (position {where}): name the "
+            "interface that the sensor is connected to, or stop their master; --force takes them to PREOP"
+        )
+    return [_stop(bus, slave, check_interrupt) if slave.at_work else slave for slave in slaves]
+
+
+def scan(bus: Bus, slaves: Sequence[Slave], check_interrupt: CheckInterrupt) -> None:
+    """Take these slaves to PREOP, numbered in this order. `slaves` has all that are on the wire.
+
+    pysoem is the master where all are sensors; where there are others, they are not written to.
+    """
+    numbered = [slave for slave in slaves if slave.is_sensor] or list(slaves)
+    for slave in numbered:
+        _check_sii(bus.ifname, slave)
+    own = bus.backend.master
+    shared = len(numbered) < len(slaves)
+    master = DatagramMaster(bus, [slave.sii for slave in slaves]) if shared or own is None else own
+    bus.scan(master, [slave.position for slave in numbered], check_interrupt)
+
+
+def _check_sii(ifname: str, slave: Slave) -> None:
+    """BusError if nothing is known of it, or if it says what no master can do: pysoem would not notice."""
+    if slave.sii is None:
+        raise BusError(unreadable(ifname, slave))
+    sizes = [size for _, size in slave.sii["mailboxes"].values()]
+    if any(sizes) and not all(size in _MAILBOX_BYTES for size in sizes):
+        raise BusError(
+            f"the SII (EEPROM) of the slave at position {slave.position} of {ifname} has mailboxes of "
+            f"{' and '.join(map(str, sizes))} bytes, which no frame can carry: its EEPROM is damaged"
+        )
+
+
+def unreadable(ifname: str, slave: Slave) -> str:
+    """The sentence about a slave of which nothing is known."""
+    return (
+        f"the SII (EEPROM) of the slave at position {slave.position} of {ifname} cannot be read, so it does "
+        "not say what it is: power it off and on; if that does not help, its EEPROM is damaged"
+    )
+
+
+def _stop(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:
+    """Take a slave that is not Bota's, and that is to be taken over, to PREOP."""
+    position = slave.position
+    request = (AlState.PREOP | _ACKNOWLEDGE).to_bytes(2, "little")
+    bus.write_surely_at(position, reg.AL_CONTROL, request)
+    deadline = Deadline(bus.clock, times.STATE_S[AlState.PREOP])
+    while True:
         check_interrupt()
-        _check_slaves(bus)
-    return bus.scan(check_interrupt)
+        status = AlStatus.parse(bus.read_surely_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE))
+        if not status.raw_state & _ABOVE_PREOP:
+            log.warning("the slave at position %d of %s was taken to %s", position, bus.ifname, status)
+            return read_slave(bus, position, status)
+        if deadline.passed:
+            raise BusError(f"slave {position} on {bus.ifname} stays in {status}: switch it off")
 
-
-def may_be_read(bus: Bus, position: int, al: AlStatus) -> bool:
-    """Whether reading the SII of the slave at `position` disturbs nobody."""
-    return not al.raw_state & _ABOVE_PREOP or _is_bota(bus, position)
-
-
-def _check_no_master(bus: Bus) -> None:
-    if (count := bus.listen(_LISTEN_S)) >= _MASTER_FRAMES:
-        raise BusError(
-            f"another EtherCAT master is sending on {bus.ifname} ({count} frames in {_LISTEN_S:g} s): stop "
-            "it, or name the interface that the sensor is connected to; --force takes its slaves over"
-        )
-
-
-def _check_slaves(bus: Bus) -> None:
-    answers = (bus.read_all(reg.AL_STATUS, 1, _TIMEOUT_S) for _ in range(_ATTEMPTS))
-    count, states = next((answer for answer in answers if answer is not None), (0, b"\0"))
-    if not states[0] & _ABOVE_PREOP:
-        return
-    found = []
-    for position in range(count):
-        data = bus.read_surely_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
-        status = AlStatus.parse(data)
-        if not may_be_read(bus, position, status):
-            found.append(f"{position} in {status.state.name}")
-    if found:
-        raise BusError(
-            f"{bus.ifname} has slaves at work that are no Bota sensors (position {', '.join(found)}): a scan "
-            "would stop them; name the interface that the sensor is connected to, or stop their master; "
-            "--force takes every slave to INIT"
-        )
-
-
-def _is_bota(bus: Bus, position: int) -> bool:
-    data = bus.read_surely_at(position, reg.SYNC_MANAGER, 4 * reg.SYNC_MANAGER_SIZE)
-    *others, inputs = _SYNC_MANAGER.iter_unpack(data)
-    return tuple(others) == _MAILBOXES_AND_OUTPUTS and inputs in [(_INPUTS, size) for size in LAYOUTS]
+        bus.clock.sleep(_PAUSE_S)

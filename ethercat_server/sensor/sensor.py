@@ -38,7 +38,7 @@ class SensorState(Enum):
     """The change failed: it gets its former settings back."""
     LOST = auto()
     REFUSED = auto()
-    """Another sensor is connected in its position."""
+    """Another sensor is connected in its place."""
 
     @property
     def reported(self) -> str:
@@ -73,12 +73,15 @@ _TRANSITIONS: Final = {
 class Sensor:
     """One sensor on the bus, as found and set up."""
 
-    position: int
+    number: int
+    """Among the sensors, from 0."""
     identity: Identity
     wanted: dict[str, SettingValue]
     """The settings to be in force; written again when the sensor has lost them."""
     asked: frozenset[str] = frozenset()
     """Those among them that a person asked for: these must exist."""
+    position: int = 0
+    """Among all slaves on the wire, from 0."""
     pdo_size: int = 0
     rate_hz: int = 0
     state: SensorState = SensorState.SETTING_UP
@@ -114,7 +117,8 @@ class Sensor:
     def describe(self) -> dict[str, Any]:
         """The sensor's part of the `describe` reply."""
         return {
-            "sensor": self.position,
+            "sensor": self.number,
+            "position": self.position,
             "name": self.identity.name,
             "serial": self.identity.serial,
             "hardware": self.identity.hardware,

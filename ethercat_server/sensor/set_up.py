@@ -67,7 +67,7 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
         texts.append(f"a sampling rate of {rate_hz} Hz (wanted: {sensor.rate_hz} Hz)")
     if texts:
         log.info(
-            "sensor %d held %s: what is wanted was written and verified", sensor.position, ", ".join(texts)
+            "sensor %d held %s: what is wanted was written and verified", sensor.number, ", ".join(texts)
         )
     yield from read_settings(sdo, sensor)
     if sensor.offset is not None:
@@ -100,13 +100,13 @@ def write_setting(sdo: Sdo, sensor: Sensor, name: str, value: SettingValue | Non
     except SdoAbortError as error:
         if error.abort_code in OBJECT_MISSING and name not in sensor.asked:
             log.warning(
-                "sensor %d (%s) has no setting %s; left out", sensor.position, sensor.identity.name, name
+                "sensor %d (%s) has no setting %s; left out", sensor.number, sensor.identity.name, name
             )
             return
         raise SdoAbortError(f"the setting {name} = {value} did not take: {error}", error.abort_code) from None
     if held != data:
         raise BusError(
-            f"the setting {name} = {value} did not take: sensor {sensor.position} holds {held.hex()} after "
+            f"the setting {name} = {value} did not take: sensor {sensor.number} holds {held.hex()} after "
             f"{data.hex()} was written; power it off and on, then start again"
         )
 
@@ -167,7 +167,7 @@ def _check_rate(sdo: Sdo, sensor: Sensor) -> Steps[None]:
         if deadline.passed:
             length = sensor.wanted[_LAST]
             raise BusError(
-                f"sensor {sensor.position} samples at {sensor.rate_hz} Hz, but sinc_length {length} implies "
+                f"sensor {sensor.number} samples at {sensor.rate_hz} Hz, but sinc_length {length} implies "
                 f"{BASE_SAMPLING_RATE_HZ / length:.0f} Hz: power it off and on, or choose another sinc_length"
             )
         yield
@@ -183,7 +183,7 @@ def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
         try:
             held[name] = dictionary.BY_SETTING[name].decode_setting(data, setting.is_bool)
         except ValueError as error:
-            log.warning("sensor %d: %s", sensor.position, error)
+            log.warning("sensor %d: %s", sensor.number, error)
     held["sinc_length"] = sensor.wanted["sinc_length"]
     sensor.hold(held)
 

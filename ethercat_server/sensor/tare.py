@@ -152,7 +152,7 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
         yield
         if deadline.passed:
             raise RequestError(
-                ErrorCode.NOT_READY, f"sensor {sensor.position} gives too few samples to tare it"
+                ErrorCode.NOT_READY, f"sensor {sensor.number} gives too few samples to tare it"
             )
         if stream.fresh == seen:
             continue
@@ -161,7 +161,7 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
         row = [*values[_LOAD], *values[_RATE]]
         if not all(map(math.isfinite, row)):
             raise RequestError(
-                ErrorCode.NOT_READY, f"sensor {sensor.position} is overloaded: it gives no finite numbers"
+                ErrorCode.NOT_READY, f"sensor {sensor.number} is overloaded: it gives no finite numbers"
             )
         first = first or row
         # From the first on, so that a large load does not drown its small changes.
@@ -211,5 +211,5 @@ def _check_rest(sensor: Sensor, found: _Window) -> None:
 
 def _not_at_rest(sensor: Sensor, why: str) -> RequestError:
     return RequestError(
-        ErrorCode.NOT_READY, f"sensor {sensor.position} is not at rest: {why}: hold it still and tare again"
+        ErrorCode.NOT_READY, f"sensor {sensor.number} is not at rest: {why}: hold it still and tare again"
     )

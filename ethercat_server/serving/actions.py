@@ -48,7 +48,7 @@ class OnSensors(Protocol):
 
     @property
     def sensors(self) -> Sequence[Described]:
-        """All of them, by position."""
+        """All of them, by number."""
         ...
 
     @property
@@ -106,8 +106,8 @@ class Actions:
         return reply(request, protocol=PROTOCOL_VERSION, version=__version__, sensors=rows, **self._extra)
 
     def _subscribe(self, connection: Connection, request: Request) -> JsonObject:
-        positions = request.values["sensors"]
-        absent = [position for position in positions or () if position >= len(self._sensors)]
+        numbers = request.values["sensors"]
+        absent = [number for number in numbers or () if number >= len(self._sensors)]
         if absent:
             raise RequestError(
                 ErrorCode.BAD_REQUEST,
@@ -115,7 +115,7 @@ class Actions:
                 "counted from 0",
             )
         connection.subscription = Subscription(
-            len(self._sensors), positions, request.values["every"], request.values["fresh_only"]
+            len(self._sensors), numbers, request.values["every"], request.values["fresh_only"]
         )
         self._hub.subscriptions_changed()
         return self._describe(connection, request)

@@ -43,14 +43,14 @@ class Unreadable(NamedTuple):
 
 
 class Subscription:
-    """Which DATA a client wants. Lists are by the sensor's position."""
+    """Which DATA a client wants. Lists are by the sensor's number."""
 
     __slots__ = ("every", "fresh_only", "gap", "last_ns", "skipped", "wanted")
 
     def __init__(
         self, sensor_count: int, sensors: tuple[int, ...] | None, every: int, fresh_only: bool
     ) -> None:
-        self.wanted = [sensors is None or position in sensors for position in range(sensor_count)]
+        self.wanted = [sensors is None or number in sensors for number in range(sensor_count)]
         self.every = every
         self.fresh_only = fresh_only
         self.skipped = [every - 1] * sensor_count
@@ -222,30 +222,30 @@ class Connection:
             return
         self.outbox.send(encode_bare_json(message) if self.bare is not None else encode_json(message))
 
-    def offer(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
+    def offer(self, frame: bytes, number: int, flags: int, now_ns: int) -> None:
         """Send a DATA frame if the subscription wants it."""
         wants = self.subscription
-        if wants is None or not wants.wanted[position]:
+        if wants is None or not wants.wanted[number]:
             return
-        if not flags and wants.every == 1 and not wants.gap[position]:
-            withheld = self.outbox.send(frame, position)
-            wants.last_ns[position] = now_ns
+        if not flags and wants.every == 1 and not wants.gap[number]:
+            withheld = self.outbox.send(frame, number)
+            wants.last_ns[number] = now_ns
             if withheld >= 0:
                 wants.gap[withheld] = True
             return
-        if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[position] < _IDLE_FRAME_NS:
+        if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[number] < _IDLE_FRAME_NS:
             return
         if flags & _GAP:
-            wants.gap[position] = True
-        if wants.skipped[position] < wants.every - 1:
-            wants.skipped[position] += 1
+            wants.gap[number] = True
+        if wants.skipped[number] < wants.every - 1:
+            wants.skipped[number] += 1
             return
-        wants.skipped[position] = 0
-        wants.last_ns[position] = now_ns
-        if wants.gap[position]:
-            wants.gap[position] = False
+        wants.skipped[number] = 0
+        wants.last_ns[number] = now_ns
+        if wants.gap[number]:
+            wants.gap[number] = False
             if not flags & _GAP:
                 frame = with_gap(frame)
-        withheld = self.outbox.send(frame, position)
+        withheld = self.outbox.send(frame, number)
         if withheld >= 0:
             wants.gap[withheld] = True

@@ -63,10 +63,10 @@ class Hub:
         """Begin to accept; until now clients waited in the kernel's queue."""
         self._handler = handler
 
-    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
-        """Send a DATA frame of the sensor at `position` to every subscriber that wants it."""
+    def publish(self, frame: bytes, number: int, flags: int, now_ns: int) -> None:
+        """Send a DATA frame of the sensor `number` to every subscriber that wants it."""
         for connection in self._subscribers:
-            connection.offer(frame, position, flags, now_ns)
+            connection.offer(frame, number, flags, now_ns)
 
     def broadcast(self, message: JsonObject) -> None:
         """Send an event to every framed connection."""

@@ -38,7 +38,7 @@ class Outbox:
         """Something is queued: `flush` when the socket is writable."""
         self.progress_ns = 0
         """CLOCK_MONOTONIC when the socket last accepted something, while something is queued."""
-        self._queue: deque[tuple[bytes, int]] = deque()  # message, sensor's position or NO_SENSOR for JSON
+        self._queue: deque[tuple[bytes, int]] = deque()  # message, sensor's number or NO_SENSOR for JSON
         self._queued_data = 0
         self._queued_json_bytes = 0
         self._head_sent = 0
@@ -49,10 +49,10 @@ class Outbox:
         replies = len(self._queue) - self._queued_data
         return replies >= MAX_QUEUED_JSON or self._queued_json_bytes > MAX_QUEUED_JSON_BYTES
 
-    def send(self, message: bytes, position: int = NO_SENSOR) -> int:
-        """Send a message or queue it; `position` is the sensor's position if it is a DATA frame.
+    def send(self, message: bytes, number: int = NO_SENSOR) -> int:
+        """Send a message or queue it; `number` is the sensor's number if it is a DATA frame.
 
-        Returns the position of the sensor whose next frame must carry GAP because one was dropped, if any.
+        Returns the number of the sensor whose next frame must carry GAP because one was dropped, if any.
         """
         if not self._queue:
             try:
@@ -63,14 +63,14 @@ class Outbox:
                 self._break()
                 return NO_SENSOR
             if sent == len(message):
-                if position >= 0:
+                if number >= 0:
                     self.sent += 1
                 return NO_SENSOR
             self._head_sent = sent
             self.waiting = True
             self.progress_ns = self._monotonic_ns()
-        self._queue.append((message, position))
-        if position < 0:
+        self._queue.append((message, number))
+        if number < 0:
             self._queued_json_bytes += len(message)
         else:
             self._queued_data += 1
@@ -81,7 +81,7 @@ class Outbox:
     def flush(self) -> None:
         """Send what is queued, as far as the socket accepts it."""
         while self._queue:
-            message, position = self._queue[0]
+            message, number = self._queue[0]
             try:
                 sent = self._send(memoryview(message)[self._head_sent :])
             except BlockingIOError:
@@ -95,7 +95,7 @@ class Outbox:
                 return
             self._queue.popleft()
             self._head_sent = 0
-            if position >= 0:
+            if number >= 0:
                 self.sent += 1
                 self._queued_data -= 1
             else:
@@ -111,18 +111,18 @@ class Outbox:
     def _drop_oldest_data(self) -> int:
         first = 1 if self._head_sent else 0  # a frame that is partly sent must go out whole
         for at in range(first, len(self._queue)):
-            position = self._queue[at][1]
-            if position < 0:
+            number = self._queue[at][1]
+            if number < 0:
                 continue
             del self._queue[at]
             self._queued_data -= 1
             self.withheld += 1
             for later in range(at, len(self._queue)):
                 frame, its_position = self._queue[later]
-                if its_position == position:
-                    self._queue[later] = (with_gap(frame), position)
+                if its_position == number:
+                    self._queue[later] = (with_gap(frame), number)
                     return NO_SENSOR
-            return position
+            return number
         return NO_SENSOR
 
 

@@ -60,21 +60,21 @@ class SensorActions:
 
     def handle(self, connection: Connection, request: Request) -> None:
         """Start `request`; RequestError refuses it."""
-        position = self._position(request.values["sensor"])
+        number = self._number(request.values["sensor"])
         if request.action in _CHANGES:
-            self._check_unchanging(position)  # the sensor may be out of OP because of a change
-        self._jobs.check_present(position)
-        values = {**request.values, "sensor": position}
+            self._check_unchanging(number)  # the sensor may be out of OP because of a change
+        self._jobs.check_present(number)
+        values = {**request.values, "sensor": number}
         self.handlers[request.action](connection, request._replace(values=values))
 
-    def _position(self, choice: SensorChoice) -> int:
+    def _number(self, choice: SensorChoice) -> int:
         found = [
-            sensor.position
+            sensor.number
             for sensor in self.sensors
-            if choice.matches(sensor.position, sensor.identity.name, sensor.identity.serial)
+            if choice.matches(sensor.number, sensor.identity.name, sensor.identity.serial)
         ]
         if len(found) != 1:
-            available = "; ".join(f"{sensor.position}: {sensor.identity}" for sensor in self.sensors)
+            available = "; ".join(f"{sensor.number}: {sensor.identity}" for sensor in self.sensors)
             problem = f"{len(found)} sensors match" if found else "no sensor"
             raise RequestError(ErrorCode.BAD_REQUEST, f"{problem} {choice} (available: {available})")
         return found[0]
@@ -88,14 +88,14 @@ class SensorActions:
 
         return done
 
-    def _start_change(self, position: int, steps: Steps[Mapping[str, Any]], done: Done) -> None:
-        self._check_unchanging(position)
-        self._jobs.start(position, steps, done, changes=True)
+    def _start_change(self, number: int, steps: Steps[Mapping[str, Any]], done: Done) -> None:
+        self._check_unchanging(number)
+        self._jobs.start(number, steps, done, changes=True)
 
-    def _check_unchanging(self, position: int) -> None:
-        if self._jobs.is_changing(position) or self._recovery.is_changing(position):
+    def _check_unchanging(self, number: int) -> None:
+        if self._jobs.is_changing(number) or self._recovery.is_changing(number):
             raise RequestError(
-                ErrorCode.BUSY, f"sensor {position} is being configured or tared: try again when that is done"
+                ErrorCode.BUSY, f"sensor {number} is being configured or tared: try again when that is done"
             )
 
     def _sdo_read(self, connection: Connection, request: Request) -> None:
@@ -138,7 +138,7 @@ class SensorActions:
                 ErrorCode.DENIED, "object 0x2000 is the factory calibration, which is never written"
             )
         sensor = self.sensors[values["sensor"]]
-        sdo = self._recovery.sdo(sensor.position)
+        sdo = self._recovery.sdo(sensor.number)
         data = bytes_to_write(values)
 
         def steps() -> Steps[Mapping[str, Any]]:
@@ -153,30 +153,30 @@ class SensorActions:
     def _tare(self, connection: Connection, request: Request) -> None:
         values = request.values
         sensor = self.sensors[values["sensor"]]
-        stream, sdo = self._streams[sensor.position], self._recovery.sdo(sensor.position)
+        stream, sdo = self._streams[sensor.number], self._recovery.sdo(sensor.number)
         steps = tare(sdo, sensor, stream, values["samples"], values["target"])
-        self._start_change(sensor.position, steps, self._answering(connection, request))
+        self._start_change(sensor.number, steps, self._answering(connection, request))
 
     def _configure(self, connection: Connection, request: Request) -> None:
         values, done = request.values, self._answering(connection, request)
         self.configure(values["sensor"], values["settings"], save_too=values["save"], done=done)
 
     def configure(
-        self, position: int, settings: Mapping[str, SettingValue], *, save_too: bool, done: Done
+        self, number: int, settings: Mapping[str, SettingValue], *, save_too: bool, done: Done
     ) -> None:
-        """Change settings of the sensor at `position`, save them if `save_too`; `done` gets the result.
+        """Change settings of the sensor `number`, save them if `save_too`; `done` gets the result.
 
         RequestError refuses it at once.
         """
-        self._check_unchanging(position)
-        self._jobs.check_present(position)
-        sensor = self.sensors[position]
+        self._check_unchanging(number)
+        self._jobs.check_present(number)
+        sensor = self.sensors[number]
         try:
             change = Change(sensor, settings)
         except SettingError as error:
             raise RequestError(ErrorCode.BAD_REQUEST, f"the key 'settings' is refused: {error}") from None
         if not change.needs_preop:
-            self._start_change(position, self._change_in_op(sensor, change, save_too), done)
+            self._start_change(number, self._change_in_op(sensor, change, save_too), done)
             return
 
         def changed(error: BusError | None) -> None:
@@ -184,27 +184,27 @@ class SensorActions:
                 done({}, refusal(error))
                 return
             try:
-                self._start_change(position, self._finish_change(sensor, save_too), done)
+                self._start_change(number, self._finish_change(sensor, save_too), done)
             except RequestError as refused:
                 done({}, refused)
 
-        self._recovery.reconfigure(position, change, changed)
+        self._recovery.reconfigure(number, change, changed)
 
     def _change_in_op(self, sensor: Sensor, change: Change, save_too: bool) -> Steps[Mapping[str, Any]]:
-        sdo = self._recovery.sdo(sensor.position)
+        sdo = self._recovery.sdo(sensor.number)
         yield from apply_in_op(sdo, sensor, change)
         if change.names:
             self._announce_change(sensor)
         return (yield from self._finish_change(sensor, save_too))
 
     def _announce_change(self, sensor: Sensor) -> None:
-        self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.position, settings=dict(sensor.settings)))
+        self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.number, settings=dict(sensor.settings)))
 
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
         if save_too:
-            yield from save(self._recovery.sdo(sensor.position), sensor)
+            yield from save(self._recovery.sdo(sensor.number), sensor)
         return {
-            "sensor": sensor.position,
+            "sensor": sensor.number,
             "settings": dict(sensor.settings),
             "rate_hz": sensor.rate_hz,
             "saved": save_too,

@@ -45,7 +45,7 @@ def add_link_arguments(
     parser.add_argument(
         "--sensor",
         metavar="WHICH",
-        help=f"position on the bus from 0, serial:1234, or name (default: {default})",
+        help=f"number on the bus from 0, serial:1234, or name (default: {default})",
     )
 
 

@@ -12,12 +12,12 @@ import pytest
 
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.errors import BusError, StopRequestedError
-from ethercat_server.ethercat import soem
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.master import soem
+from ethercat_server.ethercat.master.soem import SoemBackend
 from ethercat_server.ethercat.nic import claimed
 from ethercat_server.ethercat.raw_socket import packet_sockets
-from ethercat_server.ethercat.soem import SoemBackend
 from ethercat_server.sensor.sensor import Sensor
 from protocol.settings import SettingValue
 from tests.server.commands import command, stats
@@ -60,6 +60,7 @@ def opened(ifname: str, make: type[SoemBackend] = SoemBackend) -> Iterator[SoemB
     try:
         yield backend
     finally:
+        backend.release()
         backend.close()
         wait_until(lambda: threading.active_count() == threads, "the end of SOEM's scan")
         backend._abandoned = False
@@ -84,7 +85,7 @@ def start(
             command(sensor, text)
         with opened(veth.near, make) as backend:
             try:
-                return bring_up(Bus(backend), Asked(settings), check_interrupt)
+                return bring_up(Bus(backend), Asked(settings), check_interrupt).sensors
             except BusError as error:
                 expected = re.search(complaint, str(error)) or not starved(str(error))
                 if expected or attempt == ATTEMPTS - 1:
@@ -157,7 +158,7 @@ def test_a_slave_that_vanishes_during_the_scan_does_not_hang_the_server(
             command(sensor, "hear")
             command(sensor, "deaf-after 40")  # in the middle of reading the SII
             with pytest.raises(BusError) as info:
-                backend.scan(lambda: None)
+                backend.scan([0], lambda: None)
             if "no EtherCAT slave answers" not in str(info.value):
                 break
         backend.close()  # not from under SOEM
@@ -187,13 +188,13 @@ def test_a_start_is_given_up_between_two_transfers(bench: Bench, last: str) -> N
     transfers: list[str] = []
 
     class Noted(SoemBackend):
-        def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
+        def sdo_read(self, number: int, index: int, subindex: int) -> bytes:
             transfers.append("read")
-            return super().sdo_read(slave, index, subindex)
+            return super().sdo_read(number, index, subindex)
 
-        def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
+        def sdo_write(self, number: int, index: int, subindex: int, data: bytes) -> None:
             transfers.append("write")
-            super().sdo_write(slave, index, subindex, data)
+            super().sdo_write(number, index, subindex, data)
 
     def check_interrupt() -> None:
         if last in transfers:

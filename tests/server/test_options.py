@@ -115,7 +115,7 @@ def test_tables_that_contradict_one_another_for_one_sensor_are_named(tmp_path: P
         ("[server]\nhosts = ['localhost']\n", "an IP address"),
         ("[server]\nidle_timeout_s = 0\n", "seconds"),
         ("sensor = 3\n", "unexpected 'sensor'"),
-        ('[sensor."serial:x"]\nfir = true\n', "named by a position"),
+        ('[sensor."serial:x"]\nfir = true\n', "named by a number"),
         ("[sensor.0]\nfast = true\n", "fast is true but fir is false"),
         ("[sensor\n", "not valid TOML"),
     ],

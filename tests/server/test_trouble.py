@@ -19,9 +19,11 @@ from ethercat_server.daemon.cli import main
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.errors import ServerError
 from ethercat_server.ethercat import nic
-from ethercat_server.ethercat.backend import CheckInterrupt, SlaveIdentity
+from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.master.datagrams import DatagramMaster
 from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE
+from ethercat_server.sensor import look
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.ended import run_here
@@ -108,9 +110,10 @@ def test_interfaces_without_a_sensor(
 
 def refused(backend: MemoryBackend, wanted: Wanted | None = None, code: int = 1) -> str:
     """Why a start fails; the sensors are in INIT afterwards."""
+    bus = Bus(backend)
     with pytest.raises(ServerError) as info:
-        bring_up(Bus(backend), wanted or Asked(), lambda: None)
-    backend.close()
+        bring_up(bus, wanted or Asked(), lambda: None)
+    bus.close()
     assert all(sensor.statistics()["al_state"] in ("INIT", None) for sensor in backend.sensors.sensors)
     assert info.value.exit_code == code
     return str(info.value)
@@ -121,7 +124,7 @@ def refused(backend: MemoryBackend, wanted: Wanted | None = None, code: int = 1)
     [
         (
             odd_firmware.foreign,
-            "position 0 of memory is 'BFT-SENS-ECAT-M8' .vendor 0x0000DEAD, .* not a Bota",
+            "no Bota Gen-0 sensor .* only 'BFT-SENS-ECAT-M8' at position 0 .vendor 0x0000DEAD",
         ),
         (odd_firmware.other_product, "vendor 0x0000B07A, product 0x00000007"),
         (odd_firmware.wrong_rate, "samples at 500 Hz, but sinc_length 64 implies 800 Hz"),
@@ -136,45 +139,61 @@ def test_a_slave_that_is_wrong_in_one_way(
 
 
 @pytest.mark.parametrize(
-    ("slave", "complaint"),
+    ("identity", "complaint"),
     [
-        ((0, 0, 0, ""), "the SII .EEPROM. of the slave at position 0 of memory cannot be read"),
-        ((0xDEAD, 1, 1, ""), "position 0 of memory is 'nameless' .vendor 0x0000DEAD"),
+        (b"", "the SII .EEPROM. of the slave at position 0 of memory cannot be read"),
+        (b"\xad\xde\0\0\1", "only 'nameless' at position 0 .vendor 0x0000DEAD"),
     ],
 )
-def test_what_the_eeprom_does_not_say(slave: tuple[int, int, int, str], complaint: str) -> None:
-    class Odd(MemoryBackend):
-        def scan(self, check_interrupt: CheckInterrupt) -> list[SlaveIdentity]:
-            super().scan(check_interrupt)
-            return [SlaveIdentity(*slave)]
+def test_what_the_eeprom_does_not_say(
+    monkeypatch: pytest.MonkeyPatch, identity: bytes, complaint: str
+) -> None:
+    image = (bytes(16) + identity).ljust(128, b"\0").ljust(130, b"\xff")
+    monkeypatch.setattr(look, "read_image", lambda _bus, _position: image)
+    assert re.search(complaint, refused(MemoryBackend()))
 
-    assert re.search(complaint, refused(Odd()))
+
+@pytest.mark.parametrize("size", [0, 8, 1487, 0xFFFF])
+def test_mailboxes_that_no_frame_can_carry(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
+    """pysoem would write beyond its buffers."""
+    read_image = look.read_image
+
+    def odd_image(bus: Bus, position: int) -> bytes:
+        image = bytearray(read_image(bus, position))
+        image[0x18 * 2 + 6 : 0x18 * 2 + 8] = size.to_bytes(2, "little")
+        return bytes(image)
+
+    monkeypatch.setattr(look, "read_image", odd_image)
+    assert f"has mailboxes of 128 and {size} bytes, which no frame can carry" in refused(MemoryBackend())
 
 
 @pytest.mark.parametrize(
     ("size", "complaint"),
-    [(65, "maps process data of 65 bytes: .* 61 or 77"), (0, "did not answer what it maps")],
+    [(65, "process data of 65 bytes: .* 61 or 77"), (0, "process data of 0 bytes")],
 )
-def test_process_data_of_another_size(size: int, complaint: str) -> None:
-    class Odd(MemoryBackend):
-        def map_process_data(self) -> list[int]:
-            super().map_process_data()
-            return [size]
-
-    assert re.search(f"sensor 0 .BFT-SENS-ECAT-M8. {complaint}", refused(Odd()))
+def test_process_data_of_another_size(monkeypatch: pytest.MonkeyPatch, size: int, complaint: str) -> None:
+    monkeypatch.setattr(DatagramMaster, "map_process_data", lambda *_: [size])
+    assert re.search(f"sensor 0 .BFT-SENS-ECAT-M8. maps {complaint}", refused(MemoryBackend()))
 
 
 @pytest.mark.parametrize("unit", [0, 1])
-def test_an_fmmu_that_was_not_written(unit: int) -> None:
+@pytest.mark.parametrize("times", [1, 2, 9])
+def test_an_fmmu_that_was_not_written(monkeypatch: pytest.MonkeyPatch, unit: int, times: int) -> None:
     """SOEM does not notice; without outputs the sensor's watchdog would take it out of OP again and again."""
+    map_process_data, left = DatagramMaster.map_process_data, [times]
 
-    class Odd(MemoryBackend):
-        def map_process_data(self) -> list[int]:
-            sizes = super().map_process_data()
-            self._write(0, FMMU + unit * FMMU_SIZE, bytes(FMMU_SIZE))
-            return sizes
+    def odd(self: DatagramMaster, check_interrupt: CheckInterrupt) -> list[int]:
+        sizes = map_process_data(self, check_interrupt)
+        left[0] -= 1
+        if left[0] >= 0:
+            self._bus.write_register(0, FMMU + unit * FMMU_SIZE, bytes(FMMU_SIZE))
+        return sizes
 
-    assert "sensor 0 did not answer when it was mapped" in refused(Odd())
+    monkeypatch.setattr(DatagramMaster, "map_process_data", odd)
+    if times < 3:
+        assert bring_up(Bus(MemoryBackend()), Asked(), lambda: None).sensors[0].streams
+    else:
+        assert "sensor 0 did not answer when it was mapped" in refused(MemoryBackend())
 
 
 def test_models_and_their_names() -> None:
@@ -185,7 +204,7 @@ def test_models_and_their_names() -> None:
     wanted.sensor_name = "BFT-SENS-ECAT-M8"
     assert "is a BFT-ROKS-ECAT-M8, not a BFT-SENS-ECAT-M8" in refused(rokubi, wanted)
     wanted.sensor_name = "BFT-ROKS-ECAT-M8"
-    assert [sensor.streams for sensor in bring_up(Bus(rokubi), wanted, lambda: None)] == [True]
+    assert [sensor.streams for sensor in bring_up(Bus(rokubi), wanted, lambda: None).sensors] == [True]
 
 
 def test_settings_for_a_sensor_that_is_not_switched_on_yet(tmp_path: Path) -> None:
@@ -199,7 +218,7 @@ def test_settings_for_a_sensor_that_is_not_switched_on_yet(tmp_path: Path) -> No
     assert "settings for sensor 1, but the bus has only 0: BFT-SENS-ECAT-M8" in said
     assert said.endswith("connect that sensor, or correct the name of the table")
     backend.command("power on @1")
-    sensors = bring_up(Bus(backend), options, lambda: None)
+    sensors = bring_up(Bus(backend), options, lambda: None).sensors
     assert [sensor.settings["fir"] for sensor in sensors] == [False, True]
 
 

@@ -16,6 +16,7 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import finish
+from ethercat_server.sensor.others import Others
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 
@@ -60,6 +61,8 @@ class GivenBus:
         return 3
 
     def read_surely(self, position: int, address: int, size: int) -> bytes:
+        if address == reg.SYNC_MANAGER:
+            return struct.pack("<HH4x", 0x1000, 128) * (size // reg.SYNC_MANAGER_SIZE)
         return b"\2\4" if address == reg.FMMU_AND_SM_COUNT else bytes(size)
 
     def read_at(self, position: int, address: int, size: int) -> bytes | None:
@@ -88,6 +91,7 @@ class Watched:
             self.sensors,
             cast(list[SensorStream], [None, None]),
             self.told.append,
+            Others(cast(Bus, self.bus), ()),
         )
         self.now = self.bus.clock.now_ns
 
@@ -163,7 +167,7 @@ def test_a_refused_sensor_is_not_set_up_again_because_of_a_lost_datagram() -> No
 def test_a_sensor_that_keeps_its_error_is_not_asked_for_op() -> None:
     bus = GivenBus()
     bus.states[0], bus.error = AlState.SAFEOP, 0x001B
-    climbing = Ladder(cast(Bus, bus), a_sensor(0))._go(AlState.OP)
+    climbing = Ladder(cast(Bus, bus), a_sensor(0)).states.go(AlState.OP)
     with pytest.raises(
         BusError, match="sensor 0 keeps its error although it was acknowledged: it is in SAFEOP"
     ):

@@ -107,7 +107,7 @@ def test_a_foreign_slave_is_dumped_as_far_as_it_goes(monkeypatch: pytest.MonkeyP
         assert len(tool_here("objects", bus.near).out.splitlines()) == 2 + len(KNOWN_OBJECTS)
         assert "800" in tool_here("read", bus.near, "sampling rate").out
         assert tool_here("eeprom", bus.near, "--json").json["slaves"][0]["vendor"] == FOREIGN_VENDOR
-        assert "not a Bota Gen-0 sensor" in one_sentence(tool_here("watch", bus.near, code=1))
+        assert "no Bota Gen-0 sensor" in one_sentence(tool_here("watch", bus.near, code=1))
         assert bus.written() == []
 
 

@@ -10,22 +10,17 @@ import struct
 from dataclasses import dataclass
 from typing import Any, Final
 
-from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.slave import sii_content
 from ethercat_server.ethercat.slave.al import AlStatus
-from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.registers import (
     AL_STATUS,
     AL_STATUS_SIZE,
     DL_STATUS,
     ERROR_COUNTERS_SIZE,
     RX_ERRORS,
-    SII_OWNER,
     WATCHDOG_COUNTER,
 )
-from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
-from ethercat_server.sensor.scan import may_be_read
+from ethercat_server.sensor.look import look_at
 
 MOST_PORTS: Final = 4
 _ATTEMPTS: Final = 10
@@ -96,45 +91,21 @@ def count(bus: Bus) -> int:
 
 def look(bus: Bus, position: int) -> Slave:
     """The slave at `position`; BusError if it does not answer."""
-    al = AlStatus.parse(_read(bus, position, AL_STATUS, AL_STATUS_SIZE))
-    (links,) = struct.unpack("<H", _read(bus, position, DL_STATUS, 2))
+    al = AlStatus.parse(bus.read_surely_at(position, AL_STATUS, AL_STATUS_SIZE))
+    (links,) = struct.unpack("<H", bus.read_surely_at(position, DL_STATUS, 2))
     counters = read_counters(bus, position)
-    watchdogs = _read(bus, position, WATCHDOG_COUNTER, 1)[0]
+    watchdogs = bus.read_surely_at(position, WATCHDOG_COUNTER, 1)[0]
     found: dict[str, Any] = {
         "position": position, "al": al, "counters": counters, "watchdogs": watchdogs,
         "links": tuple(bool(links >> (4 + port) & 1) for port in range(MOST_PORTS)),
     }  # fmt: skip
-    if not may_be_read(bus, position, al):
-        return Slave(**found, at_work=True)
-    try:
-        image = sii_content.decode(_read_sii(bus, position))
-    except BusError as error:
-        return Slave(**found, sii_problem=str(error))
+    looked = look_at(bus, position)
+    if looked.sii is None:
+        return Slave(**found, at_work=looked.at_work, sii_problem=looked.problem)
     names = ("vendor", "product", "serial", "name")
-    return Slave(**found, **{name: image[name] for name in names})
+    return Slave(**found, **{name: looked.sii[name] for name in names})
 
 
 def read_counters(bus: Bus, position: int) -> ErrorCounters:
     """The error counters of the slave at `position`; BusError if it does not answer."""
-    return ErrorCounters.parse(_read(bus, position, RX_ERRORS, ERROR_COUNTERS_SIZE))
-
-
-def _read(bus: Bus, position: int, address: int, size: int) -> bytes:
-    for _ in range(_ATTEMPTS):
-        data = bus.read_at(position, address, size)
-        if data is not None:
-            return data
-    raise BusError(
-        f"slave {position} does not answer reading register 0x{address:04X}: check cable and power"
-    )
-
-
-def _read_sii(bus: Bus, position: int) -> bytes:
-    """Access to the SII returns to its owner afterwards."""
-    owner = _read(bus, position, SII_OWNER, 1)
-    registers = ByPosition(bus)
-
-    def read(word: int, words: int) -> bytes:
-        return finish(read_sii(registers, position, word, words, owner), pause_s=0, clock=bus.clock)
-
-    return sii_content.read_image(read)
+    return ErrorCounters.parse(bus.read_surely_at(position, RX_ERRORS, ERROR_COUNTERS_SIZE))

@@ -1,6 +1,6 @@
 """SDO transfers over CoE, in two forms with one interface: generators that end with the result.
 
-`BlockingSdo` goes through the backend's master and never yields; it is for start-up. `MailboxSdo` sends
+`BlockingSdo` goes through the bus's master and never yields; it is for start-up. `MailboxSdo` sends
 single datagrams and yields after each, so that the acquisition loop goes on in between; it is for OP.
 Code that configures a sensor is written once, with `yield from`, and `finish` runs it to its end at start-up.
 """
@@ -15,16 +15,15 @@ from ethercat_server.errors import BusError, SdoAbortError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
+from ethercat_server.ethercat.slave import times
 from ethercat_server.ethercat.slave.registers import MAILBOX_FULL, MAILBOX_IN_STATUS
 
 T = TypeVar("T")
 Steps = Generator[None, None, T]
 """Work in steps: yields when the loop should have its turn, returns the result."""
 
-_ANSWER_TIMEOUT_S: Final = 0.3
-_GIVE_UP_S: Final = 1.5
-"""Time for which a transfer is retried: frames lost for a moment are no refusal."""
-
+_SHORTEST_MAILBOX: Final = 16
+_LONGEST_MAILBOX: Final = 1486
 _MAILBOX_HEADER: Final = struct.Struct("<HHBB")
 _SDO_HEADER: Final = struct.Struct("<HBHB")
 _TYPE_COE: Final = 3
@@ -75,35 +74,40 @@ def finish(steps: Steps[T], pause_s: float = 0.001, clock: Clock = SYSTEM_CLOCK)
 
 
 class BlockingSdo:
-    """SDO before OP, through the backend's master: each call blocks until the answer is there.
+    """SDO before OP, through the bus's master: each call blocks until the answer is there.
 
     `check_interrupt` is called before each: with a slow slave many transfers take long.
     """
 
-    def __init__(self, bus: Bus, slave: int, check_interrupt: CheckInterrupt = lambda: None) -> None:
-        self._backend, self._slave, self._check_interrupt = bus.backend, slave, check_interrupt
+    def __init__(self, bus: Bus, number: int, check_interrupt: CheckInterrupt = lambda: None) -> None:
+        self._bus, self._number, self._check_interrupt = bus, number, check_interrupt
         self.clock = bus.clock
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """See `Sdo`."""
         self._check_interrupt()
         yield from ()
-        return self._backend.sdo_read(self._slave, index, subindex)
+        return self._bus.master.sdo_read(self._number, index, subindex)
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """See `Sdo`."""
         self._check_interrupt()
         yield from ()
-        self._backend.sdo_write(self._slave, index, subindex, data)
+        self._bus.master.sdo_write(self._number, index, subindex, data)
 
 
 class MailboxSdo:
     """SDO by single datagrams. `mailboxes`: offset and size of the one to the slave and the one from it."""
 
-    def __init__(self, bus: Bus, slave: int, mailboxes: tuple[tuple[int, int], tuple[int, int]]) -> None:
-        self._bus, self._slave = bus, slave
+    def __init__(self, bus: Bus, number: int, mailboxes: tuple[tuple[int, int], tuple[int, int]]) -> None:
+        self._bus, self._number = bus, number
         self.clock = bus.clock
         (self._out, self._out_size), (self._in, self._in_size) = mailboxes
+        if not all(_SHORTEST_MAILBOX <= size <= _LONGEST_MAILBOX for _, size in mailboxes):
+            raise BusError(
+                f"sensor {number} has mailboxes of {self._out_size} and {self._in_size} bytes, which no "
+                "frame can carry: power it off and on"
+            )
         self._counter = 0
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
@@ -123,7 +127,7 @@ class MailboxSdo:
         most = self._out_size - _MAILBOX_HEADER.size - _SDO_HEADER.size - _SIZE_BYTES
         if not 0 < len(data) <= most:
             raise BusError(
-                f"object 0x{index:04X}:{subindex} of sensor {self._slave} cannot be written: 1 to {most} "
+                f"object 0x{index:04X}:{subindex} of sensor {self._number} cannot be written: 1 to {most} "
                 f"bytes fit its mailbox, not {len(data)}"
             )
         if len(data) <= _LONGEST_EXPEDITED:
@@ -134,15 +138,15 @@ class MailboxSdo:
 
     def _transfer(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
         doing, expected = ("reading", _UPLOAD) if command == _UPLOAD else ("writing", _DOWNLOADED)
-        give_up = Deadline(self.clock, _GIVE_UP_S)
+        give_up = Deadline(self.clock, times.SDO_S)
         while not give_up.passed:
             yield from self._drain()
             self._counter = self._counter % 7 + 1
             body = _SDO_HEADER.pack(_COE_SDO_REQUEST << 12, command, index, subindex) + data.ljust(4, b"\0")
             header = _MAILBOX_HEADER.pack(len(body), 0, 0, _TYPE_COE | self._counter << 4)
             message = (header + body).ljust(self._out_size, b"\0")
-            if self._bus.write_register(self._slave, self._out, message):
-                deadline = Deadline(self.clock, _ANSWER_TIMEOUT_S)
+            if self._bus.write_register(self._number, self._out, message):
+                deadline = Deadline(self.clock, times.SDO_ANSWER_S)
                 while not deadline.passed:
                     yield
                     try:
@@ -154,7 +158,7 @@ class MailboxSdo:
                     code = int.from_bytes(answer[1][:4], "little")
                     if answer[0] == _ABORT:
                         raise SdoAbortError(
-                            f"sensor {self._slave} refused {doing} object 0x{index:04X}:{subindex} "
+                            f"sensor {self._number} refused {doing} object 0x{index:04X}:{subindex} "
                             f"(abort 0x{code:08X})",
                             code,
                         )
@@ -165,10 +169,10 @@ class MailboxSdo:
     def _drain(self) -> Steps[None]:
         """Read away what was left in the mailbox from before."""
         for _ in range(4):
-            status = self._bus.read_register(self._slave, MAILBOX_IN_STATUS, 1)
+            status = self._bus.read_register(self._number, MAILBOX_IN_STATUS, 1)
             if status is None or not status[0] & MAILBOX_FULL:
                 return
-            self._bus.read_register(self._slave, self._in, self._in_size)
+            self._bus.read_register(self._number, self._in, self._in_size)
             yield
 
     def _answer(self, index: int, subindex: int, expected: int) -> tuple[int, bytes] | None:
@@ -176,10 +180,10 @@ class MailboxSdo:
 
         Such as the late answer to a request that was repeated: about the same object, but another command's.
         """
-        status = self._bus.read_register(self._slave, MAILBOX_IN_STATUS, 1)
+        status = self._bus.read_register(self._number, MAILBOX_IN_STATUS, 1)
         if status is None or not status[0] & MAILBOX_FULL:
             return None
-        message = self._bus.read_register(self._slave, self._in, self._in_size)
+        message = self._bus.read_register(self._number, self._in, self._in_size)
         if message is None:
             # The datagram that took the answer out of the mailbox did not come back in time.
             raise _AnswerLostError
@@ -196,4 +200,4 @@ class MailboxSdo:
         return command, body[_SDO_HEADER.size :]
 
     def _unanswered(self, doing: str, index: int, subindex: int, what: str) -> str:
-        return f"sensor {self._slave} did not answer {doing} object 0x{index:04X}:{subindex}: {what}"
+        return f"sensor {self._number} did not answer {doing} object 0x{index:04X}:{subindex}: {what}"

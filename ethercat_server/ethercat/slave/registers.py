@@ -5,6 +5,7 @@ The master reads and writes them by these names, and the virtual sensor has them
 
 from __future__ import annotations
 
+import struct
 from typing import Final
 
 DL_INFORMATION: Final = 0x0000
@@ -58,3 +59,13 @@ MAILBOX_IN_STATUS: Final = SYNC_MANAGER + SYNC_MANAGER_SIZE + SM_STATUS
 USER_RAM: Final = 0x0F80
 REGISTERS_END: Final = 0x1000
 """Process data memory begins here."""
+MOST_FMMUS: Final = 16
+MOST_SYNC_MANAGERS: Final = 16
+SM_CONTROL_MAILBOX_OUT: Final = 0x26
+SM_CONTROL_MAILBOX_IN: Final = 0x22
+_SYNC_MANAGER: Final = struct.Struct("<HHBBBB")
+
+
+def pack_sync_manager(start: int, length: int, control: int) -> bytes:
+    """The registers of a sync manager, activated; zeros without a length."""
+    return _SYNC_MANAGER.pack(start, length, control, 0, 1, 0) if length else bytes(SYNC_MANAGER_SIZE)

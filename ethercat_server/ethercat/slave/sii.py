@@ -12,15 +12,13 @@ from typing import Final, Protocol
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Clock, Deadline
+from ethercat_server.ethercat.slave import times
 from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.registers import SII_CONTROL, SII_OWNER
 
 OF_FIRMWARE: Final = b"\x01"
 OF_MASTER: Final = b"\x00"
 _TAKE: Final = b"\x02"
-PROTOCOLS: Final = 0x1C
-"""Word of the SII that says which mailbox protocols there are."""
-PROTOCOL_COE: Final = 0x04
 
 _REGISTERS: Final = struct.Struct("<HI8s")
 """Control and status, the word's address, the data."""
@@ -31,8 +29,6 @@ _BUSY: Final = 0x8000
 _ERRORS: Final = 0x7800
 _EIGHT_BYTES: Final = 0x0040
 _ATTEMPTS_TO_GIVE_BACK: Final = 3
-_WORD_TIMEOUT_S: Final = 1.5
-"""Time for which reading is retried: frames lost for a moment are no refusal."""
 
 
 class Registers(Protocol):
@@ -74,15 +70,9 @@ def read_sii(bus: Registers, slave: int, word: int, count: int, owner: bytes = O
     return bytes(data[: 2 * count])
 
 
-def has_coe(bus: Registers, slave: int) -> Steps[bool]:
-    """Whether the slave has a mailbox with CoE, and so objects."""
-    words = yield from read_sii(bus, slave, PROTOCOLS, 1)
-    return bool(words[0] & PROTOCOL_COE)
-
-
 def _read_word(bus: Registers, slave: int, word: int) -> Steps[bytes]:
     """What one read command gives: two words, or four."""
-    deadline = Deadline(bus.clock, _WORD_TIMEOUT_S)
+    deadline = Deadline(bus.clock, times.SII_WORD_S)
     answer, asked = "no answer", False
     while not deadline.passed:
         if not asked:
@@ -105,7 +95,7 @@ def _read_word(bus: Registers, slave: int, word: int) -> Steps[bytes]:
 
 
 def _write(bus: Registers, slave: int, address: int, data: bytes, word: int) -> Steps[None]:
-    deadline = Deadline(bus.clock, _WORD_TIMEOUT_S)
+    deadline = Deadline(bus.clock, times.SII_WORD_S)
     while not bus.write_register(slave, address, data):
         if deadline.passed:
             raise _unreadable(slave, word, "no answer")

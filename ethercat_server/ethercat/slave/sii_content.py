@@ -7,6 +7,9 @@ from collections.abc import Callable
 from enum import IntEnum, IntFlag
 from typing import Any, Final
 
+Sii = dict[str, Any]
+"""What `decode` returns."""
+
 
 class Category(IntEnum):
     """Categories, as numbered in the SII."""
@@ -98,7 +101,7 @@ def raw_lines(image: bytes) -> list[str]:
     ]
 
 
-def decode(image: bytes) -> dict[str, Any]:
+def decode(image: bytes) -> Sii:
     """The content of an image by name; what it lacks is empty."""
     vendor, product, revision, serial = IDENTITY.unpack_from(image, IDENTITY_BYTE)
     out, out_size, back, back_size, protocols = MAILBOXES.unpack_from(image, MAILBOXES_BYTE)

@@ -10,9 +10,7 @@ from typing import Any
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.slave import sii_content
-from ethercat_server.ethercat.slave.coe import finish
-from ethercat_server.ethercat.slave.sii import read_sii
-from ethercat_server.links.direct import scan_only
+from ethercat_server.links.direct import read_images
 from ethercat_server.links.holder import find_holder
 from ethercat_server.links.link import Found, choose, note
 from ethercat_server.links.reach import find_server
@@ -70,19 +68,14 @@ def _images(args: argparse.Namespace) -> dict[int, bytes | BusError]:
         if link is not None:
             cleanup.callback(link.close)
             return {
-                sensor.position: _image(functools.partial(link.sii, sensor.position))
+                sensor.number: _image(functools.partial(link.sii, sensor.number))
                 for sensor in link.chosen(args.sensor)
             }
-        bus, slaves = scan_only(args.iface, cleanup, force=args.take_over)
-
-        def read(position: int, word: int, words: int) -> bytes:
-            return finish(read_sii(bus, position, word, words), pause_s=0, clock=bus.clock)
-
-        images = {position: _image(functools.partial(read, position)) for position in range(len(slaves))}
+        images = read_images(args.iface, cleanup, force=args.take_over)
     if args.sensor is None:
         return images
     found = [_identified(position, image) for position, image in images.items()]
-    position = choose(found, args.sensor).position
+    position = choose(found, args.sensor).number
     return {position: images[position]}
 
 

@@ -68,7 +68,7 @@ def _read_sensor(opened: Link, found: Found, rows: Sequence[ObjectEntry]) -> _Se
     objects: list[tuple[ObjectEntry, dict[str, Any]]] = []
     try:
         if found.has_objects:
-            objects.extend(_read_rows(opened.sdo(found.position), rows))
+            objects.extend(_read_rows(opened.sdo(found.number), rows))
     except BusError as error:
         return _Sensor(found, objects, error)
     return _Sensor(found, objects, None)

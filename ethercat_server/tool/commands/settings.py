@@ -38,7 +38,7 @@ def changes(sensor: Sensor, settings: Mapping[str, SettingValue]) -> list[dict[s
         if name not in sensor.settings:
             index, subindex = dictionary.BY_SETTING[name].address
             raise BusError(
-                f"sensor {sensor.position} has no setting {name}: object 0x{index:04X}:{subindex} cannot be "
+                f"sensor {sensor.number} has no setting {name}: object 0x{index:04X}:{subindex} cannot be "
                 "read or has an undefined value"
             )
     return [
@@ -101,8 +101,8 @@ def _look(
 ) -> tuple[Found, dict[str, SettingValue], Sensor]:
     """The chosen sensor, the settings requested for it, and those in force."""
     found = opened.choose(args.sensor)
-    options.check_sensors({sensor.position: sensor.identity for sensor in opened.sensors})
-    asked = options.asked_settings(found.position, found.identity.name, found.identity.serial)
+    options.check_sensors({sensor.number: sensor.identity for sensor in opened.sensors})
+    asked = options.asked_settings(found.number, found.identity.name, found.identity.serial)
     if not asked:
         raise UsageError(f"{args.config} has no settings for {found}: correct its tables, or use --set")
     return found, asked, opened.in_force(found)
@@ -131,7 +131,7 @@ def _apply(args: argparse.Namespace) -> int:
         found, settings, before = _look(args, opened, asked)
         changed = changes(before, settings)
         if changed or args.save:
-            opened.configure(found.position, settings, args.save)
+            opened.configure(found.number, settings, args.save)
         after = opened.in_force(found) if changed else before
     verify(after, settings)
     in_force = meaning(after.settings)
@@ -155,16 +155,16 @@ def verify(sensor: Sensor, settings: Mapping[str, SettingValue]) -> None:
     if wrong:
         held, took = value_text(sensor.settings.get(wrong[0])), value_text(settings[wrong[0]])
         raise BusError(
-            f"sensor {sensor.position} reads back {wrong[0]} = {held} although it accepted {took}: "
+            f"sensor {sensor.number} reads back {wrong[0]} = {held} although it accepted {took}: "
             "power it off and on, then try again"
         )
 
 
 def save_now(opened: Link, found: Found) -> None:
     """Store the sensor's parameters in its flash."""
-    sensor = Sensor(found.position, found.identity, {})
+    sensor = Sensor(found.number, found.identity, {})
     with signals_held_back():
-        finish(save(opened.sdo(found.position), sensor), clock=opened.clock)
+        finish(save(opened.sdo(found.number), sensor), clock=opened.clock)
 
 
 def _save(args: argparse.Namespace) -> int:

@@ -48,7 +48,7 @@ def _snapshot(args: argparse.Namespace) -> int:
 def _take(args: argparse.Namespace, file: SnapshotFile) -> int:
     with link(args) as opened:
         found = opened.choose(args.sensor)
-        sensor, sdo = opened.in_force(found), opened.sdo(found.position)
+        sensor, sdo = opened.in_force(found), opened.sdo(found.number)
         read = [(row, finish(read_object(sdo, row))) for row in KNOWN_OBJECTS]
     identity = found.identity
     content = {
@@ -80,7 +80,7 @@ def _restore(args: argparse.Namespace) -> int:
         lacking = sorted(snapshot.settings.keys() - sensor.settings.keys())
         settings = {name: value for name, value in snapshot.settings.items() if name not in lacking}
         changed = changes(sensor, settings)
-        differing, unreadable = finish(_differing(opened.sdo(found.position), snapshot))
+        differing, unreadable = finish(_differing(opened.sdo(found.number), snapshot))
         if changed or differing:
             with signals_held_back():
                 _put_back(opened, found, sensor, settings, differing)
@@ -140,9 +140,9 @@ def _put_back(
     objects: Mapping[tuple[int, int], tuple[bytes, bytes]],
 ) -> None:
     """Write everything and verify it; on failure restore the former values."""
-    sdo, before = opened.sdo(found.position), dict(sensor.settings)
+    sdo, before = opened.sdo(found.number), dict(sensor.settings)
     if any(before.get(name) != value for name, value in settings.items()):
-        opened.configure(found.position, settings, save=False)
+        opened.configure(found.number, settings, save=False)
     written = []
     try:
         verify(opened.in_force(found), settings)
@@ -153,7 +153,7 @@ def _put_back(
         try:
             for address in written:
                 finish(_write(sdo, address, objects[address][0]))
-            opened.configure(found.position, before, save=False)
+            opened.configure(found.number, before, save=False)
         except BusError as again:
             raise BusError(
                 f"{error}; the former values could not be restored ({again}): power the sensor off and on"

@@ -46,7 +46,7 @@ def _tare(args: argparse.Namespace) -> int:
         raise UsageError(f"--target: {error}") from None
     with link(args) as opened:
         found = opened.choose(args.sensor)
-        tared = opened.tare(found.position, args.samples, args.target)
+        tared = opened.tare(found.number, args.samples, args.target)
     keys = ("old_offset", "new_offset", "residual", "deviation")
     if moved := _moved(tared, max(args.samples, LEAST_SAMPLES)):
         note(f"tare inaccurate: {moved}; the load changed while taring: keep it still and tare again")

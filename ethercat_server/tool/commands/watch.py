@@ -29,8 +29,8 @@ class _Watch:
         self.on_terminal = sys.stdout.isatty() and not args.json
         usual = _TERMINAL_INTERVAL_S if self.on_terminal else _LINE_INTERVAL_S
         self._interval_s = args.interval or usual
-        self._sensors = {sensor.position: sensor for sensor in sensors}
-        self._blocks = {position: Block() for position in self._sensors}
+        self._sensors = {sensor.number: sensor for sensor in sensors}
+        self._blocks = {number: Block() for number in self._sensors}
         self._taken = dict.fromkeys(self._sensors, 0)
         self._samples, self._json = args.samples, args.json
         self._clock = clock
@@ -40,10 +40,10 @@ class _Watch:
 
     def take(self, frame: DataMessage) -> bool:
         """Add a frame; returns whether to continue."""
-        position = frame.sensor
-        if self._samples is not None and self._taken[position] >= self._samples:
+        number = frame.sensor
+        if self._samples is not None and self._taken[number] >= self._samples:
             return not self._enough()
-        self._taken[position] += self._blocks[position].take(frame)
+        self._taken[number] += self._blocks[number].take(frame)
         return not self._enough()
 
     def _enough(self) -> bool:
@@ -60,18 +60,18 @@ class _Watch:
 
     def show(self) -> None:
         """Show all blocks and start new ones."""
-        found = {position: block.finish() for position, block in self._blocks.items() if block}
+        found = {number: block.finish() for number, block in self._blocks.items() if block}
         if self.on_terminal:
             self._show_table(found)
             return
-        for position, row in found.items():
+        for number, row in found.items():
             if self._json:
-                say_json({**self._sensors[position].as_json(), **row}, indent=None)
+                say_json({**self._sensors[number].as_json(), **row}, indent=None)
             else:
-                say(f"sensor {position}  {_line(row)}")
+                say(f"sensor {number}  {_line(row)}")
 
     def _show_table(self, found: dict[int, dict[str, Any]]) -> None:
-        text = "\n".join(f"{self._sensors[position]}\n{_table(row)}" for position, row in found.items())
+        text = "\n".join(f"{self._sensors[number]}\n{_table(row)}" for number, row in found.items())
         if not text:
             return
         # Cursor to the first line of the previous table, then clear from there.
@@ -81,7 +81,7 @@ class _Watch:
 
     def summary(self) -> str:
         """Number of samples per sensor."""
-        return ", ".join(f"sensor {position}: {count} samples" for position, count in self._taken.items())
+        return ", ".join(f"sensor {number}: {count} samples" for number, count in self._taken.items())
 
 
 def _counts(row: dict[str, Any]) -> str:
@@ -153,7 +153,7 @@ def _watch(args: argparse.Namespace) -> int:
         if not args.json and not watch.on_terminal:
             say("\n".join(f"{sensor} (mean of each block)" for sensor in sensors))
         try:
-            opened.watch([sensor.position for sensor in sensors], watch.take, watch.idle)
+            opened.watch([sensor.number for sensor in sensors], watch.take, watch.idle)
         except KeyboardInterrupt:
             pass  # the normal end
         finally:

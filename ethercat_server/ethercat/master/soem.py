@@ -1,4 +1,4 @@
-"""The backend on pysoem: scan, SDO, mapping, states up to OP. The only file that knows pysoem.
+"""The backend and the master on pysoem: scan, SDO, mapping, states up to OP. The only file that knows pysoem.
 
 What pysoem raises is translated here, and its traps end here: the descriptor that a failed open leaks, the
 close that must happen once, the scan that may take minutes, the error ring that hands one call's error to the
@@ -13,22 +13,24 @@ import os
 import socket
 import threading
 import time
+from collections.abc import Sequence
 from typing import Any, Final
 
 import pysoem
 
-from ethercat_server.errors import BusError, SdoAbortError
-from ethercat_server.ethercat.backend import CheckInterrupt, SlaveIdentity
+from ethercat_server.errors import BusError, SdoAbortError, SetUpError
+from ethercat_server.ethercat.backend import CheckInterrupt, Master
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.nic import check_present
 from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
+from ethercat_server.ethercat.slave import times
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
 
 _SDO_ATTEMPTS: Final = 3
-_OP_TIMEOUT_S: Final = 10.0
 _SCAN_TIMEOUT_S: Final = 15.0
-_STATE_ATTEMPTS: Final = {AlState.PREOP: 80, AlState.SAFEOP: 200}
-"""Of 50 ms each."""
+_STATE_CHECK_S: Final = 0.05
+_IMAGE_BYTES: Final = 4096
+"""Of pysoem's process image, whose end nothing checks."""
 _PYSOEM_ERRORS: Final = (
     pysoem.SdoError,
     pysoem.Emergency,
@@ -42,7 +44,7 @@ log = logging.getLogger(__name__)
 
 
 class SoemBackend:
-    """See `Backend`: pysoem on a network interface, which `nic.claimed` has checked beforehand."""
+    """See `Backend` and `Master`: pysoem on an interface that `nic.claimed` has checked."""
 
     def __init__(self, ifname: str) -> None:
         self.ifname = ifname
@@ -56,6 +58,11 @@ class SoemBackend:
         self._abandoned = False
         """A thread that never ended still uses the socket: it must not be closed."""
         self._socket: RawSocket
+
+    @property
+    def master(self) -> Master:
+        """See `Backend`."""
+        return self
 
     def open(self) -> None:
         """See `Backend`."""
@@ -90,17 +97,17 @@ class SoemBackend:
         """See `Backend`."""
         check_present(self.ifname, self._ifindex)
 
-    def scan(self, check_interrupt: CheckInterrupt) -> list[SlaveIdentity]:
-        """See `Backend`."""
-        if self._config_init(check_interrupt) <= 0:
-            raise BusError(
-                f"no EtherCAT slave answers on {self.ifname}: check the cable, that the sensor has power and "
-                "that this is the interface it is connected to"
+    def scan(self, positions: Sequence[int], check_interrupt: CheckInterrupt) -> None:
+        """See `Master`. SOEM takes every slave on the wire for its own."""
+        count = self._config_init(check_interrupt)
+        if count != len(positions):
+            raise SetUpError(
+                f"{max(count, 0)} of {len(positions)} slaves on {self.ifname} answered the scan: check cable "
+                "and power"
             )
         self._slaves = list(self._master.slaves)
         for slave in self._slaves:
             slave.add_emergency_callback(_log_emergency)
-        return [SlaveIdentity(s.man, s.id, s.rev, _name(s)) for s in self._slaves]
 
     def _config_init(self, check_interrupt: CheckInterrupt) -> int:
         # SOEM tries every byte of the SII for long if a slave goes away meanwhile, two minutes in all, and no
@@ -125,41 +132,47 @@ class SoemBackend:
             self._abandoned = thread.is_alive()
         return counts[0] if counts else 0
 
-    def check_preop(self, check_interrupt: CheckInterrupt) -> None:
-        """See `Backend`."""
+    def enter_preop(self, check_interrupt: CheckInterrupt) -> None:
+        """See `Master`."""
         self._wait_state(AlState.PREOP, check_interrupt)
 
-    def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
-        """See `Backend`."""
+    def sdo_read(self, number: int, index: int, subindex: int) -> bytes:
+        """See `Master`."""
         what = f"reading object 0x{index:04X}:{subindex}"
-        data: bytes = self._sdo(slave, index, subindex, what, None)
+        data: bytes = self._sdo(number, index, subindex, what, None)
         return data
 
-    def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
-        """See `Backend`."""
-        self._sdo(slave, index, subindex, f"writing {data.hex()} to object 0x{index:04X}:{subindex}", data)
+    def sdo_write(self, number: int, index: int, subindex: int, data: bytes) -> None:
+        """See `Master`."""
+        self._sdo(number, index, subindex, f"writing {data.hex()} to object 0x{index:04X}:{subindex}", data)
 
-    def map_process_data(self) -> list[int]:
-        """See `Backend`."""
+    def map_process_data(self, check_interrupt: CheckInterrupt) -> list[int]:
+        """See `Master`."""
+        check_interrupt()
         try:
-            self._master.config_map()
+            mapped = self._master.config_map()
         except pysoem.ConfigMapError as error:
-            raise BusError(
-                f"the process data of {self.ifname} cannot be mapped: {_texts(error.error_list)}; "
-                "power the sensor off and on, then start again"
-            ) from None
+            raise self._unmapped(_texts(error.error_list)) from None
         except _PYSOEM_ERRORS as error:
-            raise BusError(f"the process data of {self.ifname} cannot be mapped: {_texts([error])}") from None
+            raise self._unmapped(_texts([error])) from None
+        if mapped > _IMAGE_BYTES:
+            raise self._unmapped(f"its slaves say that they have {mapped} bytes")
         for slave in self._slaves:
             slave.output = bytes(len(slave.output))
         return [len(slave.input) for slave in self._slaves]
 
+    def _unmapped(self, why: str) -> SetUpError:
+        return SetUpError(
+            f"the process data of {self.ifname} cannot be mapped: {why}; power the sensor off and on, then "
+            "start again"
+        )
+
     def go_operational(self, check_interrupt: CheckInterrupt) -> None:
-        """See `Backend`."""
+        """See `Master`."""
         self._wait_state(AlState.SAFEOP, check_interrupt)
         self._master.state = pysoem.OP_STATE
         self._master.write_state()
-        deadline = time.monotonic() + _OP_TIMEOUT_S
+        deadline = time.monotonic() + times.STATE_S[AlState.OP]
         while time.monotonic() < deadline:
             check_interrupt()
             for _ in range(5):
@@ -168,23 +181,28 @@ class SoemBackend:
             if self._master.state_check(pysoem.OP_STATE, 2000) == pysoem.OP_STATE:
                 self._socket.set_blocking(False)
                 return
-        raise BusError(self._state_complaint(AlState.OP))
+        raise SetUpError(self._state_complaint(AlState.OP))
+
+    def release(self) -> None:
+        """See `Master`."""
+        if not self._opened or self._abandoned or not self._scanned:
+            return
+        self._scanned = False
+        with contextlib.suppress(*_PYSOEM_ERRORS):
+            self._socket.set_blocking(True)
+            self._master.state = pysoem.INIT_STATE
+            self._master.write_state()
 
     def close(self) -> None:
-        """See `Backend`. Slaves that were never scanned are left in the state they are in."""
+        """See `Backend`."""
         if not self._opened or self._abandoned:
             return
         self._opened = False
-        with contextlib.suppress(*_PYSOEM_ERRORS):
-            self._socket.set_blocking(True)
-            if self._scanned:
-                self._master.state = pysoem.INIT_STATE
-                self._master.write_state()
         self._socket.close()
         self._master.close()
 
-    def _sdo(self, slave: int, index: int, subindex: int, what: str, data: bytes | None) -> Any:
-        target, last = self._slaves[slave], "no answer"
+    def _sdo(self, number: int, index: int, subindex: int, what: str, data: bytes | None) -> Any:
+        target, last = self._slaves[number], "no answer"
         for _ in range(_SDO_ATTEMPTS):
             try:
                 if data is None:
@@ -194,7 +212,7 @@ class SoemBackend:
                 # Another object's abort is a stale entry of the error ring, not an answer to this call.
                 if (error.index, error.subindex) == (index, subindex):
                     code = error.abort_code & 0xFFFFFFFF
-                    text = f"sensor {slave} refused {what}: {error.desc.strip()} (abort 0x{code:08X})"
+                    text = f"sensor {number} refused {what}: {error.desc.strip()} (abort 0x{code:08X})"
                     raise SdoAbortError(text, code) from None
                 last = "an answer about another object"
             except Exception as error:
@@ -202,35 +220,28 @@ class SoemBackend:
                 if not isinstance(error, _PYSOEM_ERRORS) and type(error) is not Exception:
                     raise
                 last = _texts([error])
-        raise BusError(f"sensor {slave} did not answer {what}: {last}; check cable and power")
+        raise SetUpError(f"sensor {number} did not answer {what}: {last}; check cable and power")
 
     def _wait_state(self, state: AlState, check_interrupt: CheckInterrupt) -> None:
-        for _ in range(_STATE_ATTEMPTS[state]):
+        for _ in range(round(times.STATE_S[state] / _STATE_CHECK_S)):
             check_interrupt()
-            if self._master.state_check(int(state), 50_000) == state:
+            if self._master.state_check(int(state), round(_STATE_CHECK_S * 1e6)) == state:
                 return
             # state_check wants the state itself; a slave that is above it is fine as well.
             self._master.read_state()
             if any(_al_status(s).error or s.state == pysoem.NONE_STATE for s in self._slaves):
                 break
-        raise BusError(self._state_complaint(state))
+        raise SetUpError(self._state_complaint(state))
 
     def _state_complaint(self, state: AlState) -> str:
         self._master.read_state()
-        for position, slave in enumerate(self._slaves):
+        for number, slave in enumerate(self._slaves):
             if slave.state != state:
                 return (
-                    f"sensor {position} does not reach {state.name}: it stays in {_al_status(slave)}; "
+                    f"sensor {number} does not reach {state.name}: it stays in {_al_status(slave)}; "
                     "power it off and on, then start again"
                 )
         return f"the bus on {self.ifname} does not reach {state.name}: start again"
-
-
-def _name(slave: Any) -> str:
-    try:
-        return str(slave.name)
-    except UnicodeDecodeError:  # a name in another encoding than pysoem's UTF-8
-        return ""
 
 
 def _al_status(slave: Any) -> AlStatus:

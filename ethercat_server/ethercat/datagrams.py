@@ -1,0 +1,151 @@
+"""Single datagrams on the bus: registers of the slaves, by station address or position, and broadcast reads.
+
+Each is a frame of our own over the backend, matched with its answer by its index: a frame that comes too late
+is never taken for another one's answer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import struct
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from ethercat_server.errors import BusError
+from ethercat_server.ethercat.backend import Backend
+from ethercat_server.ethercat.late_answers import LateAnswers
+from ethercat_server.ethercat.wire import FIRST_DATA, Command, build, is_answer
+
+FIRST_INDEX: Final = 0x80
+"""SOEM uses the indices below."""
+SHORTEST_FRAME: Final = 60
+_DATAGRAM_TIMEOUT_S: Final = 0.002
+_PATIENT_TIMEOUT_S: Final = 0.02
+_LEAST_TIMEOUT_S: Final = 0.0003
+_REGISTER_ATTEMPTS: Final = 20
+_U16: Final = struct.Struct("<H")
+
+
+class Datagrams:
+    """Single datagrams through `backend`. Used by one thread."""
+
+    def __init__(self, backend: Backend) -> None:
+        self.backend = backend
+        self.clock = backend.clock
+        self.ifname = backend.ifname
+        self._send, self._receive = backend.send, backend.receive
+        self._monotonic_ns = backend.clock.monotonic_ns
+        self._index = 0
+        self._datagram_timeout_s = _PATIENT_TIMEOUT_S
+        self._late = LateAnswers(backend.clock, FIRST_INDEX)
+        self._pending_ns = self._late.pending_ns
+        self.stations: list[int] = []
+        """Configured station addresses of the sensors, by number."""
+
+    def be_patient(self, patient: bool) -> None:
+        """Whether single datagrams may take long: no sensor is left that would have to wait for them."""
+        self._datagram_timeout_s = _PATIENT_TIMEOUT_S if patient else _DATAGRAM_TIMEOUT_S
+
+    @contextlib.contextmanager
+    def in_time(self, until_ns: int) -> Iterator[None]:
+        """Within it, single datagrams wait no longer than until then: an exchange is due."""
+        usual, left_s = self._datagram_timeout_s, (until_ns - self._monotonic_ns()) * 1e-9
+        self._datagram_timeout_s = min(usual, max(_LEAST_TIMEOUT_S, left_s))
+        try:
+            yield
+        finally:
+            self._datagram_timeout_s = usual
+
+    def read_register(self, number: int, address: int, size: int) -> bytes | None:
+        """Read ESC registers or a mailbox of a sensor with one datagram; None if it did not do it."""
+        return self._read(Command.FPRD, self.stations[number], address, size, self._datagram_timeout_s)
+
+    def write_register(self, number: int, address: int, data: bytes) -> bool:
+        """Write ESC registers or a mailbox of a sensor with one datagram; False if it did not."""
+        return self._write(Command.FPWR, self.stations[number], address, data, self._datagram_timeout_s)
+
+    def read_at(self, position: int, address: int, size: int) -> bytes | None:
+        """Read ESC registers of the slave at a position, scanned or not; None if it did not do it."""
+        return self._read(Command.APRD, -position, address, size, self._datagram_timeout_s)
+
+    def write_at(self, position: int, address: int, data: bytes) -> bool:
+        """Write ESC registers of the slave at a position, scanned or not; False if it did not do it."""
+        return self._write(Command.APWR, -position, address, data, self._datagram_timeout_s)
+
+    def count_slaves(self, size: int, timeout_s: float) -> int:
+        """How many slaves answer a broadcast read of `size` bytes from register 0 on; -1 if it is lost.
+
+        Needs no scan and changes nothing, so it also serves to measure the round trip of such a frame.
+        """
+        answer = self.read_all(0, size, timeout_s)
+        return -1 if answer is None else answer[0]
+
+    def read_all(self, address: int, size: int, timeout_s: float) -> tuple[int, bytes] | None:
+        """How many slaves answer a broadcast read, and what they have there, ORed; None if it is lost."""
+        return self._datagram(Command.BRD, 0, address, bytes(size), timeout_s)
+
+    def listen(self, seconds: float) -> int:
+        """The number of frames that arrive from others in this time; nothing is sent."""
+        until_ns, count = self._monotonic_ns() + int(seconds * 1e9), 0
+        while (left_ns := until_ns - self._monotonic_ns()) > 0:
+            count += self._receive(left_ns * 1e-9) is not None
+        return count
+
+    def read_surely(self, number: int, address: int, size: int) -> bytes:
+        """Read ESC registers of a sensor; BusError if it does not answer."""
+        data = self._attempt(functools.partial(self.read_register, number, address, size))
+        if data is None:
+            raise BusError(f"sensor {number} does not answer: check cable and power")
+        return data
+
+    def write_surely_at(self, position: int, address: int, data: bytes) -> None:
+        """Write ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
+        if not any(self.write_at(position, address, data) for _ in range(_REGISTER_ATTEMPTS)):
+            raise self._unanswered(position)
+
+    def read_surely_at(self, position: int, address: int, size: int) -> bytes:
+        """Read ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
+        data = self._attempt(functools.partial(self.read_at, position, address, size))
+        if data is None:
+            raise self._unanswered(position)
+        return data
+
+    def _unanswered(self, position: int) -> BusError:
+        return BusError(f"slave {position} on {self.ifname} does not answer: check cable and power")
+
+    def _attempt(self, read: Callable[[], bytes | None]) -> bytes | None:
+        """Read again while datagrams are lost, a bounded number of times."""
+        for _ in range(_REGISTER_ATTEMPTS):
+            if (data := read()) is not None:
+                return data
+        return None
+
+    def _read(self, command: Command, adp: int, address: int, size: int, timeout_s: float) -> bytes | None:
+        answer = self._datagram(command, adp, address, bytes(size), timeout_s)
+        return answer[1] if answer is not None and answer[0] == 1 else None
+
+    def _write(self, command: Command, adp: int, address: int, data: bytes, timeout_s: float) -> bool:
+        answer = self._datagram(command, adp, address, data, timeout_s)
+        return answer is not None and answer[0] == 1
+
+    def _datagram(
+        self, command: Command, adp: int, ado: int, data: bytes, timeout_s: float
+    ) -> tuple[int, bytes] | None:
+        """Send one datagram and wait for it: its working counter and data; None if it does not come back."""
+        self._index = (self._index + 1) % len(self._pending_ns)
+        index = self._index + FIRST_INDEX
+        frame = build((command, adp, ado, data), first_index=index)
+        self._pending_ns[self._index] = now_ns = self._monotonic_ns()
+        until_ns = now_ns + int(max(timeout_s, self._late.timeout_s) * 1e9)
+        self._send(frame.ljust(SHORTEST_FRAME, b"\0"))
+        end = FIRST_DATA + len(data)
+        while (left_ns := until_ns - self._monotonic_ns()) > 0:
+            answer = self._receive(left_ns * 1e-9)
+            if answer is None:
+                return None
+            if is_answer(answer, command, index, len(data)):
+                self._pending_ns[self._index] = 0
+                return _U16.unpack_from(answer, end)[0], answer[FIRST_DATA:end]
+            self._late.note(answer)
+        return None
