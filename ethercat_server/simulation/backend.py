@@ -1,7 +1,7 @@
 """The backend in memory (see `ethercat.backend`): a master for virtual sensors, over a simulated wire.
 
 Frames are processed by `virtual_sensor.bus.Bus` as those of a network interface are. The master does what
-SOEM does, by datagrams, and no more than a bus of Bota sensors needs.
+SOEM does, by datagrams, and no more than the virtual slaves need.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ethercat_server.ethercat.wire import Command, build
 from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
 from ethercat_server.virtual_sensor import bus as virtual
 from ethercat_server.virtual_sensor.faults.table import obey
-from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
+from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions, SlaveOptions
 
 _FIRST_STATION: Final = 0x1001
 _PROBES: Final = 5
@@ -34,23 +34,24 @@ _PAUSE_S: Final = 0.001
 _ACKNOWLEDGE: Final = 0x10
 _FMMU: Final = struct.Struct("<IHBBHBBB3x")
 _SYNC_MANAGER: Final = struct.Struct("<HHBBBB")
-_WRITE, _READ = 2, 1
+_LOGICAL: Final = {"outputs": 2, "inputs": 1}
+"""Type of the FMMU for each kind of sync manager."""
 
 
 class MemoryBackend:
-    """See `Backend`: a chain of virtual sensors on a simulated machine."""
+    """See `Backend`: virtual sensors, and foreign slaves, in wire order on a simulated machine."""
 
-    def __init__(self, *sensors: SensorOptions, machine: Machine | None = None) -> None:
+    def __init__(self, *slaves: SlaveOptions, machine: Machine | None = None) -> None:
         machine = machine or Machine()
         self.ifname = "memory"
         self.clock = SimulatedClock(machine)
         self.wire = Wire(machine)
-        self.sensors = virtual.Bus(BusOptions(sensors or (SensorOptions(),)), self.clock.now_ns)
+        self.sensors = virtual.Bus(BusOptions(slaves or (SensorOptions(),)), self.clock.now_ns)
         self._on_the_wire: list[tuple[int, int, bytes]] = []
         self._sent = 0
         self._bus: Bus
         self._images: list[dict[str, Any]] = []
-        self._sdos: list[MailboxSdo] = []
+        self._sdos: list[MailboxSdo | None] = []
 
     def command(self, line: str) -> str:
         """Do what a fault command of the virtual sensor says, now; returns its answer."""
@@ -112,12 +113,13 @@ class MemoryBackend:
             self._write(position, reg.AL_CONTROL, _u16(AlState.INIT | _ACKNOWLEDGE))
             image = sii_content.decode(self._read_image(position))
             out, back = (tuple(image["mailboxes"][way]) for way in ("out", "in"))
-            managers = _SYNC_MANAGER.pack(*out, 0x26, 0, 1, 0) + _SYNC_MANAGER.pack(*back, 0x22, 0, 1, 0)
-            self._write(position, reg.SYNC_MANAGER, managers)
+            if image["protocols"]:
+                managers = _SYNC_MANAGER.pack(*out, 0x26, 0, 1, 0) + _SYNC_MANAGER.pack(*back, 0x22, 0, 1, 0)
+                self._write(position, reg.SYNC_MANAGER, managers)
             self._write(position, reg.SII_OWNER, OF_FIRMWARE)
             self._write(position, reg.AL_CONTROL, AlState.PREOP.request())
             self._images.append(image)
-            self._sdos.append(MailboxSdo(bus, position, (out, back)))
+            self._sdos.append(MailboxSdo(bus, position, (out, back)) if image["protocols"] else None)
             found.append(SlaveIdentity(*(image[key] for key in ("vendor", "product", "revision", "name"))))
         return found
 
@@ -127,27 +129,36 @@ class MemoryBackend:
 
     def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
         """See `Backend`."""
-        return finish(self._sdos[slave].read(index, subindex), clock=self.clock)
+        return finish(self._sdo(slave).read(index, subindex), clock=self.clock)
 
     def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
         """See `Backend`."""
-        finish(self._sdos[slave].write(index, subindex, data), clock=self.clock)
+        finish(self._sdo(slave).write(index, subindex, data), clock=self.clock)
+
+    def _sdo(self, slave: int) -> MailboxSdo:
+        if (sdo := self._sdos[slave]) is None:
+            raise BusError(f"slave {slave} has no objects: it has no mailbox")
+        return sdo
 
     def map_process_data(self) -> list[int]:
         """See `Backend`. All outputs first, then all inputs, as SOEM has them."""
-        sizes, outputs, inputs = [], 0, len(self._images)
+        sizes, outputs = [], 0
+        inputs = sum(_size(image, "outputs") for image in self._images)
         for position, image in enumerate(self._images):
-            rows = [row for row in image["sync_managers"] if row["kind"] in ("outputs", "inputs")]
+            rows = [row for row in image["sync_managers"] if row["kind"] in _LOGICAL]
             managers = b"".join(
-                _SYNC_MANAGER.pack(row["start"], row["size"], row["control"], 0, 1, 0) for row in rows
+                _SYNC_MANAGER.pack(row["start"], row["size"], row["control"], 0, bool(row["size"]), 0)
+                for row in rows
             )
-            out, back = rows
-            units = _fmmu(outputs, out, _WRITE) + _fmmu(inputs, back, _READ)
-            self._write(position, reg.SYNC_MANAGER + 2 * reg.SYNC_MANAGER_SIZE, managers)
-            self._write(position, reg.FMMU, units)
+            at = {"outputs": outputs, "inputs": inputs}
+            units = b"".join(_fmmu(at[row["kind"]], row) for row in rows if row["size"])
+            if managers:
+                self._write(position, reg.SYNC_MANAGER + 2 * reg.SYNC_MANAGER_SIZE, managers)
+                self._write(position, reg.FMMU, units)
             self._write(position, reg.AL_CONTROL, AlState.SAFEOP.request())
-            outputs, inputs = outputs + out["size"], inputs + back["size"]
-            sizes.append(back["size"])
+            outputs += _size(image, "outputs")
+            sizes.append(_size(image, "inputs"))
+            inputs += sizes[-1]
         self._image_size = inputs
         return sizes
 
@@ -192,5 +203,10 @@ def _u16(value: int) -> bytes:
     return value.to_bytes(2, "little")
 
 
-def _fmmu(logical: int, sync_manager: dict[str, Any], kind: int) -> bytes:
+def _size(image: dict[str, Any], kind: str) -> int:
+    return sum(row["size"] for row in image["sync_managers"] if row["kind"] == kind)
+
+
+def _fmmu(logical: int, sync_manager: dict[str, Any]) -> bytes:
+    kind = _LOGICAL[sync_manager["kind"]]
     return _FMMU.pack(logical, sync_manager["size"], 0, 7, sync_manager["start"], 0, kind, 1)
