@@ -26,6 +26,7 @@ from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.doctor.bus import measurement
 from ethercat_server.doctor.bus.receiver import MESSAGE
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
 from ethercat_server.links import direct
@@ -40,6 +41,7 @@ from ethercat_server.serving.transport.in_memory import InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
+from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
 from protocol.client import blocking
 from protocol.control import request
 from protocol.errors import ConnectionFailedError
@@ -92,6 +94,11 @@ class SimulatedBus:
         found: dict[str, Any] = json.loads(self.command("stats"))["sensors"][position]
         return found
 
+    def stats_of_foreign(self, place: int) -> dict[str, Any]:
+        """What the foreign slave at this position says of itself."""
+        found: dict[str, Any] = json.loads(self.command("stats"))["foreign"][str(place)]
+        return found
+
     def written(self, position: int = 0) -> list[tuple[str, int, str]]:
         """The SDO writes so far: index, sub-index, data."""
         return [(row["index"], row["subindex"], row["hex"]) for row in self.stats(position)["sdo_writes"]]
@@ -104,15 +111,26 @@ def _read_image(bus: Bus, position: int) -> bytes:
     """The SII, on which most of a start would be spent; nothing else reads it like this."""
     finish(read_sii(ByPosition(bus), position, 0, 4), clock=bus.clock)
     assert isinstance(bus.backend, MemoryBackend)
-    life = bus.backend.sensors.sensors[position].life
+    life = bus.backend.sensors.slaves[position].life
     return _READ_IMAGE(bus, position) if life is None else life.esc.sii.image
+
+
+def chain(text: str) -> MemoryBackend:
+    """A bus with these slaves."""
+    return MemoryBackend(*slaves_in(parse_chain(text)))
+
+
+def registers(backend: MemoryBackend) -> list[bytes]:
+    """All registers of every slave."""
+    lives = [slave.life for slave in backend.sensors.slaves]
+    return [bytes(life.esc.memory[: reg.REGISTERS_END]) for life in lives if life is not None]
 
 
 @contextlib.contextmanager
 def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterator[SimulatedBus]:
     """Sensors as `ethercat-virtual-sensor IFACE arguments...` simulates; nobody writes their calibration."""
     options = options_from(build_parser().parse_args(["lo", *map(str, arguments)]))
-    bus = SimulatedBus(MemoryBackend(*options.sensors, machine=machine))
+    bus = SimulatedBus(MemoryBackend(*options.slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(look, "read_image", _read_image)
         patch.setattr(direct, "open_bus", lambda _ifname, _cleanup: Bus(bus.backend))

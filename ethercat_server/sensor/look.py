@@ -15,7 +15,7 @@ from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave import sii_content
-from ethercat_server.ethercat.slave.al import AlState, AlStatus
+from ethercat_server.ethercat.slave.al import AlStatus
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
 from ethercat_server.sensor.objects.dictionary import PRODUCT_CODE, VENDOR_ID
@@ -31,7 +31,6 @@ _MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
 """Start and length of a Bota sensor's sync managers 0 to 2."""
 _INPUTS: Final = 0x1180
 _SYNC_MANAGER: Final = struct.Struct("<HH4x")
-_ABOVE_PREOP: Final = AlState.SAFEOP | AlState.OP
 _NAMELESS: Final = "nameless"
 _KNOWN: Final = ("vendor", "product", "revision", "name")
 """What `describe` says of a slave from its SII."""
@@ -86,7 +85,7 @@ def check_no_master(bus: Bus) -> None:
 
 
 def look(bus: Bus, check_interrupt: CheckInterrupt) -> list[Slave]:
-    """All slaves, in their order on the wire; BusError if there are none."""
+    """All slaves, in their order on the wire, without their SIIs; BusError if there are none."""
     count = max(bus.count_slaves(_PROBE_BYTES, _TIMEOUT_S) for _ in range(_ATTEMPTS))
     if count <= 0:
         raise BusError(
@@ -101,22 +100,21 @@ def look(bus: Bus, check_interrupt: CheckInterrupt) -> list[Slave]:
 
 
 def look_at(bus: Bus, position: int) -> Slave:
-    """The slave at `position`; BusError if it does not answer."""
+    """The slave at `position`, without its SII; BusError if it does not answer."""
     status = AlStatus.parse(bus.read_surely_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE))
-    if status.raw_state & _ABOVE_PREOP and not _has_sensors_managers(bus, position):
-        return Slave(position, status, None, at_work=True)
-    return read_slave(bus, position, status)
+    at_work = status.is_above_preop and not _has_sensors_managers(bus, position)
+    return Slave(position, status, None, at_work=at_work)
 
 
-def read_slave(bus: Bus, position: int, status: AlStatus) -> Slave:
-    """The slave at `position` with its SII; access to the SII returns to its owner afterwards."""
+def with_sii(bus: Bus, slave: Slave) -> Slave:
+    """The same slave with its SII; access to the SII returns to its owner afterwards."""
     try:
-        content = sii_content.decode(read_image(bus, position))
+        content = sii_content.decode(read_image(bus, slave.position))
     except BusError as error:
-        return Slave(position, status, None, str(error))
+        return slave._replace(problem=str(error))
     if not content["vendor"] and not content["product"]:
-        return Slave(position, status, None, "it is empty")
-    return Slave(position, status, content)
+        return slave._replace(problem="its SII is empty")
+    return slave._replace(sii=content)
 
 
 def read_image(bus: Bus, position: int) -> bytes:

@@ -13,12 +13,11 @@ from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.master.datagrams import DatagramMaster
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave import times
-from ethercat_server.ethercat.slave.al import AlState, AlStatus
-from ethercat_server.sensor.look import Slave, check_no_master, look, read_slave
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.sensor.look import Slave, check_no_master, look, look_at, with_sii
 
 _PAUSE_S: Final = 0.002
 _ACKNOWLEDGE: Final = 0x10
-_ABOVE_PREOP: Final = AlState.SAFEOP | AlState.OP
 _MAILBOX_BYTES: Final = range(16, 1487)
 
 log = logging.getLogger(__name__)
@@ -35,15 +34,17 @@ def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = Fals
     check_interrupt()
     slaves = look(bus, check_interrupt)
     at_work = [slave for slave in slaves if slave.at_work]
-    if not at_work:
-        return slaves
-    if not force:
+    if at_work and not force:
         where = ", ".join(f"{slave.position} in {slave.status.state.name}" for slave in at_work)
         raise BusError(
             f"{bus.ifname} has slaves at work that are no Bota sensors (position {where}): name the "
             "interface that the sensor is connected to, or stop their master; --force takes them to PREOP"
         )
-    return [_stop(bus, slave, check_interrupt) if slave.at_work else slave for slave in slaves]
+    found = []
+    for slave in slaves:
+        check_interrupt()
+        found.append(with_sii(bus, _stopped(bus, slave, check_interrupt) if slave.at_work else slave))
+    return found
 
 
 def scan(bus: Bus, slaves: Sequence[Slave], check_interrupt: CheckInterrupt) -> None:
@@ -80,19 +81,16 @@ def unreadable(ifname: str, slave: Slave) -> str:
     )
 
 
-def _stop(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:
+def _stopped(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:
     """Take a slave that is not Bota's, and that is to be taken over, to PREOP."""
     position = slave.position
     request = (AlState.PREOP | _ACKNOWLEDGE).to_bytes(2, "little")
     bus.write_surely_at(position, reg.AL_CONTROL, request)
     deadline = Deadline(bus.clock, times.STATE_S[AlState.PREOP])
-    while True:
+    while (now := look_at(bus, position)).at_work:
         check_interrupt()
-        status = AlStatus.parse(bus.read_surely_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE))
-        if not status.raw_state & _ABOVE_PREOP:
-            log.warning("the slave at position %d of %s was taken to %s", position, bus.ifname, status)
-            return read_slave(bus, position, status)
         if deadline.passed:
-            raise BusError(f"slave {position} on {bus.ifname} stays in {status}: switch it off")
-
+            raise BusError(f"slave {position} on {bus.ifname} stays in {now.status}: switch it off")
         bus.clock.sleep(_PAUSE_S)
+    log.warning("the slave at position %d of %s was taken to %s", position, bus.ifname, now.status)
+    return now

@@ -10,20 +10,20 @@ import heapq
 from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
 from ethercat_server.virtual_sensor import bus as virtual
 from ethercat_server.virtual_sensor.faults.table import obey
-from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
+from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions, SlaveOptions
 
 
 class MemoryBackend:
-    """See `Backend`: a chain of virtual sensors on a simulated machine."""
+    """See `Backend`: virtual sensors, and foreign slaves, in wire order on a simulated machine."""
 
     master = None
 
-    def __init__(self, *sensors: SensorOptions, machine: Machine | None = None) -> None:
+    def __init__(self, *slaves: SlaveOptions, machine: Machine | None = None) -> None:
         machine = machine or Machine()
         self.ifname = "memory"
         self.clock = SimulatedClock(machine)
         self.wire = Wire(machine)
-        self.sensors = virtual.Bus(BusOptions(sensors or (SensorOptions(),)), self.clock.now_ns)
+        self.sensors = virtual.Bus(BusOptions(slaves or (SensorOptions(),)), self.clock.now_ns)
         self._on_the_wire: list[tuple[int, int, bytes]] = []
         self._sent = 0
 

@@ -1,4 +1,4 @@
-"""A chain of simulated sensors, in memory: bytes in, bytes out, no sockets, no threads, no clock of its own.
+"""A chain of simulated slaves, in memory: bytes in, bytes out, no sockets, no threads, no clock of its own.
 
 Time is an argument, in ns of any clock that only goes forward; nothing in here asks for it elsewhere:
 
@@ -8,8 +8,8 @@ Time is an argument, in ns of any clock that only goes forward; nothing in here 
     faults.table.obey(bus, "power off @1")  # a fault, as one line of text; answers "ok" or "error: ..."
     bus.statistics()                        # AL states, SDO writes, frames: what the command `stats` prints
 
-The same options (with their seeds), frames, commands and times give the same answers. A sensor that loses
-power, its settings and its flash are in `bus.sensors[n]`.
+The same options (with their seeds), frames, commands and times give the same answers. `bus.slaves` are in
+wire order; the sensors among them, with their settings and their flash, are in `bus.sensors`.
 """
 
 from __future__ import annotations
@@ -22,26 +22,33 @@ from typing import Any
 from ethercat_server.ethercat import wire
 from ethercat_server.virtual_sensor.esc import registers as reg
 from ethercat_server.virtual_sensor.esc.commands import execute
-from ethercat_server.virtual_sensor.firmware.firmware import Firmware
-from ethercat_server.virtual_sensor.options import BusOptions
+from ethercat_server.virtual_sensor.foreign.left_behind import leave_in
+from ethercat_server.virtual_sensor.foreign.slave import ForeignSlave
+from ethercat_server.virtual_sensor.options import BusOptions, ForeignOptions, SensorOptions
 from ethercat_server.virtual_sensor.sensor import VirtualSensor
+from ethercat_server.virtual_sensor.slave.al import AlState
+from ethercat_server.virtual_sensor.slave.application import Application
+
+Slave = VirtualSensor | ForeignSlave
 
 _LONGEST_PERIOD_NS = 50_000_000
+_FIRST_STATION = 0x1001
+"""Where another master begins."""
 
 
 @dataclass(slots=True)
 class Damage:
-    """Frames that arrive corrupted at one port of one sensor."""
+    """Frames that arrive corrupted at one port of one slave."""
 
-    sensor: VirtualSensor
+    slave: Slave
     port: int
-    """0: on the way out; 1: on the way back, from the sensor behind."""
+    """0: on the way out; 1: on the way back, from the slave behind."""
     frames: int
     """How many more."""
 
 
 class Bus:
-    """Sensors in the order in which frames reach them. All times are in ns, on the caller's clock.
+    """Slaves in the order in which frames reach them. All times are in ns, on the caller's clock.
 
     Attributes:
         now: time of the latest call.
@@ -52,46 +59,80 @@ class Bus:
     """
 
     def __init__(self, options: BusOptions, now: int) -> None:
-        """All sensors are switched on at `now`."""
+        """All slaves are switched on at `now`."""
         self.now = now
-        self.sensors = [VirtualSensor(each, lambda: self.now) for each in options.sensors]
+        self.slaves: list[Slave] = [self._made(each) for each in options.slaves]
+        self.sensors = [slave for slave in self.slaves if isinstance(slave, VirtualSensor)]
+        self.disconnected: set[Slave] = set()
+        """Those whose cable at port 0 is unplugged."""
         self.lose = 0
         self.deaf_until: float | None = None
         self.deaf_after: int | None = None
         self.damage: Damage | None = None
         self.frames = self.frames_lost = 0
-        self._power_events: list[tuple[int, VirtualSensor]] = []
-        self._alive: list[Firmware] = []
+        self._power_events: list[tuple[int, Slave]] = []
+        self._alive: list[Application] = []
         self._last_frame = 0
         self.rewire()
+        self._leave_behind()
+
+    def _made(self, options: SensorOptions | ForeignOptions) -> Slave:
+        if isinstance(options, ForeignOptions):
+            return ForeignSlave(options, lambda: self.now)
+        return VirtualSensor(options, lambda: self.now)
+
+    def _leave_behind(self) -> None:
+        """Take slaves to the state of their options as another master does: all outputs, then all inputs."""
+        left = [slave for slave in self.slaves if slave.options.state > AlState.INIT]
+        outputs = 0
+        inputs = sum(pdo.size for slave in left if slave.life for pdo in slave.life.device.outputs)
+        for slave in left:
+            life = slave.life
+            assert life is not None
+            station = _FIRST_STATION + self.slaves.index(slave)
+            leave_in(life, slave.options.state, station, outputs, inputs)
+            outputs += sum(pdo.size for pdo in life.device.outputs)
+            inputs += sum(pdo.size for pdo in life.device.inputs)
+            if isinstance(slave, ForeignSlave):
+                slave.left_at_work()
 
     def rewire(self) -> None:
-        """A sensor was switched on or off: frames reach those before the first without power."""
+        """Power or a cable has changed: frames reach the slaves before the first that is cut off."""
         self._alive = []
-        for sensor in self.sensors:
-            if sensor.life is None:
+        for slave in self.slaves:
+            if slave.life is None or slave in self.disconnected:
                 break
-            self._alive.append(sensor.life)
+            self._alive.append(slave.life)
         for life in self._alive:
             life.esc.set_ports(next_slave=life is not self._alive[-1])
 
     def set_time(self, now: int) -> None:
         """Let time pass up to `now`, with what is due meanwhile but the watchdogs: frames may be waiting."""
         while self._power_events and self._power_events[0][0] <= now:
-            self.now, sensor = self._power_events.pop(0)
-            sensor.power(True)
+            self.now, slave = self._power_events.pop(0)
+            slave.power(True)
             self.rewire()
         self.now = now
         if self.deaf_until is not None and now >= self.deaf_until:
             self.deaf_until = None
 
-    def power(self, sensor: VirtualSensor, on: bool, seconds: float | None = None) -> None:
-        """Switch a sensor on or off; on again after `seconds` unless None."""
-        self._power_events = [event for event in self._power_events if event[1] is not sensor]
-        sensor.power(on)
+    def power(self, slave: Slave, on: bool, seconds: float | None = None) -> None:
+        """Switch a slave on or off; on again after `seconds` unless None."""
+        self._power_events = [event for event in self._power_events if event[1] is not slave]
+        slave.power(on)
         if seconds is not None:
-            self._power_events.append((self.now + round(seconds * 1e9), sensor))
+            self._power_events.append((self.now + round(seconds * 1e9), slave))
             self._power_events.sort(key=operator.itemgetter(0))
+        self.rewire()
+
+    def connect(self, slave: Slave, connected: bool) -> None:
+        """Plug or unplug the cable at port 0 of a slave, which keeps its power."""
+        if connected:
+            self.disconnected.discard(slave)
+        elif slave not in self.disconnected:
+            self.disconnected.add(slave)
+            if slave.life is not None:
+                slave.life.esc.count(reg.LOST_LINKS)
         self.rewire()
 
     def process(self, frame: bytearray, size: int, now: int) -> bool:
@@ -132,18 +173,18 @@ class Bus:
         return bytes(answer) if self.process(answer, len(answer), now) else None
 
     def _damaged_at(self) -> int | None:
-        """Count a corrupted frame in the error counters; how many sensors received it intact, None for all.
+        """Count a corrupted frame in the error counters; how many slaves received it intact, None for all.
 
-        The sensor that detects the error marks the frame; those it passes afterwards, on the way out at
+        The slave that detects the error marks the frame; those it passes afterwards, on the way out at
         port 0 and on the way back at port 1, count it as forwarded.
         """
         damage = self.damage
-        if damage is None or damage.sensor.life not in self._alive:
+        if damage is None or damage.slave.life not in self._alive:
             return None
         damage.frames -= 1
         if damage.frames <= 0:
             self.damage = None
-        position = self._alive.index(damage.sensor.life)
+        position = self._alive.index(damage.slave.life)
         self._alive[position].esc.count(reg.RX_ERRORS + 2 * damage.port)
         self._alive[position].esc.count(reg.RX_ERRORS + 2 * damage.port + 1)
         if damage.port == 1:
@@ -156,9 +197,9 @@ class Bus:
             life.esc.count(reg.FORWARDED_ERRORS + 1)
         return len(self._alive) if damage.port == 1 else position
 
-    def flap(self, sensor: VirtualSensor, port: int) -> None:
+    def flap(self, slave: Slave, port: int) -> None:
         """A link is lost and returns: the controllers at both ends count it."""
-        position = self.sensors.index(sensor)
+        position = self.slaves.index(slave)
         ends = ((position, 0), (position - 1, 1)) if port == 0 else ((position, 1), (position + 1, 0))
         for end, its_port in ends:
             if 0 <= end < len(self._alive):
@@ -172,15 +213,19 @@ class Bus:
         period = min(self.now - self._last_frame, _LONGEST_PERIOD_NS)
         expected = self.now + period
         self._last_frame = self.now
+        self._check_watchdogs(self.now)
         for life in self._alive:
-            life.check_watchdog(self.now)
-            life.sampler.prepare(expected)
+            life.prepare(expected)
 
     def idle(self, now: int) -> None:
         """No frame is waiting: let time pass up to `now`, watchdogs included."""
         self.set_time(now)
-        for life in self._alive:
-            life.check_watchdog(now)
+        self._check_watchdogs(now)
+
+    def _check_watchdogs(self, now: int) -> None:
+        for slave in self.slaves:
+            if slave.life is not None:
+                slave.life.check_watchdog(now)
 
     def statistics(self) -> dict[str, Any]:
         """What the command `stats` reports."""
@@ -188,4 +233,9 @@ class Bus:
             "frames": self.frames,
             "frames_lost": self.frames_lost,
             "sensors": [sensor.statistics() for sensor in self.sensors],
+            "foreign": {
+                position: slave.statistics()
+                for position, slave in enumerate(self.slaves)
+                if isinstance(slave, ForeignSlave)
+            },
         }

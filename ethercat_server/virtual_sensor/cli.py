@@ -15,12 +15,18 @@ from ethercat_server.virtual_sensor.control import ControlError
 from ethercat_server.virtual_sensor.faults.command import CommandError, real, whole
 from ethercat_server.virtual_sensor.faults.measurement import PPM_LIMIT
 from ethercat_server.virtual_sensor.faults.table import COMMANDS
+from ethercat_server.virtual_sensor.foreign.chain import (
+    MOST_SLAVES,
+    SENSOR,
+    ChainError,
+    parse_chain,
+    slaves_in,
+)
+from ethercat_server.virtual_sensor.foreign.kinds import KINDS
 from ethercat_server.virtual_sensor.measurement.signals import SIGNALS
-from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
+from ethercat_server.virtual_sensor.options import BusOptions, ForeignOptions, SensorOptions
 from protocol.pdo import LAYOUTS
 from protocol.settings import SETTINGS
-
-MOST_SENSORS = 16
 
 
 class UsageError(Exception):
@@ -32,12 +38,17 @@ def build_parser() -> argparse.ArgumentParser:
     commands = "\n".join(f"  {c.usage:34} {c.meaning}" for c in COMMANDS)
     parser = argparse.ArgumentParser(
         prog="ethercat-virtual-sensor",
-        description="Answer EtherCAT frames on a network interface as Bota force/torque sensors do.",
+        description="Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
+        "and other slaves beside them.",
         epilog=f"commands, one per line on stdin or on the --control socket:\n{commands}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     several = "; several, comma separated or repeated, for a chain"
     parser.add_argument("iface", metavar="IFACE", help="interface, for instance one end of a veth pair")
+    parser.add_argument(
+        "--chain", metavar="SLAVES", help=f"all slaves in wire order: {SENSOR}, {', '.join(KINDS)}; "
+        "KIND:STATE if another master has left one in this AL state",
+    )  # fmt: skip
     parser.add_argument("--sensors", metavar="N", help="sensors on the bus (default: as many as named, or 1)")
     parser.add_argument("--model", action="append", metavar="NAME", help=f"default {MODELS[0]}{several}")
     parser.add_argument("--serial", action="append", metavar="N", help=f"default 1, 2, ...{several}")
@@ -61,12 +72,20 @@ def _list(given: Sequence[str] | None) -> list[str]:
 
 def options_from(args: argparse.Namespace) -> BusOptions:
     """The options in parsed arguments; UsageError if they are contradictory."""
+    try:
+        chain = None if args.chain is None else parse_chain(args.chain)
+    except ChainError as error:
+        raise UsageError(str(error)) from None
+    in_chain = sum(kind == SENSOR for kind, _ in chain or ())
+    if chain is not None and args.sensors is not None:
+        raise UsageError("--chain names the sensors too: leave --sensors out")
     models, serials, errors = _list(args.model), _list(args.serial), _list(args.ppm)
-    named = max(len(models), len(serials), len(errors), 1)
+    named = max(len(models), len(serials), len(errors), chain is None)
     sinc_range = SETTINGS["sinc_length"].choices
     assert isinstance(sinc_range, range)
     try:
-        count = whole(args.sensors, 1, MOST_SENSORS) if args.sensors is not None else named
+        count = whole(args.sensors, 1, MOST_SLAVES) if args.sensors is not None else named
+        count = count if chain is None else in_chain
         seed = whole(args.seed, 0, 2**63)
         sinc = None if args.sinc is None else whole(args.sinc, sinc_range[0], sinc_range[-1])
         serial_numbers = [whole(text, 0, 0xFFFFFFFF) for text in serials]
@@ -74,7 +93,7 @@ def options_from(args: argparse.Namespace) -> BusOptions:
     except CommandError as error:
         raise UsageError(str(error)) from None
     if named > count:
-        raise UsageError(f"{named} sensors are named but --sensors is {count}: name no more than that")
+        raise UsageError(f"{named} sensors are named but there are to be {count}: name no more than that")
     for model in models:
         if not model.isascii() or len(model) > 20:
             raise UsageError(f"model {model!r} must have at most 20 ASCII characters, such as {MODELS[0]}")
@@ -97,7 +116,7 @@ def options_from(args: argparse.Namespace) -> BusOptions:
                 seed=seed + position,
             )
         )
-    return BusOptions(tuple(sensors))
+    return BusOptions(tuple(sensors) if chain is None else slaves_in(chain, sensors))
 
 
 @contextlib.contextmanager
@@ -130,12 +149,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"ethercat-virtual-sensor: {error}", file=sys.stderr)
         return 2
     models = ", ".join(dict.fromkeys(sensor.model for sensor in options.sensors))
-    first = options.sensors[0]
+    foreign = [slave.kind for slave in options.slaves if isinstance(slave, ForeignOptions)]
 
     def ready() -> None:
         print(
             f"ready: {len(options.sensors)} sensor(s) {models} on {args.iface}, "
-            f"{first.pdo_size} bytes of process data, signal {first.signal}",
+            f"{args.pdo} bytes of process data, signal {args.signal}"
+            + (f", beside {', '.join(foreign)}" if foreign else ""),
             flush=True,
         )
 

@@ -1,10 +1,11 @@
-"""Options of a simulated sensor and of a chain."""
+"""Options of a simulated sensor, of a foreign slave, and of a chain."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 from ethercat_server.sensor.objects.dictionary import MODELS
+from ethercat_server.virtual_sensor.slave.al import AlState
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,10 +22,30 @@ class SensorOptions:
     signal: str = "scene"
     noise: bool = True
     seed: int = 0
+    state: AlState = AlState.INIT
+    """In which another master has left it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignOptions:
+    """One slave of another vendor."""
+
+    kind: str
+    """One of `foreign.kinds.KINDS`."""
+    state: AlState = AlState.INIT
+    """In which another master has left it; a drive in OP turns."""
+
+
+SlaveOptions = SensorOptions | ForeignOptions
 
 
 @dataclass(frozen=True, slots=True)
 class BusOptions:
-    """A chain of sensors, first to last."""
+    """A chain of slaves, first to last."""
 
-    sensors: tuple[SensorOptions, ...] = field(default_factory=lambda: (SensorOptions(),))
+    slaves: tuple[SlaveOptions, ...] = field(default_factory=lambda: (SensorOptions(),))
+
+    @property
+    def sensors(self) -> tuple[SensorOptions, ...]:
+        """The sensors among them."""
+        return tuple(slave for slave in self.slaves if isinstance(slave, SensorOptions))

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
-from ethercat_server.virtual_sensor.firmware.al import AlState
 from ethercat_server.virtual_sensor.firmware.firmware import Firmware
-from ethercat_server.virtual_sensor.firmware.flash import Address, Flash
+from ethercat_server.virtual_sensor.firmware.flash import Flash
 from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.slave.al import AlState
+from ethercat_server.virtual_sensor.slave.objects import Address
 
 _WRITES_REMEMBERED: Final = 1000
 _WRITES_TOLD: Final = 200

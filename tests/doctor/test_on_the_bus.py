@@ -8,17 +8,13 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.doctor.bus import examination
 from ethercat_server.doctor.finding import Level
 from ethercat_server.doctor.machine.facts import Routes
-from ethercat_server.ethercat.bus import Bus
 from ethercat_server.links.holder import Holder
 from tests.doctor.made_up import but
 from tests.doctor.running import examined
-from tests.foreign_drive import become_drive, registers, watchdog_off
 from tests.simulated_links import MESSAGE_NS, SimulatedBus, simulated_bus, simulated_server
-from tests.simulation import Asked
 
 LOOK = 0.0
 """No measurement."""
@@ -191,12 +187,8 @@ def test_another_master_is_not_disturbed(
 
 
 def test_a_drive_at_work_is_not_touched(tmp_path: Path) -> None:
-    with simulated_bus("--sensors", 2) as bus:
-        bring_up(Bus(bus.backend), Asked(), lambda: None)
-        watchdog_off(bus.backend)
-        become_drive(bus.backend, 1)
-        before = registers(bus.backend)
+    with simulated_bus("--chain", "BOTA:OP,DRIVE:OP") as bus:
         found = examined(bus, tmp_path).of("bus")["slave 1"]
         assert found.level is Level.BAD
         assert "not a Bota sensor, and in OP" in found.found
-        assert registers(bus.backend)[1] == before[1]
+        assert bus.stats_of_foreign(1)["write_count"] == 0

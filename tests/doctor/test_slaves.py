@@ -39,8 +39,8 @@ def test_whether_anything_answers() -> None:
     [
         ({}, Level.OK, "supported"),
         ({"name": "BFT-ROKS-ECAT-M8"}, Level.OK, "BFT-ROKS"),
-        ({"vendor": 2, "name": "EK1100"}, Level.BAD, "vendor 0x00000002"),
-        ({"product": 9}, Level.BAD, "product 0x00000009"),
+        ({"vendor": 2, "name": "EK1100"}, Level.OK, "vendor 0x00000002, product 0x00000001: not a Bota"),
+        ({"product": 9}, Level.OK, "product 0x00000009: not a Bota"),
         ({"name": "BFT-GENA"}, Level.BAD, "BFT-GENA"),
         ({"name": "", "sii_problem": "the SII of slave 0 is busy"}, Level.WARNING, "busy"),
     ],
@@ -49,6 +49,13 @@ def test_who_it_is(changes: dict[str, Any], level: Level, named: str) -> None:
     found = the(findings.identity(slave(**changes)))
     assert found.level is level
     assert named in found.found
+
+
+def test_a_bus_without_a_sensor() -> None:
+    coupler = slave(vendor=2, name="EK1100")
+    assert the(findings.sensors([coupler])).level is Level.BAD
+    assert not list(findings.sensors([coupler, slave()]))
+    assert not list(findings.sensors([coupler, slave(vendor=0, sii_problem="busy")])), "it may be one"
 
 
 @pytest.mark.parametrize(

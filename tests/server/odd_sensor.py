@@ -9,10 +9,11 @@ from __future__ import annotations
 import sys
 
 from ethercat_server.virtual_sensor import cli
-from ethercat_server.virtual_sensor.esc.sii import build_image
 from ethercat_server.virtual_sensor.faults import table
 from ethercat_server.virtual_sensor.faults.command import Call, FaultCommand
-from ethercat_server.virtual_sensor.firmware.al import AlStateMachine
+from ethercat_server.virtual_sensor.firmware.layout import sensor_device
+from ethercat_server.virtual_sensor.slave.al import AlStateMachine
+from ethercat_server.virtual_sensor.slave.image import build_image
 from protocol.pdo import LAYOUTS
 
 request = AlStateMachine.request
@@ -32,7 +33,7 @@ def ignore(call: Call) -> None:
 
 def eeprom(call: Call) -> None:
     options, way = call.sensor.options, call.arguments[0]
-    image = build_image(options.model, options.serial, min(LAYOUTS))
+    image = build_image(sensor_device(options.model, options.serial, min(LAYOUTS)))
     if way == "latin":  # a name that is no UTF-8
         image = image.replace(b"BFT-", b"K\xfch-")
     elif way == "no-mailbox":  # as a simple slave

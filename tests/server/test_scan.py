@@ -7,12 +7,13 @@ import pytest
 from ethercat_server.acquisition.start_up import AsFound, bring_up, find_sensors
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build
 from ethercat_server.sensor.scan import look_safely
 from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.virtual_sensor.foreign.slave import ForeignSlave
 from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.foreign_drive import become_drive, registers, watchdog_off
+from ethercat_server.virtual_sensor.slave.al import AlState
+from tests.simulated_links import chain, registers
 from tests.simulation import Asked
 
 
@@ -20,29 +21,24 @@ def no_check() -> None:
     pass
 
 
-def in_op(*pdo_sizes: int) -> MemoryBackend:
-    """A bus that a master took to OP and left like that."""
-    backend = MemoryBackend(*(SensorOptions(pdo_size=size) for size in pdo_sizes))
-    bring_up(Bus(backend), Asked(), no_check)
-    watchdog_off(backend)
-    backend.clock.sleep(1.0)
-    return backend
-
-
 @pytest.mark.parametrize("drive", [0, 1, 2])
 def test_a_drive_at_work_is_not_touched(drive: int) -> None:
-    backend = in_op(61, 61, 61)
-    become_drive(backend, drive)
+    kinds = ["BOTA:OP"] * 3
+    kinds[drive] = "DRIVE:OP"
+    backend = chain(",".join(kinds))
     before = registers(backend)
     with pytest.raises(BusError, match=rf"no Bota sensors \(position {drive} in OP\).*--force"):
         bring_up(bus := Bus(backend), Asked(), no_check)
     bus.close()
     assert registers(backend) == before
+    found = backend.sensors.slaves[drive]
+    assert isinstance(found, ForeignSlave)
+    assert not found.writes
+    assert found.turning
 
 
 def test_force_takes_it_over() -> None:
-    backend = in_op(61, 61)
-    become_drive(backend, 1)
+    backend = chain("BOTA:OP,DRIVE:OP")
     found = find_sensors(Bus(backend), AsFound(force=True), no_check)
     assert ([s.position for s in found.sensors], [o.position for o in found.others]) == ([0], [1])
     assert [image[0x0130] & 0x0F for image in registers(backend)] == [AlState.PREOP] * 2
@@ -50,17 +46,14 @@ def test_force_takes_it_over() -> None:
 
 @pytest.mark.parametrize("pdo_size", [61, 77])
 def test_a_sensor_left_in_op_is_no_obstacle(pdo_size: int) -> None:
-    backend = in_op(pdo_size, 61)
+    backend = MemoryBackend(*(SensorOptions(pdo_size=size, state=AlState.OP) for size in (pdo_size, 61)))
     sensors = bring_up(Bus(backend), Asked(), no_check).sensors
     assert [sensor.streams for sensor in sensors] == [True, True]
 
 
 def test_a_drive_that_is_not_at_work_may_be_scanned() -> None:
-    backend = in_op(61, 61)
-    become_drive(backend, 1)
-    Bus(backend).write_at(1, 0x0120, AlState.PREOP.request())
-    slaves = look_safely(Bus(backend), no_check)
-    assert [slave.sii and slave.sii["vendor"] for slave in slaves] == [0xB07A, 2]
+    slaves = look_safely(Bus(chain("BOTA:OP,DRIVE:PREOP")), no_check)
+    assert [slave.name for slave in slaves] == ["BFT-SENS-ECAT-M8", "DRIVE"]
 
 
 class OthersFrames(MemoryBackend):
@@ -91,7 +84,7 @@ def test_the_last_frames_of_a_killed_master_are_no_obstacle() -> None:
 
 
 def test_a_slave_that_stops_answering_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = in_op(61)
+    backend = chain("BOTA:OP")
     send = backend.send
 
     def lose_single_reads(frame: bytes | bytearray) -> None:
@@ -104,8 +97,7 @@ def test_a_slave_that_stops_answering_is_said(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_bus_that_loses_frames_is_looked_at_all_the_same() -> None:
-    backend = in_op(61, 61)
-    become_drive(backend, 1)
+    backend = chain("BOTA:OP,DRIVE:OP")
     backend.command("lose 2")
     with pytest.raises(BusError, match="position 1 in OP"):
         look_safely(Bus(backend), no_check)

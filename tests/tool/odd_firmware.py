@@ -9,7 +9,10 @@ import pytest
 
 from ethercat_server.ethercat.slave.abort_codes import AbortCode
 from ethercat_server.virtual_sensor.firmware import dictionary, firmware
-from ethercat_server.virtual_sensor.firmware.al import AlState
+from ethercat_server.virtual_sensor.slave import application, image
+from ethercat_server.virtual_sensor.slave.al import AlState
+from ethercat_server.virtual_sensor.slave.device import Device
+from ethercat_server.virtual_sensor.slave.objects import SdoAbortError
 
 REFUSED = {(0x8006, 1): b"\x80\0", (0x8000, 5): struct.pack("<f", 0.5)}
 FEWER = frozenset({(0x8010, 4), (0x8010, 5)})
@@ -28,7 +31,7 @@ def refusing(patch: pytest.MonkeyPatch) -> None:
     def refuse(self: dictionary.Dictionary, index: int, subindex: int, data: bytes, state: AlState) -> None:
         check(self, self.entry(index, subindex), len(data), state)
         if REFUSED.get((index, subindex)) == data:
-            raise dictionary.SdoAbortError(AbortCode.INVALID_VALUE)
+            raise SdoAbortError(AbortCode.INVALID_VALUE)
         write(self, index, subindex, data, state)
 
     patch.setattr(dictionary.Dictionary, "write", refuse)
@@ -66,17 +69,17 @@ def _lack(patch: pytest.MonkeyPatch, addresses: Collection[tuple[int, int]], cod
 
     def read_some(self: dictionary.Dictionary, index: int, subindex: int) -> bytes:
         if (index, subindex) in addresses:
-            raise dictionary.SdoAbortError(code)
+            raise SdoAbortError(code)
         return read(self, index, subindex)
 
     patch.setattr(dictionary.Dictionary, "read", read_some)
 
 
 def _change_eeprom(patch: pytest.MonkeyPatch, where: slice, data: bytes) -> None:
-    build = firmware.build_image  # type: ignore[attr-defined]
+    build = image.build_image
 
-    def changed(model: str, serial: int, pdo_size: int) -> bytes:
-        image: bytes = build(model, serial, pdo_size)
-        return image[: where.start] + data + image[where.stop :]
+    def changed(device: Device) -> bytes:
+        built = build(device)
+        return built[: where.start] + data + built[where.stop :]
 
-    patch.setattr(firmware, "build_image", changed)
+    patch.setattr(application, "build_image", changed)

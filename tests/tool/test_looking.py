@@ -9,13 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from ethercat_server.acquisition.start_up import bring_up
-from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, NOTE_NAMES
 from ethercat_server.tool.cli import COMMANDS
-from tests.foreign_drive import become_drive, registers, watchdog_off
-from tests.simulated_links import SimulatedBus, simulated_bus
-from tests.simulation import Asked
+from tests.simulated_links import SimulatedBus, registers, simulated_bus
 from tests.tool.odd_firmware import FOREIGN_LACKS, FOREIGN_VENDOR, foreign, no_mailbox
 from tests.tool.running import complaints, one_sentence, tool_here
 
@@ -196,12 +192,11 @@ def test_a_drive_at_work_is_not_touched_by(command: str, tmp_path: Path) -> None
         "read": ["sampling rate"], "snapshot": [tmp_path / "new"], "restore": [tmp_path / "old"],
         "plan": ["--set", "chop=on"], "apply": ["--set", "chop=on"],
     }  # fmt: skip
-    with simulated_bus("--sensors", 2) as bus:
-        tool_here("snapshot", bus.near, "--sensor", 0, tmp_path / "old")
-        bring_up(Bus(bus.backend), Asked(), lambda: None)
-        watchdog_off(bus.backend)
-        become_drive(bus.backend, 1)
+    with simulated_bus() as bus:
+        tool_here("snapshot", bus.near, tmp_path / "old")
+    with simulated_bus("--chain", "BOTA:OP,DRIVE:OP") as bus:
         before = registers(bus.backend)
         result = tool_here(command, bus.near, *further.get(command, []), code=1)
         assert "has slaves at work that are no Bota sensors (position 1 in OP)" in one_sentence(result)
         assert registers(bus.backend) == before
+        assert bus.stats_of_foreign(1)["write_count"] == 0

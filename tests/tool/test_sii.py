@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ethercat_server.ethercat.slave.sii_content import decode, raw_lines, read_image
-from ethercat_server.virtual_sensor.esc.sii import build_image
+from ethercat_server.virtual_sensor.firmware.layout import sensor_device
+from ethercat_server.virtual_sensor.slave.image import build_image
 from protocol.control import MAX_SII_WORDS
 
 
@@ -19,7 +20,7 @@ def reader(image: bytes) -> bytes:
 
 
 def test_an_image_is_read_to_the_end_of_its_categories_and_no_further() -> None:
-    image = build_image("BFT-ROKS-ECAT-M8", 7, 77)
+    image = build_image(sensor_device("BFT-ROKS-ECAT-M8", 7, 77))
     read = reader(image)
     assert image.startswith(read)
     assert len(read) < len(image)
@@ -29,7 +30,7 @@ def test_an_image_is_read_to_the_end_of_its_categories_and_no_further() -> None:
 
 
 def test_a_wrong_check_byte_is_seen() -> None:
-    image = bytearray(build_image("BFT-ROKS-ECAT-M8", 7, 77))
+    image = bytearray(build_image(sensor_device("BFT-ROKS-ECAT-M8", 7, 77)))
     image[2] ^= 1
     assert not decode(bytes(image))["check_byte_right"]
 
@@ -43,6 +44,6 @@ def test_an_erased_eeprom_has_nothing() -> None:
 
 @given(st.binary(max_size=600))
 def test_nonsense_is_taken_apart_without_complaint(tail: bytes) -> None:
-    read = reader(build_image("BFT-ROKS-ECAT-M8", 7, 61)[:0x80] + tail)
+    read = reader(build_image(sensor_device("BFT-ROKS-ECAT-M8", 7, 61))[:0x80] + tail)
     decode(read)
     assert len(read) <= 2 * 0x2000 + 8

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.bus import Bus
-from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
+from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions, SlaveOptions
 
 MAILBOX = 128
 INIT, PREOP, BOOT, SAFEOP, OP = 1, 2, 3, 4, 8
@@ -33,12 +33,12 @@ class Abort(Exception):  # noqa: N818
 class RawMaster:
     """Time passes only by `wait`; each exchange takes one microsecond."""
 
-    def __init__(self, *sensors: SensorOptions, start: int = 5_000_000_123) -> None:
+    def __init__(self, *slaves: SlaveOptions, start: int = 5_000_000_123) -> None:
         self.now = start
-        self.bus = Bus(BusOptions(sensors or (SensorOptions(),)), start)
-        self.count = len(sensors) or 1
+        self.bus = Bus(BusOptions(slaves or (SensorOptions(),)), start)
+        self.count = len(slaves) or 1
         self.mailbox_counter = 0
-        self.pdo_size = self.bus.sensors[0].options.pdo_size
+        self.pdo_size = self.bus.sensors[0].options.pdo_size if self.bus.sensors else 0
 
     def wait(self, ns: int) -> None:
         self.now += ns

@@ -480,7 +480,7 @@ def test_hear_ends_damage_and_the_last_port_is_open() -> None:
     do(master, "damage 5")
     do(master, "hear")
     assert answering(master) == 2
-    assert obey(master.bus, "damage 1 1 @1").startswith("error: port 1 of the last sensor")
+    assert obey(master.bus, "damage 1 1 @1").startswith("error: port 1 of the last slave")
     assert obey(master.bus, "damage 1 2").startswith("error: ")
     do(master, "power off @1")
     do(master, "damage 1 @1")

@@ -176,6 +176,34 @@ def test_a_chain_of_three(veth: tuple[str, str], start: Start, open_master: Call
     assert serials == [1, 2, 3]
 
 
+def test_a_chain_with_foreign_slaves(
+    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
+) -> None:
+    sensor = start(veth[0], "--chain", "EK1100,BOTA,EL3102,DRIVE", "--signal", "constant")
+    assert sensor.ready.endswith(", beside EK1100, EL3102, DRIVE")
+    master = open_master()
+    find(master, 4)
+    patiently(master.config_map)
+    for slave in master.slaves:
+        patiently(functools.partial(slave._fpwr, 0x0420, b"\0\0"))
+    coupler, bota, terminal, drive = master.slaves
+    drive.output = struct.pack("<Hi", 0x06, 0)
+    reach_op(master)
+    assert [slave.name for slave in master.slaves] == ["EK1100", "BFT-SENS-ECAT-M8", "EL3102", "DRIVE"]
+    assert (coupler.man, coupler.id) == (2, 0x044C2C52)
+    assert (terminal.man, terminal.id) == (2, 0x0C1E3052)
+    assert [(len(s.output), len(s.input)) for s in master.slaves] == [(0, 0), (1, 61), (0, 6), (6, 6)]
+    assert exchange(master) == master.expected_wkc == 3 + 1 + 3
+    assert struct.unpack_from("<f", bota.input, 5) == (1.5,)
+    assert struct.unpack("<BhBh", terminal.input) == (0, 0x4000, 0, -0x2000)
+    for word, state in ((0x06, 0x21), (0x07, 0x23), (0x0F, 0x27)):
+        drive.output = struct.pack("<Hi", word, 1000)
+        exchange(master)
+        exchange(master)
+        assert struct.unpack_from("<H", drive.input)[0] & 0x6F == state
+    assert read(drive, 0x1008, 0) == b"DRIVE"
+
+
 def test_an_interface_down_for_a_while(
     veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
 ) -> None:

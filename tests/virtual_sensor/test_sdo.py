@@ -5,10 +5,10 @@ import struct
 import pytest
 
 from ethercat_server.sensor.objects.dictionary import BY_SETTING, OBJECTS, Access
-from ethercat_server.virtual_sensor.firmware.coe import CoeServer
 from ethercat_server.virtual_sensor.firmware.dictionary import entries_of
-from ethercat_server.virtual_sensor.firmware.sdo_information import SdoInformation
 from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.slave.coe import CoeServer
+from ethercat_server.virtual_sensor.slave.sdo_information import SdoInformation
 from protocol.pdo import LAYOUTS
 from protocol.settings import SETTINGS
 from tests.virtual_sensor.raw_master import OP, PREOP, SAFEOP, Abort, RawMaster
@@ -249,7 +249,8 @@ def test_object_lists() -> None:
 def test_a_list_longer_than_the_mailbox_comes_in_fragments() -> None:
     life = RawMaster().bus.sensors[0].life
     assert life is not None
-    fragments = SdoInformation(life.dictionary).answer(struct.pack("<BBHH", 1, 0, 0, 1), 24)
+    information = SdoInformation(life.dictionary, life.device, {})
+    fragments = information.answer(struct.pack("<BBHH", 1, 0, 0, 1), 24)
     assert len(fragments) > 2
     assert all(len(fragment) <= 24 for fragment in fragments)
     assert struct.unpack_from("<H", fragments[0], 2)[0] == len(fragments) - 1

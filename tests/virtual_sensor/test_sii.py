@@ -5,8 +5,9 @@ import struct
 import pytest
 
 from ethercat_server.ethercat.slave.sii_content import checksum
-from ethercat_server.virtual_sensor.esc.sii import build_image
+from ethercat_server.virtual_sensor.firmware.layout import sensor_device
 from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.slave.image import build_image
 from protocol.pdo import LAYOUTS
 from tests.virtual_sensor.raw_master import RawMaster
 
@@ -39,7 +40,7 @@ def test_identity_and_mailbox_words() -> None:
 
 
 def test_check_sum() -> None:
-    image = build_image("BFT-SENS-ECAT-M8", 1, 61)
+    image = build_image(sensor_device("BFT-SENS-ECAT-M8", 1, 61))
     assert image[14] == checksum(image[:14])
     # The usual example of ETG.2010's CRC-8: an all-zero area with start value 0xFF.
     assert checksum(b"") == 0xFF
@@ -48,7 +49,7 @@ def test_check_sum() -> None:
 
 @pytest.mark.parametrize("size", list(LAYOUTS))
 def test_categories(size: int) -> None:
-    found = categories(build_image("BFT-ROKS-ECAT-M8", 7, size))
+    found = categories(build_image(sensor_device("BFT-ROKS-ECAT-M8", 7, size)))
     assert set(found) == {10, 30, 40, 41, 50, 51}
     assert found[10][1:18] == b"\x10BFT-ROKS-ECAT-M8"
     assert found[30][5] == 0x03, "SDO and SDO information, nothing else"

@@ -122,18 +122,22 @@ def _on_bus(machine: Machine, request: Request) -> Iterator[Finding]:
         count = slaves.count(bus)
         yield from examine("bus", "slaves", functools.partial(on_bus.answers, machine.shown, count))
         found: list[slaves.Slave] = []
+        in_use = slaves.in_use(bus, count)
         for position in range(count):
-            yield from _slave(bus, position, count, found)
+            yield from _slave(bus, position, count, found, in_use=in_use)
         if len(found) == count:
+            yield from examine("bus", "sensors", functools.partial(on_bus.sensors, found))
             yield from examine("bus", "line", functools.partial(on_bus.line, found))
         yield from _measured_on_bus(machine, request, bus, count, found)
 
 
-def _slave(bus: Bus, position: int, count: int, found: list[slaves.Slave]) -> Iterator[Finding]:
+def _slave(
+    bus: Bus, position: int, count: int, found: list[slaves.Slave], *, in_use: bool
+) -> Iterator[Finding]:
     """One slave, which is added to `found` if it answers."""
 
     def identify() -> Iterator[Finding]:
-        found.append(slaves.look(bus, position))
+        found.append(slaves.look(bus, position, in_use=in_use))
         yield from on_bus.identity(found[-1])
 
     yield from examine("bus", f"slave {position}", identify)

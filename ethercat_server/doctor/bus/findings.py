@@ -37,14 +37,17 @@ def identity(slave: Slave) -> Iterator[Finding]:
             **values,
         )
         return
+    if slave.left_alone:
+        yield warning(f"not read: in {slave.al.state.name}, and another master has the bus", "", **values)
+        return
     if slave.sii_problem:
         yield warning(f"unknown: {slave.sii_problem}", "its EEPROM does not answer", **values)
         return
     text = f"{slave.name or 'nameless'}, serial {slave.serial}"
-    if (slave.vendor, slave.product) != (dictionary.VENDOR_ID, dictionary.PRODUCT_CODE):
-        yield bad(
-            f"{text}, vendor 0x{slave.vendor:08X}, product 0x{slave.product:08X}",
-            "not a Bota Gen-0 sensor: the server requires that all slaves are",
+    if not slave.is_sensor:
+        yield ok(
+            f"{text}, vendor 0x{slave.vendor:08X}, product 0x{slave.product:08X}: not a Bota Gen-0 sensor, "
+            "the server leaves it alone",
             **values,
         )
     elif not is_known_model(slave.name):
@@ -53,6 +56,12 @@ def identity(slave: Slave) -> Iterator[Finding]:
         )
     else:
         yield ok(f"{text}, supported", **values)
+
+
+def sensors(slaves: Sequence[Slave]) -> Iterator[Finding]:
+    """Whether there is a sensor among them."""
+    if slaves and not any(slave.is_sensor or slave.left_alone or slave.sii_problem for slave in slaves):
+        yield bad("no Bota Gen-0 sensor", "connect one, or name the interface that it is connected to")
 
 
 def line(slaves: Sequence[Slave]) -> Iterator[Finding]:

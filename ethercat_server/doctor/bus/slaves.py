@@ -20,7 +20,8 @@ from ethercat_server.ethercat.slave.registers import (
     RX_ERRORS,
     WATCHDOG_COUNTER,
 )
-from ethercat_server.sensor.look import look_at
+from ethercat_server.sensor.look import look_at, with_sii
+from ethercat_server.sensor.objects.dictionary import PRODUCT_CODE, VENDOR_ID
 
 MOST_PORTS: Final = 4
 _ATTEMPTS: Final = 10
@@ -75,7 +76,14 @@ class Slave:
     sii_problem: str = ""
     """Why its SII, and so its identity, could not be read."""
     at_work: bool = False
-    """It is no Bota sensor and in SAFEOP or OP: its SII was left alone."""
+    """It is no Bota sensor and in SAFEOP or OP."""
+    left_alone: bool = False
+    """Its SII was not read, for another master has the bus."""
+
+    @property
+    def is_sensor(self) -> bool:
+        """Whether it is a Bota Gen-0 sensor."""
+        return (self.vendor, self.product) == (VENDOR_ID, PRODUCT_CODE)
 
     def as_json(self) -> dict[str, Any]:
         """Its JSON form."""
@@ -89,8 +97,13 @@ def count(bus: Bus) -> int:
     return max(0, *(bus.count_slaves(_PROBE_SIZE, _FIND_TIMEOUT_S) for _ in range(_FIND_ATTEMPTS)))
 
 
-def look(bus: Bus, position: int) -> Slave:
-    """The slave at `position`; BusError if it does not answer."""
+def in_use(bus: Bus, count: int) -> bool:
+    """Whether one of the slaves is no Bota sensor and in SAFEOP or OP; BusError if one does not answer."""
+    return any(look_at(bus, position).at_work for position in range(count))
+
+
+def look(bus: Bus, position: int, *, in_use: bool) -> Slave:
+    """The slave at `position`; BusError if it does not answer. `in_use`: another master has the bus."""
     al = AlStatus.parse(bus.read_surely_at(position, AL_STATUS, AL_STATUS_SIZE))
     (links,) = struct.unpack("<H", bus.read_surely_at(position, DL_STATUS, 2))
     counters = read_counters(bus, position)
@@ -100,8 +113,11 @@ def look(bus: Bus, position: int) -> Slave:
         "links": tuple(bool(links >> (4 + port) & 1) for port in range(MOST_PORTS)),
     }  # fmt: skip
     looked = look_at(bus, position)
+    if in_use and looked.status.is_above_preop:
+        return Slave(**found, at_work=looked.at_work, left_alone=True)
+    looked = with_sii(bus, looked)
     if looked.sii is None:
-        return Slave(**found, at_work=looked.at_work, sii_problem=looked.problem)
+        return Slave(**found, sii_problem=looked.problem)
     names = ("vendor", "product", "serial", "name")
     return Slave(**found, **{name: looked.sii[name] for name in names})
 

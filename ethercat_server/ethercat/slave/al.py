@@ -81,6 +81,11 @@ class AlStatus(NamedTuple):
             return AlState.NONE
 
     @property
+    def is_above_preop(self) -> bool:
+        """Whether it is in SAFEOP or OP: its process data is exchanged."""
+        return bool(self.raw_state & (AlState.SAFEOP | AlState.OP))
+
+    @property
     def is_op(self) -> bool:
         """Whether the sensor is in OP, without an error."""
         return self.raw_state == AlState.OP and not self.error

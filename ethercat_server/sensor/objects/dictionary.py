@@ -36,6 +36,8 @@ MODELS: Final = (
 class ObjectType(Enum):
     """CoE base data type: its number in the SDO Information service, and its struct format."""
 
+    I16 = (0x0003, "<h")
+    I32 = (0x0004, "<i")
     U8 = (0x0005, "<B")
     U16 = (0x0006, "<H")
     U32 = (0x0007, "<I")
@@ -144,7 +146,8 @@ class ObjectEntry:
         return bool(raw) if is_bool else int(raw)
 
 
-U8, U16, U32, REAL32, STRING, OCTETS = ObjectType
+U8, U16, U32, REAL32 = ObjectType.U8, ObjectType.U16, ObjectType.U32, ObjectType.REAL32
+STRING, OCTETS = ObjectType.STRING, ObjectType.OCTETS
 RO, RW, RW_PREOP = Access
 
 _PDO_TYPES = {PdoType.USINT: U8, PdoType.UINT: U16, PdoType.UDINT: U32, PdoType.REAL: REAL32}

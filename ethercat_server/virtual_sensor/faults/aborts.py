@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from ethercat_server.virtual_sensor.firmware.dictionary import SdoAbortError
-from ethercat_server.virtual_sensor.firmware.flash import Address
+from ethercat_server.virtual_sensor.slave.objects import Address, SdoAbortError
 
 _REPETITION_NS: Final = 300_000_000
 

@@ -31,30 +31,38 @@ def _hear(call: Call) -> None:
 
 def _port(call: Call, at: int) -> int:
     port = whole(call.arguments[at], 0, 1) if len(call.arguments) > at else 0
-    if port == 1 and call.sensor is call.bus.sensors[-1]:
-        raise CommandError("port 1 of the last sensor is not connected")
+    if port == 1 and call.slave is call.bus.slaves[-1]:
+        raise CommandError("port 1 of the last slave is not connected")
     return port
 
 
 def _damage(call: Call) -> None:
     frames, port = whole(call.arguments[0], 0, 2**31), _port(call, 1)
-    call.bus.damage = Damage(call.sensor, port, frames) if frames else None
+    call.bus.damage = Damage(call.slave, port, frames) if frames else None
 
 
 def _flap(call: Call) -> None:
-    call.bus.flap(call.sensor, _port(call, 0))
+    call.bus.flap(call.slave, _port(call, 0))
 
 
 def _power(call: Call) -> None:
     match call.arguments:
         case ["on"]:
-            call.bus.power(call.sensor, True)
+            call.bus.power(call.slave, True)
         case ["off"]:
-            call.bus.power(call.sensor, False)
+            call.bus.power(call.slave, False)
         case ["cycle", seconds]:
-            call.bus.power(call.sensor, False, real(seconds, 0, 1e6))
+            call.bus.power(call.slave, False, real(seconds, 0, 1e6))
         case _:
             raise CommandError("power takes `on`, `off` or `cycle SECONDS`")
+
+
+def _connect(call: Call) -> None:
+    call.bus.connect(call.slave, True)
+
+
+def _disconnect(call: Call) -> None:
+    call.bus.connect(call.slave, False)
 
 
 def _swap(call: Call) -> None:
@@ -72,12 +80,14 @@ COMMANDS: Final[tuple[FaultCommand, ...]] = (
     FaultCommand("hear", "hear", (0,), "end `deaf`, `deaf-after`, `lose` and `damage`", _hear),
     FaultCommand(
         "damage", "damage N [PORT] [@N]", (1, 2),
-        "corrupt the next N frames on the cable at port 0 or 1 of this sensor", _damage,
+        "corrupt the next N frames on the cable at port 0 or 1 of this slave", _damage,
     ),
     FaultCommand("flap", "flap [PORT] [@N]", (0, 1), "interrupt the link at port 0 or 1 for a moment", _flap),
     FaultCommand(
         "power", "power off|on|cycle SECONDS [@N]", (1, 2),
-        "switch a sensor off or on; sensors behind one without power are cut off", _power,
+        "switch a slave off or on; those behind one without power are cut off", _power,
     ),
+    FaultCommand("disconnect", "disconnect [@N]", (0,), "unplug the cable at port 0", _disconnect),
+    FaultCommand("connect", "connect [@N]", (0,), "end `disconnect`", _connect),
     FaultCommand("swap", "swap MODEL SERIAL [@N]", (2,), "replace the sensor by another one", _swap),
 )  # fmt: skip

@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from ethercat_server.virtual_sensor.bus import Bus
+from ethercat_server.virtual_sensor.bus import Bus, Slave
 from ethercat_server.virtual_sensor.firmware.firmware import Firmware
 from ethercat_server.virtual_sensor.sensor import VirtualSensor
+from ethercat_server.virtual_sensor.slave.application import Application
 
 
 class CommandError(Exception):
@@ -24,11 +25,25 @@ class Call:
     """One command with its arguments."""
 
     bus: Bus
-    sensor: VirtualSensor
-    """The sensor it is for."""
+    slave: Slave
+    """The slave it is for."""
     arguments: list[str]
     parse: Callable[[str], Action]
-    """Parses another command for the same sensor; CommandError if it is invalid."""
+    """Parses another command for the same slave; CommandError if it is invalid."""
+
+    @property
+    def sensor(self) -> VirtualSensor:
+        """The sensor it is for; CommandError if it is for a foreign slave."""
+        if not isinstance(self.slave, VirtualSensor):
+            raise CommandError("that slave is no sensor: choose one with `@N`")
+        return self.slave
+
+    @property
+    def application(self) -> Application:
+        """What runs in the slave; CommandError if it has no power."""
+        if self.slave.life is None:
+            raise CommandError("it has no power: use `power on` first")
+        return self.slave.life
 
     @property
     def life(self) -> Firmware:

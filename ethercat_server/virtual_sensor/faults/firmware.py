@@ -7,17 +7,17 @@ from typing import Final
 
 from ethercat_server.virtual_sensor.esc.sii import SiiInterface
 from ethercat_server.virtual_sensor.faults.command import Call, CommandError, FaultCommand, real, whole
-from ethercat_server.virtual_sensor.firmware.al import AlState
+from ethercat_server.virtual_sensor.slave.al import AlState
 
 
 def _safeop(call: Call) -> None:
     code = whole(call.arguments[0], 0, 0xFFFF)
-    call.life.fail(AlState.SAFEOP, code)
+    call.application.fail(AlState.SAFEOP, code)
 
 
 def _error(call: Call) -> None:
     code = whole(call.arguments[0], 0, 0xFFFF)
-    call.life.fail(call.life.al.state, code)
+    call.application.fail(call.application.al.state, code)
 
 
 def _abort(call: Call) -> None:
@@ -48,14 +48,14 @@ def _cut_save(call: Call) -> None:
 
 
 def _mute(call: Call) -> None:
-    call.life.mailbox.mute = whole(call.arguments[0], 0, 2**31)
+    call.application.mailbox.mute = whole(call.arguments[0], 0, 2**31)
 
 
 def _sii(call: Call) -> None:
     faults = SiiInterface.FAULTS.get(call.arguments[0])
     if faults is None:
         raise CommandError(f"sii takes {', '.join(SiiInterface.FAULTS)}")
-    call.life.esc.sii.fail(faults)
+    call.application.esc.sii.fail(faults)
 
 
 COMMANDS: Final[tuple[FaultCommand, ...]] = (

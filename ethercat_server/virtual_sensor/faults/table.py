@@ -1,18 +1,19 @@
 """Fault injection by text commands: parsing, execution, and the table of all commands.
 
-A command is one line: its name, arguments, and `@N` anywhere to mean sensor N of the chain (from 0;
-without it sensor 0). The answer is one line: `ok ...`, or `error: ` and a sentence.
+A command is one line: its name, arguments, and anywhere `@N` to mean sensor N, or `#N` the slave at
+position N of the chain (from 0; without it sensor 0). The answer is one line: `ok ...`, or `error: ` and a
+sentence.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Final
 
-from ethercat_server.virtual_sensor.bus import Bus
+from ethercat_server.virtual_sensor.bus import Bus, Slave
 from ethercat_server.virtual_sensor.faults import bus, firmware, measurement
 from ethercat_server.virtual_sensor.faults.command import Action, Call, CommandError, FaultCommand, whole
-from ethercat_server.virtual_sensor.sensor import VirtualSensor
 
 LONGEST_LINE: Final = 1000
 
@@ -54,11 +55,11 @@ def obey(bus: Bus, line: str) -> str:
     return f"ok {result}" if result else "ok"
 
 
-def _parse(bus: Bus, line: str, sensor: VirtualSensor | None) -> Action:
-    """The command in `line`, for `sensor` unless it names another; CommandError if it is invalid."""
+def _parse(bus: Bus, line: str, slave: Slave | None) -> Action:
+    """The command in `line`, for `slave` unless it names another; CommandError if it is invalid."""
     words = line.split()
-    positions = [word for word in words if word.startswith("@")]
-    words = [word for word in words if not word.startswith("@")]
+    positions = [word for word in words if word.startswith(("@", "#"))]
+    words = [word for word in words if word not in positions]
     if not words:
         raise CommandError("an empty line: type `help` for the commands")
     command = _BY_NAME.get(words[0].lower())
@@ -67,9 +68,10 @@ def _parse(bus: Bus, line: str, sensor: VirtualSensor | None) -> Action:
     if len(words) - 1 not in command.counts:
         raise CommandError(f"wrong number of arguments: {command.usage}")
     if len(positions) > 1:
-        raise CommandError("more than one sensor: use `@N` once")
+        raise CommandError("more than one slave: use `@N` or `#N` once")
     if positions:
-        sensor = bus.sensors[whole(positions[0][1:], 0, len(bus.sensors) - 1)]
-    chosen = sensor or bus.sensors[0]
+        slaves: Sequence[Slave] = bus.sensors if positions[0][0] == "@" else bus.slaves
+        slave = slaves[whole(positions[0][1:], 0, len(slaves) - 1)]
+    chosen = slave or (bus.sensors or bus.slaves)[0]
     call = Call(bus, chosen, words[1:], lambda later: _parse(bus, later, chosen))
     return lambda: command.run(call)

@@ -1,1 +1,1 @@
-"""Firmware behind the slave controller: AL states, mailbox, object dictionary."""
+"""Firmware of the sensor: object dictionary, flash, process data."""

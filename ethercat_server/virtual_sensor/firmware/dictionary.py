@@ -6,10 +6,10 @@ The rows are those of `ethercat_server.sensor.objects.dictionary`, plus the obje
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Final
 
-from ethercat_server.ethercat.slave.abort_codes import AbortCode, abort_meaning
+from ethercat_server.ethercat.slave.abort_codes import AbortCode
 from ethercat_server.sensor.objects.dictionary import (
     BY_SETTING,
     CONTROL_COMMAND,
@@ -20,14 +20,14 @@ from ethercat_server.sensor.objects.dictionary import (
     SAMPLING_RATE,
     SAVE_PARAMETERS,
     SERIAL_NUMBER,
-    Access,
     ObjectEntry,
-    ObjectType,
 )
 from ethercat_server.sensor.objects.search import TITLES
-from ethercat_server.virtual_sensor.firmware.al import AlState
-from ethercat_server.virtual_sensor.firmware.flash import Address, Flash
-from ethercat_server.virtual_sensor.firmware.layout import RXPDO, SYNC_MANAGERS, TXPDO
+from ethercat_server.virtual_sensor.firmware.flash import Flash
+from ethercat_server.virtual_sensor.firmware.layout import RXPDO, sensor_device
+from ethercat_server.virtual_sensor.slave.al import AlState
+from ethercat_server.virtual_sensor.slave.device import MAPPING_NAMES, by_address, mapping_rows
+from ethercat_server.virtual_sensor.slave.objects import Address, ObjectTable, SdoAbortError
 from protocol.pdo import INPUT_OBJECT, LAYOUTS
 from protocol.settings import SETTINGS, SettingValue, sampling_rate_hz
 
@@ -35,56 +35,21 @@ STRING_SIZES: Final = {0x1008: 20, 0x1009: 12, 0x100A: 13}
 """Declared length of each string; padded with NUL."""
 OBJECT_NAMES: Final = {
     **TITLES,
-    0x1600: "Outputs mapping",
-    0x1A00: "Inputs mapping",
-    0x1C00: "Sync manager communication type",
-    0x1C12: "Outputs assignment",
-    0x1C13: "Inputs assignment",
+    **MAPPING_NAMES,
 }
 _UNKNOWN_COMMAND = 1
 _SAVED = range(0x8000, 0x8011)
 """Objects stored by the save command; the factory calibration is stored at once."""
 
 
-class SdoAbortError(Exception):
-    """The sensor aborts the SDO transfer with `code`."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(abort_meaning(code))
-        self.code = code
-
-
-def _mapping_rows(pdo_size: int) -> list[ObjectEntry]:
-    ro, u8, u16, u32 = Access.RO, ObjectType.U8, ObjectType.U16, ObjectType.U32
-    rows = [
-        ObjectEntry(0x1C00, n, f"Sync manager {n - 1}", u8, ro, row.kind)
-        for n, row in enumerate(SYNC_MANAGERS, 1)
-    ]
-    for assignment, pdo in ((0x1C12, RXPDO), (0x1C13, TXPDO[pdo_size])):
-        rows.append(ObjectEntry(assignment, 1, "PDO 1", u16, ro, pdo.index))
-        for n, entry in enumerate(pdo.entries, 1):
-            mapped = entry.index << 16 | entry.subindex << 8 | entry.type.size * 8
-            rows.append(ObjectEntry(pdo.index, n, f"Entry {n}", u32, ro, mapped))
-    return rows
-
-
 def entries_of(pdo_size: int) -> dict[Address, ObjectEntry]:
     """Every entry of a sensor with `pdo_size` bytes of process data, in order of address."""
     mapped = {field.subindex for field in LAYOUTS[pdo_size].fields}
     rows = [row for row in OBJECTS if row.index != INPUT_OBJECT or row.subindex in mapped]
-    rows += _mapping_rows(pdo_size)
-    highest: dict[int, int] = {}
-    for row in rows:
-        if row.subindex:
-            highest[row.index] = max(row.subindex, highest.get(row.index, 0))
-    rows += [
-        ObjectEntry(index, 0, "Highest sub-index", ObjectType.U8, Access.RO, last)
-        for index, last in highest.items()
-    ]
-    return {row.address: row for row in sorted(rows, key=lambda row: row.address)}
+    return by_address(rows + mapping_rows(sensor_device("", 0, pdo_size)))
 
 
-class Dictionary:
+class Dictionary(ObjectTable):
     """Values of all entries of one sensor.
 
     `process_data` returns the newest process data (for 0x6000); `changed` is called after a write; `now`
@@ -101,7 +66,8 @@ class Dictionary:
         changed: Callable[[], None],
         now: Callable[[], int],
     ) -> None:
-        self.entries: Mapping[Address, ObjectEntry] = entries_of(pdo_size)
+        entries = entries_of(pdo_size)
+        super().__init__(entries, {address: self._initial(row) for address, row in entries.items()})
         self._flash = flash
         self._layout = LAYOUTS[pdo_size]
         self._process_data = process_data
@@ -109,7 +75,6 @@ class Dictionary:
         self._now = now
         self._saved = False
         """The last command was a save: the flash has its status."""
-        self._values = {address: self._initial(row) for address, row in self.entries.items()}
         self._values[DEVICE_NAME] = model.encode("ascii").ljust(STRING_SIZES[DEVICE_NAME[0]], b"\0")
         self._values[SERIAL_NUMBER] = struct.pack("<I", serial)
         self._values.update(flash.entries)
@@ -121,18 +86,6 @@ class Dictionary:
             return struct.pack("<f", row.subindex / 64)  # a recognizable value
         data = row.type.pack(row.default)
         return data.ljust(STRING_SIZES.get(row.index, len(data)), b"\0")
-
-    def size(self, row: ObjectEntry) -> int:
-        """Bytes of the entry `row`."""
-        return row.type.size or len(self._values[row.address])
-
-    def entry(self, index: int, subindex: int) -> ObjectEntry:
-        """The entry at an address; SdoAbortError if there is none."""
-        row = self.entries.get((index, subindex))
-        if row is None:
-            exists = any(known == index for known, _ in self.entries)
-            raise SdoAbortError(AbortCode.NO_SUBINDEX if exists else AbortCode.NO_OBJECT)
-        return row
 
     def read(self, index: int, subindex: int) -> bytes:
         """The bytes of an entry; SdoAbortError if it cannot be read."""
@@ -158,17 +111,6 @@ class Dictionary:
             self._command(data[0])
         self._follow_sinc()
         self._changed()
-
-    def check_write(self, row: ObjectEntry, length: int, state: AlState) -> None:
-        """SdoAbortError if `length` bytes cannot be written to `row` in `state`, whatever they are."""
-        if row.access is Access.RO:
-            raise SdoAbortError(AbortCode.READ_ONLY)
-        if row.access is Access.RW_PREOP and state is not AlState.PREOP:
-            raise SdoAbortError(AbortCode.NOT_IN_THIS_STATE)
-        if length > self.size(row):
-            raise SdoAbortError(AbortCode.TOO_LONG)
-        if length < self.size(row):
-            raise SdoAbortError(AbortCode.TOO_SHORT)
 
     def set_output(self, data: bytes) -> None:
         """Process data outputs, as the master sent them."""

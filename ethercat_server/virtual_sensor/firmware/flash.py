@@ -9,8 +9,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Final
 
-Address = tuple[int, int]
-"""Index and sub-index of an object entry."""
+from ethercat_server.virtual_sensor.slave.objects import Address
 
 BUSY: Final = 0xFF
 """Status while a save is under way."""

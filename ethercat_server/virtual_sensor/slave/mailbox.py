@@ -12,6 +12,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final
 
+from ethercat_server.ethercat.slave.sii_content import MailboxProtocol
 from ethercat_server.virtual_sensor.esc.sync_manager import SyncManager
 
 HEADER: Final = struct.Struct("<HHBB")
@@ -47,15 +48,20 @@ _FOE_ERROR = struct.pack("<BBI", 5, 0, 0x8002) + b"Access denied"
 
 
 class Mailbox:
-    """Both directions of one sensor's mailbox.
+    """Both directions of one slave's mailbox.
 
     `coe` answers a CoE request (what follows the mailbox header) with any number of replies; it may raise
     MailboxRequestError.
     """
 
     def __init__(
-        self, written: SyncManager, read: SyncManager, coe: Callable[[bytes, int], list[bytes]]
+        self,
+        written: SyncManager,
+        read: SyncManager,
+        coe: Callable[[bytes, int], list[bytes]],
+        protocols: MailboxProtocol,
     ) -> None:
+        self._protocols = protocols
         self._written = written
         self._read = read
         self._coe = coe
@@ -117,9 +123,9 @@ class Mailbox:
             self._replies.append(HEADER.pack(len(reply), address, 0, reply_type | self._counter << 4) + reply)
 
     def _answer(self, kind: int, body: bytes) -> tuple[MailboxType, list[bytes]]:
-        if kind == MailboxType.COE:
+        if kind == MailboxType.COE and MailboxProtocol.CoE in self._protocols:
             return MailboxType.COE, self._coe(body, self._read.length - HEADER.size)
-        if kind == MailboxType.FOE:
+        if kind == MailboxType.FOE and MailboxProtocol.FoE in self._protocols:
             # FoE is for firmware updates.
             return MailboxType.FOE, [_FOE_ERROR]
         raise MailboxRequestError(MailboxError.UNSUPPORTED_PROTOCOL)

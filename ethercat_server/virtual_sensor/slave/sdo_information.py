@@ -7,14 +7,14 @@ goes out in fragments.
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from typing import Final
 
 from ethercat_server.ethercat.slave.abort_codes import AbortCode
 from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry
-from ethercat_server.virtual_sensor.firmware.dictionary import OBJECT_NAMES, Dictionary, SdoAbortError
-from ethercat_server.virtual_sensor.firmware.layout import RXPDO
-from ethercat_server.virtual_sensor.firmware.mailbox import MailboxError, MailboxRequestError
-from protocol.pdo import INPUT_OBJECT
+from ethercat_server.virtual_sensor.slave.device import Device
+from ethercat_server.virtual_sensor.slave.mailbox import MailboxError, MailboxRequestError
+from ethercat_server.virtual_sensor.slave.objects import ObjectTable, SdoAbortError
 
 HEADER: Final = struct.Struct("<BBH")
 LIST_REQUEST, LIST_RESPONSE = 1, 2
@@ -25,7 +25,7 @@ INCOMPLETE: Final = 0x80
 
 LIST_LENGTHS, LIST_ALL, LIST_RXPDO, LIST_TXPDO, LIST_BACKUP, LIST_SETTINGS = range(6)
 _VARIABLE, _ARRAY, _RECORD = 7, 8, 9
-_TYPE_RECORD_OF: Final = {0x1018: 0x0023, 0x1600: 0x0021, 0x1A00: 0x0021}
+_TYPE_RECORD_OF: Final = {0x1018: 0x0023, 0x1600: 0x0021, 0x1A00: 0x0021, 0x1A01: 0x0021}
 """Data types of the objects whose structure the standard names."""
 
 _READ_ALWAYS = 0x07
@@ -34,10 +34,12 @@ _RXPDO_MAPPABLE, _TXPDO_MAPPABLE = 0x40, 0x80
 
 
 class SdoInformation:
-    """Describes a dictionary."""
+    """Describes the objects of a device; `names` are those of objects that have parts, by index."""
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    def __init__(self, dictionary: ObjectTable, device: Device, names: Mapping[int, str]) -> None:
         self._dictionary = dictionary
+        self._names = names
+        self._outputs, self._inputs = device.output_entries, device.input_entries
         self._indices = sorted({index for index, _ in dictionary.entries})
 
     def answer(self, request: bytes, room: int) -> list[bytes]:
@@ -75,8 +77,8 @@ class SdoInformation:
     def _list(self, kind: int) -> bytes:
         lists = {
             LIST_ALL: self._indices,
-            LIST_RXPDO: sorted({entry.index for entry in RXPDO.entries}),
-            LIST_TXPDO: [INPUT_OBJECT],
+            LIST_RXPDO: sorted({entry.index for entry in self._outputs}),
+            LIST_TXPDO: sorted({entry.index for entry in self._inputs}),
             LIST_BACKUP: self._having(Access.RW, Access.RW_PREOP),
             LIST_SETTINGS: self._having(Access.RW_PREOP),
         }
@@ -101,7 +103,7 @@ class SdoInformation:
             types = {row.type for row in parts}
             code = _ARRAY if len(types) == 1 and index not in _TYPE_RECORD_OF else _RECORD
             kind = _TYPE_RECORD_OF.get(index, parts[0].type.coe_code if code == _ARRAY else 0)
-            name = OBJECT_NAMES.get(index, parts[0].name)
+            name = self._names.get(index, parts[0].name)
         highest = max(row.subindex for row in rows)
         return struct.pack("<HHBB", index, kind, highest, code) + name.encode("ascii")
 
@@ -111,11 +113,10 @@ class SdoInformation:
         head = struct.pack("<HBBHHH", index, subindex, 0, row.type.coe_code, bits, self._access(row))
         return head + row.name.encode("ascii")
 
-    @staticmethod
-    def _access(row: ObjectEntry) -> int:
+    def _access(self, row: ObjectEntry) -> int:
         bits = _READ_ALWAYS | _WRITE[row.access]
-        if row in RXPDO.entries:
+        if row in self._outputs:
             bits |= _RXPDO_MAPPABLE
-        if row.index == INPUT_OBJECT and row.subindex:
+        if row in self._inputs:
             bits |= _TXPDO_MAPPABLE
         return bits

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from ethercat_server.ethercat.slave.abort_codes import AbortCode
-from ethercat_server.virtual_sensor.firmware.dictionary import SdoAbortError
-from ethercat_server.virtual_sensor.firmware.mailbox import MailboxError, MailboxRequestError
+from ethercat_server.virtual_sensor.slave.mailbox import MailboxError, MailboxRequestError
+from ethercat_server.virtual_sensor.slave.objects import SdoAbortError
 
 COE_HEADER: Final = 2
 SDO_HEADER: Final = 8

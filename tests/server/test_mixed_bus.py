@@ -1,0 +1,157 @@
+"""Sensors among the devices of other vendors: they stream as if alone, and nothing is done to the others."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from typing import Final
+
+import pytest
+
+from ethercat_server.acquisition.start_up import bring_up
+from ethercat_server.errors import BusError
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.simulation.machine import Machine
+from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
+from ethercat_server.virtual_sensor.foreign.slave import ForeignSlave
+from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.slave.al import AlState
+from tests.simulated_links import chain, registers
+from tests.simulation import Asked, Simulation, check_frames, more_if_long
+
+READING_THE_SII: Final = range(reg.SII_OWNER, reg.SII_DATA)
+"""All that may be written to a slave that is no sensor."""
+KINDS: Final = ("EK1100", "EL3102", "DRIVE", "DRIVE:PREOP")
+
+
+def mixed(text: str, machine: Machine | None = None) -> Simulation:
+    """A server on this chain, its sensors with clocks of their own."""
+    sensors = [SensorOptions(signal="clock", serial=1 + n, ppm=150.0 - 200 * n) for n in range(2)]
+    return Simulation(backend=MemoryBackend(*slaves_in(parse_chain(text), sensors), machine=machine))
+
+
+def every_chain() -> list[str]:
+    """Every order of one or two sensors among other devices, six slaves at most."""
+    found = []
+    for others in range(6):
+        for sensors in (1, 2):
+            if others + sensors > 6:
+                continue
+            for places in itertools.combinations(range(others + sensors), sensors):
+                kinds = itertools.cycle(KINDS[others % 3 :] + KINDS[: others % 3])
+                found.append(
+                    ",".join("BOTA" if at in places else next(kinds) for at in range(others + sensors))
+                )
+    return found
+
+
+def foreign(simulation: Simulation) -> list[ForeignSlave]:
+    return [slave for slave in simulation.backend.sensors.slaves if isinstance(slave, ForeignSlave)]
+
+
+def check_each(simulation: Simulation) -> None:
+    for number in range(len(simulation.sensors)):
+        check_frames(frame for frame in simulation.frames if frame.sensor == number)
+
+
+def states_of(text: str) -> list[AlState]:
+    """In which the others were found."""
+    kinds = [kind for kind in text.split(",") if kind != "BOTA"]
+    return [AlState.PREOP if "PREOP" in kind else AlState.INIT for kind in kinds]
+
+
+def assert_left_alone(simulation: Simulation, states: list[AlState]) -> None:
+    for slave, state in zip(foreign(simulation), states, strict=True):
+        assert slave.life is not None
+        assert slave.life.al.state == state
+        assert {address for address, _ in slave.writes} <= set(READING_THE_SII), slave.writes
+
+
+@pytest.mark.parametrize("text", more_if_long(every_chain()[::6], every_chain()))
+def test_sensors_stream_as_if_alone(text: str) -> None:
+    places = [at for at, kind in enumerate(text.split(",")) if kind == "BOTA"]
+    simulation = mixed(text)
+    simulation.run(1.0)
+    check_each(simulation)
+    for number, sensor in enumerate(simulation.sensors):
+        assert sensor.position == places[number]
+        assert len([frame for frame in simulation.frames if frame.sensor == number]) > 700
+    assert [row["position"] for row in simulation.others.rows] == [
+        at for at in range(len(text.split(","))) if at not in places
+    ]
+    assert_left_alone(simulation, states_of(text))
+    simulation.close()
+    assert_left_alone(simulation, states_of(text))
+
+
+def test_describe_tells_the_others() -> None:
+    simulation = mixed("EK1100,BOTA,EL3102,BOTA,DRIVE:PREOP")
+    described = simulation.connect().ask("describe")
+    assert [row["position"] for row in described["sensors"]] == [1, 3]
+    assert [row["sensor"] for row in described["sensors"]] == [0, 1]
+    assert [(row["position"], row["name"], row["state"]) for row in described["others"]] == [
+        (0, "EK1100", "INIT"), (2, "EL3102", "INIT"), (4, "DRIVE", "PREOP"),
+    ]  # fmt: skip
+    assert (described["others"][0]["vendor"], described["others"][0]["product"]) == (2, 0x044C2C52)
+
+
+def test_one_that_goes_away_is_told_and_costs_the_sensor_before_it_nothing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    simulation = mixed("BOTA,DRIVE")
+    simulation.run(0.5)
+    simulation.command("power off #1")
+    simulation.run(1.5)
+    assert simulation.others.rows[0]["state"] == "ABSENT"
+    assert "'DRIVE' at position 1" in caplog.text
+    simulation.command("power on #1")
+    simulation.run(1.0)
+    assert simulation.others.rows[0]["state"] == "INIT"
+    check_each(simulation)
+    assert simulation.events == []
+
+
+@pytest.mark.parametrize("fault", ["power cycle 0.3", "deaf 0.3", "error 0x1B @0"])
+@pytest.mark.parametrize("text", ["EK1100,BOTA,DRIVE:PREOP", "DRIVE:PREOP,BOTA,BOTA", "BOTA,EL3102"])
+def test_a_sensor_among_others_comes_back(text: str, fault: str) -> None:
+    simulation = mixed(text)
+    simulation.run(0.5)
+    simulation.command(fault)
+    simulation.run(3.0)
+    assert all(sensor.streams for sensor in simulation.sensors)
+    check_each(simulation)
+    assert_left_alone(simulation, states_of(text))
+
+
+@pytest.mark.parametrize("seed", more_if_long(range(4), range(40)))
+def test_on_a_wire_that_loses_frames(seed: int) -> None:
+    text = random.Random(seed).choice(every_chain())
+    simulation = mixed(text, Machine(seed=seed, lost=0.01))
+    simulation.run(1.0)
+    check_each(simulation)
+    assert all(
+        {address for address, _ in slave.writes} <= set(READING_THE_SII) for slave in foreign(simulation)
+    )
+
+
+def test_addresses_that_others_answer_to_are_not_taken() -> None:
+    """What another master left: its station addresses, and FMMUs that are active still."""
+    backend = chain("DRIVE:OP,BOTA,DRIVE:OP")
+    before = registers(backend)
+    with pytest.raises(BusError, match="slaves at work"):
+        bring_up(Bus(backend), Asked(), lambda: None)
+    assert registers(backend) == before
+
+    class Forced(Asked):
+        force = True
+
+    sensors, others = bring_up(bus := Bus(backend), Forced(), lambda: None)
+    assert [sensor.streams for sensor in sensors] == [True]
+    assert [slave.status.state.name for slave in others] == ["PREOP"] * 2
+    theirs = {before[at][reg.STATION_ADDRESS : reg.STATION_ADDRESS + 2] for at in (0, 2)}
+    assert bus.stations[0].to_bytes(2, "little") not in theirs
+    assert bus.working_counter(0) == 3
+    bus.send(backend.clock.monotonic_ns())
+    assert bus.receive(0.01) == 3, "no FMMU of another answers to it"

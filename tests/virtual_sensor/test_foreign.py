@@ -1,0 +1,262 @@
+"""Foreign slaves on the virtual bus: start-up, objects, the drive, states left by another master."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.master.datagrams import DatagramMaster
+from ethercat_server.ethercat.slave import sii_content
+from ethercat_server.ethercat.wire import Command
+from ethercat_server.sensor.scan import look_safely
+from ethercat_server.virtual_sensor.cli import build_parser, options_from
+from ethercat_server.virtual_sensor.faults.table import obey
+from ethercat_server.virtual_sensor.foreign.chain import MOST_SLAVES, ChainError, parse_chain, slaves_in
+from ethercat_server.virtual_sensor.foreign.kinds import KINDS
+from ethercat_server.virtual_sensor.foreign.slave import ForeignSlave
+from ethercat_server.virtual_sensor.options import BusOptions
+from ethercat_server.virtual_sensor.sensor import VirtualSensor
+from tests.simulated_links import chain
+from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, RawMaster, fmmu, sync_manager
+
+MS = 1_000_000
+ERROR = 0x10
+OUTPUTS, INPUTS = 0x1100, 0x1180
+
+
+def no_check() -> None:
+    pass
+
+
+def master_of(text: str) -> RawMaster:
+    return RawMaster(*slaves_in(parse_chain(text)))
+
+
+def foreign(master: RawMaster, place: int = 0) -> ForeignSlave:
+    slave = master.bus.slaves[place]
+    assert isinstance(slave, ForeignSlave)
+    return slave
+
+
+def drive_in(state: int) -> RawMaster:
+    master = master_of("DRIVE")
+    master.set_up_mailbox()
+    assert master.request(PREOP) == (PREOP, 0)
+    if state > PREOP:
+        master.write(0x0810, sync_manager(OUTPUTS, 6, 0x64) + sync_manager(INPUTS, 6, 0x20))
+        master.write(0x0600, fmmu(0, 6, OUTPUTS, 2) + fmmu(6, 6, INPUTS, 1))
+        assert master.request(SAFEOP) == (SAFEOP, 0)
+    if state == OP:
+        assert master.request(OP) == (OP, 0)
+    return master
+
+
+def exchange(master: RawMaster, controlword: int, velocity: int = 0) -> tuple[int, int]:
+    """Statusword and position."""
+    data, counter = master.one(Command.LRW, 0, 0, struct.pack("<Hi", controlword, velocity) + bytes(6))
+    assert counter == 3
+    status, position = struct.unpack_from("<Hi", data, 6)
+    return status, position
+
+
+def enabled(master: RawMaster, velocity: int) -> None:
+    for word in (0x06, 0x07, 0x0F):
+        exchange(master, word, velocity)
+
+
+def options_of(*words: str) -> BusOptions:
+    return options_from(build_parser().parse_args(["veth0", *words]))
+
+
+def test_slaves_are_in_wire_order_and_sensors_numbered_among_themselves() -> None:
+    master = RawMaster(*options_of("--chain", "ek1100, BOTA,EL3102,BOTA", "--serial", "7,9").slaves)
+    assert [type(slave) for slave in master.bus.slaves] == [
+        ForeignSlave, VirtualSensor, ForeignSlave, VirtualSensor
+    ]  # fmt: skip
+    assert [sensor.options.serial for sensor in master.bus.sensors] == [7, 9]
+    assert obey(master.bus, "power off @1") == "ok"
+    assert master.bus.slaves[3].life is None
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--chain", "BOTA,EL9999"], ["--chain", "DRIVE:BOOT"], ["--chain", "BOTA,,BOTA"], ["--chain", ""],
+        ["--chain", ",".join(["EK1100"] * (MOST_SLAVES + 1))], ["--chain", "BOTA", "--sensors", "1"],
+        ["--chain", "EK1100,BOTA", "--serial", "1,2"],
+    ],
+)  # fmt: skip
+def test_wrong_chains(words: list[str]) -> None:
+    with pytest.raises(Exception, match=r"available|at most|leave --sensors out|named"):
+        options_of(*words)
+
+
+def test_a_chain_need_not_have_a_sensor() -> None:
+    master = RawMaster(*options_of("--chain", "EK1100,EL3102").slaves)
+    assert master.one(Command.BRD, 0, 0x0130, bytes(2))[1] == 2
+    assert obey(master.bus, "stick").startswith("error: that slave is no sensor")
+    with pytest.raises(ChainError):
+        parse_chain("?")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_eeprom_says_what_it_is(kind: str) -> None:
+    life = foreign(master_of(kind)).life
+    assert life is not None
+    found = sii_content.decode(life.esc.sii.image)
+    device = KINDS[kind]
+    assert (found["vendor"], found["product"], found["name"]) == (device.vendor, device.product, kind)
+    assert found["check_byte_right"]
+    assert found["protocols"] == ([] if kind == "EK1100" else ["CoE"])
+    assert len(found["sync_managers"]) == len(device.sync_managers)
+
+
+def test_a_coupler_goes_to_op_without_anything() -> None:
+    master = master_of("EK1100")
+    for state in (PREOP, SAFEOP, OP, INIT):
+        assert master.request(state) == (state, 0)
+    assert master.request(OP) == (INIT | ERROR, 0x0011)
+    assert master.request(INIT) == (INIT, 0)
+
+
+@pytest.mark.parametrize(
+    ("state", "managers", "code"),
+    [
+        (PREOP, b"", 0x0016),
+        (SAFEOP, b"", 0x001D),
+        (SAFEOP, sync_manager(OUTPUTS, 6, 0x64) + sync_manager(INPUTS, 61, 0x20), 0x001E),
+    ],
+)
+def test_a_wrong_configuration_is_refused(state: int, managers: bytes, code: int) -> None:
+    master = master_of("DRIVE") if state == PREOP else drive_in(PREOP)
+    if managers:
+        master.write(0x0810, managers)
+    assert master.request(state)[1] == code
+
+
+def test_objects_of_a_terminal() -> None:
+    master = master_of("EL3102")
+    master.set_up_mailbox()
+    master.request(PREOP)
+    assert master.upload(0x1000, 0) == struct.pack("<I", 5001)
+    assert master.upload(0x1008, 0) == b"EL3102"
+    assert master.upload(0x1018, 2) == struct.pack("<I", 0x0C1E3052)
+    assert [master.upload(0x1C00, n)[0] for n in range(5)] == [4, 1, 2, 3, 4]
+    assert master.upload(0x1C12, 0) == b"\0"
+    assert [master.upload(0x1C13, n) for n in (1, 2)] == [b"\x00\x1a", b"\x01\x1a"]
+    assert [master.upload(0x1A01, n).hex() for n in (1, 2)] == ["08010231", "10020231"]
+    assert master.information(1, struct.pack("<H", 1))[0][0] & 0x7F == 2, "SDO Information"
+    master.write(0x0818, sync_manager(INPUTS, 6, 0x20))
+    assert master.request(SAFEOP) == (SAFEOP, 0)
+    assert struct.unpack("<BhBh", master.read(INPUTS, 6)) == (0, 0x4000, 0, -0x2000)
+
+
+def test_a_drive_turns_when_enabled() -> None:
+    master = drive_in(OP)
+    words = [0x00, 0x06, 0x07, 0x0F]
+    assert [exchange(master, word)[0] & 0x6F for word in words] == [0x40, 0x21, 0x23, 0x27]
+    _, start = exchange(master, 0x0F, 1000)
+    master.now += 50 * MS
+    _, end = exchange(master, 0x0F, 1000)
+    assert end - start == 50
+    assert exchange(master, 0x0B, 1000)[0] & 0x6F == 0x07, "quick stop"
+    assert exchange(master, 0x00, 1000)[0] & 0x6F == 0x40
+    assert not foreign(master).turning
+
+
+def test_a_drive_stops_when_process_data_stops() -> None:
+    master = drive_in(OP)
+    enabled(master, 1000)
+    assert foreign(master).turning
+    master.wait(99 * MS)
+    assert foreign(master).turning
+    master.wait(2 * MS)
+    assert (master.read16(0x0130), master.read16(0x0134)) == (SAFEOP | ERROR, 0x001B)
+    assert not foreign(master).turning
+    master.request(SAFEOP | ERROR)
+    assert master.request(OP) == (OP, 0)
+    assert exchange(master, 0x0F, 1000)[0] & 0x4F == 0x08, "a fault"
+    assert master.upload(0x603F, 0) == b"\x30\x81"
+    assert exchange(master, 0x80)[0] & 0x4F == 0x40
+    assert master.upload(0x603F, 0) == b"\0\0"
+
+
+def test_an_orderly_end_is_no_fault() -> None:
+    master = drive_in(OP)
+    enabled(master, 1000)
+    master.request(SAFEOP)
+    assert struct.unpack("<H", master.upload(0x6041, 0))[0] & 0x6F == 0x40
+
+
+def test_a_drive_obeys_objects_too() -> None:
+    master = drive_in(PREOP)
+    for word in (6, 7):
+        master.download(0x6040, 0, struct.pack("<H", word))
+    assert struct.unpack("<H", master.upload(0x6041, 0))[0] & 0x6F == 0x23
+
+
+@pytest.mark.parametrize(("name", "number"), [("PREOP", PREOP), ("SAFEOP", SAFEOP), ("OP", OP)])
+@pytest.mark.parametrize("kind", ["BOTA", *KINDS])
+def test_left_in_a_state_by_another_master(kind: str, name: str, number: int) -> None:
+    master = master_of(f"EK1100,{kind}:{name}")
+    assert master.read16(0x0130, 1) == number
+    assert master.one(Command.FPRD, 0x1002, 0x0130, bytes(2)) == (struct.pack("<H", number), 1)
+    obey(master.bus, "power cycle 0 #1")
+    master.wait(1)
+    assert master.read16(0x0130, 1) == INIT
+
+
+def test_a_drive_left_at_work_turns_and_records_what_is_written() -> None:
+    master = master_of("EK1100,DRIVE:OP,BOTA:OP,DRIVE:OP")
+    drives = foreign(master, 1), foreign(master, 3)
+    master.wait(1000 * MS)
+    for place in (1, 3):
+        assert master.read16(0x0130, place) == OP, "its watchdog waits for outputs"
+    assert all(drive.turning for drive in drives)
+    assert not any(drive.writes for drive in drives), "reading is no writing"
+    # All outputs, then all inputs: the second drive's outputs follow the sensor's.
+    assert master.one(Command.LWR, 7, 0, struct.pack("<Hi", 0, 0))[1] == 1
+    assert list(drives[1].writes) == [(OUTPUTS, bytes(6))]
+    assert not drives[1].turning
+    assert drives[0].turning
+    assert not drives[0].writes
+    master.one(Command.BWR, 0, 0x0120, b"\1\0")
+    assert list(drives[0].writes) == [(0x0120, b"\1\0")]
+    assert drives[0].write_count == 1
+
+
+def test_power_and_cable_of_a_place() -> None:
+    master = master_of("BOTA,DRIVE:OP,BOTA")
+
+    def answering() -> int:
+        answer = master.frame((Command.BRD, 0, 0x0130, bytes(2)))
+        return answer[0][1] if answer else 0
+
+    assert answering() == 3
+    obey(master.bus, "disconnect #1")
+    assert answering() == 1
+    assert foreign(master, 1).turning, "it has power"
+    obey(master.bus, "connect #1")
+    assert answering() == 3
+    assert master.read(0x0310, 1, 1) == b"\1"
+    obey(master.bus, "power off #1")
+    assert answering() == 1
+    obey(master.bus, "power on #1")
+    assert answering() == 3
+    assert obey(master.bus, "power off #3").startswith("error: ")
+    assert obey(master.bus, "error 0x1E #1") == "ok"
+    assert master.read16(0x0134, 1) == 0x001E
+
+
+def test_the_backend_in_memory_takes_a_mixed_chain_to_op() -> None:
+    backend = chain("EK1100,BOTA,EL3102,DRIVE")
+    bus = Bus(backend)
+    found = look_safely(bus, no_check)
+    assert [slave.name for slave in found] == ["EK1100", "BFT-SENS-ECAT-M8", "EL3102", "DRIVE"]
+    bus.scan(DatagramMaster(bus, [slave.sii for slave in found]), range(4), no_check)
+    assert bus.master.sdo_read(2, 0x1008, 0) == b"EL3102"
+    assert bus.master.map_process_data(no_check) == [0, 61, 6, 6]
+    states = [slave.life.al.state for slave in backend.sensors.slaves if slave.life]
+    assert states == [SAFEOP] * 4
