@@ -15,7 +15,7 @@ from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.daemon.service import Policy, Service
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.nic import claimed
+from ethercat_server.ethercat.nic.claim import claimed
 from ethercat_server.ethercat.soem import SoemBackend
 from ethercat_server.process import realtime
 from ethercat_server.process.notify import Notifier

@@ -20,7 +20,7 @@ import pysoem
 from ethercat_server.errors import BusError, SdoAbortError
 from ethercat_server.ethercat.backend import CheckInterrupt, SlaveIdentity
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.nic import check_present
+from ethercat_server.ethercat.nic.interface import check_present, why_silent
 from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
 
@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 
 class SoemBackend:
-    """See `Backend`: pysoem on a network interface, which `nic.claimed` has checked beforehand."""
+    """See `Backend`: pysoem on a network interface, which `nic.claim.claimed` has checked beforehand."""
 
     def __init__(self, ifname: str) -> None:
         self.ifname = ifname
@@ -89,6 +89,10 @@ class SoemBackend:
     def check_present(self) -> None:
         """See `Backend`."""
         check_present(self.ifname, self._ifindex)
+
+    def why_silent(self) -> str:
+        """See `Backend`."""
+        return why_silent(self.ifname)
 
     def scan(self, check_interrupt: CheckInterrupt) -> list[SlaveIdentity]:
         """See `Backend`."""

@@ -15,7 +15,7 @@ from ethercat_server.errors import BusError, ServerError, UsageError
 from ethercat_server.ethercat.backend import SlaveIdentity
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.nic import claimed
+from ethercat_server.ethercat.nic.claim import claimed
 from ethercat_server.ethercat.slave.coe import BlockingSdo, Sdo, Steps, finish
 from ethercat_server.ethercat.slave.sii import has_coe
 from ethercat_server.ethercat.soem import SoemBackend

@@ -16,6 +16,7 @@ from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import CheckInterrupt, SlaveIdentity
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.nic.interface import CHECK_CABLE
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave import sii_content
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
@@ -73,6 +74,10 @@ class MemoryBackend:
 
     def check_present(self) -> None:
         """See `Backend`."""
+
+    def why_silent(self) -> str:
+        """See `Backend`."""
+        return CHECK_CABLE
 
     def send(self, frame: bytes | bytearray) -> None:
         """See `Backend`."""

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from typing import Final, TextIO
 
-from ethercat_server.ethercat.nic import is_up
+from ethercat_server.ethercat.nic.interface import look_up
 from ethercat_server.ethercat.wire import ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.control import CommandChannel
@@ -45,7 +45,7 @@ def open_interface(ifname: str) -> socket.socket:
             f"not allowed to open a raw socket on {ifname}: it needs CAP_NET_RAW, so run it as root"
         ) from None
     try:
-        if not is_up(ifname):
+        if not look_up(ifname).is_up:
             raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
         raw.bind((ifname, ETHERTYPE))
         raw.setblocking(False)

@@ -48,7 +48,7 @@ def client(bench: RealBench) -> Iterator[Client]:
 
 def pull_cable(bench: RealBench, client: Client) -> None:
     bench.veth.ip("link", "set", bench.veth.far, "down")
-    client.wait_event("sensor_lost")
+    assert f"{bench.veth.near} has no carrier" in client.wait_event("sensor_lost")["reason"]
     bench.veth.ip("link", "set", bench.veth.far, "up")
 
 

@@ -18,7 +18,7 @@ from ethercat_server.acquisition.start_up import Wanted, bring_up
 from ethercat_server.daemon.cli import main
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.errors import ServerError
-from ethercat_server.ethercat import nic
+from ethercat_server.ethercat.nic import claim
 from ethercat_server.ethercat.backend import CheckInterrupt, SlaveIdentity
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE
@@ -95,7 +95,7 @@ def test_interfaces_without_a_sensor(
     """The kernel's flags of an interface, pysoem's scan."""
     with Veth() as veth:
         assert "no EtherCAT slave answers" in fails(caplog, veth.near, "PORT")
-        monkeypatch.setattr(nic, "_CARRIER_TIMEOUT_S", 0.1)
+        monkeypatch.setattr(claim, "_CARRIER_TIMEOUT_S", 0.1)
         veth.ip("link", "set", veth.near, "down")
         assert f"{veth.near} is down: bring it up" in fails(caplog, veth.near, "PORT")
         veth.ip("link", "set", veth.far, "down")

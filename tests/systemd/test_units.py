@@ -12,6 +12,7 @@ import pytest
 from ethercat_server.daemon.config_file import EMPTY, read_config
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.daemon.server_settings import SERVER_SETTINGS
+from ethercat_server.ethercat.nic import lock
 from protocol.settings import check_settings, start_up_defaults
 from tests.systemd.staging import (
     BRIDGE_UNIT,
@@ -67,6 +68,11 @@ def test_the_server_may_have_real_time_priority_and_locked_memory() -> None:
     assert not values(SERVER_UNIT, "RestrictRealtime")
     assert values(SERVER_UNIT, "LimitRTPRIO") == ["99"]
     assert values(SERVER_UNIT, "LimitMEMLOCK") == ["infinity"]
+
+
+def test_the_locks_of_the_interfaces_have_their_directory() -> None:
+    assert values(SERVER_UNIT, "RuntimeDirectory") == [lock.DIRECTORY.relative_to("/run").name]
+    assert values(SERVER_UNIT, "RuntimeDirectoryPreserve") == ["yes"], "other instances use it"
 
 
 def test_a_usage_error_is_not_tried_again() -> None:
