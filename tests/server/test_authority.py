@@ -37,6 +37,23 @@ def listener(host: str) -> Iterator[socket.socket]:
         yield opened
 
 
+def test_the_kernel_was_asked_before_there_is_a_loop(diagnostics: socket.socket) -> None:
+    """It loads modules for the first question about a family."""
+    answers = []
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            answers.append(diagnostics.recv(4096))
+    assert len(answers) == 2
+    with (
+        open_diagnostics() as asked_already,
+        listener("127.0.0.1") as waiting,
+        socket.create_connection(waiting.getsockname()),
+    ):
+        accepted, _ = waiting.accept()
+        with accepted:
+            assert peer_uid(asked_already, accepted) == os.geteuid(), "none of them is taken for its answer"
+
+
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 def test_the_owner_of_a_connection_is_found(diagnostics: socket.socket, host: str) -> None:
     with listener(host) as waiting, socket.create_connection(waiting.getsockname()[:2]):

@@ -18,9 +18,9 @@ from ethercat_server.acquisition.start_up import Wanted, bring_up
 from ethercat_server.daemon.cli import main
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.errors import ServerError
-from ethercat_server.ethercat.nic import claim
 from ethercat_server.ethercat.backend import CheckInterrupt, SlaveIdentity
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.nic import claim
 from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
