@@ -113,6 +113,7 @@ class DirectLink(Link):
         sensors = [self.in_force(found) for found in self.sensors]
         for sensor in sensors:
             _check_rate_known(sensor)
+        realtime.prepare(realtime.DEFAULT_PRIORITY, None)
         enter_op(self._bus, sensors, _no_check)
         return sensors
 
@@ -121,7 +122,6 @@ class _Running:
     """The server's loop in this process, with the tool instead of clients (an `Outlet`)."""
 
     def __init__(self, bus: Bus, sensors: list[Sensor], on_frame: OnFrame) -> None:
-        realtime.prepare(realtime.DEFAULT_PRIORITY, None)
         self.sensors = sensors
         self._clock = bus.clock
         self.streams = [SensorStream(sensor.position, sensor.period_ns, bus.clock) for sensor in sensors]

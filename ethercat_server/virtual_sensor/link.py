@@ -72,6 +72,7 @@ def run(
     control_path: str | None = None,
     commands: TextIO | None = None,
     exit_on_eof: bool = False,
+    on_open: Callable[[], None] = lambda: None,
     on_ready: Callable[[], None] = lambda: None,
     should_stop: threading.Event | Callable[[], bool] = lambda: False,
 ) -> None:
@@ -84,6 +85,7 @@ def run(
     stop = should_stop.is_set if isinstance(should_stop, threading.Event) else should_stop
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
+        on_open()
         bus = Bus(options, time.monotonic_ns())
         poller = select.poll()
         poller.register(raw, select.POLLIN)

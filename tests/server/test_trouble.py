@@ -22,6 +22,7 @@ from ethercat_server.ethercat.backend import CheckInterrupt, SlaveIdentity
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.nic import claim
 from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE
+from ethercat_server.process import realtime
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.ended import run_here
@@ -94,7 +95,10 @@ def test_interfaces_without_a_sensor(
 ) -> None:
     """The kernel's flags of an interface, pysoem's scan."""
     with Veth() as veth:
-        assert "no EtherCAT slave answers" in fails(caplog, veth.near, "PORT")
+        with monkeypatch.context() as unprepared:  # or this process would stay so
+            unprepared.setattr(realtime, "prepare", lambda *_, **__: None)
+            said = fails(caplog, veth.near, "PORT", "--user", "root")
+        assert "no EtherCAT slave answers" in said
         monkeypatch.setattr(claim, "_CARRIER_TIMEOUT_S", 0.1)
         veth.ip("link", "set", veth.near, "down")
         assert f"{veth.near} is down: bring it up" in fails(caplog, veth.near, "PORT")
