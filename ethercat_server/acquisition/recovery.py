@@ -30,7 +30,6 @@ _SHORT_EXCHANGES: Final = 2
 """Exchanges in a row with a short working counter before the sensors' states are read."""
 _SILENCE_NS: Final = 50_000_000
 """Time without a frame coming back after which all sensors are lost; a single lost frame never suffices."""
-_SILENT: Final = "no frame comes back: check cable and power"
 _SILENT_CHANGE_NS: Final = 1_000_000_000
 """Time without a frame that a change of settings survives: it goes on when frames come back."""
 _WATCH_EVERY_NS: Final = 100_000_000
@@ -119,12 +118,13 @@ class Recovery:
                     self._bus.backend.check_present()
                     if now_ns - self._frame_ns > _SILENT_CHANGE_NS:
                         for number in list(self._changing):
-                            self._lose_in_change(number, _SILENT)
+                            self._lose_in_change(number, self._silence())
             elif self._missed_since_ns != self._frame_ns:
                 self._missed_since_ns = self._frame_ns  # one only: at a low rate the time alone says nothing
             elif now_ns - self._frame_ns > _SILENCE_NS:
+                why = self._silence()
                 for number in range(len(self._sensors)):
-                    self._lose(number, _SILENT)
+                    self._lose(number, why)
             return
         self._frame_ns = now_ns
         self._short = self._short + 1 if wkc < self.alive_wkc else 0
@@ -138,6 +138,9 @@ class Recovery:
             self._watch_ns = now_ns + _WATCH_EVERY_NS // len(self._sensors)
             self._watch_next()
             self._others.look_at_next()
+
+    def _silence(self) -> str:
+        return f"no frame comes back: {self._bus.backend.why_silent()}"
 
     def _watch_next(self) -> None:
         if alive := self._alive():

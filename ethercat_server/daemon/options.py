@@ -33,6 +33,8 @@ class ServerOptions:
     port: int
     sensor_name: str | None = None
     virtual_arguments: str = ""
+    config: Path | None = None
+    """The configuration file."""
     force: bool = False
     """Whether to take over a bus that is in use."""
     server: Mapping[str, Any] = field(
@@ -164,6 +166,7 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
         ifname=arguments[0],
         port=_port(arguments[-1]),
         sensor_name=arguments[1] if len(arguments) == 3 else None,
+        config=parsed.config,
         force=parsed.force,
         virtual_arguments=parsed.virtual,
         server={

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import logging
+import os
 from collections.abc import Sequence
 
 from ethercat_server.acquisition.cycle import Cycle
@@ -12,13 +13,14 @@ from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.acquisition.stream import SensorStream
-from ethercat_server.daemon.options import parse_options
+from ethercat_server.daemon.options import ServerOptions, parse_options
 from ethercat_server.daemon.service import Policy, Service
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.master.soem import SoemBackend
-from ethercat_server.ethercat.nic import claimed
+from ethercat_server.ethercat.nic.claim import claimed
 from ethercat_server.process import realtime
 from ethercat_server.process.notify import Notifier
+from ethercat_server.process.privileges import User, become, user_to_become
 from ethercat_server.process.signals import Signals
 from ethercat_server.sensor.others import Others
 from ethercat_server.serving.actions import Actions
@@ -34,21 +36,23 @@ log = logging.getLogger(__name__)
 def serve(argv: Sequence[str] | None, signals: Signals) -> None:
     """Start up, stream until asked to stop, shut down; ServerError says what failed."""
     options = parse_options(argv)
+    user = user_to_become(options.server["user"])
     policy, notifier = Policy(options), Notifier()
     with contextlib.ExitStack() as cleanup:
         hub = Hub(SocketTransport(options.server["hosts"], options.port))
         cleanup.callback(hub.close)
-        policy.apply(hub)
         ifname, priority = options.ifname, options.server["rt_priority"]
         if options.is_virtual:
-            ifname = cleanup.enter_context(VirtualBus(options.virtual_arguments, priority)).ifname
+            ifname = cleanup.enter_context(_virtual_bus(options)).ifname
         cleanup.enter_context(claimed(ifname))
         backend = SoemBackend(ifname)
         bus = Bus(backend)
         cleanup.callback(bus.close)
         backend.open()
+        realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)
+        _give_up_root(user, options)
+        policy.apply(hub)
         sensors, slaves = bring_up(bus, options, signals.check)
-        realtime.prepare(priority, options.server["cpu"])
         streams = [SensorStream(sensor.number, sensor.period_ns) for sensor in sensors]
         others = Others(bus, slaves)
         recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast, others), Jobs(bus, sensors)
@@ -75,3 +79,19 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
             notifier.stopping()
             hub.broadcast(event(Event.SHUTTING_DOWN))
         log.info("shutting down: the bus goes to INIT")
+
+
+def _virtual_bus(options: ServerOptions) -> VirtualBus:
+    return VirtualBus(options.virtual_arguments, options.server["rt_priority"], options.server["user"])
+
+
+def _give_up_root(user: User | None, options: ServerOptions) -> None:
+    """Become `user`; what that will hinder is logged now."""
+    if user is None:
+        if os.geteuid() == 0 and options.server["user"] is None:
+            log.warning("running as root: name a user with --user ([server] user), or start it with sudo")
+        return
+    become(user)
+    log.info("running as user %s from here on, without privileges", user)
+    if options.config is not None and not os.access(options.config, os.R_OK):
+        log.warning("user %s cannot read the configuration %s: a reload will fail", user, options.config)

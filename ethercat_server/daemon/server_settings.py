@@ -25,6 +25,8 @@ class ServerSetting(NamedTuple):
     """Takes several values: a repeatable flag, a list in the file."""
     at_once: bool = False
     """A reload (SIGHUP) applies a change; others need a restart."""
+    text: bool = False
+    """A single string."""
 
     @property
     def flag(self) -> str:
@@ -38,6 +40,10 @@ class ServerSetting(NamedTuple):
             if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
                 raise ValueError('a list of strings, such as ["a", "b"]')
             return tuple(self.parse(item) for item in value)
+        if self.text:
+            if not isinstance(value, str):
+                raise ValueError('a string, such as "a"')
+            return self.parse(value)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ValueError("a number")
         return self.parse(str(value))
@@ -90,6 +96,11 @@ _ROWS: Final = (
     ),
     ServerSetting(
         "control_groups", "NAME", "group whose members may do so as well", _name, (), many=True, at_once=True,
+    ),
+    ServerSetting(
+        "user", "NAME", "user that a server started by root becomes before it serves clients (default: who "
+        "ran sudo; 'root' to stay root)",
+        _name, None, text=True,
     ),
     ServerSetting(
         "rt_priority", "N", "SCHED_FIFO priority, if permitted; 0 for ordinary scheduling",

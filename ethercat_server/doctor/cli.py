@@ -15,7 +15,7 @@ from ethercat_server import __version__
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE
 from ethercat_server.daemon.server_settings import SERVER_SETTINGS
 from ethercat_server.errors import ServerError, UsageError
-from ethercat_server.ethercat.nic import MAX_NAME_LENGTH
+from ethercat_server.ethercat.nic.claim import MAX_NAME_LENGTH
 from ethercat_server.process import command_line
 
 if TYPE_CHECKING:

@@ -79,6 +79,10 @@ class Backend(Protocol):
         """InterfaceError if the network interface is gone for good."""
         ...
 
+    def why_silent(self) -> str:
+        """Why no frame comes back, as far as the interface knows, and what to do: part of a sentence."""
+        ...
+
     def send(self, frame: bytes | bytearray, /) -> None:
         """Send an Ethernet frame; one that cannot be sent is lost."""
         ...

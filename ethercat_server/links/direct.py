@@ -15,7 +15,7 @@ from ethercat_server.errors import BusError, ServerError, UsageError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.master.soem import SoemBackend
-from ethercat_server.ethercat.nic import claimed
+from ethercat_server.ethercat.nic.claim import claimed
 from ethercat_server.ethercat.slave.coe import BlockingSdo, Sdo, Steps, finish
 from ethercat_server.links.link import Found, Link, OnFrame, failed_change, signals_call, signals_held_back
 from ethercat_server.process import realtime
@@ -120,6 +120,7 @@ class DirectLink(Link):
         sensors = [self.in_force(found) for found in self.sensors]
         for sensor in sensors:
             _check_rate_known(sensor)
+        realtime.prepare(realtime.DEFAULT_PRIORITY, None)
         enter_op(self._bus, sensors, _no_check)
         return sensors
 
@@ -128,7 +129,6 @@ class _Running:
     """The server's loop in this process, with the tool instead of clients (an `Outlet`)."""
 
     def __init__(self, bus: Bus, sensors: list[Sensor], on_frame: OnFrame) -> None:
-        realtime.prepare(realtime.DEFAULT_PRIORITY, None)
         self.sensors = sensors
         self._clock = bus.clock
         self.streams = [SensorStream(sensor.number, sensor.period_ns, bus.clock) for sensor in sensors]

@@ -8,6 +8,8 @@ import sys
 import time
 from typing import Final
 
+from ethercat_server.process.log_queue import QueuedHandler
+
 _MOST_AT_ONCE: Final = 5
 _WINDOW_S: Final = 10.0
 _MOST_KINDS: Final = 1000
@@ -17,7 +19,10 @@ _PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6
 
 def set_up_logging() -> None:
     """Log to standard error, with priorities if journald reads it."""
-    handler = logging.StreamHandler(sys.stderr)
+    try:
+        handler: logging.Handler = QueuedHandler(sys.stderr.fileno())
+    except (AttributeError, OSError, ValueError):
+        handler = logging.NullHandler()  # there is no standard error
     handler.setFormatter(JournalFormatter() if goes_to_journal() else PlainFormatter())
     handler.addFilter(Repetitions())
     logging.basicConfig(level=logging.INFO, handlers=[handler])
@@ -27,7 +32,7 @@ def goes_to_journal() -> bool:
     """Whether standard error is the stream that systemd connected to the journal."""
     try:
         status = os.fstat(sys.stderr.fileno())
-    except (OSError, ValueError):
+    except (AttributeError, OSError, ValueError):
         return False
     return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 

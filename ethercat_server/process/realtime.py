@@ -10,6 +10,7 @@ import ctypes
 import gc
 import logging
 import os
+import resource
 import sys
 from pathlib import Path
 from typing import Final
@@ -28,10 +29,11 @@ _ALL_CPUS: Final = frozenset(os.sched_getaffinity(0))
 log = logging.getLogger(__name__)
 
 
-def prepare(priority: int, cpu: int | None) -> None:
+def prepare(priority: int, cpu: int | None, *, becomes_user: bool = False) -> None:
     """Prepare this thread and process for the acquisition loop; threads started later inherit its scheduling.
 
-    `priority` is that of SCHED_FIFO, 1 to 99, or 0 for ordinary scheduling; `cpu` is the CPU to pin it to.
+    `priority` is that of SCHED_FIFO, 1 to 99, or 0 for ordinary scheduling; `cpu` is the CPU to pin it to;
+    `becomes_user` if the process gives up its capabilities afterwards, which ends none of it.
     """
     refused = []
     if cpu is not None:
@@ -47,8 +49,8 @@ def prepare(priority: int, cpu: int | None) -> None:
         _fine_timer()
     if not priority:
         _fine_timer()
-    if priority and ctypes.CDLL(None).mlockall(_MLOCK) != 0:
-        refused.append("locked memory (CAP_IPC_LOCK)")
+    if priority and (missing := _lock_memory(becomes_user=becomes_user)):
+        refused.append(f"locked memory ({missing})")
     if refused:
         log.warning("not granted: %s; expect more jitter", ", ".join(refused))
     sys.setswitchinterval(_SWITCH_S)
@@ -63,6 +65,16 @@ def leave() -> None:
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.sched_setaffinity(0, _ALL_CPUS)
+
+
+def _lock_memory(*, becomes_user: bool) -> str | None:
+    """The capability that is missing for it, None if memory is locked."""
+    try:
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    except (OSError, ValueError):
+        if becomes_user:  # without CAP_IPC_LOCK every allocation beyond the limit would fail
+            return "CAP_SYS_RESOURCE"
+    return None if ctypes.CDLL(None).mlockall(_MLOCK) == 0 else "CAP_IPC_LOCK"
 
 
 def _fine_timer() -> None:

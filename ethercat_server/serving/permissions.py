@@ -44,8 +44,8 @@ class Permissions:
 
 
 def controlling_uids(users: Iterable[str], groups: Iterable[str]) -> frozenset[int]:
-    """The users who may control the server; UsageError names a user or group that does not exist."""
-    found = {0, os.geteuid()}
+    """Who may control it besides the server's own user; UsageError names an unknown user or group."""
+    found = {0}
     sudo_uid = os.environ.get("SUDO_UID", "")
     if sudo_uid.isdecimal():
         found.add(int(sudo_uid))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import heapq
 
+from ethercat_server.ethercat.nic.interface import CHECK_CABLE
 from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
 from ethercat_server.virtual_sensor import bus as virtual
 from ethercat_server.virtual_sensor.faults.table import obey
@@ -45,6 +46,10 @@ class MemoryBackend:
 
     def check_present(self) -> None:
         """See `Backend`."""
+
+    def why_silent(self) -> str:
+        """See `Backend`."""
+        return CHECK_CABLE
 
     def send(self, frame: bytes | bytearray) -> None:
         """See `Backend`."""

@@ -138,8 +138,11 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the virtual sensor: 0 when ended, 1 on failure, 2 for wrong arguments."""
+def main(argv: Sequence[str] | None = None, on_open: Callable[[], None] = lambda: None) -> int:
+    """Run the virtual sensor: 0 when ended, 1 on failure, 2 for wrong arguments.
+
+    `on_open` is called once its interface is open, before it reads anything.
+    """
     args = build_parser().parse_args(argv)
     try:
         options = options_from(args)
@@ -167,6 +170,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 control_path=args.control,
                 commands=sys.stdin,
                 exit_on_eof=args.exit_on_eof,
+                on_open=on_open,
                 on_ready=ready,
                 should_stop=stopped,
             )

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from typing import Final, TextIO
 
-from ethercat_server.ethercat.nic import is_up
+from ethercat_server.ethercat.nic.interface import look_up
 from ethercat_server.ethercat.wire import ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.control import CommandChannel
@@ -45,7 +45,7 @@ def open_interface(ifname: str) -> socket.socket:
             f"not allowed to open a raw socket on {ifname}: it needs CAP_NET_RAW, so run it as root"
         ) from None
     try:
-        if not is_up(ifname):
+        if not look_up(ifname).is_up:
             raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
         raw.bind((ifname, ETHERTYPE))
         raw.setblocking(False)
@@ -72,6 +72,7 @@ def run(
     control_path: str | None = None,
     commands: TextIO | None = None,
     exit_on_eof: bool = False,
+    on_open: Callable[[], None] = lambda: None,
     on_ready: Callable[[], None] = lambda: None,
     should_stop: threading.Event | Callable[[], bool] = lambda: False,
 ) -> None:
@@ -84,6 +85,7 @@ def run(
     stop = should_stop.is_set if isinstance(should_stop, threading.Event) else should_stop
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
+        on_open()
         bus = Bus(options, time.monotonic_ns())
         poller = select.poll()
         poller.register(raw, select.POLLIN)

@@ -21,6 +21,7 @@ from types import TracebackType
 from typing import Final
 
 from ethercat_server.errors import ServerError
+from ethercat_server.process.privileges import become, user_to_become
 
 VIRTUAL_INTERFACE: Final = "virtual"
 """Interface name that requests a virtual bus."""
@@ -34,20 +35,23 @@ _FAR_END: Final = "sensor"
 class VirtualBus:
     """Brings a virtual bus up and down; `ifname` is the end for the master."""
 
-    def __init__(self, arguments: str = "", master_priority: int = 0) -> None:
+    def __init__(self, arguments: str = "", master_priority: int = 0, user: str | None = None) -> None:
         """`arguments` are `ethercat-virtual-sensor`'s own options, as on a command line.
 
-        The sensor gets a real-time priority above `master_priority`: real sensors do not wait for a CPU.
+        The sensor gets a real-time priority above `master_priority`: real sensors do not wait for a CPU. Once
+        its interface is open its process becomes `user`, or who ran sudo, as the master does, which could not
+        end it otherwise.
         """
         self._priority = min(99, master_priority + 1) if master_priority else 0
         self.ifname = f"ecat{os.getpid()}"
         self._arguments = shlex.split(arguments)
+        self._user = user or ""
         self._process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> VirtualBus:
         """Start the sensor's process and wait until it answers; ServerError if it does not."""
         command = [sys.executable, "-P", "-m", "ethercat_server.virtual_sensor.virtual_bus"]
-        command += [self.ifname, str(self._priority), *self._arguments]
+        command += [self.ifname, str(self._priority), self._user, *self._arguments]
         # A session of its own: Ctrl-C is for the server, which then ends the sensor. Its standard input
         # closes when this process ends, in any way, and ends it too.
         self._process = subprocess.Popen(
@@ -83,8 +87,9 @@ class VirtualBus:
         try:
             process.wait(timeout=3)
         except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+            with contextlib.suppress(PermissionError, subprocess.TimeoutExpired):
+                process.kill()
+                process.wait(_GONE_TIMEOUT_S)
         process.stdout.close()
         # The kernel removes a namespace a moment after its last process.
         deadline = time.monotonic() + _GONE_TIMEOUT_S
@@ -108,17 +113,18 @@ def veth_pair(near: str) -> Iterator[str]:
                     route.link("set", index=route.link_lookup(ifname=name)[0], state="up")
                 yield far
             finally:
-                for index in inner.link_lookup(ifname=far):
+                # This process may have given up the right to; the kernel does it with its own namespace.
+                for index in () if own_namespace else inner.link_lookup(ifname=far):
                     inner.link("del", index=index)
 
 
 def main(argv: Sequence[str]) -> int:
-    """The sensor's process: `argv` is the near end's name, a priority, the sensor's options."""
+    """The sensor's process: `argv` is the near end's name, a priority, a user or "", the sensor's options."""
     from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - only this process needs it
 
     from ethercat_server.virtual_sensor import cli  # noqa: PLC0415 - likewise
 
-    near, priority, *arguments = argv
+    near, priority, user, *arguments = argv
     with contextlib.ExitStack() as made:
         try:
             far = made.enter_context(veth_pair(near))
@@ -129,7 +135,17 @@ def main(argv: Sequence[str]) -> int:
         if int(priority):
             with contextlib.suppress(PermissionError):
                 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(priority)))
-        return cli.main([far, "--exit-on-eof", *arguments])
+
+        def give_up_root() -> None:
+            # Deleting an interface in the server's namespace takes rights.
+            if far == _FAR_END and (found := user_to_become(user or None)):
+                become(found)
+
+        try:
+            return cli.main([far, "--exit-on-eof", *arguments], on_open=give_up_root)
+        except ServerError as error:
+            sys.stderr.write(f"ethercat-virtual-sensor: {error}\n")
+            return 1
 
 
 if __name__ == "__main__":

@@ -37,8 +37,8 @@ exec "$@"
 namespace of its own, at its own path."""
 
 
-def _temporary() -> Path:
-    """A directory that everybody may enter: pytest's, and perhaps TMPDIR, are its owner's only."""
+def temporary() -> Path:
+    """An empty directory that everybody may enter: pytest's, and perhaps TMPDIR, are its owner's only."""
     made = Path(tempfile.mkdtemp(prefix="ethercat-readable-", dir="/tmp"))
     atexit.register(shutil.rmtree, made, ignore_errors=True)
     made.chmod(0o755)
@@ -48,7 +48,7 @@ def _temporary() -> Path:
 @functools.cache
 def copy() -> Path:
     """A directory with the server and what it needs, readable for everybody, as an installed one is."""
-    made = _temporary()
+    made = temporary()
     for name in _PACKAGES:
         spec = importlib.util.find_spec(name)
         assert spec is not None
@@ -82,7 +82,7 @@ def under() -> tuple[str, ...]:
     hidden = _closed(shown)
     if hidden is None:
         return found
-    return ("unshare", "--mount", "sh", "-c", _SHOW, "sh", str(_temporary()), str(hidden), str(shown), *found)
+    return ("unshare", "--mount", "sh", "-c", _SHOW, "sh", str(temporary()), str(hidden), str(shown), *found)
 
 
 def need(*command: str) -> None:

@@ -178,8 +178,8 @@ class Server(Program):
 
 
 @contextlib.contextmanager
-def server(ifname: str, *arguments: str, port: int = 0) -> Iterator[Server]:
-    running = _streaming(ifname, *arguments, port=port)
+def server(ifname: str, *arguments: str, port: int = 0, under: Sequence[str] = ()) -> Iterator[Server]:
+    running = _streaming(ifname, *arguments, port=port, under=under)
     try:
         yield running
     finally:
@@ -208,10 +208,10 @@ def starved(said: str) -> bool:
     return any(words in said for words in _STARVED)
 
 
-def _streaming(ifname: str, *arguments: str, port: int) -> Server:
+def _streaming(ifname: str, *arguments: str, port: int, under: Sequence[str]) -> Server:
     """A server that streams; started again where the sensor was starved."""
     for attempt in range(ATTEMPTS):
-        running = Server(ifname, *arguments, port=port)
+        running = Server(ifname, *arguments, port=port, under=under)
         try:
             return running.wait_streaming()
         except BaseException:

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import logging
 import os
+import subprocess
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
-from ethercat_server.process import logs
+from ethercat_server.process import log_queue, logs
+from ethercat_server.process.log_queue import MOST_LINES, QueuedHandler
 from ethercat_server.process.logs import JournalFormatter, PlainFormatter, Repetitions, goes_to_journal
+from protocol.errors import ConnectionFailedError
+from tests.server.running import ATTEMPTS, PATIENCE_S, Client, free_port, needs_bus, wait_until
 
 
 def record(message: str, *arguments: object, level: int = logging.WARNING) -> logging.LogRecord:
@@ -71,3 +79,117 @@ def test_repetitions_are_counted_and_told_with_the_next(monkeypatch: pytest.Monk
     alone = record("denied %d", 21)
     assert repetitions.filter(alone)
     assert alone.getMessage() == "denied 21"
+
+
+# -- a terminal or pipe that takes nothing
+
+
+class Pipe:
+    """A pipe that nobody reads, and that is full."""
+
+    def __init__(self) -> None:
+        self.reading, self.writing = os.pipe()
+        fcntl.fcntl(self.writing, fcntl.F_SETPIPE_SZ, 4096)
+        os.set_blocking(self.writing, False)
+        self.filled = 0
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self.filled += os.write(self.writing, b"." * 1024)
+        os.set_blocking(self.writing, True)
+
+    def drain(self, end: bytes) -> list[str]:
+        """What was written to it, up to this end."""
+        data = b""
+        while not data.endswith(end):
+            data += os.read(self.reading, 65536)
+        return data[self.filled :].decode().splitlines()
+
+    def close(self) -> None:
+        os.close(self.reading)
+        os.close(self.writing)
+
+
+@pytest.fixture
+def pipe() -> Iterator[Pipe]:
+    with contextlib.closing(Pipe()) as found:
+        yield found
+
+
+def test_who_logs_does_not_wait_and_learns_what_was_dropped(
+    pipe: Pipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A real pipe, because only that blocks. The first line may be with the writer already."""
+    monkeypatch.setattr(log_queue, "_FLUSH_S", 0.01)
+    handler = QueuedHandler(pipe.writing)
+    handler.setFormatter(PlainFormatter())
+    for number in range(MOST_LINES + 100):
+        handler.handle(record("event %d", number))
+    handler.flush()  # returns all the same
+    lines = pipe.drain(b"blocked\n")
+    count = len(lines) - 1
+    assert lines[:-1] == [f"ethercat-server: event {number}" for number in range(count)], "the first ones"
+    assert lines[-1] == (
+        f"ethercat-server: {MOST_LINES + 100 - count} log messages dropped: standard error was blocked"
+    )
+    assert MOST_LINES <= count <= MOST_LINES + 1
+    handler.handle(record("after"))
+    assert pipe.drain(b"after\n") == [], "less than what had filled it"
+    handler.flush()
+
+
+def test_everything_is_written_before_the_end() -> None:
+    """Of a real process, in one that ends at once."""
+    program = "import logging; from ethercat_server.process.logs import set_up_logging; set_up_logging()\n"
+    program += "for number in range(500): logging.info(str(number))"
+    environment = {name: value for name, value in os.environ.items() if name != "JOURNAL_STREAM"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True, env=environment)
+    assert done.stderr.count(b"\n") == 500
+
+
+def test_without_standard_error_nothing_is_written_anywhere(tmp_path: Path) -> None:
+    """Its descriptor may be another file's by then: in a process of its own."""
+    other = tmp_path / "other"
+    program = "import logging, os, sys; from ethercat_server.process.logs import set_up_logging\n"
+    program += "os.open(sys.argv[1], os.O_WRONLY | os.O_CREAT); set_up_logging(); logging.info('x')"
+    done = subprocess.run(
+        ["sh", "-c", 'exec "$@" 2>&-', "sh", sys.executable, "-c", program, str(other)],
+        check=False, cwd=Path(__file__).parent.parent.parent,
+    )  # fmt: skip
+    assert done.returncode == 0
+    assert other.read_text() == ""
+
+
+def connected(process: subprocess.Popen[bytes], port: int) -> Client | None:
+    """A client of the server, once it streams; None if it ended."""
+    clients: list[Client] = []
+
+    def streams() -> bool:
+        with contextlib.suppress(ConnectionFailedError):
+            clients.append(Client(port))
+        return bool(clients) or process.poll() is not None
+
+    wait_until(streams, "the server")
+    return clients[0] if clients else None
+
+
+@pytest.mark.bus
+@needs_bus
+def test_the_server_streams_and_ends_while_nobody_reads_its_log(pipe: Pipe) -> None:
+    """What blocks is the kernel's pipe, so it is a real server; it used to stop at its first line."""
+    for _ in range(ATTEMPTS):  # on a busy machine the sensor may be starved
+        port = free_port()
+        command = [sys.executable, "-m", "ethercat_server.daemon.cli", "virtual", str(port)]
+        process = subprocess.Popen(command, stderr=pipe.writing, start_new_session=True)
+        try:
+            if (client := connected(process, port)) is None:
+                continue
+            with client:
+                assert client.ask("subscribe")["ok"]
+                client.fresh(100)
+                assert client.ask("shutdown")["ok"]
+            assert process.wait(PATIENCE_S) == 0
+            return
+        finally:
+            process.kill()
+            process.wait()
+    pytest.fail("it did not start")

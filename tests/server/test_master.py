@@ -16,7 +16,7 @@ from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.master import soem
 from ethercat_server.ethercat.master.soem import SoemBackend
-from ethercat_server.ethercat.nic import claimed
+from ethercat_server.ethercat.nic.claim import claimed
 from ethercat_server.ethercat.raw_socket import packet_sockets
 from ethercat_server.sensor.sensor import Sensor
 from protocol.settings import SettingValue

@@ -6,8 +6,10 @@ about recovery is in test_recovery.py. One server for all; the last test ends it
 
 from __future__ import annotations
 
+import json
 import signal
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
@@ -48,7 +50,7 @@ def client(bench: RealBench) -> Iterator[Client]:
 
 def pull_cable(bench: RealBench, client: Client) -> None:
     bench.veth.ip("link", "set", bench.veth.far, "down")
-    client.wait_event("sensor_lost")
+    assert f"{bench.veth.near} has no carrier" in client.wait_event("sensor_lost")["reason"]
     bench.veth.ip("link", "set", bench.veth.far, "up")
 
 
@@ -123,3 +125,42 @@ def test_an_interface_that_disappears_ends_the_server_with_a_sentence(bench: Rea
     assert running.wait() == 1
     assert f"the interface {veth.near} has disappeared" in running.said()
     assert "Traceback" not in running.said()
+
+
+@pytest.mark.parametrize("text", ["EK1100,BOTA,EL3102,DRIVE", "DRIVE:PREOP,BOTA,BOTA"])
+def test_sensors_among_other_devices(text: str) -> None:
+    """The master by single datagrams on a raw socket that pysoem opened."""
+    with (
+        virtual_sensor("--chain", text, "--signal", "clock") as (veth, sensor),
+        server(veth.near) as running,
+        running.connect() as client,
+    ):
+        described = client.ask("subscribe")
+        assert [row["position"] for row in described["others"]] == [
+            at for at, kind in enumerate(text.split(",")) if kind != "BOTA"
+        ]
+        assert len(client.fresh(200)) == 200
+        before = foreign(sensor)
+        pull_cable(RealBench(veth, sensor, running), client)
+        client.wait_event("sensor_back")
+        assert len(client.fresh(200)) == 200
+        assert foreign(sensor) == before
+        assert {row["al_state"] for row in before} <= {"INIT", "PREOP"}
+
+
+def test_a_drive_at_work_is_not_touched() -> None:
+    """pysoem opens the interface; nothing is written."""
+    with virtual_sensor("--chain", "BOTA:OP,DRIVE:OP") as (veth, sensor):
+        refused = Server(veth.near)
+        try:
+            assert refused.wait() == 1
+            assert "no Bota sensors (position 1 in OP)" in refused.said()
+        finally:
+            refused.close()
+        assert [row["write_count"] for row in foreign(sensor)] == [0]
+
+
+def foreign(sensor: Program) -> list[dict[str, Any]]:
+    """What the slaves that are no sensors say of themselves."""
+    answer = command(sensor, "stats").removeprefix("ok ")
+    return list(json.loads(answer)["foreign"].values())

@@ -165,6 +165,23 @@ def test_the_socket_side_goes_on_while_a_sensor_is_lost() -> None:
     assert len(client.fresh(20)) == 20
 
 
+def test_an_interface_that_is_down_is_the_reason_and_is_asked_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    simulation, client = streaming()
+    asked: list[int] = []
+
+    def why_silent() -> str:
+        asked.append(simulation.clock.now_ns)
+        return "ens5 is down: bring it up with 'sudo ip link set ens5 up'"
+
+    monkeypatch.setattr(simulation.backend, "why_silent", why_silent)
+    simulation.command("power off")
+    assert client.wait_event("sensor_lost")["reason"].startswith("no frame comes back: ens5 is down")
+    simulation.run(2.0)
+    assert len(asked) == 1
+
+
 def test_one_of_a_chain_is_lost_and_the_other_goes_on() -> None:
     simulation, client = streaming(CLOCK, SensorOptions(signal="clock", serial=2))
     simulation.command("power off @1")

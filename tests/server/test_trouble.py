@@ -18,11 +18,12 @@ from ethercat_server.acquisition.start_up import Wanted, bring_up
 from ethercat_server.daemon.cli import main
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.errors import ServerError
-from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.master.datagrams import DatagramMaster
+from ethercat_server.ethercat.nic import claim
 from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE
+from ethercat_server.process import realtime
 from ethercat_server.sensor import look
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -96,8 +97,11 @@ def test_interfaces_without_a_sensor(
 ) -> None:
     """The kernel's flags of an interface, pysoem's scan."""
     with Veth() as veth:
-        assert "no EtherCAT slave answers" in fails(caplog, veth.near, "PORT")
-        monkeypatch.setattr(nic, "_CARRIER_TIMEOUT_S", 0.1)
+        with monkeypatch.context() as unprepared:  # or this process would stay so
+            unprepared.setattr(realtime, "prepare", lambda *_, **__: None)
+            said = fails(caplog, veth.near, "PORT", "--user", "root")
+        assert "no EtherCAT slave answers" in said
+        monkeypatch.setattr(claim, "_CARRIER_TIMEOUT_S", 0.1)
         veth.ip("link", "set", veth.near, "down")
         assert f"{veth.near} is down: bring it up" in fails(caplog, veth.near, "PORT")
         veth.ip("link", "set", veth.far, "down")

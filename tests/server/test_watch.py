@@ -27,7 +27,7 @@ _ERROR_BIT = 0x10
 class GivenBus:
     """Two sensors in the AL states given; None does not answer."""
 
-    backend = SimpleNamespace(check_present=lambda: None)
+    backend = SimpleNamespace(check_present=lambda: None, why_silent=lambda: "check cable and power")
     stations = (1, 2)
     fmmus = (b"", b"")
 

@@ -12,6 +12,7 @@ import pytest
 from ethercat_server.daemon.config_file import EMPTY, read_config
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.daemon.server_settings import SERVER_SETTINGS
+from ethercat_server.ethercat.nic import lock
 from protocol.settings import check_settings, start_up_defaults
 from tests.systemd.staging import (
     BRIDGE_UNIT,
@@ -69,6 +70,11 @@ def test_the_server_may_have_real_time_priority_and_locked_memory() -> None:
     assert values(SERVER_UNIT, "LimitMEMLOCK") == ["infinity"]
 
 
+def test_the_locks_of_the_interfaces_have_their_directory() -> None:
+    assert values(SERVER_UNIT, "RuntimeDirectory") == [lock.DIRECTORY.relative_to("/run").name]
+    assert values(SERVER_UNIT, "RuntimeDirectoryPreserve") == ["yes"], "other instances use it"
+
+
 def test_a_usage_error_is_not_tried_again() -> None:
     for unit in (SERVER_UNIT, BRIDGE_UNIT):
         assert values(unit, "Restart") == ["on-failure"]
@@ -98,7 +104,7 @@ def test_the_default_configuration_says_nothing_new() -> None:
     for name, value in tomllib.loads(servers).items():
         setting = SERVER_SETTINGS[name]
         checked = setting.check(value)
-        assert checked == setting.default or name in {"control_users", "control_groups", "cpu"}, name
+        assert checked == setting.default or name in {"control_users", "control_groups", "cpu", "user"}, name
     assert read_config(UNITS / "default.toml") == EMPTY
     common = tomllib.loads("calibration_matrix" + sensors.rpartition("\n")[0])
     assert check_settings(common) == start_up_defaults()

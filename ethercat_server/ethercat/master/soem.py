@@ -21,7 +21,7 @@ import pysoem
 from ethercat_server.errors import BusError, SdoAbortError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt, Master
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.nic import check_present
+from ethercat_server.ethercat.nic.interface import check_present, why_silent
 from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
 from ethercat_server.ethercat.slave import times
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 
 class SoemBackend:
-    """See `Backend` and `Master`: pysoem on an interface that `nic.claimed` has checked."""
+    """See `Backend` and `Master`: pysoem on an interface that `nic.claim.claimed` has checked."""
 
     def __init__(self, ifname: str) -> None:
         self.ifname = ifname
@@ -96,6 +96,10 @@ class SoemBackend:
     def check_present(self) -> None:
         """See `Backend`."""
         check_present(self.ifname, self._ifindex)
+
+    def why_silent(self) -> str:
+        """See `Backend`."""
+        return why_silent(self.ifname)
 
     def scan(self, positions: Sequence[int], check_interrupt: CheckInterrupt) -> None:
         """See `Master`. SOEM takes every slave on the wire for its own."""

@@ -34,9 +34,16 @@ Address = tuple[str, int] | tuple[str, int, int, int]
 
 
 def open_diagnostics() -> socket.socket:
-    """The socket that `peer_uid` asks with; OSError if the kernel has no socket diagnostics."""
+    """The socket that `peer_uid` asks with; OSError if the kernel has no socket diagnostics.
+
+    It has been asked once about each family: the kernel loads a module for the first question, which must not
+    happen in the acquisition loop.
+    """
     diagnostics = socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, _NETLINK_SOCK_DIAG)
     diagnostics.setblocking(False)  # the kernel answers before send returns
+    for family, nobody in ((socket.AF_INET, ("127.0.0.1", 0)), (socket.AF_INET6, ("::1", 0))):
+        with contextlib.suppress(OSError):  # no IPv6 on this machine
+            diagnostics.send(_question(family, nobody, nobody))
     return diagnostics
 
 

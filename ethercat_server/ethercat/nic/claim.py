@@ -1,0 +1,80 @@
+"""Checks a network interface before the bus is opened on it, and keeps other masters of ours away from it.
+
+SOEM itself would say only that it failed, and open it beside another master.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.nic.interface import look_up, trouble
+from ethercat_server.ethercat.nic.lock import in_use, locked
+
+MAX_NAME_LENGTH: Final = 15
+"""Linux's limit; a longer name would overflow SOEM's buffer."""
+
+_ETHERCAT: Final = 0x88A4
+_CARRIER_TIMEOUT_S: Final = 5.0
+_CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
+
+
+@contextlib.contextmanager
+def claimed(ifname: str) -> Iterator[None]:
+    """Within it the bus may be opened on `ifname`, by nobody else of this project.
+
+    InterfaceError unless the interface exists, is free, can carry EtherCAT frames and may be opened.
+    """
+    index = _check_allowed(ifname)
+    # Of two that start at once neither has the bus open yet, so looking for that is not enough.
+    with locked(ifname, index):
+        _check_free(ifname, index)
+        _wait_usable(ifname)
+        yield
+
+
+def _check_allowed(ifname: str) -> int:
+    if not 0 < len(ifname.encode()) <= MAX_NAME_LENGTH or "/" in ifname:
+        raise InterfaceError(
+            f"{ifname!r} is no name of a network interface: it must have 1 to {MAX_NAME_LENGTH} characters; "
+            "'ip link' lists them"
+        )
+    found = look_up(ifname)
+    if found.is_loopback:
+        raise InterfaceError(f"{ifname} is the loopback interface: name the one the sensor is connected to")
+    missing = _missing_capabilities()
+    if missing:
+        raise InterfaceError(
+            f"not allowed to open {ifname}: {' and '.join(missing)} missing; run with sudo, or "
+            "give the service CAP_NET_RAW and CAP_NET_ADMIN"
+        )
+    return found.ifindex
+
+
+def _check_free(ifname: str, index: int) -> None:
+    """Raise InterfaceError if another EtherCAT master has the interface open: two would wreck one another."""
+    for line in Path("/proc/self/net/packet").read_text(encoding="ascii").splitlines()[1:]:
+        _, _, _, protocol, its_index, *_ = line.split()
+        if int(protocol, 16) == _ETHERCAT and int(its_index) == index:
+            raise in_use(ifname)
+
+
+def _wait_usable(ifname: str) -> None:
+    # A link that was just brought up takes a moment, with a real network card up to some seconds.
+    deadline = time.monotonic() + _CARRIER_TIMEOUT_S
+    while (found := look_up(ifname)).is_up and not found.has_carrier and time.monotonic() < deadline:
+        time.sleep(0.02)
+    if problem := trouble(ifname):
+        raise InterfaceError(problem)
+
+
+def _missing_capabilities() -> list[str]:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("CapEff:"):
+            effective = int(line.split()[1], 16)
+            return [name for bit, name in _CAPABILITIES.items() if not effective >> bit & 1]
+    return []

@@ -1,0 +1,123 @@
+"""What the kernel says of a network interface, and what it needs to carry EtherCAT frames. Needs no rights.
+
+Asked by netlink (linux/rtnetlink.h), not of /sys, which shows the namespace it was mounted in.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+from typing import Final, NamedTuple
+
+from ethercat_server.errors import InterfaceError
+
+LEAST_MTU: Final = 1500
+"""Bytes: an EtherCAT frame may be as long as any Ethernet frame."""
+CHECK_CABLE: Final = "check cable and power"
+
+_RTM_NEWLINK, _RTM_GETLINK, _NLM_F_REQUEST = 16, 18, 1
+_IFLA_MTU, _IFLA_MASTER = 4, 10
+_HEADER: Final = struct.Struct("=IHHII")
+"""Length, type, flags, sequence number, port."""
+_LINK: Final = struct.Struct("=BxHiII")
+"""Family, type, index, flags, change mask."""
+_ATTRIBUTE: Final = struct.Struct("=HH")
+_U32: Final = struct.Struct("=I")
+_BUFFER: Final = 65536
+_IFF_UP, _IFF_LOOPBACK, _IFF_RUNNING = 0x1, 0x8, 0x40
+
+
+class Interface(NamedTuple):
+    """An interface as it is now."""
+
+    ifindex: int
+    flags: int
+    mtu: int
+    master: int
+    """Index of the bridge or bond that it is part of, 0 if none."""
+
+    @property
+    def is_up(self) -> bool:
+        """Whether it is up."""
+        return bool(self.flags & _IFF_UP)
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether it is the loopback interface."""
+        return bool(self.flags & _IFF_LOOPBACK)
+
+    @property
+    def has_carrier(self) -> bool:
+        """Whether it is up and linked with something."""
+        return bool(self.flags & _IFF_RUNNING)
+
+
+def look_up(ifname: str) -> Interface:
+    """The interface named `ifname`; InterfaceError if there is none."""
+    try:
+        return _answer(socket.if_nametoindex(ifname))
+    except (OSError, struct.error):
+        names = ", ".join(name for _, name in socket.if_nameindex())
+        raise InterfaceError(f"no network interface {ifname!r} on this machine: there are {names}") from None
+
+
+def trouble(ifname: str) -> str | None:
+    """What keeps frames from passing over `ifname`, and what to do; None if it is not the interface."""
+    found = look_up(ifname)
+    if not found.is_up:
+        return f"{ifname} is down: bring it up with 'sudo ip link set {ifname} up'"
+    if found.master:
+        return (
+            f"{ifname} is part of {_name(found.master)} (a bridge or bond), which takes its frames: remove "
+            f"it with 'sudo ip link set {ifname} nomaster', or use another interface"
+        )
+    if found.mtu < LEAST_MTU:
+        return (
+            f"{ifname} has an MTU of {found.mtu} bytes, too few for EtherCAT: "
+            f"'sudo ip link set {ifname} mtu {LEAST_MTU}'"
+        )
+    if not found.has_carrier:
+        return f"{ifname} has no carrier: check the cable, the PoE injector and its power supply"
+    return None
+
+
+def why_silent(ifname: str) -> str:
+    """Why no frame comes back, as far as the interface knows, and what to do."""
+    try:
+        return trouble(ifname) or CHECK_CABLE
+    except InterfaceError as error:
+        return str(error)
+
+
+def check_present(ifname: str, ifindex: int) -> None:
+    """Raise InterfaceError unless `ifname` is still the interface that was opened."""
+    if (ifindex, ifname) not in socket.if_nameindex():
+        raise InterfaceError(f"the interface {ifname} has disappeared: connect it and start the server again")
+
+
+def _name(index: int) -> str:
+    try:
+        return socket.if_indextoname(index)
+    except OSError:
+        return f"interface {index}"
+
+
+def _answer(index: int) -> Interface:
+    """What the kernel answers about the interface `index`; OSError or struct.error if it does not."""
+    request = _HEADER.pack(_HEADER.size + _LINK.size, _RTM_GETLINK, _NLM_F_REQUEST, 0, 0)
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as asked:
+        asked.setblocking(False)  # the kernel answers before send returns
+        asked.send(request + _LINK.pack(0, 0, index, 0, 0))
+        answer = asked.recv(_BUFFER)
+    size, kind, *_ = _HEADER.unpack_from(answer)
+    if kind != _RTM_NEWLINK:
+        raise OSError("no such interface")
+    _, _, index, flags, _ = _LINK.unpack_from(answer, _HEADER.size)
+    values = {_IFLA_MTU: 0, _IFLA_MASTER: 0}
+    at, end = _HEADER.size + _LINK.size, min(size, len(answer))
+    while at + _ATTRIBUTE.size <= end:
+        length, attribute = _ATTRIBUTE.unpack_from(answer, at)
+        if attribute in values:
+            (values[attribute],) = _U32.unpack_from(answer, at + _ATTRIBUTE.size)
+        at += max(_ATTRIBUTE.size, length + 3 & ~3)
+    return Interface(index, flags, values[_IFLA_MTU], values[_IFLA_MASTER])

@@ -1,0 +1,195 @@
+"""What is said of an interface that cannot carry EtherCAT frames, and who may have it. On real interfaces:
+what the kernel says of one, and whose lock it is, only the kernel knows."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.nic import lock
+from ethercat_server.ethercat.nic.claim import claimed
+from ethercat_server.ethercat.nic.interface import look_up, why_silent
+from tests.server import readable
+from tests.server.as_another_user import NO_OTHER_USER, NOBODY
+from tests.server.running import Veth, needs_bus, wait_until
+
+pytestmark = [pytest.mark.bus, needs_bus]
+AS_NOBODY = pytest.mark.skipif(NO_OTHER_USER is not None, reason=NO_OTHER_USER or "")
+CLAIM = """
+import sys
+from ethercat_server.ethercat.nic.claim import claimed
+with claimed(sys.argv[1]):
+    print("claimed", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture(scope="module")
+def veth() -> Iterator[Veth]:
+    with Veth() as found:
+        yield found
+
+
+@pytest.fixture
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """In place of the one in /run."""
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    found = tmp_path / "ethercat-server"
+    monkeypatch.setattr(lock, "DIRECTORY", found)
+    return found
+
+
+def refusal(ifname: str) -> str:
+    with pytest.raises(InterfaceError) as refused, claimed(ifname):
+        pass
+    return str(refused.value)
+
+
+# -- an interface that cannot carry frames
+
+
+def test_a_small_mtu_is_named_with_its_remedy(veth: Veth) -> None:
+    veth.ip("link", "set", veth.near, "mtu", "1400")
+    try:
+        assert why_silent(veth.near) == refusal(veth.near)
+        assert refusal(veth.near).endswith(f"'sudo ip link set {veth.near} mtu 1500'")
+    finally:
+        veth.ip("link", "set", veth.near, "mtu", "1500")
+    assert why_silent(veth.near) == "check cable and power"
+
+
+def test_a_part_of_a_bridge_is_refused_and_the_bridge_is_named(veth: Veth) -> None:
+    bridge = f"br{os.getpid()}"
+    veth.ip("link", "add", bridge, "type", "bridge")
+    try:
+        veth.ip("link", "set", veth.near, "master", bridge)
+        assert f"{veth.near} is part of {bridge} (a bridge or bond)" in refusal(veth.near)
+        assert bridge in why_silent(veth.near)
+    finally:
+        veth.ip("link", "del", bridge)
+    with claimed(veth.near):
+        pass
+
+
+def test_an_interface_that_is_down_or_gone_is_why_nothing_comes_back(veth: Veth) -> None:
+    veth.ip("link", "set", veth.far, "down")
+    assert "has no carrier" in why_silent(veth.near)
+    veth.ip("link", "set", veth.near, "down")
+    assert f"{veth.near} is down: bring it up" in why_silent(veth.near)
+    veth.ip("link", "set", veth.near, "up")
+    veth.ip("link", "set", veth.far, "up")
+    wait_until(lambda: look_up(veth.near).has_carrier, "the carrier")
+    assert "no network interface 'nothing0'" in why_silent("nothing0")
+
+
+# -- who has it
+
+
+@contextlib.contextmanager
+def another(ifname: str) -> Iterator[subprocess.Popen[str]]:
+    """Another process that has claimed the interface."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", CLAIM, ifname], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "claimed\n"
+        yield process
+
+
+def test_the_process_that_has_the_interface_is_named_until_it_ends_in_any_way(veth: Veth) -> None:
+    with another(veth.near) as process:
+        name = Path(f"/proc/{process.pid}/comm").read_text().strip()
+        expected = f"{veth.near} is in use by another EtherCAT master, process {process.pid} ({name}): stop"
+        if os.access(lock.DIRECTORY, os.W_OK):
+            assert refusal(veth.near).startswith(expected)
+            with claimed(veth.far):
+                pass
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        with claimed(veth.near):
+            pass
+
+
+@AS_NOBODY
+def test_another_user_can_take_neither_the_lock_nor_its_file(
+    veth: Veth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it could an abstract socket."""
+    directory = readable.temporary() / "ethercat-server"
+    monkeypatch.setattr(lock, "DIRECTORY", directory)
+    with claimed(veth.near):
+        pass
+    taking = f"""
+import fcntl, os, socket
+from pathlib import Path
+os.setgroups([]); os.setgid({NOBODY.pw_gid}); os.setuid({NOBODY.pw_uid})
+taken = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+taken.bind("\\0bota-ethercat-bridge/ifindex/{socket.if_nametoindex(veth.near)}")
+for mode in (os.O_RDONLY, os.O_RDWR):
+    try:
+        os.open({str(directory / "lock")!r}, mode)
+    except PermissionError:
+        print("denied", flush=True)
+input()
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", taking], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert [other.stdout.readline(), other.stdout.readline()] == ["denied\n"] * 2
+        with claimed(veth.near):
+            pass
+        other.kill()
+
+
+def test_what_root_made_first_is_the_services_too(veth: Veth, directory: Path) -> None:
+    directory.mkdir(mode=0o755)
+    if os.geteuid() == 0 and NO_OTHER_USER is None:
+        os.chown(directory, NOBODY.pw_uid, NOBODY.pw_gid)
+    with claimed(veth.near):
+        found = (directory / "lock").stat()
+    assert stat.S_IMODE(found.st_mode) == 0o600
+    assert found.st_uid == directory.stat().st_uid
+
+
+@pytest.mark.parametrize("trap", ["link", "hard link", "fifo", "writable"])
+def test_a_file_that_may_be_anothers_is_not_touched(veth: Veth, directory: Path, trap: str) -> None:
+    directory.mkdir(mode=0o755)
+    victim, place = directory.parent / "victim", directory / "lock"
+    victim.write_text("as it was")
+    before = victim.stat()
+    if trap == "link":
+        place.symlink_to(victim)
+    elif trap == "hard link":
+        place.hardlink_to(victim)
+    elif trap == "fifo":
+        os.mkfifo(place)
+    else:
+        directory.chmod(0o777)
+    with claimed(veth.near):  # without a lock: whether another has it open is seen all the same
+        assert lock._open_any() is None
+    assert (victim.stat().st_uid, victim.stat().st_mode) == (before.st_uid, before.st_mode)
+
+
+def test_without_run_it_is_the_users_own_runtime_directory(
+    veth: Veth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As for the root of a user namespace."""
+    monkeypatch.setattr(lock, "DIRECTORY", Path("/proc/ethercat-server"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with claimed(veth.near):
+        assert (tmp_path / "ethercat-server" / "lock").exists()
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    with claimed(veth.near):
+        pass

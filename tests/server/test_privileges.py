@@ -1,0 +1,314 @@
+"""A server that root starts becomes another user before it serves anyone, and works on without privileges.
+
+What a process may do only the kernel decides, so most of these are processes of a second user.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pwd
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ethercat_server.daemon import server as daemon
+from ethercat_server.errors import ServerError, StopRequestedError, UsageError
+from ethercat_server.process import privileges, realtime
+from ethercat_server.process.privileges import User, user_to_become
+from ethercat_server.process.signals import Signals
+from protocol.control import request
+from tests.server.as_another_user import NO_OTHER_USER, NOBODY
+from tests.server.commands import command
+from tests.server.running import (
+    Program,
+    Server,
+    Veth,
+    free_port,
+    needs_bus,
+    server,
+    virtual_sensor,
+    wait_until,
+)
+
+AS_NOBODY = pytest.mark.skipif(NO_OTHER_USER is not None, reason=NO_OTHER_USER or "")
+BY_SUDO = ("env", f"SUDO_UID={NOBODY.pw_uid}", f"SUDO_GID={NOBODY.pw_gid}")
+"""As if nobody had started it with sudo."""
+
+
+# -- who
+
+
+@pytest.fixture
+def as_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+
+
+@pytest.mark.usefixtures("as_root")
+def test_it_becomes_who_ran_sudo_or_the_one_who_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    nobody = User(NOBODY.pw_uid, NOBODY.pw_gid, "nobody")
+    monkeypatch.setenv("SUDO_UID", str(NOBODY.pw_uid))
+    monkeypatch.setenv("SUDO_GID", "4711")
+    assert user_to_become(None) == nobody._replace(gid=4711)
+    assert user_to_become("nobody") == user_to_become(str(NOBODY.pw_uid)) == nobody
+    assert user_to_become("root") is None
+    monkeypatch.setenv("SUDO_UID", "4711")
+    assert user_to_become(None) == User(4711, 4711, "")
+    for of_nobody in ("0", "", "-1", "x"):
+        monkeypatch.setenv("SUDO_UID", of_nobody)
+        assert user_to_become(None) is None, of_nobody
+    for unknown in ("no-such-user", "4294967295", "9" * 30, "9" * 5000):
+        with pytest.raises(UsageError, match="there is no such user"):
+            user_to_become(unknown)
+
+
+def test_only_root_becomes_somebody_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: NOBODY.pw_uid)
+    monkeypatch.setenv("SUDO_UID", "4711")
+    monkeypatch.setenv("SUDO_GID", "4711")
+    assert user_to_become(None) is None, "as under systemd"
+    assert user_to_become("nobody") is None
+    with pytest.raises(UsageError, match="--user root: only root can become another user"):
+        user_to_become("root")
+
+
+# -- when
+
+
+@pytest.mark.usefixtures("as_root")
+def test_what_needs_root_is_done_first_and_all_before_a_frame_is_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[str] = []
+
+    class Backend:
+        def __init__(self, ifname: str) -> None:
+            done.append(f"made {ifname}")
+
+        def open(self) -> None:
+            done.append("opened")
+
+        def close(self) -> None:
+            pass
+
+    def bring_up(*_: object) -> None:
+        done.append("brought up")
+        raise StopRequestedError("enough")
+
+    def prepare(_priority: int, _cpu: int | None, *, becomes_user: bool) -> None:
+        done.append(f"prepared, becomes user: {becomes_user}")
+
+    monkeypatch.setattr(daemon, "claimed", contextlib.nullcontext)
+    monkeypatch.setattr(daemon, "SoemBackend", Backend)
+    monkeypatch.setattr(daemon, "Bus", lambda backend: backend)
+    monkeypatch.setattr(daemon, "bring_up", bring_up)
+    monkeypatch.setattr(realtime, "prepare", prepare)
+    monkeypatch.setattr(daemon, "become", lambda user: done.append(f"became {user}"))
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        with pytest.raises(StopRequestedError):
+            daemon.serve(["ens5", str(free_port()), "--user", "nobody"], Signals())
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    assert done == ["made ens5", "opened", "prepared, becomes user: True", "became nobody", "brought up"]
+
+
+# -- how
+
+BECOME = """
+import ctypes, json, mmap, os, pwd, threading
+from pathlib import Path
+from ethercat_server.process import realtime
+from ethercat_server.process.privileges import user_to_become, become
+waiting, ready, end = [], threading.Event(), threading.Event()
+def other():
+    ready.set()
+    end.wait()
+threading.Thread(target=other, daemon=True).start()
+ready.wait()
+realtime.prepare(40, None, becomes_user=True)
+become(user_to_become("nobody"))
+memory = [bytearray(1 << 20) for _ in range(64)]
+mapped = mmap.mmap(-1, 64 << 20)
+threads = [threading.Thread(target=end.wait, daemon=True) for _ in range(20)]
+for thread in threads:
+    thread.start()
+refused = []
+for attempt in (lambda: os.setresuid(0, 0, 0), lambda: os.setgroups([0]), lambda: os.kill(1, 0)):
+    try:
+        attempt()
+    except PermissionError:
+        refused.append(True)
+rows = [Path(f"/proc/self/task/{task}/status").read_text() for task in os.listdir("/proc/self/task")]
+kinds = ("Uid", "Gid", "Groups", "Cap")
+found = [dict(l.split(":", 1) for l in text.splitlines() if l.startswith(kinds)) for text in rows]
+print(json.dumps([found, refused, os.sched_getscheduler(0), Path("/proc/self/status").read_text()]))
+"""
+
+
+@AS_NOBODY
+def test_it_cannot_go_back_and_keeps_what_it_has() -> None:
+    """Priority and locked memory stay; memory and threads can be had as before."""
+    done = subprocess.run([sys.executable, "-c", BECOME], capture_output=True, text=True, check=True)
+    threads, refused, scheduler, status = json.loads(done.stdout)
+    assert refused == [True] * 3
+    assert len(threads) == 22
+    groups = os.getgrouplist("nobody", NOBODY.pw_gid)
+    for thread in threads:
+        assert thread["Uid"].split() == [str(NOBODY.pw_uid)] * 4
+        assert thread["Gid"].split() == [str(NOBODY.pw_gid)] * 4
+        assert sorted(map(int, thread["Groups"].split())) == sorted(groups)
+        assert not int(thread["CapEff"], 16) | int(thread["CapPrm"], 16) | int(thread["CapAmb"], 16)
+    assert "NoNewPrivs:\t1" in status
+    if "real-time priority" not in done.stderr:
+        assert scheduler == os.SCHED_FIFO
+    if "locked memory" not in done.stderr:
+        assert "VmLck:\t       0 kB" not in status
+
+
+# -- the server
+
+
+def rows_of(process: int) -> dict[str, str]:
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    return {key: value.strip() for key, _, value in (line.partition(":") for line in lines)}
+
+
+def check_unprivileged(process: int) -> None:
+    rows = rows_of(process)
+    assert rows["Uid"].split() == [str(NOBODY.pw_uid)] * 4
+    assert int(rows["CapEff"], 16) == int(rows["CapPrm"], 16) == 0
+    assert rows["NoNewPrivs"] == "1"
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[tuple[Veth, Program]]:
+    with virtual_sensor() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def running(
+    bench: tuple[Veth, Program], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Server, Path]]:
+    """It finds its Python unreadable where that is root's: it must need nothing of it any more."""
+    config = tmp_path_factory.mktemp("privileges") / "c.toml"
+    config.write_text("[server]\nidle_timeout_s = 50\n")
+    config.chmod(0o600)
+    with server(bench[0].near, "--config", str(config), under=BY_SUDO) as found:
+        yield found, config
+
+
+def as_nobody(port: int, *messages: dict[str, Any]) -> list[dict[str, Any]]:
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.server.stranger", "127.0.0.1", str(port), "ask", json.dumps(messages)],
+        check=True, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+@AS_NOBODY
+@pytest.mark.bus
+@needs_bus
+def test_it_streams_and_recovers_without_privileges(
+    running: tuple[Server, Path], bench: tuple[Veth, Program]
+) -> None:
+    found, _ = running
+    veth, sensor = bench
+    check_unprivileged(found.process.pid)
+    assert "running as user nobody from here on" in found.said()
+    assert "running as root" not in found.said()
+    with found.connect() as client:
+        assert client.ask("subscribe")["ok"]
+        client.fresh(50)
+        command(sensor, "power off")
+        client.wait_event("sensor_lost")
+        command(sensor, "power on")
+        client.wait_event("sensor_back")
+        veth.ip("link", "set", veth.near, "down")
+        assert f"{veth.near} is down" in client.wait_event("sensor_lost")["reason"]
+        veth.ip("link", "set", veth.near, "up")
+        client.wait_event("sensor_back")
+        client.fresh(50)
+        assert client.ask("configure", settings={"fir": True})["ok"], "root may control it"
+    (answer,) = as_nobody(found.port, request("configure", 1, sensor=0, settings={"fir": False}))
+    assert answer["ok"], "and so may its own user"
+
+
+@AS_NOBODY
+@pytest.mark.bus
+@needs_bus
+def test_only_the_loop_has_real_time_priority(running: tuple[Server, Path]) -> None:
+    found, _ = running
+    if "real-time priority" in found.said():
+        pytest.skip("no real-time priority here: run it as real root")
+    tasks = [int(path.name) for path in Path(f"/proc/{found.process.pid}/task").iterdir()]
+    policies = {task: os.sched_getscheduler(task) & ~os.SCHED_RESET_ON_FORK for task in tasks}
+    assert policies.pop(found.process.pid) == os.SCHED_FIFO
+    assert policies
+    assert set(policies.values()) == {os.SCHED_OTHER}, "the log's"
+
+
+@AS_NOBODY
+@pytest.mark.bus
+@needs_bus
+def test_a_file_that_its_user_cannot_read_is_known_at_start_and_refused_later(
+    running: tuple[Server, Path],
+) -> None:
+    found, config = running
+    assert f"user nobody cannot read the configuration {config}: a reload will fail" in found.said()
+    found.signal(signal.SIGHUP)
+    found.wait_for("reload failed, the configuration is unchanged: cannot read the configuration")
+    with found.connect() as client:
+        client.ask("subscribe")
+        assert len(client.fresh(50)) == 50
+
+
+@AS_NOBODY
+@pytest.mark.bus
+@needs_bus
+@pytest.mark.parametrize("stuck", [False, True])
+def test_the_virtual_sensor_becomes_the_same_user_and_goes_with_the_server(stuck: bool) -> None:
+    """A stopped process does not end by itself; that of another user could not be killed."""
+    with server("virtual", "--user", "nobody") as found:
+        process = found.process.pid
+        (child,) = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+        for each in (process, int(child)):
+            check_unprivileged(each)
+        with found.connect() as client:
+            client.ask("subscribe")
+            client.fresh(50)
+        if stuck:
+            os.kill(int(child), signal.SIGSTOP)
+        found.signal(signal.SIGTERM)
+        assert found.wait() == 0
+        assert "Traceback" not in found.said()
+        wait_until(lambda: found.ifname not in {name for _, name in socket.if_nameindex()}, "the veth pair")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
+@pytest.mark.bus
+@needs_bus
+def test_root_without_sudo_stays_root_and_is_told_how_not_to() -> None:
+    with server("virtual") as found:
+        assert rows_of(found.process.pid)["Uid"].split() == ["0"] * 4
+        assert found.said().count("running as root: name a user with --user") == 1
+        found.signal(signal.SIGTERM)
+        assert found.wait() == 0
+
+
+def test_what_cannot_be_given_up_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "initgroups", refuse)
+    with pytest.raises(ServerError, match="cannot become user nobody: Operation not permitted"):
+        privileges.become(User(NOBODY.pw_uid, NOBODY.pw_gid, pwd.getpwuid(NOBODY.pw_uid).pw_name))
