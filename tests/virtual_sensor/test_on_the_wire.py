@@ -5,6 +5,7 @@ What does not depend on SOEM or the kernel is tested in memory, in the other fil
 
 from __future__ import annotations
 
+import functools
 import struct
 import subprocess
 import time
@@ -104,7 +105,7 @@ def bring_up(master: Any, count: int = 1) -> None:
 
 
 def set_up(master: Any, count: int) -> bool:
-    """One attempt to reach SAFEOP: on a busy machine SOEM may lose what it writes once, such as an address."""
+    """One attempt to reach SAFEOP: on a busy machine SOEM loses what it writes once, such as an address."""
     find(master, count)
     try:
         master.config_map()
@@ -189,13 +190,9 @@ def test_a_chain_with_foreign_slaves(
     sensor = start(veth[0], "--chain", "EK1100,BOTA,EL3102,DRIVE", "--signal", "constant")
     assert sensor.ready.endswith(", beside EK1100, EL3102, DRIVE")
     master = open_master()
-    find(master, 4)
-    patiently(master.config_map)
-    for slave in master.slaves:
-        patiently(functools.partial(slave._fpwr, 0x0420, b"\0\0"))
+    bring_up(master, 4)
     coupler, bota, terminal, drive = master.slaves
     drive.output = struct.pack("<Hi", 0x06, 0)
-    reach_op(master)
     assert [slave.name for slave in master.slaves] == ["EK1100", "BFT-SENS-ECAT-M8", "EL3102", "DRIVE"]
     assert (coupler.man, coupler.id) == (2, 0x044C2C52)
     assert (terminal.man, terminal.id) == (2, 0x0C1E3052)
