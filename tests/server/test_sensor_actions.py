@@ -50,7 +50,9 @@ def test_objects_are_read_by_name(streaming: tuple[Bench, Client, Client]) -> No
     _, _, asking = streaming
     rate = asking.ask("sdo_read", name="Sampling Rate")
     assert (rate["index"], rate["subindex"], rate["type"], rate["value"]) == (RATE, 0, "u16", 800)
-    assert asking.ask("sdo_read", name="sinc_length")["value"] == 64
+    assert asking.ask("sdo_read", name="sinc_length")["value"] == 384, "not what was written"
+    imu = asking.ask("sdo_read", name="IMU active")
+    assert (imu["type"], imu["value"]) == ("u8", 1)
     assert asking.ask("sdo_read", name="control status")["name"] == "Control Status"
     assert asking.ask("sdo_read", name="Device name")["value"] == "BFT-SENS-ECAT-M8"
     assert asking.ask("sdo_read", name="FIR disable", type="bool")["value"] is True
