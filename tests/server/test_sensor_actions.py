@@ -58,7 +58,7 @@ def test_objects_are_read_by_name(streaming: tuple[Bench, Client, Client]) -> No
     assert asking.ask("sdo_read", name="FIR disable", type="bool")["value"] is True
     for name, said in (
         ("Status", "2 objects: Measurement Status, Control Status"),
-        ("Calibration", "58 objects: "),
+        ("Calibration", "88 objects: "),
         ("colour", "no object's"),
         ("", "a text of 1 to 80 characters"),
         ("x" * 81, "a text of 1 to 80 characters"),

@@ -296,3 +296,15 @@ def test_one_byte_settings_are_bit8() -> None:
         assert struct.unpack_from("<HH", reply, 8) == (0x0037, 8)
     assert struct.unpack("<I", master.upload(0x1000, 0)) == (5001,)
     assert master.upload(0x100A, 0) == b"1.3.8-dirty-R"
+
+
+def test_types_of_the_factory_calibration() -> None:
+    master = RawMaster().go(PREOP)
+    assert master.upload(0x2000, 0) == b"\x57"
+    sizes = [len(master.upload(0x2000, n)) for n in range(1, 0x58)]
+    assert [n for n, size in enumerate(sizes, 1) if size == 1] == [0x2D, *range(0x52, 0x58)]
+
+
+def test_the_output_is_no_matter_of_objects() -> None:
+    master = RawMaster().go(PREOP)
+    assert abort_of(master, 0x7000, 0, b"\1") == 0x06010002

@@ -36,6 +36,7 @@ MODELS: Final = (
 class ObjectType(Enum):
     """CoE base data type: its number in the SDO Information service, and its struct format."""
 
+    I8 = (0x0002, "<b")
     I16 = (0x0003, "<h")
     I32 = (0x0004, "<i")
     U8 = (0x0005, "<B")
@@ -148,7 +149,7 @@ class ObjectEntry:
 
 
 U8, U16, U32, REAL32 = ObjectType.U8, ObjectType.U16, ObjectType.U32, ObjectType.REAL32
-STRING, OCTETS, BIT8 = ObjectType.STRING, ObjectType.OCTETS, ObjectType.BIT8
+STRING, OCTETS, BIT8, I8 = ObjectType.STRING, ObjectType.OCTETS, ObjectType.BIT8, ObjectType.I8
 RO, RW, RW_PREOP = Access
 
 _PDO_TYPES = {PdoType.USINT: U8, PdoType.UINT: U16, PdoType.UDINT: U32, PdoType.REAL: REAL32}
@@ -157,7 +158,7 @@ _INVERTED: Mapping[SettingValue, int] = {True: 0, False: 1}
 
 FACTORY_CALIBRATION: Final = 0x2000
 """Writable on the device in every state. Never write it: the calibration is lost."""
-FACTORY_CALIBRATION_ENTRIES: Final = 57
+FACTORY_CALIBRATION_ENTRIES: Final = 0x57
 
 DEVICE_NAME: Final = (0x1008, 0)
 HARDWARE_VERSION: Final = (0x1009, 0)
@@ -169,6 +170,16 @@ CONTROL_COMMAND: Final = (0x8030, 1)
 CONTROL_STATUS: Final = (0x8030, 2)
 SAVE_PARAMETERS: Final = 1
 
+
+def _calibration_type(subindex: int) -> ObjectType:
+    """REAL32 but for a password, the offsets, range and gains of the converters, and the bridges' DACs."""
+    if subindex == 0x01 or 0x27 <= subindex <= 0x2C or 0x4C <= subindex <= 0x51:
+        return U32
+    if subindex == 0x2D:
+        return BIT8
+    return I8 if subindex >= 0x52 else REAL32
+
+
 OBJECTS: Final[tuple[ObjectEntry, ...]] = (
     ObjectEntry(0x1000, 0, "Device type", U32, RO, 5001),
     ObjectEntry(0x1008, 0, "Device name", STRING, RO, MODELS[0]),
@@ -179,14 +190,14 @@ OBJECTS: Final[tuple[ObjectEntry, ...]] = (
     ObjectEntry(0x1018, 3, "Revision", U32, RO, REVISION),
     ObjectEntry(0x1018, 4, "Serial number", U32, RO, 1),
     *(
-        ObjectEntry(FACTORY_CALIBRATION, sub, f"Calibration {sub}", REAL32, RW)
+        ObjectEntry(FACTORY_CALIBRATION, sub, f"Calibration {sub}", _calibration_type(sub), RW)
         for sub in range(1, FACTORY_CALIBRATION_ENTRIES + 1)
     ),
     *(
         ObjectEntry(INPUT_OBJECT, field.subindex, field.title, _PDO_TYPES[field.type], RO, 0, field.unit)
         for field in PDO_FIELDS
     ),
-    ObjectEntry(0x7000, 0, "Digital output", U8, RW),
+    ObjectEntry(0x7000, 0, "Digital output", I8, RO),
     *(
         ObjectEntry(FORCE_TORQUE_OFFSET, sub, f"{axis} offset", REAL32, RW, 0, "N" if sub <= 3 else "Nm")
         for sub, axis in enumerate(_AXES, 1)

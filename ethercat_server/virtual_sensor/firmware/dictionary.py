@@ -21,6 +21,7 @@ from ethercat_server.sensor.objects.dictionary import (
     SAVE_PARAMETERS,
     SERIAL_NUMBER,
     ObjectEntry,
+    ObjectType,
 )
 from ethercat_server.sensor.objects.search import TITLES
 from ethercat_server.virtual_sensor.firmware.flash import Flash
@@ -85,7 +86,8 @@ class Dictionary(ObjectTable):
     @staticmethod
     def _initial(row: ObjectEntry) -> bytes:
         if row.index == FACTORY_CALIBRATION and row.subindex:
-            return struct.pack("<f", row.subindex / 64)  # a recognizable value
+            # A recognizable value.
+            return row.type.pack(row.subindex / 64 if row.type is ObjectType.REAL32 else row.subindex)
         data = row.type.pack(row.default)
         return data.ljust(STRING_SIZES.get(row.index, len(data)), b"\0")
 
