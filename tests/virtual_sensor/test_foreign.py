@@ -244,8 +244,10 @@ def test_power_and_cable_of_a_place() -> None:
     assert master.read16(0x0134, 1) == 0x001E
 
 
-def test_the_backend_in_memory_takes_a_mixed_chain_to_op() -> None:
-    backend = chain("EK1100,BOTA,EL3102,DRIVE")
+@pytest.mark.parametrize("state", ["", ":SAFEOP", ":OP"])
+def test_the_backend_in_memory_takes_a_mixed_chain_to_op(state: str) -> None:
+    """Also one that another master has left."""
+    backend = chain(f"EK1100{state},BOTA{state},EL3102{state},DRIVE{state}")
     found = backend.scan(lambda: None)
     assert [slave.name for slave in found] == ["EK1100", "BFT-SENS-ECAT-M8", "EL3102", "DRIVE"]
     backend.check_preop(lambda: None)

@@ -176,10 +176,11 @@ def test_a_chain_of_three(veth: tuple[str, str], start: Start, open_master: Call
     assert serials == [1, 2, 3]
 
 
+@pytest.mark.parametrize("chain", ["EK1100,BOTA,EL3102,DRIVE", "EK1100:OP,BOTA:OP,EL3102:OP,DRIVE:OP"])
 def test_a_chain_with_foreign_slaves(
-    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
+    chain: str, veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
 ) -> None:
-    sensor = start(veth[0], "--chain", "EK1100,BOTA,EL3102,DRIVE", "--signal", "constant")
+    sensor = start(veth[0], "--chain", chain, "--signal", "constant")
     assert sensor.ready.endswith(", beside EK1100, EL3102, DRIVE")
     master = open_master()
     find(master, 4)

@@ -27,6 +27,8 @@ class SiiInterface:
     def __init__(self, memory: bytearray, image: bytes, clock: Callable[[], int], read_ns: int) -> None:
         self._clock = clock
         self._read_ns = read_ns
+        self._word = 0
+        """What is being read."""
         self._done_at: int | None = None
         self._memory = memory
         self.image = image
@@ -45,20 +47,18 @@ class SiiInterface:
     def advance(self) -> None:
         """The registers are about to be read: what was being read may be there."""
         if self._done_at is not None and self._clock() >= self._done_at:
-            self._finish()
-
-    def _finish(self) -> None:
-        (word,) = struct.unpack_from("<I", self._memory, reg.SII_ADDRESS)
-        self._memory[reg.SII_DATA : reg.SII_DATA + 8] = self.image[word * 2 : word * 2 + 8].ljust(8, b"\xff")
-        self._done_at = None
-        self._set_status(0)
+            at = self._word * 2
+            self._memory[reg.SII_DATA : reg.SII_DATA + 8] = self.image[at : at + 8].ljust(8, b"\xff")
+            self._done_at = None
+            self._set_status(0)
 
     def command(self) -> None:
         """Execute the command in the control register at the word in the address register."""
+        control, word = struct.unpack_from("<HI", self._memory, reg.SII_CONTROL)
         self.advance()
-        (control,) = struct.unpack_from("<H", self._memory, reg.SII_CONTROL)
-        if self._done_at is not None:
-            self._set_status(_BUSY)  # it takes no command meanwhile
+        if self._done_at is not None:  # it takes no command meanwhile
+            self._set_status(_BUSY)
+            struct.pack_into("<I", self._memory, reg.SII_ADDRESS, self._word)
             return
         if self._memory[reg.SII_CONFIGURATION] & 0x01:
             # The interface belongs to the sensor's firmware until the master takes it back.
@@ -68,7 +68,7 @@ class SiiInterface:
         if operation == _READ and self._faults:
             self._set_status(self._faults)
         elif operation == _READ:
-            self._done_at = self._clock() + self._read_ns
+            self._done_at, self._word = self._clock() + self._read_ns, word
             self._set_status(_BUSY)
             self.advance()
         elif operation == _WRITE:

@@ -61,7 +61,7 @@ def _emergency(call: Call) -> None:
     if len(data) > 5:
         raise CommandError("the data of an emergency are at most 5 bytes in hexadecimal digits")
     if call.application.al.state < AlState.PREOP or not call.application.device.protocols:
-        raise CommandError("its mailbox is off: take it to PREOP first")
+        raise CommandError("its mailbox is off: it needs one, and PREOP or above")
     call.application.mailbox.raise_emergency(whole(code, 0, 0xFFFF), register, data)
 
 
