@@ -103,8 +103,8 @@ class Bus:
             if slave.life is None or slave in self.disconnected:
                 break
             self._alive.append(slave.life)
-        for life in self._alive:
-            life.esc.set_ports(next_slave=life is not self._alive[-1])
+        for position, life in enumerate(self._alive):
+            life.esc.set_line(position, len(self._alive) - 1 - position)
 
     def set_time(self, now: int) -> None:
         """Let time pass up to `now`, with what is due meanwhile but the watchdogs: frames may be waiting."""

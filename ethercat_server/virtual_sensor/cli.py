@@ -24,7 +24,7 @@ from ethercat_server.virtual_sensor.foreign.chain import (
 )
 from ethercat_server.virtual_sensor.foreign.kinds import KINDS
 from ethercat_server.virtual_sensor.measurement.signals import SIGNALS
-from ethercat_server.virtual_sensor.options import BusOptions, ForeignOptions, SensorOptions
+from ethercat_server.virtual_sensor.options import EEPROM_MS, BusOptions, ForeignOptions, SensorOptions
 from protocol.pdo import LAYOUTS
 from protocol.settings import SETTINGS
 
@@ -60,6 +60,12 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
     parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of the scene")
     parser.add_argument("--seed", default="0", metavar="N", help="seed of the noise")
+    parser.add_argument(
+        "--eeprom-ms",
+        default=str(EEPROM_MS),
+        metavar="X",
+        help=f"time of an EEPROM read (default {EEPROM_MS:g})",
+    )
     parser.add_argument("--control", metavar="PATH", help="Unix socket for commands")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
@@ -89,6 +95,7 @@ def options_from(args: argparse.Namespace) -> BusOptions:
         seed = whole(args.seed, 0, 2**63)
         sinc = None if args.sinc is None else whole(args.sinc, sinc_range[0], sinc_range[-1])
         serial_numbers = [whole(text, 0, 0xFFFFFFFF) for text in serials]
+        eeprom_ms = real(args.eeprom_ms, 0, 1000)
         ppms = [real(text, -PPM_LIMIT, PPM_LIMIT) for text in errors]
     except CommandError as error:
         raise UsageError(str(error)) from None
@@ -114,9 +121,10 @@ def options_from(args: argparse.Namespace) -> BusOptions:
                 signal=args.signal,
                 noise=args.noise == "on",
                 seed=seed + position,
+                eeprom_ms=eeprom_ms,
             )
         )
-    return BusOptions(tuple(sensors) if chain is None else slaves_in(chain, sensors))
+    return BusOptions(tuple(sensors) if chain is None else slaves_in(chain, sensors, eeprom_ms))
 
 
 @contextlib.contextmanager

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final
 
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor.slave.al import AlState
+
+EEPROM_MS: Final = 2.0
+"""About what a real EEPROM needs for the eight bytes of a read command."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +28,8 @@ class SensorOptions:
     seed: int = 0
     state: AlState = AlState.INIT
     """In which another master has left it."""
+    eeprom_ms: float = EEPROM_MS
+    """Time that reading from its EEPROM takes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +40,7 @@ class ForeignOptions:
     """One of `foreign.kinds.KINDS`."""
     state: AlState = AlState.INIT
     """In which another master has left it; a drive in OP turns."""
+    eeprom_ms: float = EEPROM_MS
 
 
 SlaveOptions = SensorOptions | ForeignOptions

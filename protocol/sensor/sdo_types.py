@@ -56,7 +56,7 @@ _ROWS: Final = (
     SdoType("i16", ("int16", "int", "integer16"), "<h"),
     SdoType("i32", ("int32", "dint", "integer32"), "<i"),
     SdoType("i64", ("int64", "lint", "integer64"), "<q"),
-    SdoType("u8", ("uint8", "usint", "unsigned8", "byte"), "<B"),
+    SdoType("u8", ("uint8", "usint", "unsigned8", "byte", "bit8"), "<B"),
     SdoType("u16", ("uint16", "uint", "unsigned16"), "<H"),
     SdoType("u32", ("uint32", "udint", "unsigned32"), "<I"),
     SdoType("u64", ("uint64", "ulint", "unsigned64"), "<Q"),

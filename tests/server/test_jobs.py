@@ -93,7 +93,7 @@ def test_a_setting_of_another_size_means_nothing(caplog: pytest.LogCaptureFixtur
     finish(read_settings(sdo, sensor))
     assert "imu_active" not in sensor.settings
     assert "fir" in sensor.settings
-    assert "0x8010:3 holds 0100, which is no U8" in caplog.text
+    assert "0x8010:3 holds 0100, which is no BIT8" in caplog.text
     assert finish(write(sdo, sensor, *IMU, b"\2\0"))["hex"] == "0200"
     assert "imu_active" not in sensor.wanted
 

@@ -11,6 +11,7 @@ from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.firmware import firmware
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.framing import DataFlag
+from protocol.settings import sampling_rate_hz
 from tests.simulation import OLD, Client, Simulation, check_frames, more_if_long, reading
 
 CLOCK = SensorOptions(signal="clock", ppm=150.0)
@@ -201,7 +202,11 @@ def test_one_of_a_chain_is_lost_and_the_other_goes_on() -> None:
 def test_a_server_that_was_stopped_carries_on() -> None:
     simulation, client = streaming()
     simulation.at(0.1, lambda: simulation.clock.stall(0.5e9))
-    # The sensor's watchdog took it to SAFEOP; the server acknowledges and takes it back to OP.
+    # The sensor has no process data watchdog, and stays in OP.
+    simulation.run(1.0)
+    assert client.events == []
+    simulation.at(0.1, lambda: simulation.clock.stall(0.5e9))
+    simulation.at(0.3, "safeop 0x1B")  # it acknowledges, and takes the sensor back to OP
     client.wait_event("sensor_back")
     client.fresh(100)
     check_frames(simulation.frames)
@@ -340,9 +345,11 @@ def test_whatever_happens_the_stream_is_true_and_comes_back(seed: int) -> None:
     # What the server says is in force the sensor holds.
     described = asking.ask("describe")["sensors"][0]
     for name, value in described["settings"].items():
-        if name in ("imu_active", "chop", "acceleration_range_g", "sinc_length"):
+        if name in ("imu_active", "chop", "acceleration_range_g"):
             assert setting_value(name, read_object(asking, name=name)["hex"]) == value, name
     assert described["settings"]["acceleration_range_g"] == 8
+    rate = read_object(asking, name="Sampling rate")["value"]
+    assert rate == described["rate_hz"] == sampling_rate_hz(described["settings"]["sinc_length"])
     now = sensor_offset(asking)
     tared = [reply for reply in asking.replies if reply["reply"] == "tare" and reply["ok"]]
     assert now == pytest.approx(tared[-1]["new_offset"] if tared else offset)

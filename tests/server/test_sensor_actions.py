@@ -50,13 +50,15 @@ def test_objects_are_read_by_name(streaming: tuple[Bench, Client, Client]) -> No
     _, _, asking = streaming
     rate = asking.ask("sdo_read", name="Sampling Rate")
     assert (rate["index"], rate["subindex"], rate["type"], rate["value"]) == (RATE, 0, "u16", 800)
-    assert asking.ask("sdo_read", name="sinc_length")["value"] == 64
+    assert asking.ask("sdo_read", name="sinc_length")["value"] == 384, "not what was written"
+    imu = asking.ask("sdo_read", name="IMU active")
+    assert (imu["type"], imu["value"]) == ("u8", 1)
     assert asking.ask("sdo_read", name="control status")["name"] == "Control Status"
     assert asking.ask("sdo_read", name="Device name")["value"] == "BFT-SENS-ECAT-M8"
     assert asking.ask("sdo_read", name="FIR disable", type="bool")["value"] is True
     for name, said in (
         ("Status", "2 objects: Measurement Status, Control Status"),
-        ("Calibration", "58 objects: "),
+        ("Calibration", "88 objects: "),
         ("colour", "no object's"),
         ("", "a text of 1 to 80 characters"),
         ("x" * 81, "a text of 1 to 80 characters"),

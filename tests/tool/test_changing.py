@@ -252,7 +252,11 @@ def test_a_snapshot_is_restored_as_far_as_it_differs(bench: SimulatedBus, tmp_pa
     tool_here("apply", near, "--set", "sinc_length=341", "--set", "fir=on")
     assert tool_here("snapshot", near, path, "--json").json["objects"] > 100
     content = json.loads(path.read_text())
-    assert (content["model"], content["serial"], content["firmware"]) == ("BFT-SENS-ECAT-M8", 4711, "1.3.8")
+    assert (content["model"], content["serial"], content["firmware"]) == (
+        "BFT-SENS-ECAT-M8",
+        4711,
+        "1.3.8-dirty-R",
+    )
     before = bench.written()
     assert "nothing to restore" in tool_here("restore", near, path).out
     assert bench.written() == before

@@ -209,7 +209,7 @@ def test_channel_faults_are_gone_with_the_power() -> None:
 
 
 def test_swap() -> None:
-    master = RawMaster(*chain(2)).go(OP)
+    master = RawMaster(*chain(2, eeprom_ms=0)).go(OP)
     do(master, "swap BFT-MEDS-ECAT-M8 4711 @1")
     assert master.read16(0x0130, 1) == INIT
     master.set_up_mailbox(1)
@@ -261,7 +261,7 @@ def test_saving_takes_its_time_and_a_power_cut_leaves_the_rest() -> None:
     do(master, "power off")
     do(master, "power on")
     master.go(PREOP)
-    assert [master.upload(0x8006, n) for n in (1, 2, 3, 4)] == [b"\x80\0", b"\0", b"\0", b"\0"]
+    assert [master.upload(0x8006, n) for n in (1, 2, 3, 4)] == [b"\0\3", b"\0", b"\0", b"\0"], "768"
     assert master.upload(*STATUS) == b"\0"
     master.download(*SAVE, b"\1")
     master.wait(371_000_000)
@@ -290,7 +290,7 @@ def test_a_save_may_end_with_a_status_or_with_the_power() -> None:
 
 
 def test_an_eeprom_that_cannot_be_read() -> None:
-    master = RawMaster()
+    master = RawMaster(SensorOptions(eeprom_ms=0))
 
     def status() -> int:
         master.write(0x0502, struct.pack("<HI", 0x0100, 8))

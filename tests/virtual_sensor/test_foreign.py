@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import struct
 
 import pytest
@@ -250,13 +251,33 @@ def test_power_and_cable_of_a_place() -> None:
     assert master.read16(0x0134, 1) == 0x001E
 
 
-def test_the_backend_in_memory_takes_a_mixed_chain_to_op() -> None:
-    backend = chain("EK1100,BOTA,EL3102,DRIVE")
+@pytest.mark.parametrize("state", ["", ":SAFEOP", ":OP"])
+def test_the_backend_in_memory_takes_a_mixed_chain_to_safeop(state: str) -> None:
+    """Also one that another master has left."""
+    backend = chain(f"EK1100{state},BOTA{state},EL3102{state},DRIVE{state}")
     bus = Bus(backend)
-    found = look_safely(bus, no_check)
+    found = look_safely(bus, no_check, force=True)
     assert [slave.name for slave in found] == ["EK1100", "BFT-SENS-ECAT-M8", "EL3102", "DRIVE"]
     bus.scan(DatagramMaster(bus, [slave.sii for slave in found]), range(4), no_check)
     assert bus.master.sdo_read(2, 0x1008, 0) == b"EL3102"
     assert bus.master.map_process_data(no_check) == [0, 61, 6, 6]
     states = [slave.life.al.state for slave in backend.sensors.slaves if slave.life]
     assert states == [SAFEOP] * 4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_datagrams_do_no_harm(seed: int) -> None:
+    chance = random.Random(seed)
+    master = master_of("EK1100:OP,EL3102:PREOP,DRIVE:OP,BOTA:OP")
+    places = (0x0120, 0x0500, 0x0600, 0x0800, 0x0900, 0x0910, 0x0920, 0x1000, 0x1080, OUTPUTS, INPUTS)
+    for _ in range(2000):
+        command, adp = chance.randrange(16), chance.choice((0, -1, -2, -3, 0x1001, 0x1003))
+        ado = chance.choice((*places, chance.randrange(0x2000)))
+        master.one(command, adp & 0xFFFF, ado, chance.randbytes(chance.choice((1, 2, 4, 8, 16, 32, 128))))
+        if chance.random() < 0.1:
+            master.wait(chance.randrange(10) * MS)
+    for place in range(4):
+        obey(master.bus, f"power off #{place}")
+        obey(master.bus, f"power on #{place}")
+    for place in range(4):
+        assert master.read16(0x0130, place) == INIT

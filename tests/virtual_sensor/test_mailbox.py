@@ -2,7 +2,11 @@
 
 import struct
 
+import pytest
+
 from ethercat_server.ethercat.wire import Command
+from ethercat_server.virtual_sensor.faults.table import obey
+from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
 from tests.virtual_sensor.raw_master import INIT, MAILBOX, PREOP, RawMaster
 
 READ_NAME = struct.pack("<HBHBI", 0x2000, 0x40, 0x1008, 0, 0)
@@ -113,3 +117,64 @@ def test_no_mailbox_in_init() -> None:
     master.request(PREOP)
     master.request(INIT)
     assert master.send_mailbox(3, READ_NAME) == 0
+
+
+def emergency_of(message: tuple[int, bytes] | None) -> tuple[int, int, bytes]:
+    assert message is not None
+    kind, body = message
+    assert kind == 3
+    service, code, register = struct.unpack_from("<HHB", body)
+    assert service == 1 << 12
+    return code, register, body[5:]
+
+
+def test_an_emergency_is_the_next_message_out() -> None:
+    master = RawMaster().go(PREOP)
+    assert obey(master.bus, "emergency 0x8130 0x11 0102030405") == "ok"
+    assert master.mailbox_full()
+    assert emergency_of(master.fetch_mailbox()) == (0x8130, 0x11, b"\1\2\3\4\5")
+    assert master.fetch_mailbox() is None
+    obey(master.bus, "emergency 0x1000")
+    assert emergency_of(master.fetch_mailbox()) == (0x1000, 0, bytes(5))
+
+
+def test_messages_are_numbered_in_the_order_in_which_they_go_out() -> None:
+    master = RawMaster().go(PREOP)
+    obey(master.bus, "on-request emergency 0x1000")
+    counters = []
+    for _ in range(4):
+        master.send_mailbox(3, READ_TYPE)
+        while (message := master.one(Command.APRD, 0, 0x1080, bytes(MAILBOX)))[1]:
+            counters.append(message[0][5] >> 4)
+    assert counters == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("command", ["on-request emergency 0x8130", "on-write 0x8000 1 emergency 0x8130"])
+def test_an_emergency_between_a_request_and_its_answer(command: str) -> None:
+    master = RawMaster().go(PREOP)
+    assert obey(master.bus, command) == "ok"
+    request = struct.pack("<HBHBf", 0x2000, 0x23, 0x8000, 1, 2.5)
+    for first in (True, False):
+        assert master.send_mailbox(3, request) == 1
+        if first:
+            assert emergency_of(master.fetch_mailbox())[0] == 0x8130
+        answer = master.fetch_mailbox()
+        assert answer is not None
+        assert answer[1][2] == 0x60
+    assert master.fetch_mailbox() is None
+
+
+def test_emergencies_that_cannot_be_sent() -> None:
+    master = RawMaster()
+    assert obey(master.bus, "emergency 0x8130").startswith("error: its mailbox is off")
+    master.go(PREOP)
+    for wrong in ("emergency 0x10000", "emergency 1 256", "emergency 1 0 xy", "emergency 1 0 010203040506"):
+        assert obey(master.bus, wrong).startswith("error: ")
+    assert master.fetch_mailbox() is None
+
+
+def test_an_emergency_of_a_foreign_slave() -> None:
+    master = RawMaster(*slaves_in(parse_chain("EK1100,DRIVE:OP")))
+    obey(master.bus, "emergency 0x3210 #1")
+    assert emergency_of(master.fetch_mailbox(1))[0] == 0x3210
+    assert obey(master.bus, "emergency 0x3210 #0").startswith("error: ")

@@ -184,10 +184,11 @@ def test_a_chain_of_three(veth: tuple[str, str], start: Start, open_master: Call
     assert serials == [1, 2, 3]
 
 
+@pytest.mark.parametrize("chain", ["EK1100,BOTA,EL3102,DRIVE", "EK1100:OP,BOTA:OP,EL3102:OP,DRIVE:OP"])
 def test_a_chain_with_foreign_slaves(
-    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
+    chain: str, veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
 ) -> None:
-    sensor = start(veth[0], "--chain", "EK1100,BOTA,EL3102,DRIVE", "--signal", "constant")
+    sensor = start(veth[0], "--chain", chain, "--signal", "constant")
     assert sensor.ready.endswith(", beside EK1100, EL3102, DRIVE")
     master = open_master()
     bring_up(master, 4)
@@ -206,6 +207,42 @@ def test_a_chain_with_foreign_slaves(
         exchange(master)
         assert struct.unpack_from("<H", drive.input)[0] & 0x6F == state
     assert read(drive, 0x1008, 0) == b"DRIVE"
+
+
+def test_soem_sets_distributed_clocks_up(
+    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
+) -> None:
+    start(veth[0], "--chain", "EK1100,BOTA,DRIVE")
+    master = open_master()
+    find(master, 3)
+    patiently(master.config_map)
+    assert master.config_dc()
+    times = [struct.unpack("<Q", slave._fprd(0x0910, 8))[0] for slave in master.slaves]
+    assert times == sorted(times)
+    assert max(times) - min(times) < 10**9, "one system time"
+    delays = [struct.unpack("<I", slave._fprd(0x0928, 4))[0] for slave in master.slaves]
+    assert 0 == delays[0] < delays[1] < delays[2]
+    reach_op(master)
+
+
+def test_pysoem_reports_an_emergency(
+    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
+) -> None:
+    sensor = start(veth[0])
+    master = open_master()
+    find(master, 1)
+    [slave] = master.slaves
+    told: list[Any] = []
+    slave.add_emergency_callback(told.append)
+    master.state_check(pysoem.PREOP_STATE, 2_000_000)
+    for command in ("emergency 0x8130 0x11 0102030405", "on-request emergency 0x8130 0x11 0102030405"):
+        told.clear()
+        assert sensor.command(command) == "ok"
+        assert read(slave, 0x1008, 0).rstrip(b"\0") == b"BFT-SENS-ECAT-M8"
+        assert [(e.error_code, e.error_reg) for e in told] == [(0x8130, 0x11)]
+    assert sensor.command("emergency 0x8131") == "ok"
+    patiently(master.config_map)
+    assert master.state_check(pysoem.SAFEOP_STATE, 2_000_000) == pysoem.SAFEOP_STATE
 
 
 def test_an_interface_down_for_a_while(

@@ -46,7 +46,8 @@ def test_a_chain() -> None:
     "words",
     [
         ["--sensors", "0"], ["--sensors", "many"], ["--sensors", "17"], ["--sensors", "1", "--model", "A,B"],
-        ["--serial", "-1"], ["--ppm", "nan"], ["--sinc", "31"], ["--model", "x" * 21], ["--model", "é"],
+        ["--serial", "-1"], ["--ppm", "nan"], ["--sinc", "31"], ["--eeprom-ms", "-1"],
+        ["--model", "x" * 21], ["--model", "é"],
     ],
 )  # fmt: skip
 def test_wrong_arguments(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ def test_dl_information() -> None:
     kind, _, _, fmmus, managers, ram, ports, features = struct.unpack("<BBHBBBBH", master.read(0, 10))
     assert kind
     assert (fmmus, managers, ram, ports) == (3, 4, 4, 0x0F)
-    assert features & 0x04 == 0, "no distributed clocks"
+    assert features & 0x0C == 0x0C, "a distributed clock of 64 bits"
 
 
 def test_broadcast_counts_slaves_and_ors_data() -> None:
@@ -42,7 +42,7 @@ def test_ports_follow_the_chain() -> None:
     assert last & 0x0C00 == 0x0400
 
 
-@pytest.mark.parametrize("register", [0x0000, 0x0008, 0x0012, 0x0110, 0x0130, 0x0134, 0x0140, 0x0220, 0x0910])
+@pytest.mark.parametrize("register", [0x0000, 0x0008, 0x0012, 0x0110, 0x0130, 0x0134, 0x0140, 0x0220, 0x0904])
 def test_read_only_registers_ignore_writes(register: int) -> None:
     master = RawMaster()
     before = master.read(register, 2)
@@ -164,3 +164,41 @@ def test_a_disabled_sync_manager_frees_its_memory() -> None:
     master = RawMaster()
     master.write(0x0800, sync_manager(0x1000, 128, 0x26, 0))
     assert master.write(0x1010, b"x") == 1
+
+
+def receive_times(master: RawMaster, position: int) -> tuple[int, int]:
+    out, back = struct.unpack("<II", master.read(0x0900, 8, position))
+    return out, back
+
+
+def test_receive_times_are_latched_by_a_write() -> None:
+    master = RawMaster(*chain(3))
+    assert [receive_times(master, n) for n in range(3)] == [(0, 0)] * 3
+    master.wait(1_000_000)
+    assert master.one(Command.BWR, 0, 0x0900, bytes(4))[1] == 3
+    times = [receive_times(master, n) for n in range(3)]
+    master.wait(1_000_000)
+    assert [receive_times(master, n) for n in range(3)] == times
+    (first, first_back), (second, second_back), (last, last_back) = times
+    # As a master computes delays: half of what the round trip takes longer than from the next slave.
+    assert (first_back - first) - (second_back - second) == 2 * (second - first) > 0
+    assert last_back == 0, "nothing is behind it"
+    assert last > second
+    assert struct.unpack("<Q", master.read(0x0918, 8, 1)) == (second,)
+
+
+def test_the_system_time_runs_with_its_offset() -> None:
+    master = RawMaster()
+
+    def system_time() -> int:
+        time: int = struct.unpack("<Q", master.read(0x0910, 8))[0]
+        return time
+
+    before = system_time()
+    master.wait(1_000_000)
+    assert system_time() - before == 1_001_000, "with the exchange"
+    assert master.write(0x0920, struct.pack("<QI", 10**18, 350)) == 1
+    assert system_time() - before == 10**18 + 350 + 1_003_000
+    assert master.read(0x0920, 12) == struct.pack("<QI", 10**18, 350)
+    assert master.write(0x0910, struct.pack("<I", (system_time() + 1500) & 0xFFFFFFFF)) == 1
+    assert master.read(0x092C, 4) == struct.pack("<I", 500), "behind that one"

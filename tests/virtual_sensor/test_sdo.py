@@ -10,7 +10,7 @@ from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.slave.coe import CoeServer
 from ethercat_server.virtual_sensor.slave.sdo_information import SdoInformation
 from protocol.pdo import LAYOUTS
-from protocol.settings import SETTINGS
+from protocol.settings import SETTINGS, sampling_rate_hz
 from tests.virtual_sensor.raw_master import OP, PREOP, SAFEOP, Abort, RawMaster
 
 STATES = [PREOP, SAFEOP, OP]
@@ -88,7 +88,13 @@ def test_setting_ranges(name: str) -> None:
     row, setting = BY_SETTING[name], SETTINGS[name]
     for value in (False, True) if setting.is_bool else tuple(setting.choices or ()):
         master.download(row.index, row.subindex, row.encode_setting(value))
-        assert master.upload(row.index, row.subindex) == row.encode_setting(value)
+        held = master.upload(row.index, row.subindex)
+        if name == "sinc_length":
+            rate = sampling_rate_hz(int(value))
+            assert master.upload(0x8011, 0) == struct.pack("<H", rate)
+            assert held == struct.pack("<H", round(307_200 / rate))
+        else:
+            assert held == row.encode_setting(value)
     too_high = b"\xff" * row.type.size
     assert abort_of(master, row.index, row.subindex, too_high) == 0x06090031
     if name in ("sinc_length", "acceleration_filter", "angular_rate_filter"):
@@ -273,3 +279,32 @@ def test_descriptions() -> None:
     for request in ((3, struct.pack("<H", 0x5555)), (5, struct.pack("<HBB", 0x1018, 9, 0)), (9, b"")):
         [reply] = master.information(*request)
         assert reply[0] == 7
+
+
+@pytest.mark.parametrize(("length", "reads"), [(128, 768), (341, 2048)])
+def test_the_sinc_length_does_not_read_back(length: int, reads: int) -> None:
+    """As with real sensors."""
+    master = RawMaster().go(PREOP)
+    master.download(0x8006, 1, struct.pack("<H", length))
+    assert master.upload(0x8006, 1) == struct.pack("<H", reads)
+
+
+def test_one_byte_settings_are_bit8() -> None:
+    master = RawMaster().go(PREOP)
+    for index, subindex in [(0x8004, 0), (0x8005, 0), (0x8007, 0), (0x8008, 0), (0x8010, 1), (0x8010, 6)]:
+        [reply] = master.information(5, struct.pack("<HBB", index, subindex, 0))
+        assert struct.unpack_from("<HH", reply, 8) == (0x0037, 8)
+    assert struct.unpack("<I", master.upload(0x1000, 0)) == (5001,)
+    assert master.upload(0x100A, 0) == b"1.3.8-dirty-R"
+
+
+def test_types_of_the_factory_calibration() -> None:
+    master = RawMaster().go(PREOP)
+    assert master.upload(0x2000, 0) == b"\x57"
+    sizes = [len(master.upload(0x2000, n)) for n in range(1, 0x58)]
+    assert [n for n, size in enumerate(sizes, 1) if size == 1] == [0x2D, *range(0x52, 0x58)]
+
+
+def test_the_output_is_no_matter_of_objects() -> None:
+    master = RawMaster().go(PREOP)
+    assert abort_of(master, 0x7000, 0, b"\1") == 0x06010002

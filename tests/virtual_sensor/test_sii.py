@@ -6,14 +6,19 @@ import pytest
 
 from ethercat_server.ethercat.slave.sii_content import checksum
 from ethercat_server.virtual_sensor.firmware.layout import sensor_device
-from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.options import EEPROM_MS, SensorOptions
 from ethercat_server.virtual_sensor.slave.image import build_image
 from protocol.pdo import LAYOUTS
 from tests.virtual_sensor.raw_master import RawMaster
 
+MS = 1_000_000
+BUSY = 0x8000
+
 
 def read_words(master: RawMaster, word: int, command: int = 0x0100) -> tuple[int, bytes]:
     master.write(0x0502, struct.pack("<HI", command, word))
+    while master.read16(0x0502) & BUSY:
+        master.wait(MS)
     return master.read16(0x0502), master.read(0x0508, 8)
 
 
@@ -58,7 +63,7 @@ def test_categories(size: int) -> None:
     assert [(m[0], m[1], m[2], m[5]) for m in managers] == [
         (0x1000, 128, 0x26, 1),
         (0x1080, 128, 0x22, 2),
-        (0x1100, 1, 0x64, 3),
+        (0x1100, 1, 0x24, 3),
         (0x1180, size, 0x20, 4),
     ]
     index, count, manager = struct.unpack_from("<HBB", found[50])
@@ -89,6 +94,7 @@ def test_it_is_not_read_while_the_sensor_owns_it() -> None:
 def test_a_master_that_writes_control_and_two_address_bytes() -> None:
     master = RawMaster()
     assert master.write(0x0502, b"\x80\x01\x08\x00") == 1
+    master.wait(3 * MS)
     data = master.read(0x0502, 10)
     assert data[1] & 0xA1 == 0
     assert data[6:10] == struct.pack("<I", 0xB07A)
@@ -96,3 +102,24 @@ def test_a_master_that_writes_control_and_two_address_bytes() -> None:
 
 def test_beyond_the_end_it_is_erased() -> None:
     assert read_words(RawMaster(), 0xFFFF)[1] == b"\xff" * 8
+
+
+def test_reading_takes_its_time() -> None:
+    master = RawMaster()
+    master.write(0x0502, struct.pack("<HI", 0x0100, 0x08))
+    assert master.read16(0x0502) & BUSY
+    master.wait(round(EEPROM_MS * MS) - 100_000)
+    assert master.read16(0x0502) & BUSY
+    master.write(0x0502, struct.pack("<HI", 0x0100, 0x0C))
+    assert master.read16(0x0502) & BUSY, "it takes no other command meanwhile"
+    master.wait(100_000)
+    assert master.read(0x0502, 10)[2:] == struct.pack("<II", 0x08, 0xB07A)
+    master.write(0x0502, struct.pack("<HI", 0x0100, 0x08))
+    master.wait(3 * MS)  # nobody looks, and the next command is executed all the same
+    master.write(0x0502, struct.pack("<HI", 0x0100, 0x0C))
+    assert master.read16(0x0502) & BUSY
+    master.wait(3 * MS)
+    assert master.read(0x0502, 14)[6:] == struct.pack("<II", 3, 1)
+    quick = RawMaster(SensorOptions(eeprom_ms=0))
+    quick.write(0x0502, struct.pack("<HI", 0x0100, 0x08))
+    assert quick.read(0x0502, 14)[6:] == struct.pack("<II", 0xB07A, 1)

@@ -56,6 +56,18 @@ MAILBOX_FULL: Final = 0x08
 """Bit of a mailbox sync manager's status."""
 MAILBOX_IN_STATUS: Final = SYNC_MANAGER + SYNC_MANAGER_SIZE + SM_STATUS
 """Status of sync manager 1, the mailbox from the slave."""
+DC_RECEIVE_TIMES: Final = 0x0900
+"""Four bytes a port, ns: when the frame that wrote here arrived."""
+DC_SYSTEM_TIME: Final = 0x0910
+DC_RECEIVE_TIME: Final = 0x0918
+"""Eight bytes: the same, at the processing unit."""
+DC_OFFSET: Final = 0x0920
+DC_DELAY: Final = 0x0928
+DC_DIFFERENCE: Final = 0x092C
+DC_SPEED_START: Final = 0x0930
+DC_FILTERS: Final = 0x0934
+DC_ACTIVATION: Final = 0x0980
+"""Two bytes: who controls the SYNC signals, which are active."""
 USER_RAM: Final = 0x0F80
 REGISTERS_END: Final = 0x1000
 """Process data memory begins here."""

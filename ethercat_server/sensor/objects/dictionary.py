@@ -36,12 +36,14 @@ MODELS: Final = (
 class ObjectType(Enum):
     """CoE base data type: its number in the SDO Information service, and its struct format."""
 
+    I8 = (0x0002, "<b")
     I16 = (0x0003, "<h")
     I32 = (0x0004, "<i")
     U8 = (0x0005, "<B")
     U16 = (0x0006, "<H")
     U32 = (0x0007, "<I")
     REAL32 = (0x0008, "<f")
+    BIT8 = (0x0037, "<B")
     STRING = (0x0009, "")
     OCTETS = (0x000A, "")
     """Bytes whose meaning is not known; the value is their hexadecimal digits."""
@@ -147,7 +149,7 @@ class ObjectEntry:
 
 
 U8, U16, U32, REAL32 = ObjectType.U8, ObjectType.U16, ObjectType.U32, ObjectType.REAL32
-STRING, OCTETS = ObjectType.STRING, ObjectType.OCTETS
+STRING, OCTETS, BIT8, I8 = ObjectType.STRING, ObjectType.OCTETS, ObjectType.BIT8, ObjectType.I8
 RO, RW, RW_PREOP = Access
 
 _PDO_TYPES = {PdoType.USINT: U8, PdoType.UINT: U16, PdoType.UDINT: U32, PdoType.REAL: REAL32}
@@ -156,7 +158,7 @@ _INVERTED: Mapping[SettingValue, int] = {True: 0, False: 1}
 
 FACTORY_CALIBRATION: Final = 0x2000
 """Writable on the device in every state. Never write it: the calibration is lost."""
-FACTORY_CALIBRATION_ENTRIES: Final = 57
+FACTORY_CALIBRATION_ENTRIES: Final = 0x57
 
 DEVICE_NAME: Final = (0x1008, 0)
 HARDWARE_VERSION: Final = (0x1009, 0)
@@ -168,24 +170,34 @@ CONTROL_COMMAND: Final = (0x8030, 1)
 CONTROL_STATUS: Final = (0x8030, 2)
 SAVE_PARAMETERS: Final = 1
 
+
+def _calibration_type(subindex: int) -> ObjectType:
+    """REAL32 but for a password, the offsets, range and gains of the converters, and the bridges' DACs."""
+    if subindex == 0x01 or 0x27 <= subindex <= 0x2C or 0x4C <= subindex <= 0x51:
+        return U32
+    if subindex == 0x2D:
+        return BIT8
+    return I8 if subindex >= 0x52 else REAL32
+
+
 OBJECTS: Final[tuple[ObjectEntry, ...]] = (
-    ObjectEntry(0x1000, 0, "Device type", U32, RO, 0),
+    ObjectEntry(0x1000, 0, "Device type", U32, RO, 5001),
     ObjectEntry(0x1008, 0, "Device name", STRING, RO, MODELS[0]),
     ObjectEntry(0x1009, 0, "Hardware version", STRING, RO, "RM200V4_6adc"),
-    ObjectEntry(0x100A, 0, "Firmware version", STRING, RO, "1.3.8"),
+    ObjectEntry(0x100A, 0, "Firmware version", STRING, RO, "1.3.8-dirty-R"),
     ObjectEntry(0x1018, 1, "Vendor ID", U32, RO, VENDOR_ID),
     ObjectEntry(0x1018, 2, "Product code", U32, RO, PRODUCT_CODE),
     ObjectEntry(0x1018, 3, "Revision", U32, RO, REVISION),
     ObjectEntry(0x1018, 4, "Serial number", U32, RO, 1),
     *(
-        ObjectEntry(FACTORY_CALIBRATION, sub, f"Calibration {sub}", REAL32, RW)
+        ObjectEntry(FACTORY_CALIBRATION, sub, f"Calibration {sub}", _calibration_type(sub), RW)
         for sub in range(1, FACTORY_CALIBRATION_ENTRIES + 1)
     ),
     *(
         ObjectEntry(INPUT_OBJECT, field.subindex, field.title, _PDO_TYPES[field.type], RO, 0, field.unit)
         for field in PDO_FIELDS
     ),
-    ObjectEntry(0x7000, 0, "Digital output", U8, RW),
+    ObjectEntry(0x7000, 0, "Digital output", I8, RO),
     *(
         ObjectEntry(FORCE_TORQUE_OFFSET, sub, f"{axis} offset", REAL32, RW, 0, "N" if sub <= 3 else "Nm")
         for sub, axis in enumerate(_AXES, 1)
@@ -199,25 +211,25 @@ OBJECTS: Final[tuple[ObjectEntry, ...]] = (
         for sub in range(1, 7)
     ),
     ObjectEntry(
-        0x8004, 0, "Acceleration range", U8, RW_PREOP, 0, "g",
+        0x8004, 0, "Acceleration range", BIT8, RW_PREOP, 0, "g",
         "acceleration_range_g", {2: 0, 4: 1, 8: 2, 16: 3},
     ),
     ObjectEntry(
-        0x8005, 0, "Angular rate range", U8, RW_PREOP, 0, "deg/s",
+        0x8005, 0, "Angular rate range", BIT8, RW_PREOP, 0, "deg/s",
         "angular_rate_range_dps", {250: 0, 500: 1, 1000: 2, 2000: 3},
     ),
     ObjectEntry(0x8006, 1, "SINC length", U16, RW_PREOP, 64, "", "sinc_length"),
     ObjectEntry(0x8006, 2, "FIR disable", U8, RW_PREOP, 1, "", "fir", _INVERTED),
     ObjectEntry(0x8006, 3, "FAST enable", U8, RW_PREOP, 0, "", "fast"),
     ObjectEntry(0x8006, 4, "CHOP enable", U8, RW_PREOP, 0, "", "chop"),
-    ObjectEntry(0x8007, 0, "Acceleration filter", U8, RW_PREOP, 1, "", "acceleration_filter"),
-    ObjectEntry(0x8008, 0, "Angular rate filter", U8, RW_PREOP, 3, "", "angular_rate_filter"),
-    ObjectEntry(0x8010, 1, "Calibration matrix active", U8, RW, 1, "", "calibration_matrix"),
-    ObjectEntry(0x8010, 2, "Temperature compensation", U8, RW, 0, "", "temperature_compensation"),
-    ObjectEntry(0x8010, 3, "IMU active", U8, RW, 1, "", "imu_active"),
-    ObjectEntry(0x8010, 4, "Coordinate system active", U8, RW, 0, "", "coordinate_system"),
-    ObjectEntry(0x8010, 5, "Inertia and gravity compensation", U8, RW, 0, "", "inertia_compensation"),
-    ObjectEntry(0x8010, 6, "Orientation estimation", U8, RW, 0, "", "orientation_estimation"),
+    ObjectEntry(0x8007, 0, "Acceleration filter", BIT8, RW_PREOP, 1, "", "acceleration_filter"),
+    ObjectEntry(0x8008, 0, "Angular rate filter", BIT8, RW_PREOP, 3, "", "angular_rate_filter"),
+    ObjectEntry(0x8010, 1, "Calibration matrix active", BIT8, RW, 1, "", "calibration_matrix"),
+    ObjectEntry(0x8010, 2, "Temperature compensation", BIT8, RW, 0, "", "temperature_compensation"),
+    ObjectEntry(0x8010, 3, "IMU active", BIT8, RW, 1, "", "imu_active"),
+    ObjectEntry(0x8010, 4, "Coordinate system active", BIT8, RW, 0, "", "coordinate_system"),
+    ObjectEntry(0x8010, 5, "Inertia and gravity compensation", BIT8, RW, 0, "", "inertia_compensation"),
+    ObjectEntry(0x8010, 6, "Orientation estimation", BIT8, RW, 0, "", "orientation_estimation"),
     ObjectEntry(0x8011, 0, "Sampling rate", U16, RO, 800, "Hz"),
     ObjectEntry(0x8030, 1, "Command", U8, RW, values={SAVE_PARAMETERS: "save the parameters"}),
     ObjectEntry(0x8030, 2, "Status", U8, RO, values={0: "success"}),

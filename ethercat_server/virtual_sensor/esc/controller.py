@@ -7,9 +7,11 @@ Source: ETG.1000.4. Datagrams reach it through `commands`; what only the sensor'
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import Protocol
 
 from ethercat_server.virtual_sensor.esc import registers as reg
+from ethercat_server.virtual_sensor.esc.distributed_clock import DistributedClock
 from ethercat_server.virtual_sensor.esc.fmmu import Fmmu
 from ethercat_server.virtual_sensor.esc.sii import SiiInterface
 from ethercat_server.virtual_sensor.esc.sync_manager import SyncManager
@@ -21,6 +23,9 @@ _LINE_GOES_ON, _LINE_ENDS = 0x5A33, 0x5613
 
 class Pdi(Protocol):
     """What the controller calls in the firmware behind it."""
+
+    clock: Callable[[], int]
+    """The time in ns."""
 
     def al_control(self, value: int) -> None:
         """The master wrote AL control."""
@@ -52,11 +57,13 @@ class Esc:
         plans: what each logical command copies, by address and length; emptied when an FMMU changes.
     """
 
-    def __init__(self, pdi: Pdi, sii_image: bytes) -> None:
+    def __init__(self, pdi: Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
+        """`sii_read_ns` is how long reading from the EEPROM takes."""
         self._pdi = pdi
         self.memory = reg.power_on_values()
         self.memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = sii_image[8:10]
-        self.sii = SiiInterface(self.memory, sii_image)
+        self.sii = SiiInterface(self.memory, sii_image, pdi.clock, sii_read_ns)
+        self.clock = DistributedClock(self.memory, pdi.clock)
         self.sync_managers = [SyncManager(self.memory, n) for n in range(reg.SYNC_MANAGER_COUNT)]
         self.fmmus: list[Fmmu] = []
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
@@ -66,8 +73,10 @@ class Esc:
         """Add one to the error counter at this register; it stays at 255."""
         self.memory[counter] = min(self.memory[counter] + 1, 0xFF)
 
-    def set_ports(self, next_slave: bool) -> None:
-        """Port 0 is always open; port 1 is open if another slave follows."""
+    def set_line(self, before: int, behind: int) -> None:
+        """So many slaves are before it and behind it. Port 0 is always open; port 1 if one is behind."""
+        self.clock.before, self.clock.behind = before, behind
+        next_slave = behind > 0
         status = _LINE_GOES_ON if next_slave else _LINE_ENDS
         before = _U16.unpack_from(self.memory, reg.DL_STATUS)[0]
         if before == _LINE_GOES_ON and not next_slave:
@@ -191,6 +200,10 @@ class Esc:
     def _read_registers(self, start: int, end: int) -> bytes:
         if start <= reg.EVENT_REQUEST + 1 and end > reg.EVENT_REQUEST:
             _U16.pack_into(self.memory, reg.EVENT_REQUEST, self.events)
+        if start < reg.SII_DATA and end > reg.SII_CONTROL:
+            self.sii.advance()
+        if start < reg.DC_RECEIVE_TIME and end > reg.DC_SYSTEM_TIME:
+            self.clock.show()
         data = bytes(self.memory[start:end])
         if start <= reg.AL_STATUS < end:
             self._events &= ~reg.EVENT_AL_STATUS
@@ -234,5 +247,9 @@ class Esc:
             self._pdi.sync_managers_changed()
             if self.sync_managers[1].repeat_request != repeat_before:
                 self._pdi.repeat_requested()
+        if touched(reg.DC_RECEIVE_TIMES, 4):
+            self.clock.latch()
+        if touched(reg.DC_SYSTEM_TIME, 4):
+            self.clock.compare()
         if touched(reg.AL_CONTROL, 2):
             self._pdi.al_control(_U16.unpack_from(self.memory, reg.AL_CONTROL)[0])

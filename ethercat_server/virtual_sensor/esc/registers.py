@@ -1,7 +1,7 @@
 """Registers of the virtual sensor's slave controller: what a master may write, power-on values.
 
 The addresses are those of `ethercat_server.ethercat.slave.registers`. The controller has two ports, 3 FMMUs,
-4 sync managers, 4 KB of process data memory, and no distributed clocks.
+4 sync managers, 4 KB of process data memory, and a distributed clock of 64 bits without SYNC signals.
 """
 # ruff: noqa: F403, F405
 
@@ -65,6 +65,12 @@ def _write_mask() -> bytes:
         at = SYNC_MANAGER + number * SYNC_MANAGER_SIZE
         allow(at, 5)
         allow(at + SM_ACTIVATE, 1, 0xC3)
+    allow(DC_RECEIVE_TIMES, 4)
+    allow(DC_SYSTEM_TIME, 8)
+    allow(DC_OFFSET, 12)
+    allow(DC_SPEED_START, 2)
+    allow(DC_FILTERS, 2)
+    allow(DC_ACTIVATION, 2)
     allow(USER_RAM, REGISTERS_END - USER_RAM)
     return bytes(mask)
 
@@ -77,10 +83,10 @@ def power_on_values() -> bytearray:
     """Registers and memory of a controller that has just been switched on."""
     memory = bytearray(MEMORY_END)
     # Type, revision, build, FMMUs, sync managers, RAM in KB, ports 0 and 1 MII, features: bit-wise FMMUs,
-    # separate counting of check sum errors; no distributed clocks.
+    # distributed clock, of 64 bits, separate counting of check sum errors.
     struct.pack_into(
         "<BBHBBBBH", memory, DL_INFORMATION,
-        0xC0, 2, 0, FMMU_COUNT, SYNC_MANAGER_COUNT, MEMORY_KB, 0x0F, 0x0080,
+        0xC0, 2, 0, FMMU_COUNT, SYNC_MANAGER_COUNT, MEMORY_KB, 0x0F, 0x008C,
     )  # fmt: skip
     memory[DL_CONTROL] = 0x01
     memory[AL_CONTROL] = memory[AL_STATUS] = 0x01

@@ -6,6 +6,7 @@ Source: ETG.1000.4. It is read-only: a write command ends with the error bit "wr
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import Final
 
 from ethercat_server.virtual_sensor.esc import registers as reg
@@ -18,12 +19,17 @@ _NO_OPERATION, _READ, _WRITE, _RELOAD = 0, 1, 2, 4
 
 
 class SiiInterface:
-    """The registers 0x0500 to 0x050F. A command is done at once: the busy bit is seen with a fault only."""
+    """The registers 0x0500 to 0x050F. Reading takes `read_ns`; other commands are done at once."""
 
     FAULTS: Final = {"ok": 0, "error": _ERROR_COMMAND, "busy": _BUSY}
     """Error bits by name: an EEPROM that works, that returns an error, that stays busy."""
 
-    def __init__(self, memory: bytearray, image: bytes) -> None:
+    def __init__(self, memory: bytearray, image: bytes, clock: Callable[[], int], read_ns: int) -> None:
+        self._clock = clock
+        self._read_ns = read_ns
+        self._word = 0
+        """What is being read."""
+        self._done_at: int | None = None
         self._memory = memory
         self.image = image
         self._faults = 0
@@ -35,11 +41,25 @@ class SiiInterface:
     def fail(self, bits: int) -> None:
         """End every read with these bits of the control register; 0: no fault."""
         self._faults = bits
+        self._done_at = None
         self._set_status(0)
+
+    def advance(self) -> None:
+        """The registers are about to be read: what was being read may be there."""
+        if self._done_at is not None and self._clock() >= self._done_at:
+            at = self._word * 2
+            self._memory[reg.SII_DATA : reg.SII_DATA + 8] = self.image[at : at + 8].ljust(8, b"\xff")
+            self._done_at = None
+            self._set_status(0)
 
     def command(self) -> None:
         """Execute the command in the control register at the word in the address register."""
         control, word = struct.unpack_from("<HI", self._memory, reg.SII_CONTROL)
+        self.advance()
+        if self._done_at is not None:  # it takes no command meanwhile
+            self._set_status(_BUSY)
+            struct.pack_into("<I", self._memory, reg.SII_ADDRESS, self._word)
+            return
         if self._memory[reg.SII_CONFIGURATION] & 0x01:
             # The interface belongs to the sensor's firmware until the master takes it back.
             self._set_status(_ERROR_COMMAND)
@@ -48,9 +68,9 @@ class SiiInterface:
         if operation == _READ and self._faults:
             self._set_status(self._faults)
         elif operation == _READ:
-            data = self.image[word * 2 : word * 2 + 8].ljust(8, b"\xff")
-            self._memory[reg.SII_DATA : reg.SII_DATA + 8] = data
-            self._set_status(0)
+            self._done_at, self._word = self._clock() + self._read_ns, word
+            self._set_status(_BUSY)
+            self.advance()
         elif operation == _WRITE:
             self._set_status(_ERROR_WRITE_ENABLE)
         elif operation in (_NO_OPERATION, _RELOAD):

@@ -74,6 +74,11 @@ class SyncManager:
         at = self.registers + reg.SM_STATUS
         self._memory[at] = self._memory[at] & ~reg.MAILBOX_FULL | (reg.MAILBOX_FULL if value else 0)
 
+    @property
+    def unread(self) -> bool:
+        """Whether the mailbox is full, and its reader has not begun to take it."""
+        return self.full and not self._open
+
     def put(self, offset: int, data: bytes) -> bool:
         """The master writes into its write mailbox; False if it may not now."""
         if self.full or not (self._open or offset == 0):

@@ -51,6 +51,30 @@ def _mute(call: Call) -> None:
     call.application.mailbox.mute = whole(call.arguments[0], 0, 2**31)
 
 
+def _emergency(call: Call) -> None:
+    code, *more = call.arguments
+    register = whole(more[0], 0, 0xFF) if more else 0
+    try:
+        data = bytes.fromhex(more[1]) if len(more) > 1 else b""
+    except ValueError:
+        data = bytes(6)
+    if len(data) > 5:
+        raise CommandError("the data of an emergency are at most 5 bytes in hexadecimal digits")
+    if call.application.al.state < AlState.PREOP or not call.application.device.protocols:
+        raise CommandError("its mailbox is off: it needs one, and PREOP or above")
+    call.application.mailbox.raise_emergency(whole(code, 0, 0xFFFF), register, data)
+
+
+def _on_request(call: Call) -> None:
+    later = call.parse(" ".join(call.arguments))
+
+    def do() -> None:
+        with contextlib.suppress(CommandError):  # no power by then
+            later()
+
+    call.life.on_request = lambda: call.sensor.due.append(do)
+
+
 def _sii(call: Call) -> None:
     faults = SiiInterface.FAULTS.get(call.arguments[0])
     if faults is None:
@@ -76,5 +100,13 @@ COMMANDS: Final[tuple[FaultCommand, ...]] = (
         "cut-save", "cut-save N [@N]", (1,), "lose power in the next save after N entries", _cut_save
     ),
     FaultCommand("mute-mailbox", "mute-mailbox N [@N]", (1,), "drop the next N mailbox requests", _mute),
+    FaultCommand(
+        "emergency", "emergency CODE [REGISTER [HEX]] [@N]", (1, 2, 3),
+        "send a CoE emergency before all that the mailbox holds", _emergency,
+    ),
+    FaultCommand(
+        "on-request", "on-request COMMAND ...", range(1, 7),
+        "execute a command after the next mailbox request, before its answer is read", _on_request,
+    ),
     FaultCommand("sii", "sii error|busy|ok [@N]", (1,), "result of reading the EEPROM", _sii),
 )  # fmt: skip

@@ -21,6 +21,7 @@ from ethercat_server.sensor.objects.dictionary import (
     SAVE_PARAMETERS,
     SERIAL_NUMBER,
     ObjectEntry,
+    ObjectType,
 )
 from ethercat_server.sensor.objects.search import TITLES
 from ethercat_server.virtual_sensor.firmware.flash import Flash
@@ -38,6 +39,8 @@ OBJECT_NAMES: Final = {
     **MAPPING_NAMES,
 }
 _UNKNOWN_COMMAND = 1
+_SINC_UNIT = 307_200
+"""What the SINC length reads back, times the sampling rate: 768 at 400 Hz, 2048 at 150 Hz (real sensors)."""
 _SAVED = range(0x8000, 0x8011)
 """Objects stored by the save command; the factory calibration is stored at once."""
 
@@ -83,7 +86,8 @@ class Dictionary(ObjectTable):
     @staticmethod
     def _initial(row: ObjectEntry) -> bytes:
         if row.index == FACTORY_CALIBRATION and row.subindex:
-            return struct.pack("<f", row.subindex / 64)  # a recognizable value
+            # A recognizable value.
+            return row.type.pack(row.subindex / 64 if row.type is ObjectType.REAL32 else row.subindex)
         data = row.type.pack(row.default)
         return data.ljust(STRING_SIZES.get(row.index, len(data)), b"\0")
 
@@ -94,6 +98,8 @@ class Dictionary(ObjectTable):
             field = next(f for f in self._layout.fields if f.subindex == subindex)
             start = self._layout.offsets[field.name]
             return self._process_data()[start : start + field.type.size]
+        if row.setting == "sinc_length":
+            return row.type.pack(round(_SINC_UNIT / sampling_rate_hz(int(self.number(row.address)))))
         if row.address == CONTROL_STATUS and self._saved:
             return bytes([self._flash.status(self._now())])
         return self._values[row.address]

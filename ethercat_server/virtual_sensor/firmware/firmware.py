@@ -29,6 +29,8 @@ class Firmware(Application):
         self, options: SensorOptions, flash: Flash, clock: Callable[[], int], on_write: OnWrite
     ) -> None:
         self._on_write = on_write
+        self.on_request: Callable[[], None] | None = None
+        """Called once, after the next mailbox request."""
         self.dictionary = Dictionary(
             options.model, options.serial, options.pdo_size,
             flash, self.inputs, self._settings_changed, clock,
@@ -36,7 +38,15 @@ class Firmware(Application):
         self.sampler = Sampler(options, self.dictionary, clock)
         self.aborts = AbortFaults()
         device = sensor_device(options.model, options.serial, options.pdo_size)
-        super().__init__(device, clock, SdoInformation(self.dictionary, device, OBJECT_NAMES))
+        information = SdoInformation(self.dictionary, device, OBJECT_NAMES)
+        super().__init__(device, clock, information, options.eeprom_ms)
+
+    def mailbox_written(self) -> None:
+        """A request has arrived."""
+        super().mailbox_written()
+        if (action := self.on_request) is not None:
+            self.on_request = None
+            action()
 
     def inputs(self) -> bytes:
         """The newest process data."""

@@ -37,7 +37,7 @@ def sensor_device(model: str, serial: int, pdo_size: int) -> Device:
         (
             SyncManagerRow(0x1000, 128, 0x26, MAILBOX_OUT),
             SyncManagerRow(0x1080, 128, 0x22, MAILBOX_IN),
-            SyncManagerRow(0x1100, RXPDO.size, 0x64, OUTPUTS),  # 0x40: writes trigger the watchdog
+            SyncManagerRow(0x1100, RXPDO.size, 0x24, OUTPUTS),  # without 0x40: no process data watchdog
             SyncManagerRow(0x1180, pdo_size, 0x20, INPUTS),
         ),
         (RXPDO,),

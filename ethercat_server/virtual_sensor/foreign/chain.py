@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from ethercat_server.virtual_sensor.foreign.kinds import KINDS
-from ethercat_server.virtual_sensor.options import ForeignOptions, SensorOptions, SlaveOptions
+from ethercat_server.virtual_sensor.options import EEPROM_MS, ForeignOptions, SensorOptions, SlaveOptions
 from ethercat_server.virtual_sensor.slave.al import AlState
 
 SENSOR: Final = "BOTA"
@@ -35,16 +35,22 @@ def parse_chain(text: str) -> list[tuple[str, AlState]]:
 
 
 def slaves_in(
-    chain: Iterable[tuple[str, AlState]], sensors: Sequence[SensorOptions] = ()
+    chain: Iterable[tuple[str, AlState]],
+    sensors: Sequence[SensorOptions] = (),
+    eeprom_ms: float = EEPROM_MS,
 ) -> tuple[SlaveOptions, ...]:
     """The options of the slaves in a parsed chain; `sensors` are its sensors, the default ones if too few."""
     slaves: list[SlaveOptions] = []
     number = 0
     for kind, state in chain:
         if kind == SENSOR:
-            sensor = sensors[number] if number < len(sensors) else SensorOptions(serial=number + 1)
+            sensor = (
+                sensors[number]
+                if number < len(sensors)
+                else SensorOptions(serial=number + 1, eeprom_ms=eeprom_ms)
+            )
             slaves.append(replace(sensor, state=state))
             number += 1
         else:
-            slaves.append(ForeignOptions(kind, state))
+            slaves.append(ForeignOptions(kind, state, eeprom_ms))
     return tuple(slaves)

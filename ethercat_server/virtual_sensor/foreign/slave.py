@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
@@ -25,8 +26,8 @@ Record = Callable[[int, bytes], None]
 class _RecordingEsc(Esc):
     """A controller that reports all that a master writes: address, data."""
 
-    def __init__(self, pdi: Pdi, image: bytes, record: Record) -> None:
-        super().__init__(pdi, image)
+    def __init__(self, pdi: Pdi, image: bytes, sii_read_ns: int, record: Record) -> None:
+        super().__init__(pdi, image, sii_read_ns)
         self._record = record
 
     def write(self, address: int, data: bytes) -> bool:
@@ -38,12 +39,14 @@ class _RecordingEsc(Esc):
 class ForeignApplication(Application):
     """What a foreign slave does: see `foreign.kinds`."""
 
-    def __init__(self, device: Device, clock: Callable[[], int], record: Record) -> None:
+    def __init__(self, device: Device, clock: Callable[[], int], eeprom_ms: float, record: Record) -> None:
         entries = by_address(objects_of(device) + mapping_rows(device))
         self.objects = ObjectTable(entries, {a: row.type.pack(row.default) for a, row in entries.items()})
         self.drive = Drive(clock()) if device.name == DRIVE else None
         information = SdoInformation(self.objects, device, MAPPING_NAMES)
-        super().__init__(device, clock, information, lambda pdi, image: _RecordingEsc(pdi, image, record))
+        super().__init__(
+            device, clock, information, eeprom_ms, functools.partial(_RecordingEsc, record=record)
+        )
 
     def inputs(self) -> bytes:
         """The process data."""
@@ -125,7 +128,8 @@ class ForeignSlave:
         if not on:
             self.life = None
         elif self.life is None:
-            self.life = ForeignApplication(KINDS[self.options.kind], self._clock, self._remember)
+            device = KINDS[self.options.kind]
+            self.life = ForeignApplication(device, self._clock, self.options.eeprom_ms, self._remember)
 
     def _remember(self, address: int, data: bytes) -> None:
         self.writes.append((address, bytes(data)))

@@ -27,7 +27,8 @@ _OUTPUTS, _INPUTS = 2, 3
 class Application(ABC):
     """What the EtherCAT controller calls (`esc.Pdi`) and what SDOs access (`coe.Objects`).
 
-    `clock` gives the time in ns; `controller` makes the EtherCAT controller.
+    `clock` gives the time in ns; reading its EEPROM takes `eeprom_ms`; `controller` makes the
+    EtherCAT controller.
     """
 
     def __init__(
@@ -35,11 +36,12 @@ class Application(ABC):
         device: Device,
         clock: Callable[[], int],
         information: Information,
-        controller: Callable[[Application, bytes], Esc] = Esc,
+        eeprom_ms: float,
+        controller: Callable[[Application, bytes, int], Esc] = Esc,
     ) -> None:
         self.device = device
         self.clock = clock
-        self.esc = controller(self, build_image(device))
+        self.esc = controller(self, build_image(device), round(eeprom_ms * 1e6))
         self.al = AlStateMachine(self._mailbox_fault, self._process_data_fault)
         self.coe = CoeServer(self, information)
         managers = self.esc.sync_managers

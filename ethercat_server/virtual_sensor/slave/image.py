@@ -18,6 +18,7 @@ from ethercat_server.ethercat.slave.sii_content import (
     MAILBOXES_BYTE,
     SYNC_MANAGER,
     Category,
+    MailboxProtocol,
     checksum,
 )
 from ethercat_server.virtual_sensor.esc import registers as reg
@@ -69,7 +70,7 @@ def build_image(device: Device) -> bytes:
     coe_details = COE_SDO | COE_SDO_INFORMATION if device.protocols else 0
     general = struct.pack(
         "<BBBBBBBBBBBBhHH14x",
-        group, 0, name, name, 0, coe_details, bool(device.protocols),
+        group, 0, name, name, 0, coe_details, MailboxProtocol.FoE in device.protocols,
         0, 0, 0, 0, 0, device.bus_current_ma, 0, 0x0011,
     )  # fmt: skip
     managers = b"".join(

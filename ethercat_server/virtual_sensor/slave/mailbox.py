@@ -16,6 +16,8 @@ from ethercat_server.ethercat.slave.sii_content import MailboxProtocol
 from ethercat_server.virtual_sensor.esc.sync_manager import SyncManager
 
 HEADER: Final = struct.Struct("<HHBB")
+COE_EMERGENCY: Final = 1
+"""Service in the CoE header."""
 _TYPE_MASK = 0x0F
 
 
@@ -65,7 +67,9 @@ class Mailbox:
         self._written = written
         self._read = read
         self._coe = coe
-        self._replies: deque[bytes] = deque()
+        self._replies: deque[tuple[MailboxType, int, bytes]] = deque()
+        self._last: tuple[MailboxType, int, bytes] | None = None
+        """Type, address and body of what is in the read mailbox, or was."""
         self._last_reply = b""
         self._last_counter = 0
         self._counter = 0
@@ -90,8 +94,21 @@ class Mailbox:
             self._written.full = False
             self._request(message)
         if self._replies:
-            self._last_reply = self._replies.popleft()
+            self._last = self._replies.popleft()
+            kind, address, body = self._last
+            self._counter = self._counter % 7 + 1
+            self._last_reply = HEADER.pack(len(body), address, 0, kind | self._counter << 4) + body
             self._read.load(self._last_reply)
+
+    def raise_emergency(self, code: int, register: int, data: bytes) -> None:
+        """Put a CoE emergency before all that the master has not read yet; the mailbox must be on."""
+        body = struct.pack("<HHB5s", COE_EMERGENCY << 12, code, register, data)
+        if self._read.unread and self._last is not None:
+            self._replies.appendleft(self._last)
+            self._read.full = False
+            self._counter = (self._counter - 2) % 7 + 1
+        self._replies.appendleft((MailboxType.COE, 0, body))
+        self.work()
 
     def repeat(self) -> None:
         """The master lost the last reply: repeat it."""
@@ -118,9 +135,7 @@ class Mailbox:
             reply_type, replies = self._answer(kind & _TYPE_MASK, body)
         except MailboxRequestError as fault:
             replies = [struct.pack("<HH", 1, fault.detail)]
-        for reply in replies:
-            self._counter = self._counter % 7 + 1
-            self._replies.append(HEADER.pack(len(reply), address, 0, reply_type | self._counter << 4) + reply)
+        self._replies += [(reply_type, address, reply) for reply in replies]
 
     def _answer(self, kind: int, body: bytes) -> tuple[MailboxType, list[bytes]]:
         if kind == MailboxType.COE and MailboxProtocol.CoE in self._protocols:
