@@ -145,7 +145,10 @@ class Cycle:
                 watchdog.feed()
             self._cycles += 1
             self._lost_frames += wkc < 0
-            self._exchange.record(back - sent)
+            took = back - sent
+            self._exchange.record(took)
+            if took > shortest_ns and wkc >= 0:  # the computer stood still meanwhile
+                self._missed_deadlines += int(took // shortest_ns)
 
     def _limits(self) -> tuple[float, float]:
         """The shortest sample period in ns and how long a frame may take in s; both change with the rates."""
