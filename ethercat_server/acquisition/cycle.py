@@ -122,8 +122,7 @@ class Cycle:
                 late = sent - deadline
                 lead_ns += _LATENESS_GAIN * (min(late, _MAX_LEAD_NS) - lead_ns)
                 self._wake.record(late)
-                if late > shortest_ns:
-                    self._missed_deadlines += int(late // shortest_ns)
+                self._missed_deadlines += int(max(late, 0) // shortest_ns)
             bus.send(sent)
             wkc = bus.receive(wait_s)
             back = monotonic_ns()
@@ -145,10 +144,9 @@ class Cycle:
                 watchdog.feed()
             self._cycles += 1
             self._lost_frames += wkc < 0
-            took = back - sent
-            self._exchange.record(took)
-            if took > shortest_ns and wkc >= 0:  # the computer stood still meanwhile
-                self._missed_deadlines += int(took // shortest_ns)
+            self._exchange.record(back - sent)
+            if back - sent > shortest_ns and wkc >= 0:  # the computer stood still meanwhile
+                self._missed_deadlines += int((back - sent) // shortest_ns)
 
     def _limits(self) -> tuple[float, float]:
         """The shortest sample period in ns and how long a frame may take in s; both change with the rates."""
