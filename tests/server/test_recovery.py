@@ -387,3 +387,24 @@ def test_what_is_lost_is_flagged_or_counted_through_recoveries(seed: int) -> Non
         client.fresh(chance.randrange(1, 100))
     check_frames(simulation.frames)
     assert client.ask("status")["sensors"][0]["recoveries"] == 30
+
+
+@pytest.mark.parametrize("seed", more_if_long([0], range(5)))
+def test_one_that_returns_with_a_slow_eeprom_costs_the_other_nothing(seed: int) -> None:
+    """Two sensors, 20 power cuts of the second; its EEPROM takes 30 ms a read."""
+
+    def lost(cuts: int) -> int:
+        simulation = Simulation(
+            CLOCK, SensorOptions(signal="clock", serial=2, eeprom_ms=30.0), machine=Machine(seed=seed)
+        )
+        for cut in range(cuts):
+            simulation.at(0.5 + 0.5 * cut, "power cycle 0.1 @1")
+        simulation.run(0.5 + 0.5 * 20)
+        first, second = simulation.status()["sensors"]
+        assert second["recoveries"] == cuts
+        assert simulation.sensors[1].streams
+        check_frames(frame for frame in simulation.frames if frame.sensor == 0)
+        assert not any(frame.flags & OLD for frame in simulation.frames if frame.sensor == 0)
+        return int(first["lost_samples"])
+
+    assert lost(20) <= lost(0)
