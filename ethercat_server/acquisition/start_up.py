@@ -106,7 +106,7 @@ def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> S
     sensors = _again(find)
     _check_places(bus.ifname, sensors, wanted)
     for slave in others:
-        log.info("%s is not ours: it stays in %s", slave, slave.status)
+        log.info("%s is left alone: it stays in %s", slave, slave.status)
     return Started(sensors, others)
 
 
