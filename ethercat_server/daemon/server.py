@@ -78,7 +78,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         finally:
             notifier.stopping()
             hub.broadcast(event(Event.SHUTTING_DOWN))
-        log.info("shutting down: the bus goes to INIT")
+        log.info("shutting down: the sensors go to INIT")
 
 
 def _virtual_bus(options: ServerOptions) -> VirtualBus:
