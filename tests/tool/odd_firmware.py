@@ -39,6 +39,16 @@ def wrong_rate(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(dictionary, "sampling_rate_hz", lambda _: 500)
 
 
+def subtracting(patch: pytest.MonkeyPatch) -> None:
+    """Subtracts its offsets."""
+    offsets = dictionary.Dictionary.offsets
+
+    def negative(self: dictionary.Dictionary, index: int) -> tuple[float, ...]:
+        return tuple(-value for value in offsets(self, index))
+
+    patch.setattr(dictionary.Dictionary, "offsets", negative)
+
+
 def fewer_objects(patch: pytest.MonkeyPatch) -> None:
     """No coordinate system and no inertia compensation."""
     _lack(patch, FEWER, AbortCode.NO_SUBINDEX)
