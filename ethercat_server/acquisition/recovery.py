@@ -245,6 +245,8 @@ class Recovery:
         sensor, stream = self._sensors[number], self._streams[number]
         del self._work[number]
         sensor.enter(SensorState.STREAMING)
+        if left_op:
+            sensor.settle(self._clock)
         self._count_alive()
         stream.recover(sensor.period_ns if left_op else None, lost=number in self._lost_at_ns)
         if (change := self._changing.pop(number, None)) is not None:

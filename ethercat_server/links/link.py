@@ -16,7 +16,8 @@ from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import BY_SETTING, SAMPLING_RATE
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.sensor.set_up import read_settings
-from protocol.framing import DataMessage
+from protocol.accounting import NOT_NEW
+from protocol.framing import DataFlag, DataMessage
 from protocol.sensor.filters import FORCE_TORQUE_FILTERS
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue
@@ -43,6 +44,21 @@ OnFrame = Callable[[DataMessage], bool]
 """Receives a DATA message; returns whether to continue."""
 
 
+class SettledFrames:
+    """Hands frames to `on_frame` but for the samples of settling sensors, whose GAP the next frame gets."""
+
+    def __init__(self, on_frame: OnFrame) -> None:
+        self._on_frame = on_frame
+        self._gaps: dict[int, int] = {}
+
+    def take(self, frame: DataMessage, settling: bool) -> bool:
+        """A frame of a sensor that is or is not `settling`; returns whether to continue."""
+        if settling and not frame.flags & NOT_NEW:
+            self._gaps[frame.sensor] = self._gaps.get(frame.sensor, 0) | frame.flags & DataFlag.GAP
+            return True
+        return self._on_frame(frame._replace(flags=frame.flags | self._gaps.pop(frame.sensor, 0)))
+
+
 class Link(ABC):
     """Access to the sensors of one bus. Errors are ServerErrors."""
 
@@ -66,7 +82,13 @@ class Link(ABC):
 
     @abstractmethod
     def watch(self, numbers: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
-        """Stream until `on_frame` or the periodic `on_idle` returns False. The last call on a link."""
+        """Stream until `on_frame` or the periodic `on_idle` returns False. The last call on a link.
+
+        Samples of settling sensors are left out; it begins when they have settled.
+        """
+
+    def wait_settled(self, numbers: Sequence[int]) -> None:  # noqa: B027
+        """Wait until the data of these sensors has settled; in PREOP it has."""
 
     @abstractmethod
     def close(self) -> None:

@@ -15,12 +15,9 @@ from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
 from ethercat_server.sensor.objects import dictionary
-from ethercat_server.sensor.sensor import Identity, Sensor
+from ethercat_server.sensor.sensor import SETTLING_S, Identity, Sensor
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue
 from protocol.text.visible import visible
-
-_SETTLE_S: Final = 0.5
-"""How long Bota's own driver waits for new filter settings to take effect."""
 
 _LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]
 """sinc_length."""
@@ -162,7 +159,7 @@ def _rate_is_right(sdo: Sdo, sensor: Sensor) -> Steps[bool]:
 
 
 def _check_rate(sdo: Sdo, sensor: Sensor) -> Steps[None]:
-    deadline = Deadline(sdo.clock, _SETTLE_S)
+    deadline = Deadline(sdo.clock, SETTLING_S)
     while not (yield from _rate_is_right(sdo, sensor)):
         if deadline.passed:
             length = sensor.wanted[_LAST]

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple, Protocol
 from ethercat_server.errors import BusError, CutOffError, extended
 from ethercat_server.ethercat.clock import Clock, Deadline
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
-from ethercat_server.sensor.sensor import Sensor
+from ethercat_server.sensor.sensor import SETTLING_SAMPLES, Sensor
 from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
 from protocol.control import ErrorCode
 from protocol.errors import RequestError
@@ -47,8 +47,6 @@ _PARTS: Final = 8
 """Parts of a window whose means give the standard error of the whole window's."""
 _ROUNDING: Final = 1e-6
 """Share of a reading by which REAL32 arithmetic in the sensor may be off."""
-_SETTLING: Final = 8
-"""Samples after which a new offset is in effect."""
 _PATIENCE: Final = 4.0
 """Timeout for samples, in multiples of their nominal duration."""
 
@@ -75,6 +73,8 @@ def tare(
     """
     _check_fits(target, "the key 'target'")
     samples = max(samples, LEAST_SAMPLES)
+    while sensor.settling:
+        yield
     before = yield from _average(sdo.clock, sensor, stream, samples)
     _check_rest(sensor, before)
     old = yield from read_offset(sdo)
@@ -82,7 +82,7 @@ def tare(
     _check_fits(new, "the offset that the key 'target' asks for")
     try:
         yield from write_offset(sdo, new)
-        yield from _wait(sdo.clock, sensor, stream, _SETTLING)
+        yield from _wait(sdo.clock, sensor, stream, SETTLING_SAMPLES)
         after = yield from _average(sdo.clock, sensor, stream, samples)
         _check_better(sensor, before, after, target)
     except (BusError, RequestError) as error:

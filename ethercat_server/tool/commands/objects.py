@@ -15,6 +15,7 @@ from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION, Objec
 from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, find_objects, similar_names
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.show import columns, say, say_json, value_text
+from protocol.pdo import INPUT_OBJECT
 from protocol.sensor.meaning import value_meaning
 
 _MOST_SILENT: Final = 3
@@ -67,6 +68,8 @@ class _Sensor(NamedTuple):
 def _read_sensor(opened: Link, found: Found, rows: Sequence[ObjectEntry]) -> _Sensor:
     objects: list[tuple[ObjectEntry, dict[str, Any]]] = []
     try:
+        if any(row.index == INPUT_OBJECT for row in rows):
+            opened.wait_settled([found.number])
         if found.has_objects:
             objects.extend(_read_rows(opened.sdo(found.number), rows))
     except BusError as error:

@@ -39,6 +39,8 @@ class SensorInfo(NamedTuple):
     rate: float = 0.0
     """`rate_hz` as a number; 0 if it is none."""
     settings: Mapping[str, SettingValue] = {}
+    settling: bool = False
+    """Whether its data has not settled."""
 
     def __str__(self) -> str:
         """One phrase for the log."""
@@ -147,8 +149,10 @@ def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
             )
             hz = row.get("rate_hz")
             number = float(hz) if isinstance(hz, int | float) and 0 < hz <= _MOST_HZ else 0.0
-            settings = known_settings(row.get("settings"))
-            return SensorInfo(sensor, name, serial, rate, state, hardware, firmware, number, settings)
+            settings, settling = known_settings(row.get("settings")), row.get("settling") is True
+            return SensorInfo(
+                sensor, name, serial, rate, state, hardware, firmware, number, settings, settling
+            )
     there = ", ".join(printable(row.get("sensor"), 10) for row in found[:16]) or "none"
     raise ConnectionFailedError(
         f"the server has no sensor {sensor} (it has: {there}): set the parameter 'sensor' to one it has"
