@@ -89,6 +89,9 @@ SETTINGS: Final[Mapping[str, Setting]] = {
 BASE_SAMPLING_RATE_HZ: Final = 51200
 """The ADC's rate: sampling rate = 51200 / SINC length."""
 
+_MOST_DIVIDED: Final = 8
+"""By how much CHOP may divide the sampling rate; no source says whether it does, so object 0x8011 decides."""
+
 PUBLISHED_RATES_HZ: Final[Mapping[int, int]] = {
     length: row.rate_hz for length, row in FORCE_TORQUE_FILTERS.items()
 }
@@ -98,6 +101,18 @@ PUBLISHED_RATES_HZ: Final[Mapping[int, int]] = {
 def sampling_rate_hz(sinc_length: int) -> int:
     """The rate in whole Hz that object 0x8011 gives for a SINC length."""
     return PUBLISHED_RATES_HZ.get(sinc_length, round(BASE_SAMPLING_RATE_HZ / sinc_length))
+
+
+def rate_divisor(sinc_length: int, rate_hz: int, chop: SettingValue | None = False) -> int | None:
+    """By what the rate of a SINC length is divided if object 0x8011 gives `rate_hz`: 1, or with CHOP up to 8.
+
+    None if the length does not explain the rate. The object rounds up or down to whole Hz.
+    """
+    if sinc_length <= 0:
+        return None
+    nominal = BASE_SAMPLING_RATE_HZ / sinc_length
+    nearest = min(range(1, _MOST_DIVIDED + 1 if chop else 2), key=lambda by: abs(rate_hz - nominal / by))
+    return nearest if abs(rate_hz - nominal / nearest) < 1.0 else None
 
 
 def check_settings(values: Mapping[str, object]) -> dict[str, SettingValue]:

@@ -20,7 +20,7 @@ from protocol.accounting import NOT_NEW
 from protocol.framing import DataFlag, DataMessage
 from protocol.sensor.filters import FORCE_TORQUE_FILTERS
 from protocol.sensor_choice import SensorChoice
-from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue
+from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
 
 
 class Found(NamedTuple):
@@ -138,8 +138,9 @@ def read_in_force(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     """Read settings and rate, and take them as wanted."""
     rate = yield from _number(sdo, SAMPLING_RATE)
     length = yield from _number(sdo, _SINC)
+    chop = yield from _number(sdo, BY_SETTING["chop"].address)
     sensor.rate_hz = rate or 0
-    held = sinc_length_in_force(length, rate)
+    held = sinc_length_in_force(length, rate, chop)
     sensor.wanted = {"sinc_length": held or 0}
     yield from read_settings(sdo, sensor)
     if not held:
@@ -150,14 +151,14 @@ def read_in_force(sdo: Sdo, sensor: Sensor) -> Steps[None]:
 _SINC: Final = BY_SETTING["sinc_length"].address
 
 
-def sinc_length_in_force(read: int | None, rate_hz: int | None) -> int | None:
+def sinc_length_in_force(read: int | None, rate_hz: int | None, chop: int | None = 0) -> int | None:
     """The SINC length, from what object 0x8006:1 and the sampling rate read.
 
     The rate decides: a real device read back 2048 while it sampled with 341.
     """
     if not rate_hz:
         return read
-    if read and abs(rate_hz - BASE_SAMPLING_RATE_HZ / read) <= 1.0:
+    if read and rate_divisor(read, rate_hz, chop):
         return read
     published = [length for length, row in FORCE_TORQUE_FILTERS.items() if row.rate_hz == rate_hz]
     return published[0] if published else round(BASE_SAMPLING_RATE_HZ / rate_hz)

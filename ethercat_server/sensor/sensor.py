@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from ethercat_server.ethercat.clock import Clock, Deadline
 from protocol.sensor.meaning import value_meaning
-from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue
+from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
 
 SETTLING_S: Final = 0.5
 """How long Bota's own driver lets a sensor settle: new filter settings, and the data after entering OP."""
@@ -123,12 +123,21 @@ class Sensor:
     @property
     def period_ns(self) -> float:
         """Nominal sample period; 0x8011 rounds the rate to whole Hz, so it follows from the SINC length."""
-        return 1e9 * self.wanted["sinc_length"] / BASE_SAMPLING_RATE_HZ
+        length = self.wanted["sinc_length"]
+        divisor = rate_divisor(length, self.rate_hz, self.wanted.get("chop")) or 1
+        return 1e9 * length * divisor / BASE_SAMPLING_RATE_HZ
 
     def hold(self, settings: Mapping[str, SettingValue]) -> None:
         """These settings are in force now."""
         self.settings = dict(settings)
-        self.meaning = {name: value_meaning(name, value) for name, value in settings.items()}
+        chop = settings.get("chop")
+        self.meaning = {
+            name: value_meaning(name, value, self.rate_hz, chop) for name, value in settings.items()
+        }
+
+    def in_force(self) -> dict[str, Any]:
+        """What replies and events say of a change."""
+        return {"settings": dict(self.settings), "rate_hz": self.rate_hz}
 
     def describe(self) -> dict[str, Any]:
         """The sensor's part of the `describe` reply."""

@@ -21,6 +21,8 @@ class SensorOptions:
     signal: str = "scene"
     noise: bool = True
     seed: int = 0
+    chop_divides: int = 1
+    """By what CHOP divides its sampling rate."""
 
 
 @dataclass(frozen=True, slots=True)

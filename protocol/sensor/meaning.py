@@ -14,7 +14,7 @@ from protocol.sensor.filters import (
     FORCE_TORQUE_FILTERS,
     ImuFilter,
 )
-from protocol.settings import SettingValue, sampling_rate_hz
+from protocol.settings import SettingValue, rate_divisor, sampling_rate_hz
 
 NOT_IN_TABLE: Final = "not in the table"
 
@@ -31,8 +31,13 @@ _ON_OFF: Final[Mapping[str, tuple[str, str]]] = {
 _IMU: Final = ("no IMU", "internal IMU", "external IMU", "both IMUs")
 
 
-def value_meaning(name: str, value: SettingValue) -> str:
-    """The meaning of `value` for the setting `name`. KeyError if there is no such setting."""
+def value_meaning(
+    name: str, value: SettingValue, rate_hz: int | None = None, chop: SettingValue | None = False
+) -> str:
+    """The meaning of `value` for the setting `name`. KeyError if there is no such setting.
+
+    `rate_hz` is the sampling rate that the sensor reports, if it is known, and `chop` whether CHOP is on.
+    """
     if name in _ON_OFF:
         return _ON_OFF[name][0 if value else 1]
     if name == "imu_active":
@@ -47,6 +52,10 @@ def value_meaning(name: str, value: SettingValue) -> str:
         return _or_not(ANGULAR_RATE_FILTERS.get(value))
     if name != "sinc_length":
         raise KeyError(name)
+    if rate_hz and (divisor := rate_divisor(value, rate_hz, chop)) is not None and divisor > 1:
+        return (
+            f"{rate_hz} Hz (CHOP divides {sampling_rate_hz(value)} Hz by {divisor}); cut-off {NOT_IN_TABLE}"
+        )
     row = FORCE_TORQUE_FILTERS.get(value)
     if row is None:
         return f"{sampling_rate_hz(value)} Hz (51200 / length); cut-off {NOT_IN_TABLE}"
@@ -87,15 +96,16 @@ class Meaning(NamedTuple):
         }
 
 
-def meaning(settings: Mapping[str, SettingValue]) -> Meaning:
-    """What `settings` mean together."""
+def meaning(settings: Mapping[str, SettingValue], rate_hz: int | None = None) -> Meaning:
+    """What `settings` mean together; `rate_hz` is the rate that the sensor reports, if it is known."""
     length, row = settings.get("sinc_length"), None
     if length is not None:
         row = FORCE_TORQUE_FILTERS.get(length)
     fir = settings.get("fir")
-    known = row is not None and fir is not None and not settings.get("fast")
+    divided = length and rate_hz and rate_divisor(length, rate_hz, settings.get("chop")) != 1
+    known = row is not None and fir is not None and not settings.get("fast") and not divided
     return Meaning(
-        sampling_rate_hz(length) if length else None,
+        rate_hz or (sampling_rate_hz(length) if length else None),
         row.cutoff_hz(bool(fir)) if row is not None and known else None,
         ACCELERATION_FILTERS.get(settings.get("acceleration_filter", 0)),
         ANGULAR_RATE_FILTERS.get(settings.get("angular_rate_filter", 0)),

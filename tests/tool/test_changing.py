@@ -159,6 +159,26 @@ def test_a_sinc_length_is_verified_by_the_rate(single: SimulatedBus, monkeypatch
     assert "samples at 500 Hz" in one_sentence(failed)
 
 
+def test_chop_that_divides_the_rate_is_taken_and_told(single: SimulatedBus) -> None:
+    near, life = single.near, single.backend.sensors.sensors[0].life
+    assert life is not None
+    life.dictionary.let_chop_divide(2)
+    applied = tool_here("apply", near, "--set", "chop=on", "--json").json
+    assert (applied["rate_hz"], applied["meaning"]["rate_hz"], applied["meaning"]["cutoff_hz"]) == (
+        400,
+        400,
+        None,
+    )
+    assert (applied["settings"]["sinc_length"], applied["settings"]["chop"]) == (64, True)
+    planned = tool_here("plan", near, "--set", "chop=on", "--set", "sinc_length=64", "--json").json
+    assert (planned["changes"], planned["then"]["rate_hz"]) == ([], 400)
+    planned = tool_here("plan", near, "--set", "imu_active=3", "--json", code=3).json
+    assert planned["then"]["rate_hz"] == 400
+    assert len(tool_here("tare", near, "--samples", 20, "--json").json["new_offset"]) == 6
+    watched = tool_here("watch", near, "--samples", 100, "--interval", 9, "--json").json
+    assert (round(watched["rate_hz"]), watched["gaps"]) == (400, 0)
+
+
 def test_tare_makes_the_mean_the_target(bench: SimulatedBus) -> None:
     near = bench.near
     target = ("1", "-2", "3", "0.1", "0.2", "-0.3")

@@ -113,8 +113,10 @@ def _plan(args: argparse.Namespace) -> int:
     with link(args) as opened:
         found, settings, sensor = _look(args, opened, asked)
     changed = changes(sensor, settings)
-    now = meaning(sensor.settings)
-    then = meaning({**sensor.settings, **{row["name"]: row["then"] for row in changed}})
+    now = meaning(sensor.settings, sensor.rate_hz)
+    names = {row["name"] for row in changed}
+    rate_hz = None if names & {"sinc_length", "chop"} else sensor.rate_hz
+    then = meaning({**sensor.settings, **{row["name"]: row["then"] for row in changed}}, rate_hz)
     lines = [change_lines(changed)]
     if changed:
         lines.append("settings afterwards:\n  " + "\n  ".join(then.lines()))
@@ -134,7 +136,7 @@ def _apply(args: argparse.Namespace) -> int:
             opened.configure(found.number, settings, args.save)
         after = opened.in_force(found) if changed else before
     verify(after, settings)
-    in_force = meaning(after.settings)
+    in_force = meaning(after.settings, after.rate_hz)
     values = {
         "changes": changed, "saved": args.save, "settings": after.settings, "rate_hz": after.rate_hz,
         "meaning": in_force.as_json(),

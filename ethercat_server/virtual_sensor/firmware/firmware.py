@@ -46,6 +46,7 @@ class Firmware:
             options.model, options.serial, options.pdo_size,
             flash, self.inputs, self._settings_changed, clock,
         )  # fmt: skip
+        self.dictionary.let_chop_divide(options.chop_divides)
         self.sampler = Sampler(options, self.dictionary, clock)
         self.esc = Esc(self, build_image(options.model, options.serial, options.pdo_size))
         self.al = AlStateMachine(self._mailbox_fault, self._process_data_fault)

@@ -138,6 +138,11 @@ def known_settings(settings: object) -> dict[str, SettingValue]:
     return found
 
 
+def known_rate(rate_hz: object) -> float:
+    """The sampling rate that a message gives, Hz; 0 if it is none."""
+    return float(rate_hz) if isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ else 0.0
+
+
 def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
     """The row of `sensor` in a `describe` reply; ConnectionFailedError if there is none."""
     found = rows(description.get("sensors"))
@@ -147,8 +152,7 @@ def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
                 printable(row.get(key, "?"), 40)
                 for key in ("name", "serial", "rate_hz", "state", "hardware", "firmware")
             )
-            hz = row.get("rate_hz")
-            number = float(hz) if isinstance(hz, int | float) and 0 < hz <= _MOST_HZ else 0.0
+            number = known_rate(row.get("rate_hz"))
             settings, settling = known_settings(row.get("settings")), row.get("settling") is True
             return SensorInfo(
                 sensor, name, serial, rate, state, hardware, firmware, number, settings, settling
