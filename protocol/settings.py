@@ -115,6 +115,27 @@ def rate_divisor(sinc_length: int, rate_hz: int, chop: SettingValue | None = Fal
     return nearest if abs(rate_hz - nominal / nearest) < 1.0 else None
 
 
+def sinc_length_of(
+    read: int | None,
+    rate_hz: int | None,
+    chop: SettingValue | None = False,
+    asked: SettingValue | None = None,
+) -> int | None:
+    """The SINC length in force, from what object 0x8006:1 reads and the sampling rate in 0x8011.
+
+    The rate decides: real devices read back 768 after 128, and 2048 at 150 Hz. Of several lengths with this
+    rate it is the one read, else the one `asked` for, else the manual's.
+    """
+    if not rate_hz:
+        return read
+    allowed = SETTINGS["sinc_length"].choices or ()
+    for length in (read, asked):
+        if length is not None and length in allowed and rate_divisor(length, rate_hz, chop):
+            return length
+    published = [length for length, published in PUBLISHED_RATES_HZ.items() if published == rate_hz]
+    return published[0] if published else min(round(BASE_SAMPLING_RATE_HZ / rate_hz), allowed[-1])
+
+
 def check_settings(values: Mapping[str, object]) -> dict[str, SettingValue]:
     """Return `values` if every name exists and every value is allowed; else raise SettingError."""
     checked: dict[str, SettingValue] = {}

@@ -97,7 +97,7 @@ class DirectLink(Link):
 
     def configure(self, number: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """See `Link`."""
-        sdo, sensor = self.sdo(number), self.in_force(self.sensors[number])
+        sdo, sensor = self.sdo(number), self.in_force(self.sensors[number], settings)
         _check_rate_known(sensor)
         try:
             change = Change(sensor, settings)

@@ -193,6 +193,15 @@ def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     sensor.hold(held)
 
 
+def read_sinc(sdo: Sdo) -> Steps[tuple[int | None, int | None, bool]]:
+    """What tells the SINC length in force: what it reads back, the sampling rate, CHOP. None: unreadable."""
+    length = yield from _read(sdo, dictionary.BY_SETTING[_LAST].address)
+    rate = yield from _read(sdo, dictionary.SAMPLING_RATE)
+    chop = yield from _read(sdo, dictionary.BY_SETTING["chop"].address)
+    numbers = [None if data is None else int.from_bytes(data, "little") for data in (length, rate)]
+    return numbers[0], numbers[1], any(chop or b"")
+
+
 def _read(sdo: Sdo, address: tuple[int, int]) -> Steps[bytes | None]:
     try:
         return (yield from sdo.read(*address))

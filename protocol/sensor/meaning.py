@@ -12,9 +12,10 @@ from protocol.sensor.filters import (
     ACCELERATION_FILTERS,
     ANGULAR_RATE_FILTERS,
     FORCE_TORQUE_FILTERS,
+    ForceTorqueFilter,
     ImuFilter,
 )
-from protocol.settings import SettingValue, rate_divisor, sampling_rate_hz
+from protocol.settings import SettingValue, rate_divisor, sampling_rate_hz, sinc_length_of
 
 NOT_IN_TABLE: Final = "not in the table"
 
@@ -36,7 +37,8 @@ def value_meaning(
 ) -> str:
     """The meaning of `value` for the setting `name`. KeyError if there is no such setting.
 
-    `rate_hz` is the sampling rate that the sensor reports, if it is known, and `chop` whether CHOP is on.
+    For a SINC length that was read: `rate_hz` is the sampling rate that the sensor reports, if it is known,
+    and `chop` whether CHOP is on. The rate decides.
     """
     if name in _ON_OFF:
         return _ON_OFF[name][0 if value else 1]
@@ -52,17 +54,27 @@ def value_meaning(
         return _or_not(ANGULAR_RATE_FILTERS.get(value))
     if name != "sinc_length":
         raise KeyError(name)
-    if rate_hz and (divisor := rate_divisor(value, rate_hz, chop)) is not None and divisor > 1:
-        return (
-            f"{rate_hz} Hz (CHOP divides {sampling_rate_hz(value)} Hz by {divisor}); cut-off {NOT_IN_TABLE}"
-        )
-    row = FORCE_TORQUE_FILTERS.get(value)
+    return _sinc_meaning(value, rate_hz, chop)
+
+
+def _sinc_meaning(length: int, rate_hz: int | None, chop: SettingValue | None) -> str:
+    divisor = rate_divisor(length, rate_hz, chop) if rate_hz else 1
+    if divisor is None:
+        right = sinc_length_of(length, rate_hz, chop)
+        row = None if chop else FORCE_TORQUE_FILTERS.get(right or 0)
+        cutoff = NOT_IN_TABLE if row is None else _cutoff_text(row)
+        return f"{rate_hz} Hz; cut-off {cutoff}: by the sampling rate, which this length does not match"
+    if divisor > 1:
+        nominal_hz = sampling_rate_hz(length)
+        return f"{rate_hz} Hz (CHOP divides {nominal_hz} Hz by {divisor}); cut-off {NOT_IN_TABLE}"
+    row = FORCE_TORQUE_FILTERS.get(length)
     if row is None:
-        return f"{sampling_rate_hz(value)} Hz (51200 / length); cut-off {NOT_IN_TABLE}"
-    return (
-        f"{row.rate_hz} Hz; cut-off {row.cutoff_fir_off_hz:g} Hz with FIR off, "
-        f"{row.cutoff_fir_on_hz:g} Hz with FIR on"
-    )
+        return f"{sampling_rate_hz(length)} Hz (51200 / length); cut-off {NOT_IN_TABLE}"
+    return f"{row.rate_hz} Hz; cut-off {_cutoff_text(row)}"
+
+
+def _cutoff_text(row: ForceTorqueFilter) -> str:
+    return f"{row.cutoff_fir_off_hz:g} Hz with FIR off, {row.cutoff_fir_on_hz:g} Hz with FIR on"
 
 
 class Meaning(NamedTuple):

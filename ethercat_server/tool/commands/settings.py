@@ -105,7 +105,7 @@ def _look(
     asked = options.asked_settings(found.number, found.identity.name, found.identity.serial)
     if not asked:
         raise UsageError(f"{args.config} has no settings for {found}: correct its tables, or use --set")
-    return found, asked, opened.in_force(found)
+    return found, asked, opened.in_force(found, asked)
 
 
 def _plan(args: argparse.Namespace) -> int:
@@ -134,7 +134,7 @@ def _apply(args: argparse.Namespace) -> int:
         changed = changes(before, settings)
         if changed or args.save:
             opened.configure(found.number, settings, args.save)
-        after = opened.in_force(found) if changed else before
+        after = opened.in_force(found, settings) if changed else before
     verify(after, settings)
     in_force = meaning(after.settings, after.rate_hz)
     values = {
