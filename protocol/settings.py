@@ -89,6 +89,9 @@ SETTINGS: Final[Mapping[str, Setting]] = {
 BASE_SAMPLING_RATE_HZ: Final = 51200
 """The ADC's rate: sampling rate = 51200 / SINC length."""
 
+_MOST_DIVIDED: Final = 8
+"""By how much CHOP may divide the sampling rate; no source says whether it does, so object 0x8011 decides."""
+
 PUBLISHED_RATES_HZ: Final[Mapping[int, int]] = {
     length: row.rate_hz for length, row in FORCE_TORQUE_FILTERS.items()
 }
@@ -98,6 +101,39 @@ PUBLISHED_RATES_HZ: Final[Mapping[int, int]] = {
 def sampling_rate_hz(sinc_length: int) -> int:
     """The rate in whole Hz that object 0x8011 gives for a SINC length."""
     return PUBLISHED_RATES_HZ.get(sinc_length, round(BASE_SAMPLING_RATE_HZ / sinc_length))
+
+
+def rate_divisor(sinc_length: int, rate_hz: int, chop: SettingValue | None = False) -> int | None:
+    """By what the rate of a SINC length is divided if object 0x8011 gives `rate_hz`: 1, or with CHOP up to 8.
+
+    None if the length does not explain the rate. The object rounds up or down to whole Hz.
+    """
+    if sinc_length <= 0:
+        return None
+    nominal = BASE_SAMPLING_RATE_HZ / sinc_length
+    nearest = min(range(1, _MOST_DIVIDED + 1 if chop else 2), key=lambda by: abs(rate_hz - nominal / by))
+    return nearest if abs(rate_hz - nominal / nearest) < 1.0 else None
+
+
+def sinc_length_of(
+    read: int | None,
+    rate_hz: int | None,
+    chop: SettingValue | None = False,
+    asked: SettingValue | None = None,
+) -> int | None:
+    """The SINC length in force, from what object 0x8006:1 reads and the sampling rate in 0x8011.
+
+    The rate decides: real devices read back 768 after 128, and 2048 at 150 Hz. Of several lengths with this
+    rate it is the one read, else the one `asked` for, else the manual's.
+    """
+    if not rate_hz:
+        return read
+    allowed = SETTINGS["sinc_length"].choices or ()
+    for length in (read, asked):
+        if length is not None and length in allowed and rate_divisor(length, rate_hz, chop):
+            return length
+    published = [length for length, published in PUBLISHED_RATES_HZ.items() if published == rate_hz]
+    return published[0] if published else min(round(BASE_SAMPLING_RATE_HZ / rate_hz), allowed[-1])
 
 
 def check_settings(values: Mapping[str, object]) -> dict[str, SettingValue]:

@@ -52,6 +52,8 @@ class ReplayedSensors:
         settings = event.event.get("settings")
         if isinstance(settings, dict):
             sensor.row = {**sensor.row, "settings": settings}
+            if "rate_hz" in event.event:
+                sensor.row["rate_hz"] = event.event["rate_hz"]
         state = _STATES.get(event.name)
         if state is not None:
             sensor.row = {**sensor.row, "state": state}

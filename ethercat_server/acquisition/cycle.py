@@ -182,8 +182,8 @@ class Cycle:
                 "age_us": [recent for _, recent in ages],
             },
             "sensors": [
-                {**stream.status(), "age_us": age}
-                for stream, (age, _) in zip(self._streams, ages, strict=True)
+                {**stream.status(), "settling": sensor.settling, "age_us": age}
+                for sensor, stream, (age, _) in zip(self._sensors, self._streams, ages, strict=True)
             ],
             "uptime_s": round((now_ns - self._started_ns) * 1e-9, 3),
         }

@@ -248,17 +248,19 @@ class Recovery:
         sensor, stream = self._sensors[number], self._streams[number]
         del self._work[number]
         sensor.enter(SensorState.STREAMING)
+        if left_op:
+            sensor.settle(self._clock)
         self._count_alive()
         stream.recover(sensor.period_ns if left_op else None, lost=number in self._lost_at_ns)
         if (change := self._changing.pop(number, None)) is not None:
             if change.failed is None:
-                self._announce(event(Event.RECONFIGURED, sensor=number, settings=dict(sensor.settings)))
+                self._announce(event(Event.RECONFIGURED, sensor=number, **sensor.in_force()))
             change.done(change.failed and extended(change.failed, IN_FORCE))
         if number not in self._lost_at_ns:
             return
         lost_s = round((self._clock.monotonic_ns() - self._lost_at_ns.pop(number)) * 1e-9, 3)
         log.info("sensor %d (%s) is back after %.3f s", number, sensor.identity, lost_s)
-        self._announce(event(Event.SENSOR_BACK, sensor=number, lost_s=lost_s, settings=dict(sensor.settings)))
+        self._announce(event(Event.SENSOR_BACK, sensor=number, lost_s=lost_s, **sensor.in_force()))
 
     def _refuse(self, number: int, found: Identity) -> None:
         sensor = self._sensors[number]

@@ -125,6 +125,7 @@ def enter_op(bus: Bus, sensors: list[Sensor], check_interrupt: CheckInterrupt) -
     _again(enter, lambda: bus.scan(bus.master, bus.positions, check_interrupt))
     for sensor in sensors:
         sensor.enter(SensorState.STREAMING)
+        sensor.settle(bus.clock)
 
 
 def _again(attempt: Callable[[], T], prepare: Callable[[], None] = lambda: None) -> T:

@@ -17,7 +17,15 @@ from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.master.soem import SoemBackend
 from ethercat_server.ethercat.nic.claim import claimed
 from ethercat_server.ethercat.slave.coe import BlockingSdo, Sdo, Steps, finish
-from ethercat_server.links.link import Found, Link, OnFrame, failed_change, signals_call, signals_held_back
+from ethercat_server.links.link import (
+    Found,
+    Link,
+    OnFrame,
+    SettledFrames,
+    failed_change,
+    signals_call,
+    signals_held_back,
+)
 from ethercat_server.process import realtime
 from ethercat_server.process.notify import Notifier
 from ethercat_server.sensor import look
@@ -89,7 +97,7 @@ class DirectLink(Link):
 
     def configure(self, number: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """See `Link`."""
-        sdo, sensor = self.sdo(number), self.in_force(self.sensors[number])
+        sdo, sensor = self.sdo(number), self.in_force(self.sensors[number], settings)
         _check_rate_known(sensor)
         try:
             change = Change(sensor, settings)
@@ -109,11 +117,19 @@ class DirectLink(Link):
     def watch(self, numbers: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
         """See `Link`."""
 
-        def wanted(frame: DataMessage) -> bool:
-            return frame.sensor not in numbers or on_frame(frame)
+        sensors, settled = self._operational(), SettledFrames(on_frame)
+        begun = False
 
-        running = _Running(self._bus, self._operational(), wanted)
-        running.on_idle = on_idle
+        def wanted(frame: DataMessage) -> bool:
+            return frame.sensor not in numbers or settled.take(frame, sensors[frame.sensor].settling)
+
+        def idle() -> bool:
+            nonlocal begun
+            begun = begun or not any(sensors[number].settling for number in numbers)
+            return not begun or on_idle()
+
+        running = _Running(self._bus, sensors, wanted)
+        running.on_idle = idle
         running.run()
 
     def _operational(self) -> list[Sensor]:

@@ -9,17 +9,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from ethercat_server.errors import BusError, SdoAbortError, UsageError
+from ethercat_server.errors import BusError, UsageError
 from ethercat_server.ethercat.clock import Clock
 from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
 from ethercat_server.sensor.guard import GuardedSdo
-from ethercat_server.sensor.objects.dictionary import BY_SETTING, SAMPLING_RATE
 from ethercat_server.sensor.sensor import Identity, Sensor
-from ethercat_server.sensor.set_up import read_settings
-from protocol.framing import DataMessage
-from protocol.sensor.filters import FORCE_TORQUE_FILTERS
+from ethercat_server.sensor.set_up import read_settings, read_sinc
+from protocol.accounting import NOT_NEW
+from protocol.framing import DataFlag, DataMessage
 from protocol.sensor_choice import SensorChoice
-from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue
+from protocol.settings import SettingValue, sinc_length_of
 
 
 class Found(NamedTuple):
@@ -39,8 +38,24 @@ class Found(NamedTuple):
         return {"sensor": self.number, **self.identity._asdict()}
 
 
+NO_SETTINGS: Final[Mapping[str, SettingValue]] = {}
 OnFrame = Callable[[DataMessage], bool]
 """Receives a DATA message; returns whether to continue."""
+
+
+class SettledFrames:
+    """Hands frames to `on_frame` but for the samples of settling sensors, whose GAP the next frame gets."""
+
+    def __init__(self, on_frame: OnFrame) -> None:
+        self._on_frame = on_frame
+        self._gaps: dict[int, int] = {}
+
+    def take(self, frame: DataMessage, settling: bool) -> bool:
+        """A frame of a sensor that is or is not `settling`; returns whether to continue."""
+        if settling and not frame.flags & NOT_NEW:
+            self._gaps[frame.sensor] = self._gaps.get(frame.sensor, 0) | frame.flags & DataFlag.GAP
+            return True
+        return self._on_frame(frame._replace(flags=frame.flags | self._gaps.pop(frame.sensor, 0)))
 
 
 class Link(ABC):
@@ -66,7 +81,13 @@ class Link(ABC):
 
     @abstractmethod
     def watch(self, numbers: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
-        """Stream until `on_frame` or the periodic `on_idle` returns False. The last call on a link."""
+        """Stream until `on_frame` or the periodic `on_idle` returns False. The last call on a link.
+
+        Samples of settling sensors are left out; it begins when they have settled.
+        """
+
+    def wait_settled(self, numbers: Sequence[int]) -> None:  # noqa: B027
+        """Wait until the data of these sensors has settled; in PREOP it has."""
 
     @abstractmethod
     def close(self) -> None:
@@ -80,10 +101,10 @@ class Link(ABC):
         """The same for read-only commands: all sensors if None."""
         return self.sensors if wanted is None else [self.choose(wanted)]
 
-    def in_force(self, found: Found) -> Sensor:
-        """The sensor with its present settings, which are also the wanted ones."""
+    def in_force(self, found: Found, asked: Mapping[str, SettingValue] = NO_SETTINGS) -> Sensor:
+        """The sensor with its present settings, also as the wanted ones; see `read_in_force` for `asked`."""
         sensor = Sensor(found.number, found.identity, {})
-        finish(read_in_force(self.sdo(found.number), sensor), clock=self.clock)
+        finish(read_in_force(self.sdo(found.number), sensor, asked), clock=self.clock)
         return sensor
 
 
@@ -112,40 +133,19 @@ def choose(sensors: Sequence[Found], wanted: str | None) -> Found:
     return found[0]
 
 
-def read_in_force(sdo: Sdo, sensor: Sensor) -> Steps[None]:
-    """Read settings and rate, and take them as wanted."""
-    rate = yield from _number(sdo, SAMPLING_RATE)
-    length = yield from _number(sdo, _SINC)
+def read_in_force(sdo: Sdo, sensor: Sensor, asked: Mapping[str, SettingValue] = NO_SETTINGS) -> Steps[None]:
+    """Read settings and rate, and take them as wanted.
+
+    The SINC length that is `asked` for is in force if it has the rate and what is read does not.
+    """
+    length, rate, chop = yield from read_sinc(sdo)
     sensor.rate_hz = rate or 0
-    held = sinc_length_in_force(length, rate)
+    held = sinc_length_of(length, rate, chop, asked.get("sinc_length"))
     sensor.wanted = {"sinc_length": held or 0}
     yield from read_settings(sdo, sensor)
     if not held:
         sensor.hold({name: value for name, value in sensor.settings.items() if name != "sinc_length"})
     sensor.wanted = dict(sensor.settings)
-
-
-_SINC: Final = BY_SETTING["sinc_length"].address
-
-
-def sinc_length_in_force(read: int | None, rate_hz: int | None) -> int | None:
-    """The SINC length, from what object 0x8006:1 and the sampling rate read.
-
-    The rate decides: a real device read back 2048 while it sampled with 341.
-    """
-    if not rate_hz:
-        return read
-    if read and abs(rate_hz - BASE_SAMPLING_RATE_HZ / read) <= 1.0:
-        return read
-    published = [length for length, row in FORCE_TORQUE_FILTERS.items() if row.rate_hz == rate_hz]
-    return published[0] if published else round(BASE_SAMPLING_RATE_HZ / rate_hz)
-
-
-def _number(sdo: Sdo, address: tuple[int, int]) -> Steps[int | None]:
-    try:
-        return int.from_bytes((yield from sdo.read(*address)), "little")
-    except SdoAbortError:
-        return None
 
 
 def note(text: str) -> None:

@@ -6,9 +6,17 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
-from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
 from ethercat_server.ethercat.slave.coe import Steps
-from ethercat_server.links.link import Found, Link, OnFrame, note, signals_call, signals_held_back
+from ethercat_server.links.link import (
+    Found,
+    Link,
+    OnFrame,
+    SettledFrames,
+    note,
+    signals_call,
+    signals_held_back,
+)
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.sensor import Identity
 from protocol.address import Address
@@ -29,6 +37,8 @@ _ANSWER_TIMEOUT_S: Final = 30.0
 _SLOWEST_SAMPLE_S: Final = 0.2
 """Upper bound for the time per sample of a tare: 25 Hz is the lowest rate, and a tare takes two windows."""
 _IDLE_S: Final = 0.05
+_SETTLED_WITHIN_S: Final = 10.0
+"""Timeout for what settles."""
 _READ_ATTEMPTS: Final = 3
 _READ_PAUSE_S: Final = 0.1
 
@@ -107,21 +117,40 @@ class ServerLink(Link):
 
     def watch(self, numbers: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
         """See `Link`."""
+        self.wait_settled(numbers)
         self.ask("subscribe", sensors=list(numbers))
+        settled, settling, asked = SettledFrames(on_frame), set[int](), Deadline(self.clock, 0.0)
         while on_idle():
+            later = settling
+            if settling and asked.passed:
+                later, asked = self._settling(numbers), Deadline(self.clock, _IDLE_S)
             try:
                 frames = self._client.receive(_IDLE_S)
             except ConnectionFailedError as error:
                 raise ServerError(f"{self._name} closed the connection ({error}): see its log") from None
-            for frame in frames:
-                if not on_frame(frame):
-                    return
             while self._client.events:
                 event = self._client.events.popleft()
                 if event["event"] == Event.SHUTTING_DOWN:
                     raise ServerError(f"{self._name} is shutting down")
                 if event.get("sensor") in numbers:
                     _tell(event)
+                    if event["event"] in (Event.SENSOR_BACK, Event.RECONFIGURED):
+                        settling = later = later | {event["sensor"]}
+            for frame in frames:  # those on the way while it was asked are judged by what it said before
+                if not settled.take(frame, frame.sensor in settling):
+                    return
+            settling = later
+
+    def wait_settled(self, numbers: Sequence[int]) -> None:
+        """See `Link`."""
+        deadline = Deadline(self.clock, _SETTLED_WITHIN_S)
+        while self._settling(numbers) and not deadline.passed:
+            self.clock.sleep(_IDLE_S)
+
+    def _settling(self, numbers: Sequence[int]) -> set[int]:
+        """Those among these sensors whose data has not settled."""
+        rows = self.ask("describe")["sensors"]
+        return {row["sensor"] for row in rows if row.get("settling") is True} & set(numbers)
 
 
 class _ServerSdo:

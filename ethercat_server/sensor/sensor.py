@@ -8,9 +8,14 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Any, Final, NamedTuple
 
+from ethercat_server.ethercat.clock import Clock, Deadline
 from protocol.sensor.meaning import value_meaning
-from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue
+from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
 
+SETTLING_S: Final = 0.5
+"""How long Bota's own driver lets a sensor settle: new filter settings, and the data after entering OP."""
+SETTLING_SAMPLES: Final = 8
+"""At the lowest rates: how many samples the filters take, and a new offset."""
 _MODEL_NAME: Final = re.compile(r"BFT-[A-Z]{4}-ECAT-M8")
 
 
@@ -91,6 +96,8 @@ class Sensor:
     """What each of them means. Kept, so that telling it takes no time from the samples."""
     offset: tuple[float, ...] | None = None
     """The force/torque offset that was set while streaming; written again when the sensor has lost it."""
+    settled_at: Deadline | None = None
+    """When its data will have settled; see `settle`."""
     unsettled: bool = False
     """A change was interrupted: neither the former settings nor the wanted ones are in force for certain."""
 
@@ -98,6 +105,15 @@ class Sensor:
     def streams(self) -> bool:
         """Whether its process data is its own: it is in OP and answers."""
         return self.state is SensorState.STREAMING
+
+    def settle(self, clock: Clock) -> None:
+        """It has entered OP, so its data is settling. The stream does not wait, what averages does."""
+        self.settled_at = Deadline(clock, max(SETTLING_S, SETTLING_SAMPLES * self.period_ns * 1e-9))
+
+    @property
+    def settling(self) -> bool:
+        """Whether it streams data that has not settled."""
+        return self.streams and self.settled_at is not None and not self.settled_at.passed
 
     def enter(self, state: SensorState) -> None:
         """Go to another state; AssertionError for a transition that cannot be."""
@@ -107,12 +123,21 @@ class Sensor:
     @property
     def period_ns(self) -> float:
         """Nominal sample period; 0x8011 rounds the rate to whole Hz, so it follows from the SINC length."""
-        return 1e9 * self.wanted["sinc_length"] / BASE_SAMPLING_RATE_HZ
+        length = self.wanted["sinc_length"]
+        divisor = rate_divisor(length, self.rate_hz, self.wanted.get("chop")) or 1
+        return 1e9 * length * divisor / BASE_SAMPLING_RATE_HZ
 
     def hold(self, settings: Mapping[str, SettingValue]) -> None:
         """These settings are in force now."""
         self.settings = dict(settings)
-        self.meaning = {name: value_meaning(name, value) for name, value in settings.items()}
+        chop = settings.get("chop")
+        self.meaning = {
+            name: value_meaning(name, value, self.rate_hz, chop) for name, value in settings.items()
+        }
+
+    def in_force(self) -> dict[str, Any]:
+        """What replies and events say of a change."""
+        return {"settings": dict(self.settings), "rate_hz": self.rate_hz}
 
     def describe(self) -> dict[str, Any]:
         """The sensor's part of the `describe` reply."""
@@ -126,6 +151,7 @@ class Sensor:
             "pdo_size": self.pdo_size,
             "rate_hz": self.rate_hz,
             "state": self.state.reported,
+            "settling": self.settling,
             "settings": self.settings,
             "meaning": self.meaning,
         }

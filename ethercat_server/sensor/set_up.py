@@ -15,12 +15,9 @@ from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
 from ethercat_server.sensor.objects import dictionary
-from ethercat_server.sensor.sensor import Identity, Sensor
-from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue
+from ethercat_server.sensor.sensor import SETTLING_S, Identity, Sensor
+from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor
 from protocol.text.visible import visible
-
-_SETTLE_S: Final = 0.5
-"""How long Bota's own driver waits for new filter settings to take effect."""
 
 _LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]
 """sinc_length."""
@@ -57,13 +54,14 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
             if found is not None:
                 held[name] = _setting_text(name, found)
     # The valid SINC range depends on the filters before it, and only the sampling rate shows what it is.
-    right = yield from _rate_is_right(sdo, sensor)
+    # With CHOP, which may divide the rate, not even that shows it.
+    right = (yield from _divisor(sdo, sensor)) == 1
     rate_hz = sensor.rate_hz
-    if written or not right:
+    if written or not right or sensor.wanted.get("chop"):
         yield from write_setting(sdo, sensor, _LAST)
         yield from _check_rate(sdo, sensor)
     texts = [f"{name} = {text} (wanted: {_text(sensor.wanted[name])})" for name, text in held.items()]
-    if not right:
+    if rate_hz != sensor.rate_hz:
         texts.append(f"a sampling rate of {rate_hz} Hz (wanted: {sensor.rate_hz} Hz)")
     if texts:
         log.info(
@@ -155,22 +153,29 @@ def write_offset(sdo: Sdo, offset: Sequence[float]) -> Steps[None]:
             raise BusError(f"the offset {dictionary.BY_ADDRESS[address].name} = {value:g} did not take")
 
 
-def _rate_is_right(sdo: Sdo, sensor: Sensor) -> Steps[bool]:
+def _divisor(sdo: Sdo, sensor: Sensor) -> Steps[int | None]:
+    """Read the rate; see `rate_divisor`."""
     sensor.rate_hz = int.from_bytes((yield from sdo.read(*dictionary.SAMPLING_RATE)), "little")
-    # Table III.4 rounds some rates up and some down.
-    return abs(sensor.rate_hz - BASE_SAMPLING_RATE_HZ / sensor.wanted[_LAST]) <= 1.0
+    return rate_divisor(sensor.wanted[_LAST], sensor.rate_hz, sensor.wanted.get("chop"))
 
 
 def _check_rate(sdo: Sdo, sensor: Sensor) -> Steps[None]:
-    deadline = Deadline(sdo.clock, _SETTLE_S)
-    while not (yield from _rate_is_right(sdo, sensor)):
-        if deadline.passed:
-            length = sensor.wanted[_LAST]
-            raise BusError(
-                f"sensor {sensor.number} samples at {sensor.rate_hz} Hz, but sinc_length {length} implies "
-                f"{BASE_SAMPLING_RATE_HZ / length:.0f} Hz: power it off and on, or choose another sinc_length"
-            )
+    deadline = Deadline(sdo.clock, SETTLING_S)
+    # A divided rate may be one from before: it counts once it has had the time to change.
+    while (divisor := (yield from _divisor(sdo, sensor))) != 1 and not deadline.passed:
         yield
+    length = sensor.wanted[_LAST]
+    nominal = BASE_SAMPLING_RATE_HZ / length
+    if divisor is None:
+        raise BusError(
+            f"sensor {sensor.number} samples at {sensor.rate_hz} Hz, but sinc_length {length} implies "
+            f"{nominal:.0f} Hz: power it off and on, or choose another sinc_length"
+        )
+    if divisor > 1:
+        log.info(
+            "sensor %d samples at %d Hz: CHOP divides the %.0f Hz of sinc_length %d by %d",
+            sensor.number, sensor.rate_hz, nominal, length, divisor,
+        )  # fmt: skip
 
 
 def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
@@ -186,6 +191,15 @@ def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
             log.warning("sensor %d: %s", sensor.number, error)
     held["sinc_length"] = sensor.wanted["sinc_length"]
     sensor.hold(held)
+
+
+def read_sinc(sdo: Sdo) -> Steps[tuple[int | None, int | None, bool]]:
+    """What tells the SINC length in force: what it reads back, the sampling rate, CHOP. None: unreadable."""
+    length = yield from _read(sdo, dictionary.BY_SETTING[_LAST].address)
+    rate = yield from _read(sdo, dictionary.SAMPLING_RATE)
+    chop = yield from _read(sdo, dictionary.BY_SETTING["chop"].address)
+    numbers = [None if data is None else int.from_bytes(data, "little") for data in (length, rate)]
+    return numbers[0], numbers[1], any(chop or b"")
 
 
 def _read(sdo: Sdo, address: tuple[int, int]) -> Steps[bytes | None]:

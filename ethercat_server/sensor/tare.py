@@ -1,18 +1,24 @@
 """Tare: sets the sensor's own force/torque offset so that the mean reading becomes a given wrench.
 
 The sensor adds its offset to what it measures, so new = target - mean + current.
+
+An offset that makes an axis worse is taken back: one that is afterwards further from its target than
+before, by more than five standard errors of the difference of the two means. The standard error of a mean
+is the larger of two estimates: from single samples, and from the means of eight parts of its window, which
+covers noise that the sensor's filters have correlated.
 """
 
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
 from ethercat_server.errors import BusError, CutOffError, extended
 from ethercat_server.ethercat.clock import Clock, Deadline
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
-from ethercat_server.sensor.sensor import Sensor
+from ethercat_server.sensor.sensor import SETTLING_SAMPLES, Sensor
 from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
 from protocol.control import ErrorCode
 from protocol.errors import RequestError
@@ -30,13 +36,17 @@ _REST_FORCE_N: Final = 1.0
 _REST_TORQUE_NM: Final = 0.05
 _REST_RATE_DPS: Final = 3.0
 """Limits of the standard deviation for a stationary sensor, above Bota's own limits for a healthy one."""
+_LIMITS: Final = (_REST_FORCE_N,) * 3 + (_REST_TORQUE_NM,) * 3 + (_REST_RATE_DPS,) * 3
+_UNITS: Final = ("N",) * 3 + ("Nm",) * 3 + ("deg/s",) * 3
 _REST_TURN_DPS: Final = math.degrees(0.5)
 """Length of the mean angular rate: beyond it a robot is plainly moving. The residual tells what a slower turn
 costs."""
 _BY_CHANCE: Final = 5.0
 """Standard errors by which two means must differ to differ significantly."""
-_SETTLING: Final = 8
-"""Samples after which a new offset is in effect."""
+_PARTS: Final = 8
+"""Parts of a window whose means give the standard error of the whole window's."""
+_ROUNDING: Final = 1e-6
+"""Share of a reading by which REAL32 arithmetic in the sensor may be off."""
 _PATIENCE: Final = 4.0
 """Timeout for samples, in multiples of their nominal duration."""
 
@@ -57,12 +67,14 @@ def tare(
     sdo: Sdo, sensor: Sensor, stream: Samples, samples: int, target: Sequence[float]
 ) -> Steps[dict[str, Any]]:
     """Steps of the action `tare`; returns what its reply carries. RequestError if the sensor is not at rest,
-    or cannot hold the offset.
+    or cannot hold the offset, or if that makes an axis worse.
 
     If it fails half-way the old offset is put back.
     """
     _check_fits(target, "the key 'target'")
     samples = max(samples, LEAST_SAMPLES)
+    while sensor.settling:
+        yield
     before = yield from _average(sdo.clock, sensor, stream, samples)
     _check_rest(sensor, before)
     old = yield from read_offset(sdo)
@@ -70,8 +82,9 @@ def tare(
     _check_fits(new, "the offset that the key 'target' asks for")
     try:
         yield from write_offset(sdo, new)
-        yield from _wait(sdo.clock, sensor, stream, _SETTLING)
+        yield from _wait(sdo.clock, sensor, stream, SETTLING_SAMPLES)
         after = yield from _average(sdo.clock, sensor, stream, samples)
+        _check_better(sensor, before, after, target)
     except (BusError, RequestError) as error:
         raise (yield from _take_back(sdo, sensor, old, error)) from None
     sensor.offset = new
@@ -118,6 +131,8 @@ class _Window(NamedTuple):
     """From the mean of the first half to that of the second."""
     by_chance: list[float]
     """What noise explains of that."""
+    error: list[float]
+    """Standard error of the mean."""
 
 
 class _Block:
@@ -147,6 +162,7 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
     deadline = _patience(clock, sensor, samples)
     seen = stream.fresh
     whole, halves = _Block(_CHANNELS), (_Block(_CHANNELS), _Block(_CHANNELS))
+    parts = [_Block(_CHANNELS) for _ in range(_PARTS)]
     first: list[float] = []
     while whole.taken < samples:
         yield
@@ -167,6 +183,7 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
         # From the first on, so that a large load does not drown its small changes.
         row = [value - start for value, start in zip(row, first, strict=True)]
         halves[2 * whole.taken >= samples].add(row)
+        parts[_PARTS * whole.taken // samples].add(row)
         whole.add(row)
     found = list(whole.statistics())
     mean = [m + start for (m, _), start in zip(found, first, strict=True)]
@@ -174,7 +191,17 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
     for (one, noise), (other, more_noise) in zip(*(half.statistics() for half in halves), strict=True):
         change.append(abs(other - one))
         by_chance.append(_BY_CHANCE * math.sqrt((noise + more_noise) / halves[0].taken))
-    return _Window(mean, [math.sqrt(variance) for _, variance in found], change, by_chance)
+    deviation = [math.sqrt(variance) for _, variance in found]
+    error = [
+        max(alone / math.sqrt(samples), statistics.stdev(means) / math.sqrt(_PARTS))
+        for alone, means in zip(deviation, _means(parts), strict=True)
+    ]
+    return _Window(mean, deviation, change, by_chance, error)
+
+
+def _means(parts: Sequence[_Block]) -> list[tuple[float, ...]]:
+    """The means of the parts, channel by channel."""
+    return list(zip(*([mean for mean, _ in part.statistics()] for part in parts), strict=True))
 
 
 def _wait(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[None]:
@@ -194,19 +221,37 @@ def _check_rest(sensor: Sensor, found: _Window) -> None:
     turn = math.hypot(*found.mean[6:])
     if turn > _REST_TURN_DPS:
         raise _not_at_rest(sensor, f"it turns by {turn:.3g} deg/s (mean; at most {_REST_TURN_DPS:.3g})")
-    limits = (_REST_FORCE_N,) * 3 + (_REST_TORQUE_NM,) * 3 + (_REST_RATE_DPS,) * 3
-    units = ("N",) * 3 + ("Nm",) * 3 + ("deg/s",) * 3
-    for name, deviation, limit, unit in zip(_NAMES, found.deviation, limits, units, strict=True):
+    for name, deviation, limit, unit in zip(_NAMES, found.deviation, _LIMITS, _UNITS, strict=True):
         if deviation > limit:
             raise _not_at_rest(
                 sensor, f"{name} varies by {deviation:.3g} {unit} (standard deviation; at most {limit:g})"
             )
     # The means of the two halves may lie as far apart as single samples, and what noise explains.
-    changes = zip(_NAMES[:6], found.change[:6], found.by_chance[:6], limits[:6], units[:6], strict=True)
+    changes = zip(_NAMES[:6], found.change[:6], found.by_chance[:6], _LIMITS[:6], _UNITS[:6], strict=True)
     for name, change, by_chance, limit, unit in changes:
         if change > limit + by_chance:
             text = f"{name} changes by {change:.3g} {unit} (mean; at most {limit + by_chance:.3g})"
             raise _not_at_rest(sensor, text)
+
+
+def _check_better(sensor: Sensor, before: _Window, after: _Window, target: Sequence[float]) -> None:
+    """RequestError if an axis is further from its target than before, and noise does not explain it."""
+    worst, text = 0.0, ""
+    for n, (name, wanted, limit) in enumerate(zip(_NAMES[:6], target, _LIMITS[:6], strict=True)):
+        was, now = before.mean[n] - wanted, after.mean[n] - wanted
+        allowed = _BY_CHANCE * math.hypot(before.error[n], after.error[n])
+        allowed += _ROUNDING * max(1.0, abs(wanted), abs(before.mean[n]))
+        worse = (abs(now) - abs(was) - allowed) / limit  # so that N and Nm compare
+        if worse > worst:
+            worst, text = (
+                worse,
+                f"{name} is {now:.3g} {_UNITS[n]} off target after it and was {was:.3g} before",
+            )
+    if text:
+        raise RequestError(
+            ErrorCode.NOT_READY,
+            f"the tare made sensor {sensor.number} worse: {text}: keep its load still and tare again",
+        )
 
 
 def _not_at_rest(sensor: Sensor, why: str) -> RequestError:

@@ -198,17 +198,12 @@ class SensorActions:
         return (yield from self._finish_change(sensor, save_too))
 
     def _announce_change(self, sensor: Sensor) -> None:
-        self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.number, settings=dict(sensor.settings)))
+        self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.number, **sensor.in_force()))
 
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
         if save_too:
             yield from save(self._recovery.sdo(sensor.number), sensor)
-        return {
-            "sensor": sensor.number,
-            "settings": dict(sensor.settings),
-            "rate_hz": sensor.rate_hz,
-            "saved": save_too,
-        }
+        return {"sensor": sensor.number, **sensor.in_force(), "saved": save_too}
 
 
 def _answer(request: Request, values: Mapping[str, Any], error: RequestError | None) -> JsonObject:

@@ -30,6 +30,8 @@ class SensorOptions:
     """In which another master has left it."""
     eeprom_ms: float = EEPROM_MS
     """Time that reading from its EEPROM takes."""
+    chop_divides: int = 1
+    """By what CHOP divides its sampling rate."""
 
 
 @dataclass(frozen=True, slots=True)

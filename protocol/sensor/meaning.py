@@ -12,9 +12,10 @@ from protocol.sensor.filters import (
     ACCELERATION_FILTERS,
     ANGULAR_RATE_FILTERS,
     FORCE_TORQUE_FILTERS,
+    ForceTorqueFilter,
     ImuFilter,
 )
-from protocol.settings import SettingValue, sampling_rate_hz
+from protocol.settings import SettingValue, rate_divisor, sampling_rate_hz, sinc_length_of
 
 NOT_IN_TABLE: Final = "not in the table"
 
@@ -31,8 +32,14 @@ _ON_OFF: Final[Mapping[str, tuple[str, str]]] = {
 _IMU: Final = ("no IMU", "internal IMU", "external IMU", "both IMUs")
 
 
-def value_meaning(name: str, value: SettingValue) -> str:
-    """The meaning of `value` for the setting `name`. KeyError if there is no such setting."""
+def value_meaning(
+    name: str, value: SettingValue, rate_hz: int | None = None, chop: SettingValue | None = False
+) -> str:
+    """The meaning of `value` for the setting `name`. KeyError if there is no such setting.
+
+    For a SINC length that was read: `rate_hz` is the sampling rate that the sensor reports, if it is known,
+    and `chop` whether CHOP is on. The rate decides.
+    """
     if name in _ON_OFF:
         return _ON_OFF[name][0 if value else 1]
     if name == "imu_active":
@@ -47,13 +54,27 @@ def value_meaning(name: str, value: SettingValue) -> str:
         return _or_not(ANGULAR_RATE_FILTERS.get(value))
     if name != "sinc_length":
         raise KeyError(name)
-    row = FORCE_TORQUE_FILTERS.get(value)
+    return _sinc_meaning(value, rate_hz, chop)
+
+
+def _sinc_meaning(length: int, rate_hz: int | None, chop: SettingValue | None) -> str:
+    divisor = rate_divisor(length, rate_hz, chop) if rate_hz else 1
+    if divisor is None:
+        right = sinc_length_of(length, rate_hz, chop)
+        row = None if chop else FORCE_TORQUE_FILTERS.get(right or 0)
+        cutoff = NOT_IN_TABLE if row is None else _cutoff_text(row)
+        return f"{rate_hz} Hz; cut-off {cutoff}: by the sampling rate, which this length does not match"
+    if divisor > 1:
+        nominal_hz = sampling_rate_hz(length)
+        return f"{rate_hz} Hz (CHOP divides {nominal_hz} Hz by {divisor}); cut-off {NOT_IN_TABLE}"
+    row = FORCE_TORQUE_FILTERS.get(length)
     if row is None:
-        return f"{sampling_rate_hz(value)} Hz (51200 / length); cut-off {NOT_IN_TABLE}"
-    return (
-        f"{row.rate_hz} Hz; cut-off {row.cutoff_fir_off_hz:g} Hz with FIR off, "
-        f"{row.cutoff_fir_on_hz:g} Hz with FIR on"
-    )
+        return f"{sampling_rate_hz(length)} Hz (51200 / length); cut-off {NOT_IN_TABLE}"
+    return f"{row.rate_hz} Hz; cut-off {_cutoff_text(row)}"
+
+
+def _cutoff_text(row: ForceTorqueFilter) -> str:
+    return f"{row.cutoff_fir_off_hz:g} Hz with FIR off, {row.cutoff_fir_on_hz:g} Hz with FIR on"
 
 
 class Meaning(NamedTuple):
@@ -87,15 +108,16 @@ class Meaning(NamedTuple):
         }
 
 
-def meaning(settings: Mapping[str, SettingValue]) -> Meaning:
-    """What `settings` mean together."""
+def meaning(settings: Mapping[str, SettingValue], rate_hz: int | None = None) -> Meaning:
+    """What `settings` mean together; `rate_hz` is the rate that the sensor reports, if it is known."""
     length, row = settings.get("sinc_length"), None
     if length is not None:
         row = FORCE_TORQUE_FILTERS.get(length)
     fir = settings.get("fir")
-    known = row is not None and fir is not None and not settings.get("fast")
+    divided = length and rate_hz and rate_divisor(length, rate_hz, settings.get("chop")) != 1
+    known = row is not None and fir is not None and not settings.get("fast") and not divided
     return Meaning(
-        sampling_rate_hz(length) if length else None,
+        rate_hz or (sampling_rate_hz(length) if length else None),
         row.cutoff_hz(bool(fir)) if row is not None and known else None,
         ACCELERATION_FILTERS.get(settings.get("acceleration_filter", 0)),
         ANGULAR_RATE_FILTERS.get(settings.get("angular_rate_filter", 0)),

@@ -77,8 +77,8 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         )
         self.triggers = (
             Services(self, link, self.requests, self.sensor_settings, self.compensation.after_sensor_tare),
-            BiasServices(self, self.compensation),
-            IdentifyServices(self, self.compensation),
+            BiasServices(self, self.compensation, self.requests),
+            IdentifyServices(self, self.compensation, self.requests),
         )
         link.on_change = self._on_link_change
         self.create_subscription(

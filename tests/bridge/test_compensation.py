@@ -33,7 +33,7 @@ from tests.bridge.compensating import (
     weight,
 )
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
-from tests.bridge.streaming import SETTINGS, values
+from tests.bridge.streaming import SETTINGS, streaming_description, values
 from tests.compensation.making import BIAS, TOOL
 
 pytestmark = pytest.mark.ros
@@ -111,6 +111,28 @@ def test_a_tare_takes_the_offset_and_leaves_the_tool(
     assert list(node.parameters("bias")[0]) == pytest.approx(BIAS.values, abs=1e-4)
     hold(server, OVER, bias=BIAS)
     stages.settle(ZERO6)  # in every other pose too
+
+
+def test_a_tare_waits_for_settled_data(stages: Stages, server: SimulatedServer, node: SimulatedNode) -> None:
+    description = streaming_description()
+    (row,) = description["sensors"]
+    row["settling"] = True
+    server.answers["describe"] = lambda _: {"ok": True, **description}
+    hold(server, UP, force_x=5.0)  # it has not settled
+
+    def settle() -> None:
+        hold(server, UP)
+        row["settling"] = False
+
+    node.at(1.0, settle)
+    try:
+        done, text = node.trigger("tare")
+        assert done, text
+        assert list(node.parameters("bias")[0]) == pytest.approx(ZERO6, abs=1e-4)
+        row["settling"] = True
+        assert node.trigger("tare") == (False, "sensor 0 does not settle: see the server's log")
+    finally:
+        del server.answers["describe"]
 
 
 def test_a_tare_without_a_payload_takes_all(

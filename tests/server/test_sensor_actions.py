@@ -276,6 +276,34 @@ def test_a_sensor_that_moves_is_not_tared(streaming: tuple[Bench, Client, Client
     assert asking.ask("sdo_read", index=OFFSET, subindex=1, type="f32")["value"] == 0
 
 
+def test_a_tare_that_made_it_worse_is_taken_back(bench: tuple[Bench, Client]) -> None:
+    sensor, asking = bench
+    offset = tare_at_rest(asking)["new_offset"]
+    sensor.command("on-write 0x8000 1 limit force.z 9")  # the load is less from here on
+    refused = error(asking.ask("tare", samples=50))
+    assert refused["code"] == "not_ready"
+    assert "Fz is 0.75 N off target after it and was 0 before" in refused["message"]
+    assert refused["message"].endswith("; the old offset is in force")
+    held = [asking.ask("sdo_read", index=OFFSET, subindex=sub, type="f32")["value"] for sub in range(1, 7)]
+    assert held == offset
+    sensor.command("limit force.z off")
+    sensor.command("power cycle 0.2")
+    sensor.wait_event("sensor_back")
+    held = [asking.ask("sdo_read", index=OFFSET, subindex=sub, type="f32")["value"] for sub in range(1, 7)]
+    assert held == offset, "it outlives a power cut too"
+
+
+def test_noise_does_not_make_a_tare_worse(bench: tuple[Bench, Client]) -> None:
+    """It is on target already, so that each of these may be somewhat worse by chance."""
+    sensor, asking = bench
+    for channel, deviation in (("force.x", 0.5), ("force.z", 0.1), ("torque.y", 0.02)):
+        sensor.command(f"noise {channel} {deviation}")
+    for samples in (20, 200):
+        for _ in range(40):
+            tared = asking.ask("tare", samples=samples)
+            assert tared["ok"], tared
+
+
 def test_an_offset_that_no_sensor_can_hold_is_refused_before_anything_is_written(
     bench: tuple[Bench, Client],
 ) -> None:

@@ -12,10 +12,10 @@ from ethercat_server.errors import ForbiddenWriteError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.slave.coe import Steps, finish
 from ethercat_server.links.holder import find_holder
-from ethercat_server.links.link import sinc_length_in_force
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
 from ethercat_server.tool.commands.snapshot_file import RESTORABLE
+from protocol.settings import sinc_length_of
 from tests.server.running import needs_bus
 from tests.tool.running import one_sentence, tool_here
 
@@ -84,12 +84,34 @@ def _name(call: ast.Call) -> str:
         (None, 250, 205),
         (64, None, 64),
         (64, 0, 64),
+        (768, 400, 128),
+        (12288, 25, 2048),
+        (2048, 25, 2048),
     ],
 )
 def test_the_rate_decides_which_sinc_length_is_in_force(
     read: int | None, rate: int | None, length: int
 ) -> None:
-    assert sinc_length_in_force(read, rate) == length
+    assert sinc_length_of(read, rate) == length
+
+
+@pytest.mark.parametrize(
+    ("read", "rate", "chop", "asked", "length"),
+    [
+        (2048, 150, False, 342, 342),
+        (2048, 150, False, 338, 341),
+        (341, 150, False, 342, 341),
+        (768, 400, False, 64, 128),
+        (64, 400, True, 128, 64),
+        (384, 400, True, 64, 64),
+        (384, 400, True, None, 128),
+        (12288, 4, True, None, 2048),
+    ],
+)
+def test_of_lengths_with_one_rate_it_is_the_one_read_or_asked_for(
+    read: int, rate: int, chop: bool, asked: int | None, length: int
+) -> None:
+    assert sinc_length_of(read, rate, chop, asked) == length
 
 
 @pytest.mark.parametrize(

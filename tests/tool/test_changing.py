@@ -13,7 +13,7 @@ import pytest
 
 from protocol.sensor.filters import FORCE_TORQUE_FILTERS
 from tests.simulated_links import SimulatedBus, simulated_bus
-from tests.tool.odd_firmware import fewer_objects, refusing, wrong_rate
+from tests.tool.odd_firmware import fewer_objects, refusing, subtracting, wrong_rate
 from tests.tool.running import one_sentence, tool_here
 
 TARGET = ("--target", "1", "2", "3", "4", "5", "6")
@@ -159,6 +159,26 @@ def test_a_sinc_length_is_verified_by_the_rate(single: SimulatedBus, monkeypatch
     assert "samples at 500 Hz" in one_sentence(failed)
 
 
+def test_chop_that_divides_the_rate_is_taken_and_told(single: SimulatedBus) -> None:
+    near, life = single.near, single.backend.sensors.sensors[0].life
+    assert life is not None
+    life.dictionary.let_chop_divide(2)
+    applied = tool_here("apply", near, "--set", "chop=on", "--json").json
+    assert (applied["rate_hz"], applied["meaning"]["rate_hz"], applied["meaning"]["cutoff_hz"]) == (
+        400,
+        400,
+        None,
+    )
+    assert (applied["settings"]["sinc_length"], applied["settings"]["chop"]) == (64, True)
+    planned = tool_here("plan", near, "--set", "chop=on", "--set", "sinc_length=64", "--json").json
+    assert (planned["changes"], planned["then"]["rate_hz"]) == ([], 400)
+    planned = tool_here("plan", near, "--set", "imu_active=3", "--json", code=3).json
+    assert planned["then"]["rate_hz"] == 400
+    assert len(tool_here("tare", near, "--samples", 20, "--json").json["new_offset"]) == 6
+    watched = tool_here("watch", near, "--samples", 100, "--interval", 9, "--json").json
+    assert (round(watched["rate_hz"]), watched["gaps"]) == (400, 0)
+
+
 def test_tare_makes_the_mean_the_target(bench: SimulatedBus) -> None:
     near = bench.near
     target = ("1", "-2", "3", "0.1", "0.2", "-0.3")
@@ -182,6 +202,27 @@ def test_a_slow_motion_during_a_tare_is_told() -> None:
         tared = tool_here("tare", bus.near, "--samples", 800, "--json")
     assert max(map(abs, tared.json["residual"][:3])) > 0.3
     assert re.search("tare inaccurate: F[xyz] is still -?[0-9.]+ N off target", tared.err)
+
+
+def test_a_tare_that_made_it_worse_is_taken_back(
+    single: SimulatedBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near = single.near
+    tool_here("tare", near, "--samples", 50)
+    single.command("on-write 0x8000 6 limit force.z 9")  # the load is less from here on
+    failed = tool_here("tare", near, "--samples", 50, "--json", code=1)
+    assert failed.json["error"] == (
+        "the tare made sensor 0 worse: Fz is 0.75 N off target after it and was 0 before: keep its load "
+        "still and tare again; the old offset is in force"
+    )
+    read = tool_here("read", near, "Force/Torque Offset", "--json").json["sensors"][0]["objects"]
+    assert [row["value"] for row in read[1:]] == [-1.5, 2.25, 9.75, -0.125, 0.0625, -0.03125]
+    single.power_cycle()
+    subtracting(monkeypatch)
+    failed = tool_here("tare", near, "--samples", 50, code=1)
+    assert "Fz is -19.5 N off target after it and was -9.75 before" in one_sentence(failed)
+    read = tool_here("read", near, "Force/Torque Offset", "--json").json["sensors"][0]["objects"]
+    assert [row["value"] for row in read[1:]] == [0.0] * 6
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

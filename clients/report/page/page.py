@@ -58,6 +58,7 @@ def _view(examination: Examination, name: str) -> dict[str, Any]:
     subject, series, drift = examination.subject, examination.series, examination.drift
     stamps, spectrum = subject.columns.stamp_ns, examination.spectrum
     groups = [group for group in GROUPS if not (group.is_imu and series.imu_off)]
+    chop = subject.settings.get("chop")
     cutoffs = plots.cutoffs(series)
     return {
         **vars(examination),
@@ -67,11 +68,11 @@ def _view(examination: Examination, name: str) -> dict[str, Any]:
         if len(stamps)
         else "nothing was received",
         "settings": [
-            (setting, str(value).lower(), value_meaning(setting, value))
+            (setting, str(value).lower(), value_meaning(setting, value, round(subject.rate_hz), chop))
             for setting in SETTINGS
             if (value := subject.settings.get(setting)) is not None
         ],
-        "meaning": "; ".join(meaning(subject.settings).lines()),
+        "meaning": "; ".join(meaning(subject.settings, round(subject.rate_hz)).lines()),
         "over_time": [
             (group.title, plots.over_time(series, group, f"{name}-{group.name}"), _marks(examination, at))
             for at, group in enumerate(GROUPS)

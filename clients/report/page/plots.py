@@ -118,7 +118,7 @@ def noise_bars(noise: Noise, name: str) -> str | None:
 
 def cutoffs(series: Series) -> dict[str, float]:
     """The cut-off frequency of each group's filter, Hz, where it is known."""
-    filters = meaning(series.subject.settings)
+    filters = meaning(series.subject.settings, round(series.subject.rate_hz))
     found = {}
     if filters.cutoff_hz is not None:
         found["force"] = found["torque"] = float(filters.cutoff_hz)

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from clients.recording.columns import Columns
 from protocol.errors import SettingError
-from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue
+from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor
 from protocol.text.visible import printable
 
 _LONGEST_TEXT: Final = 80
@@ -48,7 +48,8 @@ class Subject:
     def nominal_period_s(self) -> float | None:
         """From the settings; None if unknown."""
         if self.sinc_length is not None:
-            return self.sinc_length / BASE_SAMPLING_RATE_HZ
+            divisor = rate_divisor(self.sinc_length, round(self.rate_hz), self.settings.get("chop"))
+            return self.sinc_length * (divisor or 1) / BASE_SAMPLING_RATE_HZ
         return 1 / self.rate_hz if 0 < self.rate_hz <= _HIGHEST_RATE_HZ else None
 
     def with_remarks(self, remarks: Iterable[str]) -> Subject:

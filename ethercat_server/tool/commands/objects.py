@@ -13,8 +13,10 @@ from ethercat_server.links.link import Found, Link, note
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION, ObjectEntry
 from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, find_objects, similar_names
+from ethercat_server.sensor.set_up import read_sinc
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.show import columns, say, say_json, value_text
+from protocol.pdo import INPUT_OBJECT
 from protocol.sensor.meaning import value_meaning
 
 _MOST_SILENT: Final = 3
@@ -37,6 +39,14 @@ def read_object(sdo: Sdo, row: ObjectEntry) -> Steps[dict[str, Any]]:
             "hex": data.hex(),
             "error": f"{len(data)} bytes do not fit type {row.type.name}: {data.hex()}",
         }
+    if row.setting == "sinc_length":
+        _, rate_hz, chop = yield from read_sinc(sdo)
+        if rate_hz:  # what it reads back may not be what is in force, nor what it may be set to
+            return {
+                "hex": data.hex(),
+                "value": value,
+                "meaning": value_meaning(row.setting, int(value), rate_hz, chop),
+            }
     return {"hex": data.hex(), "value": value, "meaning": _meaning(row, value)}
 
 
@@ -67,6 +77,8 @@ class _Sensor(NamedTuple):
 def _read_sensor(opened: Link, found: Found, rows: Sequence[ObjectEntry]) -> _Sensor:
     objects: list[tuple[ObjectEntry, dict[str, Any]]] = []
     try:
+        if any(row.index == INPUT_OBJECT for row in rows):
+            opened.wait_settled([found.number])
         if found.has_objects:
             objects.extend(_read_rows(opened.sdo(found.number), rows))
     except BusError as error:

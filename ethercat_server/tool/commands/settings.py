@@ -105,7 +105,7 @@ def _look(
     asked = options.asked_settings(found.number, found.identity.name, found.identity.serial)
     if not asked:
         raise UsageError(f"{args.config} has no settings for {found}: correct its tables, or use --set")
-    return found, asked, opened.in_force(found)
+    return found, asked, opened.in_force(found, asked)
 
 
 def _plan(args: argparse.Namespace) -> int:
@@ -113,8 +113,10 @@ def _plan(args: argparse.Namespace) -> int:
     with link(args) as opened:
         found, settings, sensor = _look(args, opened, asked)
     changed = changes(sensor, settings)
-    now = meaning(sensor.settings)
-    then = meaning({**sensor.settings, **{row["name"]: row["then"] for row in changed}})
+    now = meaning(sensor.settings, sensor.rate_hz)
+    names = {row["name"] for row in changed}
+    rate_hz = None if names & {"sinc_length", "chop"} else sensor.rate_hz
+    then = meaning({**sensor.settings, **{row["name"]: row["then"] for row in changed}}, rate_hz)
     lines = [change_lines(changed)]
     if changed:
         lines.append("settings afterwards:\n  " + "\n  ".join(then.lines()))
@@ -132,9 +134,9 @@ def _apply(args: argparse.Namespace) -> int:
         changed = changes(before, settings)
         if changed or args.save:
             opened.configure(found.number, settings, args.save)
-        after = opened.in_force(found) if changed else before
+        after = opened.in_force(found, settings) if changed else before
     verify(after, settings)
-    in_force = meaning(after.settings)
+    in_force = meaning(after.settings, after.rate_hz)
     values = {
         "changes": changed, "saved": args.save, "settings": after.settings, "rate_hz": after.rate_hz,
         "meaning": in_force.as_json(),

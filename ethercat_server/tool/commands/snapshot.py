@@ -76,7 +76,7 @@ def _restore(args: argparse.Namespace) -> int:
     with link(args) as opened:
         found = opened.choose(args.sensor)
         _check_whose(found.identity, snapshot.identity, args)
-        sensor = opened.in_force(found)
+        sensor = opened.in_force(found, snapshot.settings)
         lacking = sorted(snapshot.settings.keys() - sensor.settings.keys())
         settings = {name: value for name, value in snapshot.settings.items() if name not in lacking}
         changed = changes(sensor, settings)
@@ -145,7 +145,7 @@ def _put_back(
         opened.configure(found.number, settings, save=False)
     written = []
     try:
-        verify(opened.in_force(found), settings)
+        verify(opened.in_force(found, settings), settings)
         for address, (_, wanted) in objects.items():
             written.append(address)
             finish(_write(sdo, address, wanted))

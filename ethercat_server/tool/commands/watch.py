@@ -33,9 +33,9 @@ class _Watch:
         self._blocks = {number: Block() for number in self._sensors}
         self._taken = dict.fromkeys(self._sensors, 0)
         self._samples, self._json = args.samples, args.json
-        self._clock = clock
-        self._end = Deadline(clock, args.seconds) if args.seconds else None
-        self._show = Deadline(clock, self._interval_s)
+        self._clock, self._seconds = clock, args.seconds
+        self._end: Deadline | None = None
+        self._show: Deadline | None = None
         self._height = 0
 
     def take(self, frame: DataMessage) -> bool:
@@ -51,6 +51,9 @@ class _Watch:
 
     def idle(self) -> bool:
         """Show what is due; returns whether to continue."""
+        if self._show is None:  # it begins: the sensors have settled
+            self._show = Deadline(self._clock, self._interval_s)
+            self._end = Deadline(self._clock, self._seconds) if self._seconds else None
         if self._end is not None and self._end.passed:
             return False
         if self._show.passed:

@@ -148,9 +148,21 @@ class Dictionary(ObjectTable):
         self._values[address] = self._flash.entries[address] = struct.pack("<H", sinc_length)
         self._follow_sinc()
 
+    _chop_divides = 1
+
+    def let_chop_divide(self, by: int) -> None:
+        """Have CHOP divide the sampling rate."""
+        self._chop_divides = by
+        self._follow_sinc()
+
+    @property
+    def sinc_in_effect(self) -> int:
+        """The SINC length whose rate it samples at."""
+        chop = self.number(BY_SETTING["chop"].address)
+        return int(self.number(BY_SETTING["sinc_length"].address)) * (self._chop_divides if chop else 1)
+
     def _follow_sinc(self) -> None:
-        sinc_length = int(self.number(BY_SETTING["sinc_length"].address))
-        self._values[SAMPLING_RATE] = struct.pack("<H", sampling_rate_hz(sinc_length))
+        self._values[SAMPLING_RATE] = struct.pack("<H", sampling_rate_hz(self.sinc_in_effect))
 
     def _command(self, command: int) -> None:
         self._saved = command == SAVE_PARAMETERS

@@ -35,6 +35,7 @@ class Firmware(Application):
             options.model, options.serial, options.pdo_size,
             flash, self.inputs, self._settings_changed, clock,
         )  # fmt: skip
+        self.dictionary.let_chop_divide(options.chop_divides)
         self.sampler = Sampler(options, self.dictionary, clock)
         self.aborts = AbortFaults()
         device = sensor_device(options.model, options.serial, options.pdo_size)

@@ -41,7 +41,7 @@ class Sampler:
         self._now = now
         self._layout = layout_for(options.pdo_size)
         self._signal, self._signal_start = make_signal(options), now()
-        self.clock = SampleClock(now(), int(dictionary.settings()["sinc_length"]), options.ppm)
+        self.clock = SampleClock(now(), dictionary.sinc_in_effect, options.ppm)
         self.made = 0
         self.disturbances = Disturbances(options.seed)
         self._warnings, self._warnings_until = 0, -1
@@ -83,7 +83,7 @@ class Sampler:
     def settings_changed(self) -> None:
         """Settings or offsets in the dictionary have changed."""
         settings = self._dictionary.settings()
-        sinc_length = int(settings["sinc_length"])
+        sinc_length = self._dictionary.sinc_in_effect
         if sinc_length != self.clock.sinc_length:
             self.clock.change(self._now(), sinc_length=sinc_length)
         if isinstance(self._signal, Scene):

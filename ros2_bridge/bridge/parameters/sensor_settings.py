@@ -113,7 +113,7 @@ class SettingsParameters:
         )
         in_force = reply.get("settings")
         in_force = in_force if isinstance(in_force, dict) else {}
-        self._link.take_settings(in_force)
+        self._link.take_settings(reply)
         for name, value in wanted.items():
             if (held := in_force.get(name)) != value:
                 self.changed()

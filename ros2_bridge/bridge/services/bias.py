@@ -9,6 +9,7 @@ from rclpy.node import Node
 from bridge.compensating.control import CompensationControl
 from bridge.services.triggers import create_triggers
 from bridge.services.window import take_window
+from bridge.stream.requests import Requests
 from ft_compensation.bias import estimate_bias, gravity_of
 from ft_compensation.quantities import NO_WRENCH, CompensationError, Wrench, length
 
@@ -18,14 +19,14 @@ AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 class BiasServices:
     """A tare blocks the executor for `rest.duration`, and never the stream."""
 
-    def __init__(self, node: Node, control: CompensationControl) -> None:
-        self._control, self._log = control, node.get_logger()
+    def __init__(self, node: Node, control: CompensationControl, requests: Requests) -> None:
+        self._control, self._requests, self._log = control, requests, node.get_logger()
         acts = {"tare": self._tare, "clear_tare": self._clear, "undo_tare": self._undo}
         create_triggers(node, acts, CompensationError)
 
     def _tare(self) -> str:
         control = self._control
-        window = take_window(control)
+        window = take_window(control, self._requests)
         means = window.means()
         payload, gravity = control.parameters.payload, None
         if payload.mass:

@@ -12,6 +12,7 @@ from bridge.parameters.compensation import AUTO
 from bridge.services.bias import wrench_text
 from bridge.services.triggers import create_triggers
 from bridge.services.window import take_window
+from bridge.stream.requests import Requests
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified
 from ft_compensation.identification.session import IdentificationSession, summary
@@ -21,8 +22,8 @@ from ft_compensation.quantities import CompensationError, length
 class IdentifyServices:
     """One identification at a time. A pose blocks the executor for `rest.duration`, and never the stream."""
 
-    def __init__(self, node: Node, control: CompensationControl) -> None:
-        self._control, self._log = control, node.get_logger()
+    def __init__(self, node: Node, control: CompensationControl, requests: Requests) -> None:
+        self._control, self._requests, self._log = control, requests, node.get_logger()
         self._session: IdentificationSession | None = None
         self._sensors = control.sensors
         """As of the session's start."""
@@ -56,7 +57,7 @@ class IdentifyServices:
 
     def _add_pose(self) -> str:
         session = self._started()
-        window = take_window(self._control)
+        window = take_window(self._control, self._requests)
         means = window.means()
         text = session.add(means, window.gravity())
         self._control.note_rest(means.angular_rate)

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Final
 
 from bridge.compensating.control import CompensationControl
 from bridge.publishing.compensated_wrench import RestWindow
+from bridge.stream.connection import find_sensor
+from bridge.stream.requests import DESCRIBE_TIMEOUT_S, RequestFailedError, Requests
 from ft_compensation.quantities import CompensationError
+from protocol.errors import ConnectionFailedError
 
 _PATIENCE_S: Final = 2.0
 """A window may take this much longer than half as long again as it lasts."""
 _LOOK_S: Final = 0.05
+_SETTLED_WITHIN_S: Final = 10.0
 
 
-def take_window(control: CompensationControl) -> RestWindow:
-    """The samples of the next `rest.duration`, whole; blocks the caller and never the stream.
+def take_window(control: CompensationControl, requests: Requests) -> RestWindow:
+    """The samples of the next `rest.duration`, whole, once the sensor's data has settled; blocks the caller
+    and never the stream.
 
     CompensationError if they do not come or mean nothing.
     """
@@ -23,6 +29,7 @@ def take_window(control: CompensationControl) -> RestWindow:
     link = control.link
     if link.connection is None:
         raise CompensationError(f"{link.absence}, so there are no samples")
+    _wait_settled(control, requests)
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
     window = RestWindow(seconds, limits, control.source)
     patience_s = 1.5 * seconds + _PATIENCE_S
@@ -49,3 +56,16 @@ def take_window(control: CompensationControl) -> RestWindow:
             "call again"
         )
     return window
+
+
+def _wait_settled(control: CompensationControl, requests: Requests) -> None:
+    """After a sensor has entered OP its data settles, which the server knows."""
+    link = control.link
+    deadline_s = link.clock.monotonic() + _SETTLED_WITHIN_S
+    try:
+        while find_sensor(requests.ask("describe", DESCRIBE_TIMEOUT_S), link.sensor).settling:
+            if link.clock.monotonic() > deadline_s:
+                raise CompensationError(f"sensor {link.sensor} does not settle: see the server's log")
+            link.clock.wait(threading.Event(), _LOOK_S)
+    except (RequestFailedError, ConnectionFailedError) as error:
+        raise CompensationError(str(error)) from None

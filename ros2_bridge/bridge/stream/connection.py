@@ -39,6 +39,8 @@ class SensorInfo(NamedTuple):
     rate: float = 0.0
     """`rate_hz` as a number; 0 if it is none."""
     settings: Mapping[str, SettingValue] = {}
+    settling: bool = False
+    """Whether its data has not settled."""
 
     def __str__(self) -> str:
         """One phrase for the log."""
@@ -136,6 +138,11 @@ def known_settings(settings: object) -> dict[str, SettingValue]:
     return found
 
 
+def known_rate(rate_hz: object) -> float:
+    """The sampling rate that a message gives, Hz; 0 if it is none."""
+    return float(rate_hz) if isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ else 0.0
+
+
 def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
     """The row of `sensor` in a `describe` reply; ConnectionFailedError if there is none."""
     found = rows(description.get("sensors"))
@@ -145,10 +152,11 @@ def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
                 printable(row.get(key, "?"), 40)
                 for key in ("name", "serial", "rate_hz", "state", "hardware", "firmware")
             )
-            hz = row.get("rate_hz")
-            number = float(hz) if isinstance(hz, int | float) and 0 < hz <= _MOST_HZ else 0.0
-            settings = known_settings(row.get("settings"))
-            return SensorInfo(sensor, name, serial, rate, state, hardware, firmware, number, settings)
+            number = known_rate(row.get("rate_hz"))
+            settings, settling = known_settings(row.get("settings")), row.get("settling") is True
+            return SensorInfo(
+                sensor, name, serial, rate, state, hardware, firmware, number, settings, settling
+            )
     there = ", ".join(printable(row.get("sensor"), 10) for row in found[:16]) or "none"
     raise ConnectionFailedError(
         f"the server has no sensor {sensor} (it has: {there}): set the parameter 'sensor' to one it has"

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from bridge.clock import Clock
-from bridge.stream.connection import Connection, SensorInfo, known_settings
+from bridge.stream.connection import Connection, SensorInfo, known_rate, known_settings
 from protocol.control import Event
 from protocol.settings import SettingValue, sampling_rate_hz
 from protocol.text.json_text import JsonObject
@@ -85,19 +85,26 @@ class Link:
         elif event in (Event.SENSOR_BACK, Event.RECONFIGURED):
             self.lost = None
             self.epoch += 1
-            self.take_settings(message.get("settings"))
+            self.take_settings(message)
         else:
             return True
         self.on_change()
         return True
 
-    def take_settings(self, settings: object) -> None:
-        """Note the settings that a message says are in force."""
-        found = known_settings(settings)
+    def take_settings(self, message: JsonObject) -> None:
+        """Note the settings, and the rate, that a message says are in force."""
+        found = known_settings(message.get("settings"))
         if not found or self.connection is None:
             return
-        if (length := found.get("sinc_length")) != self.settings.get("sinc_length") and length:
-            self.rate_hz = float(sampling_rate_hz(int(length)))
+        rate_hz = known_rate(message.get("rate_hz"))
+        if (
+            not rate_hz
+            and (length := found.get("sinc_length")) != self.settings.get("sinc_length")
+            and length
+        ):
+            rate_hz = float(sampling_rate_hz(int(length)))  # the server is an older one
+        if rate_hz not in (0.0, self.rate_hz):
+            self.rate_hz = rate_hz
             self.epoch += 1
         self.settings = found
 

@@ -1,0 +1,81 @@
+"""`watch`, `tare` and `read` use no samples of a sensor that has entered OP less than half a second ago."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import pytest
+
+from tests.simulated_links import SimulatedBus, SimulatedServer, simulated_bus, simulated_server
+from tests.tool.running import tool_here
+
+FORCE = (1.5, -2.25, -9.75)
+SERVER = ("--server", SimulatedServer.address)
+FORCE_Z = "0x6000:6"
+
+
+@pytest.fixture
+def bus() -> Iterator[SimulatedBus]:
+    with simulated_bus("--signal", "rest") as found:
+        yield found
+
+
+def unsettled_at_first(bus: SimulatedBus) -> None:
+    """The sensor gives a wrong force for the first 0.4 s in OP, from now on."""
+    state = ""
+
+    def look() -> None:
+        nonlocal state
+        before, state = state, bus.stats()["al_state"]
+        if state == "OP" != before:
+            bus.command("limit force.z 5")
+            bus.at(0.4, "limit force.z off")
+        bus.at(0.001, look)
+
+    look()
+
+
+def test_watch_begins_with_settled_data(bus: SimulatedBus) -> None:
+    unsettled_at_first(bus)
+    for end in (("--samples", 20), ("--seconds", 0.2)):
+        shown = tool_here("watch", bus.near, *end, "--interval", 9, "--json").json
+        assert (*shown["force"], shown["samples"] >= 20) == (*FORCE, True)
+
+
+def test_tare_without_a_server_takes_settled_data(bus: SimulatedBus) -> None:
+    unsettled_at_first(bus)
+    assert tool_here("tare", bus.near, "--samples", 50, "--json").json["new_offset"][2] == -FORCE[2]
+
+
+@pytest.mark.parametrize("command", ["watch", "tare", "read"])
+def test_through_a_server_that_has_just_started(bus: SimulatedBus, command: str) -> None:
+    unsettled_at_first(bus)
+    with simulated_server(bus):
+        if command == "watch":
+            shown = tool_here("watch", *SERVER, "--samples", 20, "--interval", 9, "--json").json["force"][2]
+        elif command == "tare":
+            shown = -tool_here("tare", *SERVER, "--samples", 20, "--json").json["new_offset"][2]
+        else:
+            read = tool_here("read", FORCE_Z, *SERVER, "--json").json["sensors"][0]["objects"]
+            shown = read[0]["value"]
+    assert shown == FORCE[2]
+
+
+@pytest.mark.parametrize("through", ["interface", "server"])
+def test_watch_leaves_out_what_has_not_settled_after_a_recovery(bus: SimulatedBus, through: str) -> None:
+    def watched(*way: str) -> list[dict[str, object]]:
+        bus.at(1.5, "power cycle 0.2")
+        ended = tool_here("watch", *way, "--seconds", 3, "--interval", 0.1, "--json")
+        return [json.loads(line) for line in ended.out.splitlines()]
+
+    unsettled_at_first(bus)
+    if through == "interface":
+        rows = watched(bus.near)
+    else:
+        with simulated_server(bus):
+            rows = watched(*SERVER)
+    full = [row for row in rows if row["samples"]]
+    assert all(tuple(row["force"]) == FORCE for row in full)  # type: ignore[arg-type]
+    assert len(full) < len(rows), "it was lost, and told so"
+    assert sum(row["gaps"] for row in full) == 1, full  # type: ignore[misc]

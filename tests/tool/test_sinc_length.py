@@ -1,0 +1,67 @@
+"""Real sensors do not read back the SINC length they were given: the sampling rate says what is in force."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.simulated_links import SimulatedBus, SimulatedServer, simulated_bus, simulated_server
+from tests.tool.odd_firmware import other_sinc_length
+from tests.tool.running import tool_here
+
+UNMATCHED = ": by the sampling rate, which this length does not match"
+MEANINGS = {
+    64: (384, "800 Hz; cut-off 209.5 Hz with FIR off, 31.5 Hz with FIR on" + UNMATCHED),
+    128: (768, "400 Hz; cut-off 105 Hz with FIR off, 16 Hz with FIR on" + UNMATCHED),
+    341: (2048, "150 Hz; cut-off 39.5 Hz with FIR off, 6 Hz with FIR on" + UNMATCHED),
+    1000: (6024, "51 Hz; cut-off not in the table" + UNMATCHED),
+    2048: (12288, "25 Hz; cut-off not in the table" + UNMATCHED),
+}
+
+
+@pytest.fixture
+def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedBus]:
+    other_sinc_length(monkeypatch)
+    with simulated_bus("--signal", "rest") as found:
+        yield found
+
+
+@pytest.fixture(params=["interface", "server"])
+def way(request: pytest.FixtureRequest, bus: SimulatedBus) -> Iterator[tuple[str, ...]]:
+    """How the tool is told to reach the sensor."""
+    if request.param == "interface":
+        yield (bus.near,)
+    else:
+        with simulated_server(bus):
+            yield ("--server", SimulatedServer.address)
+
+
+@pytest.mark.parametrize("length", MEANINGS)
+def test_what_is_said_of_it_follows_the_rate(way: tuple[str, ...], length: int) -> None:
+    applied = tool_here("apply", *way, "--set", f"sinc_length={length}", "--json").json
+    assert applied["settings"]["sinc_length"] == length
+    (read,) = tool_here("read", *way, "sinc_length", "--json").json["sensors"][0]["objects"]
+    assert (read["value"], read["meaning"]) == MEANINGS[length]
+    assert MEANINGS[length][1] in tool_here("objects", *way).out
+
+
+@pytest.mark.parametrize("length", [32, 128, 341, 342, 1000])
+def test_plan_and_restore_end(way: tuple[str, ...], bus: SimulatedBus, length: int, tmp_path: Path) -> None:
+    asked = ("--set", f"sinc_length={length}")
+    tool_here("plan", *way, *asked, code=3)
+    tool_here("apply", *way, *asked)
+    assert "nothing to change" in tool_here("plan", *way, *asked).out
+    path = tmp_path / "a.json"
+    tool_here("snapshot", *way, path)
+    content = json.loads(path.read_text())
+    content["settings"]["sinc_length"] = length  # of several with this rate, it cannot know which
+    path.write_text(json.dumps(content))
+    assert "nothing to restore" in tool_here("restore", *way, path).out
+    tool_here("apply", *way, "--set", "sinc_length=64", "--set", "fir=on")
+    restored = tool_here("restore", *way, path, "--json").json
+    assert {row["name"]: row["then"] for row in restored["changes"]} == {"sinc_length": length, "fir": False}
+    assert "nothing to restore" in tool_here("restore", *way, path).out
+    assert bus.stats()["sinc_length"] == length
