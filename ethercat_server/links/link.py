@@ -141,6 +141,7 @@ def read_in_force(sdo: Sdo, sensor: Sensor, asked: Mapping[str, SettingValue] = 
     length, rate, chop = yield from read_sinc(sdo)
     sensor.rate_hz = rate or 0
     held = sinc_length_of(length, rate, chop, asked.get("sinc_length"))
+    sensor.sinc_guessed = chop and held not in (length, asked.get("sinc_length"))
     sensor.wanted = {"sinc_length": held or 0}
     yield from read_settings(sdo, sensor)
     if not held:

@@ -16,13 +16,13 @@ class SensorOptions:
     pdo_size: int = 61
     sinc_length: int | None = None
     """None: the value in flash, by default 64."""
+    chop_divides: int = 1
+    """By what CHOP divides its sampling rate."""
     ppm: float = 0.0
     """Error of its clock: positive is fast."""
     signal: str = "scene"
     noise: bool = True
     seed: int = 0
-    chop_divides: int = 1
-    """By what CHOP divides its sampling rate."""
 
 
 @dataclass(frozen=True, slots=True)
