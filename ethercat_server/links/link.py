@@ -55,7 +55,9 @@ class SettledFrames:
         if settling and not frame.flags & NOT_NEW:
             self._gaps[frame.sensor] = self._gaps.get(frame.sensor, 0) | frame.flags & DataFlag.GAP
             return True
-        return self._on_frame(frame._replace(flags=frame.flags | self._gaps.pop(frame.sensor, 0)))
+        if self._gaps and (gap := self._gaps.pop(frame.sensor, 0)):
+            frame = frame._replace(flags=frame.flags | gap)
+        return self._on_frame(frame)
 
 
 class Link(ABC):
