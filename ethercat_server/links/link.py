@@ -55,7 +55,9 @@ class SettledFrames:
         if settling and not frame.flags & NOT_NEW:
             self._gaps[frame.sensor] = self._gaps.get(frame.sensor, 0) | frame.flags & DataFlag.GAP
             return True
-        return self._on_frame(frame._replace(flags=frame.flags | self._gaps.pop(frame.sensor, 0)))
+        if self._gaps and (gap := self._gaps.pop(frame.sensor, 0)):
+            frame = frame._replace(flags=frame.flags | gap)
+        return self._on_frame(frame)
 
 
 class Link(ABC):
@@ -141,6 +143,7 @@ def read_in_force(sdo: Sdo, sensor: Sensor, asked: Mapping[str, SettingValue] = 
     length, rate, chop = yield from read_sinc(sdo)
     sensor.rate_hz = rate or 0
     held = sinc_length_of(length, rate, chop, asked.get("sinc_length"))
+    sensor.sinc_guessed = chop and held not in (length, asked.get("sinc_length"))
     sensor.wanted = {"sinc_length": held or 0}
     yield from read_settings(sdo, sensor)
     if not held:

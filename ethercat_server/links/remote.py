@@ -34,8 +34,8 @@ from protocol.text.json_text import JsonObject
 
 _CONNECT_TIMEOUT_S: Final = 5.0
 _ANSWER_TIMEOUT_S: Final = 30.0
-_SLOWEST_SAMPLE_S: Final = 0.2
-"""Upper bound for the time per sample of a tare: 25 Hz is the lowest rate, and a tare takes two windows."""
+_SLOWEST_SAMPLE_S: Final = 1.0
+"""Upper bound for the time per sample of a tare: CHOP may divide 25 Hz by 8, and a tare takes two windows."""
 _IDLE_S: Final = 0.05
 _SETTLED_WITHIN_S: Final = 10.0
 """Timeout for what settles."""

@@ -96,6 +96,8 @@ class Sensor:
     """What each of them means. Kept, so that telling it takes no time from the samples."""
     offset: tuple[float, ...] | None = None
     """The force/torque offset that was set while streaming; written again when the sensor has lost it."""
+    sinc_guessed: bool = False
+    """The SINC length is a guess from a rate that CHOP may have divided: not to be written for no reason."""
     settled_at: Deadline | None = None
     """When its data will have settled; see `settle`."""
     unsettled: bool = False

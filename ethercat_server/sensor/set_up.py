@@ -57,7 +57,7 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     # With CHOP, which may divide the rate, not even that shows it.
     right = (yield from _divisor(sdo, sensor)) == 1
     rate_hz = sensor.rate_hz
-    if written or not right or sensor.wanted.get("chop"):
+    if not right or ((written or sensor.wanted.get("chop")) and not sensor.sinc_guessed):
         yield from write_setting(sdo, sensor, _LAST)
         yield from _check_rate(sdo, sensor)
     texts = [f"{name} = {text} (wanted: {_text(sensor.wanted[name])})" for name, text in held.items()]

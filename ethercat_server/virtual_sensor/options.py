@@ -21,6 +21,8 @@ class SensorOptions:
     pdo_size: int = 61
     sinc_length: int | None = None
     """None: the value in flash, by default 64."""
+    chop_divides: int = 1
+    """By what CHOP divides its sampling rate."""
     ppm: float = 0.0
     """Error of its clock: positive is fast."""
     signal: str = "scene"
@@ -30,8 +32,6 @@ class SensorOptions:
     """In which another master has left it."""
     eeprom_ms: float = EEPROM_MS
     """Time that reading from its EEPROM takes."""
-    chop_divides: int = 1
-    """By what CHOP divides its sampling rate."""
 
 
 @dataclass(frozen=True, slots=True)

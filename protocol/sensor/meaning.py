@@ -83,7 +83,7 @@ class Meaning(NamedTuple):
     rate_hz: int | None
     """Sampling rate."""
     cutoff_hz: float | None
-    """Of force and torque. None with FAST on too: it switches between the two cut-offs."""
+    """Of force and torque. None with FAST on, which switches between the two cut-offs, and with CHOP on."""
     acceleration: ImuFilter | None
     angular_rate: ImuFilter | None
 
@@ -115,7 +115,8 @@ def meaning(settings: Mapping[str, SettingValue], rate_hz: int | None = None) ->
         row = FORCE_TORQUE_FILTERS.get(length)
     fir = settings.get("fir")
     divided = length and rate_hz and rate_divisor(length, rate_hz, settings.get("chop")) != 1
-    known = row is not None and fir is not None and not settings.get("fast") and not divided
+    plain = not settings.get("fast") and not settings.get("chop")
+    known = row is not None and fir is not None and plain and not divided
     return Meaning(
         rate_hz or (sampling_rate_hz(length) if length else None),
         row.cutoff_hz(bool(fir)) if row is not None and known else None,

@@ -14,7 +14,7 @@ from protocol.framing import DataFlag
 from protocol.pdo import encode
 from protocol.sensor.warnings_register import WARNINGS
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
-from tests.bridge.streaming import status, streaming_description, values
+from tests.bridge.streaming import SETTINGS, status, streaming_description, values
 
 pytestmark = pytest.mark.ros
 OK, WARN, ERROR, STALE = range(4)
@@ -105,6 +105,17 @@ def test_lost_samples_are_counted(node: SimulatedNode, server: SimulatedServer) 
 def test_another_rate_than_expected(node: SimulatedNode, server: SimulatedServer) -> None:
     server.description["sensors"][0]["rate_hz"] = 200
     node.until("100 samples a second instead of 200", stream=WARN)
+
+
+def test_a_change_says_the_rate_that_its_settings_do_not(
+    node: SimulatedNode, server: SimulatedServer
+) -> None:
+    server.answers["describe"] = lambda _: None
+    for settings, rate_hz in ((SETTINGS, 50), ({**SETTINGS, "chop": True}, None), (SETTINGS, "fast")):
+        message = {"event": "reconfigured", "sensor": 0, "settings": settings, "rate_hz": rate_hz}
+        server.send_json(message)
+        node.run(0.1)
+        assert node.node.reader.link.rate_hz == 50
 
 
 def test_samples_that_come_late(node: SimulatedNode, server: SimulatedServer) -> None:

@@ -224,8 +224,10 @@ def test_describe_follows_the_events(path: Path, frames: list[DataMessage]) -> N
     with open_recording(path) as recording:
         sensors = ReplayedSensors(recording.sensors)
     for event, state in (("sensor_lost", "lost"), ("sensor_back", "OP")):
-        sensors.take(Event(0, {"event": event, "sensor": 1, "settings": {"sinc_length": 32}}))
+        row = {"event": event, "sensor": 1, "settings": {"sinc_length": 32}, "rate_hz": 1600}
+        sensors.take(Event(0, row))
         described = [sensor.describe() for sensor in sensors.sensors]
+        assert [sensor["rate_hz"] for sensor in described] == [800, 1600]
         assert [(row["state"], row["settings"]["sinc_length"]) for row in described] == [
             ("OP", 64),
             (state, 32),

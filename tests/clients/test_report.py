@@ -22,6 +22,7 @@ from clients.report.subjects.subject import Subject, subject
 from ethercat_server.virtual_sensor.measurement import scene
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
+from protocol.sensor.meaning import meaning
 from tests.clients.simulated import Script, decoded, described, sensor, simulate, subject_of
 
 SLOW = 512
@@ -417,6 +418,17 @@ def test_descriptions_are_taken_for_what_they_are() -> None:
     assert len(made.firmware) <= 80
     assert made.hardware.isprintable()
     assert len(made.remarks) <= 21
+
+
+def test_a_rate_that_chop_divides_is_that_of_the_report() -> None:
+    settings = {"sinc_length": 64, "fir": False, "chop": True}
+    made = subject({"rate_hz": 400}, settings, decoded([]), "s", 0)
+    assert made.nominal_period_s == 0.0025
+    assert subject({"rate_hz": 800}, settings, decoded([]), "s", 0).nominal_period_s == 0.00125
+    assert meaning(settings, 400).lines()[:2] == [
+        "sampling rate 400 Hz",
+        "force and torque: cut-off not in the table, added delay not in the table",
+    ]
 
 
 # Spectra.

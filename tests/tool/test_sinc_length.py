@@ -48,6 +48,20 @@ def test_what_is_said_of_it_follows_the_rate(way: tuple[str, ...], length: int) 
     assert MEANINGS[length][1] in tool_here("objects", *way).out
 
 
+def test_a_length_that_chop_hides_is_not_overwritten(bus: SimulatedBus) -> None:
+    life = bus.backend.sensors.sensors[0].life
+    assert life is not None
+    life.dictionary.let_chop_divide(2)
+    assert tool_here("apply", bus.near, "--set", "chop=on", "--json").json["rate_hz"] == 400
+    written = bus.written()
+    assert tool_here("apply", bus.near, "--set", "imu_active=3", "--json").json["rate_hz"] == 400
+    assert {row[0] for row in bus.written()[len(written) :]} == {"0x8010"}
+    asked = ("--set", "sinc_length=64")
+    assert "nothing to change" in tool_here("plan", bus.near, *asked).out
+    (read,) = tool_here("read", bus.near, "sinc_length", "--json").json["sensors"][0]["objects"]
+    assert (read["value"], read["meaning"]) == (768, "400 Hz; cut-off not in the table" + UNMATCHED)
+
+
 @pytest.mark.parametrize("length", [32, 128, 341, 342, 1000])
 def test_plan_and_restore_end(way: tuple[str, ...], bus: SimulatedBus, length: int, tmp_path: Path) -> None:
     asked = ("--set", f"sinc_length={length}")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import socket
 import struct
+import sys
 from typing import Final, NamedTuple
 
 from ethercat_server.errors import InterfaceError
@@ -16,13 +17,12 @@ LEAST_MTU: Final = 1500
 CHECK_CABLE: Final = "check cable and power"
 
 _RTM_NEWLINK, _RTM_GETLINK, _NLM_F_REQUEST = 16, 18, 1
-_IFLA_MTU, _IFLA_MASTER = 4, 10
+_IFLA_MTU, _IFLA_MASTER, _IFLA_CARRIER = 4, 10, 33
 _HEADER: Final = struct.Struct("=IHHII")
 """Length, type, flags, sequence number, port."""
 _LINK: Final = struct.Struct("=BxHiII")
 """Family, type, index, flags, change mask."""
 _ATTRIBUTE: Final = struct.Struct("=HH")
-_U32: Final = struct.Struct("=I")
 _BUFFER: Final = 65536
 _IFF_UP, _IFF_LOOPBACK, _IFF_RUNNING = 0x1, 0x8, 0x40
 
@@ -35,6 +35,8 @@ class Interface(NamedTuple):
     mtu: int
     master: int
     """Index of the bridge or bond that it is part of, 0 if none."""
+    carrier: bool
+    """What the driver says of the link."""
 
     @property
     def is_up(self) -> bool:
@@ -48,8 +50,8 @@ class Interface(NamedTuple):
 
     @property
     def has_carrier(self) -> bool:
-        """Whether it is up and linked with something."""
-        return bool(self.flags & _IFF_RUNNING)
+        """Whether it is linked with something, and ready: the flag follows the driver up to a second later."""
+        return self.carrier and bool(self.flags & _IFF_RUNNING)
 
 
 def look_up(ifname: str) -> Interface:
@@ -113,11 +115,11 @@ def _answer(index: int) -> Interface:
     if kind != _RTM_NEWLINK:
         raise OSError("no such interface")
     _, _, index, flags, _ = _LINK.unpack_from(answer, _HEADER.size)
-    values = {_IFLA_MTU: 0, _IFLA_MASTER: 0}
+    values = {_IFLA_MTU: 0, _IFLA_MASTER: 0, _IFLA_CARRIER: 0}
     at, end = _HEADER.size + _LINK.size, min(size, len(answer))
     while at + _ATTRIBUTE.size <= end:
         length, attribute = _ATTRIBUTE.unpack_from(answer, at)
         if attribute in values:
-            (values[attribute],) = _U32.unpack_from(answer, at + _ATTRIBUTE.size)
+            values[attribute] = int.from_bytes(answer[at + _ATTRIBUTE.size : at + length], sys.byteorder)
         at += max(_ATTRIBUTE.size, length + 3 & ~3)
-    return Interface(index, flags, values[_IFLA_MTU], values[_IFLA_MASTER])
+    return Interface(index, flags, values[_IFLA_MTU], values[_IFLA_MASTER], bool(values[_IFLA_CARRIER]))
