@@ -50,7 +50,7 @@ class Interface(NamedTuple):
 
     @property
     def has_carrier(self) -> bool:
-        """Whether it is linked with something, and ready: the flag follows the driver up to a second later."""
+        """Whether it is linked, and ready to send: the flag may follow the driver a second later."""
         return self.carrier and bool(self.flags & _IFF_RUNNING)
 
 
