@@ -141,7 +141,7 @@ def test_a_name_that_is_no_utf_8_and_a_slave_without_a_mailbox(bench: Bench) -> 
 
 def test_an_object_that_aborts_is_named(bench: Bench) -> None:
     """An SDO abort as pysoem raises it; INIT as it asks for it."""
-    complaint = "sinc_length = 128 did not take.*0x06090030"
+    complaint = "sinc_length = 128 did not take.*: the value is out of range .*0x06090030"
     with pytest.raises(BusError, match=complaint):
         start(bench, "abort 0x8006 1 0x06090030", complaint=complaint, settings={"sinc_length": 128})
     wait_until(lambda: stats(bench[1])["al_state"] == "INIT", "INIT")

@@ -18,12 +18,13 @@ from typing import Any, Final
 
 import pysoem
 
-from ethercat_server.errors import BusError, SdoAbortError, SetUpError
+from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt, Master
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.nic import check_present
 from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
 from ethercat_server.ethercat.slave import times
+from ethercat_server.ethercat.slave.abort_codes import abort_meaning, refused
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
 
 _SDO_ATTEMPTS: Final = 3
@@ -211,9 +212,7 @@ class SoemBackend:
             except pysoem.SdoError as error:
                 # Another object's abort is a stale entry of the error ring, not an answer to this call.
                 if (error.index, error.subindex) == (index, subindex):
-                    code = error.abort_code & 0xFFFFFFFF
-                    text = f"sensor {number} refused {what}: {error.desc.strip()} (abort 0x{code:08X})"
-                    raise SdoAbortError(text, code) from None
+                    raise refused(number, what, error.abort_code & 0xFFFFFFFF) from None
                 last = "an answer about another object"
             except Exception as error:
                 # pysoem raises a plain Exception for an entry of its error ring that it does not know.
@@ -255,6 +254,12 @@ def _log_emergency(emergency: Any) -> None:
 
 
 def _texts(errors: list[Any]) -> str:
-    texts = [str(getattr(error, "desc", None) or error).strip() for error in errors]
+    texts = [_text(error) for error in errors]
     meant = [text for text in texts if text and text != "No error"]
     return "; ".join(dict.fromkeys(meant)) or "no answer"
+
+
+def _text(error: Any) -> str:
+    if isinstance(error, pysoem.SdoError):
+        return abort_meaning(error.abort_code & 0xFFFFFFFF)
+    return str(getattr(error, "desc", None) or error).strip()

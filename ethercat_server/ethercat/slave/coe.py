@@ -11,11 +11,12 @@ import struct
 from collections.abc import Generator
 from typing import Final, Protocol, TypeVar
 
-from ethercat_server.errors import BusError, SdoAbortError
+from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
 from ethercat_server.ethercat.slave import times
+from ethercat_server.ethercat.slave.abort_codes import refused
 from ethercat_server.ethercat.slave.registers import MAILBOX_FULL, MAILBOX_IN_STATUS
 
 T = TypeVar("T")
@@ -155,13 +156,9 @@ class MailboxSdo:
                         break  # ask again: reading and writing twice does no harm
                     if answer is None:
                         continue
-                    code = int.from_bytes(answer[1][:4], "little")
                     if answer[0] == _ABORT:
-                        raise SdoAbortError(
-                            f"sensor {self._number} refused {doing} object 0x{index:04X}:{subindex} "
-                            f"(abort 0x{code:08X})",
-                            code,
-                        )
+                        code = int.from_bytes(answer[1][:4], "little")
+                        raise refused(self._number, f"{doing} object 0x{index:04X}:{subindex}", code)
                     return answer
             yield
         raise BusError(self._unanswered(doing, index, subindex, "no answer"))
