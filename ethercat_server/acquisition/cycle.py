@@ -158,7 +158,7 @@ class Cycle:
         self._exchange.roll()
         for stream in self._streams:
             stream.age.roll()
-            stream.check_rate()
+            stream.check()
         self.every_second()
 
     def status(self) -> dict[str, Any]:
