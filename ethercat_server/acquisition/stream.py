@@ -14,6 +14,7 @@ from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.sample_clock import SampleClock
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
 from protocol.framing import DataFlag, encode_data
+from protocol.pdo import is_finite
 
 DISCARDED_AT_START: Final = 3
 """Bota's own driver discards the first three frames after entering OP."""
@@ -103,6 +104,8 @@ class SensorStream:
         self.clock.observe(sent_ns, back_ns, fresh)
         if fresh and locked:
             self.age.record(back_ns - int(self.clock.instant_ns))
+        if fresh and self._handed_out is self.process_data and not is_finite(self.process_data):
+            self.health.not_finite += 1
 
     def _new_sample(self, now_ns: int) -> int:
         self._idle_at_ns = now_ns + _IDLE_PERIODS * self.clock.period_ns
@@ -143,6 +146,7 @@ class SensorStream:
             "repeated": self.repeated,
             "invalid": self.invalid,
             "lost_samples": self.lost_samples,
+            "not_finite": self.health.not_finite,
             "recoveries": self.recoveries,
             "clock": self.clock.describe(),
         }

@@ -10,7 +10,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.health import Level, Status, judge, text_of
-from bridge.diagnostics.snapshot import Snapshot
+from bridge.diagnostics.snapshot import ServerCounts, Snapshot
 from bridge.parameters.table import Thresholds
 from bridge.stream.connection import SensorInfo
 from bridge.stream.frame_selector import FrameCounts
@@ -27,8 +27,8 @@ GOOD = Snapshot(
     connection_s=5.0, connects=1, new_connects=0,
     info=SensorInfo(0, "name", "7", "800", "OP"), lost=None, silent_s=0.0, rate_hz=800.0, expected_hz=800.0,
     age_us=(100.0, 300.0), counts=FrameCounts(), new=FrameCounts(), not_finite=0, new_not_finite=0,
-    flags=Flags(), temperature=30.0, server={"sensors": [{"clock": {"mode": "locked"}}]}, new_server_lost=0,
-    answer_s=0.0,
+    flags=Flags(), temperature=30.0, server={"sensors": [{"clock": {"mode": "locked"}}]},
+    new_server=ServerCounts(), answer_s=0.0,
 )  # fmt: skip
 
 
@@ -81,9 +81,10 @@ def test_good_is_good() -> None:
         ("stream", Level.WARN, "12.0 ms old", {"age_us": (1.0, 12_000.0)}),
         ("stream", Level.ERROR, "120.0 ms old", {"age_us": (1.0, 120_000.0)}),
         ("stream", Level.WARN, "3 samples lost", {"new": FrameCounts(lost=3)}),
-        ("stream", Level.WARN, "4 samples lost", {"new_server_lost": 4}),
+        ("stream", Level.WARN, "4 samples lost", {"new_server": ServerCounts(lost_samples=4)}),
         ("stream", Level.WARN, "5 old samples skipped", {"new": FrameCounts(stale=5)}),
-        ("stream", Level.WARN, "not finite", {"new_not_finite": 1}),
+        ("stream", Level.ERROR, "not finite: power-cycle", {"new_not_finite": 1}),
+        ("stream", Level.ERROR, "2 samples had", {"new_server": ServerCounts(not_finite=2)}),
         ("sensor", Level.ERROR, "no power; check its cable", {"lost": "no power"}),
         ("sensor", Level.STALE, "see stream", {"silent_s": 2.0}),
         ("sensor", Level.WARN, "force torque saturated: axes 0x2", {"flags": Flags(0, 0, 2)}),

@@ -172,10 +172,18 @@ def test_saturated_axes_are_named_with_their_remedy(model: Model, bits: int) -> 
 def test_values_that_are_no_numbers_are_told_and_spoil_no_peak(model: Model) -> None:
     bad = frame(3, {**REST, "force.z": math.nan}), frame(4, {**REST, "torque.x": math.inf})
     sensor = take(model, *run(0, 3), *bad)
-    assert texts(sensor) == ["Force/torque is not a finite number"]
+    assert texts(sensor) == ["A measured value is not a finite number"]
     assert sensor.peaks is not None
     assert all(math.isfinite(value) for peak in sensor.peaks for value in peak)
     assert tuple(sensor.peaks[2]) == (-8, -8)
+
+
+def test_values_that_only_the_server_saw_are_told_too(model: Model) -> None:
+    for not_finite, told in ((5, []), (5, []), (6, ["A measured value is not a finite number"])):
+        reply = status()
+        reply["sensors"][0]["not_finite"] = not_finite
+        model.take_status(reply, now(0))
+        assert texts(only(model, now(0))) == told
 
 
 def test_a_lost_sensor_is_told_until_it_is_back(model: Model) -> None:

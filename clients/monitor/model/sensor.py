@@ -88,8 +88,11 @@ class SensorModel:
         """The server has lost the sensor, for this reason; None: it is back."""
         self._lost = message
 
-    def take_status(self, row: JsonObject, last_10s: Any) -> None:
+    def take_status(self, row: JsonObject, last_10s: Any, now_s: float) -> None:
         """The sensor's row of `status`, and its distribution of ages of the last ten seconds."""
+        before, after = whole(self._status.get("not_finite")), whole(row.get("not_finite"))
+        if before is not None and after is not None and after > before:
+            self._not_finite_s = now_s
         self._status, self._last_10s = row, last_10s
 
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
@@ -174,7 +177,7 @@ class SensorModel:
         if self._not_finite_s is not None:
             ago = _ago(self._not_finite_s, now_s)
             remedy = "Power-cycle the sensor; if it persists, contact support"
-            alerts.append(Alert("error", "Force/torque is not a finite number", remedy, ago))
+            alerts.append(Alert("error", "A measured value is not a finite number", remedy, ago))
         for bit in {**self._warned_s, **self._saturation_bits()}:
             (row,) = explain(bit)
             axes = [name for name in _AXES_OF.get(bit, ()) if name in self._saturated_s]

@@ -118,6 +118,7 @@ def _stream(s: Snapshot, t: Thresholds) -> Status:
         "repeated": s.counts.repeated,
         "invalid": s.counts.invalid,
         "not_finite": s.not_finite,
+        "server_not_finite": mine.get("not_finite", ""),
         "server_lost": mine.get("lost_samples", ""),
         "server_recoveries": mine.get("recoveries", ""),
         "server_missed_deadlines": s.server.get("missed_deadlines", ""),
@@ -144,13 +145,18 @@ def _judge_samples(verdict: _Verdict, s: Snapshot, t: Thresholds) -> None:
 
 
 def _judge_losses(verdict: _Verdict, s: Snapshot, t: Thresholds) -> None:
-    missing = max(s.new.missing, s.new_server_lost)
+    missing = max(s.new.missing, s.new_server.lost_samples)
     if missing >= t.lost_warn:
         verdict.add(Level.WARN, f"{missing} samples lost at the server or on the way")
     if s.new.stale >= t.lost_warn:
         verdict.add(Level.WARN, f"{s.new.stale} old samples skipped: the node or the server was stopped")
-    if s.new_not_finite:
-        verdict.add(Level.WARN, f"{s.new_not_finite} samples had values that are not finite")
+    # The node checks those that it publishes, the server all.
+    if not_finite := max(s.new_not_finite, s.new_server.not_finite):
+        verdict.add(
+            Level.ERROR,
+            f"{not_finite} samples had values that are not finite: power-cycle the sensor; if that does not "
+            "help, ask Bota",
+        )
 
 
 def _lost_text(lost: str) -> str:
