@@ -181,7 +181,7 @@ class Cycle:
                 "age_us": [recent for _, recent in ages],
             },
             "sensors": [
-                {**stream.status(), "age_us": age}
+                {**stream.status(), **self._bus.emergencies.status(stream.number), "age_us": age}
                 for stream, (age, _) in zip(self._streams, ages, strict=True)
             ],
             "uptime_s": round((now_ns - self._started_ns) * 1e-9, 3),

@@ -45,6 +45,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         cleanup.enter_context(claimed(ifname))
         backend = SoemBackend(ifname)
         bus = Bus(backend)
+        backend.on_emergency = bus.emergencies.note
         cleanup.callback(bus.close)
         backend.open()
         sensors, slaves = bring_up(bus, options, signals.check)

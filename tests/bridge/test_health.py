@@ -101,6 +101,24 @@ def test_what_is_wrong_is_said(name: str, level: Level, words: str, changes: dic
     assert words in status.message
 
 
+@pytest.mark.parametrize(
+    ("code", "ago_s", "level"), [(0x4210, 3.0, Level.WARN), (0x4210, 90.0, Level.OK), (0x0000, 3.0, Level.OK)]
+)
+def test_the_last_emergency_is_a_warning_for_a_minute(code: int, ago_s: float, level: Level) -> None:
+    last = {"code": code, "text": "temper\x1bature", "register": 9, "data": "00", "ago_s": ago_s}
+    clock = {"mode": "locked"}
+    status = statuses(server={"sensors": [{"clock": clock, "emergencies": 7, "emergency": last}]})["sensor"]
+    assert status.level == level
+    assert ("emergency 0x4210 (temper?ature) 3 s ago" in status.message) == (level is Level.WARN)
+    assert status.values["last_emergency"] == f"emergency 0x{code:04X} (temper?ature)"
+    assert (status.values["emergencies"], status.values["last_emergency_ago_s"]) == (7, ago_s)
+
+
+@pytest.mark.parametrize("last", [5, [], {}, {"code": "x", "ago_s": 1}, {"code": 0x4210, "ago_s": "now"}])
+def test_an_emergency_that_makes_no_sense_is_none(last: object) -> None:
+    assert statuses(server={"sensors": [{"emergency": last}]})["sensor"].level == Level.OK
+
+
 @pytest.mark.parametrize("row", WARNINGS, ids=lambda row: str(row.flag))
 def test_each_bit_has_its_level_and_remedy(row: Any) -> None:
     status = statuses(flags=Flags(warnings=row.flag))["sensor"]
