@@ -45,6 +45,7 @@ class Event(StrEnum):
     SENSOR_LOST = "sensor_lost"
     SENSOR_BACK = "sensor_back"
     RECONFIGURED = "reconfigured"
+    EMERGENCY = "emergency"
     SHUTTING_DOWN = "shutting_down"
 
 

@@ -95,6 +95,7 @@ class PdoLayout:
         offsets: byte offset of each field, by name.
         struct: little-endian `struct.Struct` of all fields.
         size: bytes.
+        reals: the same with the REAL fields only.
         has_orientation: whether the quaternion is mapped.
     """
 
@@ -102,6 +103,9 @@ class PdoLayout:
         self.fields = fields
         self.struct = struct.Struct("<" + "".join(field.type.value for field in fields))
         self.size = self.struct.size
+        self.reals = struct.Struct(
+            "<" + "".join("f" if f.type is PdoType.REAL else f"{f.type.size}x" for f in fields)
+        )
         self.offsets: dict[str, int] = {}
         offset = 0
         for field in fields:
@@ -126,6 +130,13 @@ def layout_for(size: int) -> PdoLayout:
         return LAYOUTS[size]
     except KeyError:
         raise PdoSizeError(size, tuple(LAYOUTS)) from None
+
+
+def is_finite(process_data: bytes) -> bool:
+    """Whether every measured value is a finite number; True for process data of unknown size."""
+    layout = LAYOUTS.get(len(process_data))
+    # An infinity or a NaN survives every sum, and a sum of float32 values cannot overflow a double.
+    return layout is None or math.isfinite(sum(layout.reals.unpack(process_data)))
 
 
 Vector3 = tuple[float, float, float]

@@ -159,7 +159,7 @@ class Cycle:
         self._exchange.roll()
         for stream in self._streams:
             stream.age.roll()
-            stream.check_rate()
+            stream.check()
         self.every_second()
 
     def status(self) -> dict[str, Any]:
@@ -182,7 +182,12 @@ class Cycle:
                 "age_us": [recent for _, recent in ages],
             },
             "sensors": [
-                {**stream.status(), "settling": sensor.settling, "age_us": age}
+                {
+                    **stream.status(),
+                    **self._bus.emergencies.status(stream.number),
+                    "settling": sensor.settling,
+                    "age_us": age,
+                }
                 for sensor, stream, (age, _) in zip(self._sensors, self._streams, ages, strict=True)
             ],
             "uptime_s": round((now_ns - self._started_ns) * 1e-9, 3),

@@ -13,6 +13,7 @@ from typing import Final
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.mailbox.mailbox import Mailbox
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
@@ -52,8 +53,9 @@ class Ladder:
             sensor.number, reg.SYNC_MANAGER, count * reg.SYNC_MANAGER_SIZE
         )
         out, back = struct.unpack_from("<HH", rows), struct.unpack_from("<HH", rows, reg.SYNC_MANAGER_SIZE)
-        self.sdo = GuardedSdo(MailboxSdo(bus, sensor.number, (out, back)))
-        """SDO transfers in steps. One for all: the slave drops a request that reuses the last counter."""
+        self.mailbox = Mailbox(bus, sensor.number, (out, back))
+        self.sdo = GuardedSdo(MailboxSdo(self.mailbox))
+        """SDO transfers in steps."""
 
     def bring_back(self, pause_s: float = 0.0) -> Steps[bool]:
         """Returns once the sensor is in OP: True if it had left it, False if it had only been out of reach.

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
+from ethercat_server.acquisition.health.mailboxes import Mailboxes
 from ethercat_server.acquisition.ladder import DifferentSensorError, Ladder
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError, extended
@@ -33,7 +34,7 @@ _SILENCE_NS: Final = 50_000_000
 _SILENT_CHANGE_NS: Final = 1_000_000_000
 """Time without a frame that a change of settings survives: it goes on when frames come back."""
 _WATCH_EVERY_NS: Final = 100_000_000
-"""A sensor can leave OP and still be counted, so its AL status is read this often."""
+"""A sensor can leave OP and still be counted, so its AL status is read this often; and its mailbox."""
 _FAILED_PAUSE_S: Final = 0.25
 _REVERT_S: Final = times.STATE_S[AlState.OP]
 """Timeout for a sensor whose change failed to be back in OP."""
@@ -69,6 +70,7 @@ class Recovery:
         self._announce = announce
         self._others = others
         self._ladders = [Ladder(bus, sensor) for sensor in sensors]
+        self._mailboxes = Mailboxes(bus, sensors, [ladder.mailbox for ladder in self._ladders], announce)
         self._clock = bus.clock
         self._work: dict[int, Steps[bool]] = {}
         """What is under way to bring back those that do not stream."""
@@ -80,6 +82,8 @@ class Recovery:
         """When the frame came that was the last before the first that is missing."""
         self._watch_ns = 0
         self._watched = 0
+        self._looks_at_states = False
+        """Or at the mailboxes: in turns, so that no exchange has to wait for both."""
         self.alive_wkc: int
         """The working counter of all sensors that are not lost."""
         self.all_lost: bool
@@ -135,7 +139,11 @@ class Recovery:
             for number in list(self._work):
                 self._step(number)
         if now_ns >= self._watch_ns:
-            self._watch_ns = now_ns + _WATCH_EVERY_NS // len(self._sensors)
+            self._watch_ns = now_ns + _WATCH_EVERY_NS // (2 * len(self._sensors))
+            self._looks_at_states = not self._looks_at_states
+            if not self._looks_at_states:
+                self._mailboxes.look_at_next()
+                return
             self._watch_next()
             self._others.look_at_next()
 

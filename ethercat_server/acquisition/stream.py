@@ -7,22 +7,19 @@ find the same data again only because the bus is read more often than the sensor
 
 from __future__ import annotations
 
-import logging
 from typing import Any, Final
 
+from ethercat_server.acquisition.health.samples import SampleHealth
 from ethercat_server.acquisition.histogram import RecentDistribution
-from ethercat_server.acquisition.sample_clock import PLAUSIBLE_PULL, SampleClock
+from ethercat_server.acquisition.sample_clock import SampleClock
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
 from protocol.framing import DataFlag, encode_data
+from protocol.pdo import is_finite
 
 DISCARDED_AT_START: Final = 3
 """Bota's own driver discards the first three frames after entering OP."""
-_DEVIATING_SECONDS: Final = 10
-"""Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment."""
 _IDLE_PERIODS: Final = 3.0
 """Periods without a new sample after which a sensor counts as silent, not just late."""
-
-log = logging.getLogger(__name__)
 
 REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))
 
@@ -46,12 +43,11 @@ class SensorStream:
         self.recoveries = 0
         self.age = RecentDistribution()
         """From the estimated instant of a sample to its hand-out, while locked."""
+        self.health = SampleHealth(number)
         self._discard = DISCARDED_AT_START
         self._gap = False
         self._seen = (0, 0, False, False)
         """The last exchange, as `learn` needs it: sent, back, valid, fresh."""
-        self._rate_reported = False
-        self._deviating_seconds = 0
         self._valid_ns = 0
         self._moment_ns = 0
         """Of the newest sample."""
@@ -108,6 +104,8 @@ class SensorStream:
         self.clock.observe(sent_ns, back_ns, fresh)
         if fresh and locked:
             self.age.record(back_ns - int(self.clock.instant_ns))
+        if fresh and self._handed_out is self.process_data and not is_finite(self.process_data):
+            self.health.not_finite += 1
 
     def _new_sample(self, now_ns: int) -> int:
         self._idle_at_ns = now_ns + _IDLE_PERIODS * self.clock.period_ns
@@ -128,17 +126,9 @@ class SensorStream:
         self.invalid += 1
         return INVALID
 
-    def check_rate(self) -> None:
-        """To be called once a second: say once if the sensor samples at another rate than it is set to."""
-        pull = self.clock.pull
-        deviates = self.clock.locked and abs(pull) > PLAUSIBLE_PULL
-        self._deviating_seconds = self._deviating_seconds + 1 if deviates else 0
-        if self._deviating_seconds == _DEVIATING_SECONDS and not self._rate_reported:
-            self._rate_reported = True
-            log.warning(
-                "sensor %d samples every %.1f µs, %+.1f %% off what it is set to: check its settings",
-                self.number, self.clock.period_ns / 1000, 100 * pull,
-            )  # fmt: skip
+    def check(self) -> None:
+        """To be called once a second: log what the samples show of the sensor."""
+        self.health.check(self.fresh, self.repeated, self.clock)
 
     def recover(self, period_ns: float | None, *, lost: bool = True) -> None:
         """The sensor is back after it was out; `period_ns` if it entered OP anew, None if it never left."""
@@ -156,6 +146,7 @@ class SensorStream:
             "repeated": self.repeated,
             "invalid": self.invalid,
             "lost_samples": self.lost_samples,
+            "not_finite": self.health.not_finite,
             "recoveries": self.recoveries,
             "clock": self.clock.describe(),
         }

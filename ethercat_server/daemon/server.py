@@ -47,6 +47,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         cleanup.enter_context(claimed(ifname))
         backend = SoemBackend(ifname)
         bus = Bus(backend)
+        backend.on_emergency = bus.emergencies.note
         cleanup.callback(bus.close)
         backend.open()
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 from ethercat_server.errors import SetUpError
 from ethercat_server.ethercat.backend import Backend, CheckInterrupt, Master
 from ethercat_server.ethercat.datagrams import FIRST_INDEX, SHORTEST_FRAME, Datagrams
+from ethercat_server.ethercat.mailbox.emergencies import Emergencies
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import COUNTER_SIZE, DATAGRAM_INDEX, FIRST_DATA, Command, build
 
@@ -41,6 +42,8 @@ class Bus(Datagrams):
         self.master: Master
         """Whoever scanned it."""
         self._is_scanned = False
+        self.emergencies = Emergencies(backend.clock)
+        """What the sensors report unasked."""
         self.positions: list[int] = []
         """Where the sensors are on the wire: by number, as everything below."""
         self.fmmus: list[bytes] = []

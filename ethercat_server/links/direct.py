@@ -55,6 +55,7 @@ def open_bus(ifname: str, cleanup: contextlib.ExitStack) -> Bus:
     cleanup.enter_context(claimed(ifname))
     backend = SoemBackend(ifname)
     bus = Bus(backend)
+    backend.on_emergency = bus.emergencies.note
     cleanup.callback(bus.close)
     backend.open()
     return bus

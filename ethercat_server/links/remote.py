@@ -186,6 +186,8 @@ def _tell(event: JsonObject) -> None:
         note(str(event.get("message", f"sensor {number} is lost")))
     elif event.get("event") == Event.SENSOR_BACK:
         note(f"sensor {number} is back after {event.get('lost_s')} s")
+    elif event.get("event") == Event.EMERGENCY:
+        note(str(event.get("message", f"sensor {number} reports an emergency")))
     elif event.get("event") == Event.RECONFIGURED:
         note(f"the settings of sensor {number} have changed")
 

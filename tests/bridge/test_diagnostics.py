@@ -102,6 +102,15 @@ def test_lost_samples_are_counted(node: SimulatedNode, server: SimulatedServer) 
     assert values(array["stream"])["server_lost"] == "11"
 
 
+def test_what_the_server_found_not_finite_is_told(node: SimulatedNode, server: SimulatedServer) -> None:
+    answer = status()
+    answer["sensors"][0]["not_finite"] = 3
+    server.answers["status"] = lambda _: answer
+    array = node.until("3 samples had values that are not finite", stream=ERROR)
+    assert values(array["stream"])["server_not_finite"] == "3"
+    node.until(**HEALTHY)
+
+
 def test_another_rate_than_expected(node: SimulatedNode, server: SimulatedServer) -> None:
     server.description["sensors"][0]["rate_hz"] = 200
     node.until("100 samples a second instead of 200", stream=WARN)

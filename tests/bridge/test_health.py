@@ -10,7 +10,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.health import Level, Status, judge, text_of
-from bridge.diagnostics.snapshot import Snapshot
+from bridge.diagnostics.snapshot import ServerCounts, Snapshot
 from bridge.parameters.table import Thresholds
 from bridge.stream.connection import SensorInfo
 from bridge.stream.frame_selector import FrameCounts
@@ -27,8 +27,8 @@ GOOD = Snapshot(
     connection_s=5.0, connects=1, new_connects=0,
     info=SensorInfo(0, "name", "7", "800", "OP"), lost=None, silent_s=0.0, rate_hz=800.0, expected_hz=800.0,
     age_us=(100.0, 300.0), counts=FrameCounts(), new=FrameCounts(), not_finite=0, new_not_finite=0,
-    flags=Flags(), temperature=30.0, server={"sensors": [{"clock": {"mode": "locked"}}]}, new_server_lost=0,
-    answer_s=0.0,
+    flags=Flags(), temperature=30.0, server={"sensors": [{"clock": {"mode": "locked"}}]},
+    new_server=ServerCounts(), answer_s=0.0,
 )  # fmt: skip
 
 
@@ -81,9 +81,10 @@ def test_good_is_good() -> None:
         ("stream", Level.WARN, "12.0 ms old", {"age_us": (1.0, 12_000.0)}),
         ("stream", Level.ERROR, "120.0 ms old", {"age_us": (1.0, 120_000.0)}),
         ("stream", Level.WARN, "3 samples lost", {"new": FrameCounts(lost=3)}),
-        ("stream", Level.WARN, "4 samples lost", {"new_server_lost": 4}),
+        ("stream", Level.WARN, "4 samples lost", {"new_server": ServerCounts(lost_samples=4)}),
         ("stream", Level.WARN, "5 old samples skipped", {"new": FrameCounts(stale=5)}),
-        ("stream", Level.WARN, "not finite", {"new_not_finite": 1}),
+        ("stream", Level.ERROR, "not finite: power-cycle", {"new_not_finite": 1}),
+        ("stream", Level.ERROR, "2 samples had", {"new_server": ServerCounts(not_finite=2)}),
         ("sensor", Level.ERROR, "no power; check its cable", {"lost": "no power"}),
         ("sensor", Level.STALE, "see stream", {"silent_s": 2.0}),
         ("sensor", Level.WARN, "force torque saturated: axes 0x2", {"flags": Flags(0, 0, 2)}),
@@ -98,6 +99,24 @@ def test_what_is_wrong_is_said(name: str, level: Level, words: str, changes: dic
     status = statuses(**changes)[name]
     assert status.level == level
     assert words in status.message
+
+
+@pytest.mark.parametrize(
+    ("code", "ago_s", "level"), [(0x4210, 3.0, Level.WARN), (0x4210, 90.0, Level.OK), (0x0000, 3.0, Level.OK)]
+)
+def test_the_last_emergency_is_a_warning_for_a_minute(code: int, ago_s: float, level: Level) -> None:
+    last = {"code": code, "text": "temper\x1bature", "register": 9, "data": "00", "ago_s": ago_s}
+    clock = {"mode": "locked"}
+    status = statuses(server={"sensors": [{"clock": clock, "emergencies": 7, "emergency": last}]})["sensor"]
+    assert status.level == level
+    assert ("emergency 0x4210 (temper?ature) 3 s ago" in status.message) == (level is Level.WARN)
+    assert status.values["last_emergency"] == f"emergency 0x{code:04X} (temper?ature)"
+    assert (status.values["emergencies"], status.values["last_emergency_ago_s"]) == (7, ago_s)
+
+
+@pytest.mark.parametrize("last", [5, [], {}, {"code": "x", "ago_s": 1}, {"code": 0x4210, "ago_s": "now"}])
+def test_an_emergency_that_makes_no_sense_is_none(last: object) -> None:
+    assert statuses(server={"sensors": [{"emergency": last}]})["sensor"].level == Level.OK
 
 
 @pytest.mark.parametrize("row", WARNINGS, ids=lambda row: str(row.flag))

@@ -102,12 +102,19 @@ def test_what_is_no_news_is_not_published(
 def test_events_are_said(server: ScriptedServer, listener: Listener, node: NodeThread) -> None:
     server.send_json({"event": "sensor_lost", "sensor": 0})
     server.send_json({"event": "sensor_back", "sensor": 0})
+    server.send_json({"event": "emergency", "sensor": 0, "message": "too hot"})
     server.send_json({"event": "some\x1b[2Jthing", "detail": "{0}"})
     server.send_json({"neither": "event nor reply"})
     server.send_json({"event": ["odd"]})
     server.send_sample(1.0)
     assert listener.next_number() == 1.0
-    for words in ("has lost the sensor", "the sensor is back", "the server says some?[2Jthing"):
+    for words in (
+        "has lost the sensor",
+        "the sensor is back",
+        "emergency",
+        "too hot",
+        "the server says some?[2Jthing",
+    ):
         node.says(words)
 
 

@@ -417,7 +417,7 @@ def test_odd_values_where_others_are_expected(server: PlayedServer) -> None:
     with stream(server) as running:
         messages: list[JsonObject] = []
         for odd in (None, True, -1, 256, 1.5, 10**30, "0", "", [], {}, [0], {"sensor": 0}, "\\ud800\\u0000"):
-            for name in ("sensor_lost", "sensor_back", "reconfigured", "unknown", odd):
+            for name in ("sensor_lost", "sensor_back", "reconfigured", "emergency", "unknown", odd):
                 messages.append({"event": name, "sensor": odd, "message": odd})
             messages += [
                 {"event": "sensor_lost", "sensor": 1, "message": odd},

@@ -172,10 +172,35 @@ def test_saturated_axes_are_named_with_their_remedy(model: Model, bits: int) -> 
 def test_values_that_are_no_numbers_are_told_and_spoil_no_peak(model: Model) -> None:
     bad = frame(3, {**REST, "force.z": math.nan}), frame(4, {**REST, "torque.x": math.inf})
     sensor = take(model, *run(0, 3), *bad)
-    assert texts(sensor) == ["Force/torque is not a finite number"]
+    assert texts(sensor) == ["A measured value is not a finite number"]
     assert sensor.peaks is not None
     assert all(math.isfinite(value) for peak in sensor.peaks for value in peak)
     assert tuple(sensor.peaks[2]) == (-8, -8)
+
+
+def test_values_that_only_the_server_saw_are_told_too(model: Model) -> None:
+    for not_finite, told in ((5, []), (5, []), (6, ["A measured value is not a finite number"])):
+        reply = status()
+        reply["sensors"][0]["not_finite"] = not_finite
+        model.take_status(reply, now(0))
+        assert texts(only(model, now(0))) == told
+
+
+def test_the_last_emergency_is_told_until_it_is_over_or_reset(model: Model) -> None:
+    def after(count: int, code: int, at_s: float) -> list[str]:
+        reply = status()
+        last = {"code": code, "text": "temperature", "ago_s": 2.0}
+        reply["sensors"][0].update(emergencies=count, emergency=last if count else None)
+        model.take_status(reply, at_s)
+        return texts(only(model, at_s))
+
+    assert after(0, 0, now(0)) == []
+    assert after(1, 0x4210, now(0)) == ["Emergency 0x4210: temperature"]
+    assert only(model, now(0)).alerts[0].ago_s == pytest.approx(2.0)
+    model.reset()
+    assert after(1, 0x4210, now(80)) == []
+    assert after(2, 0x4210, now(160)) == ["Emergency 0x4210: temperature"]
+    assert after(3, 0x0000, now(240)) == []
 
 
 def test_a_lost_sensor_is_told_until_it_is_back(model: Model) -> None:

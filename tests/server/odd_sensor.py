@@ -1,11 +1,13 @@
-"""The virtual sensor as a process, with two commands for what pysoem has to get along with.
+"""The virtual sensor as a process, with commands for what pysoem has to get along with.
 
 `ignore STATE` makes it stay below this AL state, of which it says `ignored`; `eeprom latin|no-mailbox|ok`
-changes its EEPROM. What is no matter of pysoem is in memory: see `tests.tool.odd_firmware`.
+changes its EEPROM; `report INDEX SUBINDEX BEFORE AFTER` puts so many emergencies before and after
+the next answer about this object. What is no matter of pysoem is in memory: see `tests.tool.odd_firmware`.
 """
 
 from __future__ import annotations
 
+import struct
 import sys
 
 from ethercat_server.virtual_sensor import cli
@@ -42,8 +44,24 @@ def eeprom(call: Call) -> None:
     call.life.al._mailbox_fault = (lambda: 0) if way == "no-mailbox" else call.life._mailbox_fault
 
 
-for name, run in (("ignore", ignore), ("eeprom", eeprom)):
-    table._BY_NAME[name] = FaultCommand(name, name, (1,), "", run)
+def report(call: Call) -> None:
+    index, subindex, before, after = (int(text, 0) for text in call.arguments)
+    mailbox, emergency = call.life.mailbox, struct.pack("<HHB5s", 1 << 12, 0x4210, 1, b"12345")
+    answer = mailbox._coe
+
+    def report_and_answer(request: bytes, room: int) -> list[bytes]:
+        nonlocal before, after
+        if struct.unpack_from("<HB", request, 3) != (index, subindex):
+            return answer(request, room)
+        reported = [emergency] * before + answer(request, room) + [emergency] * after
+        before = after = 0
+        return reported
+
+    mailbox._coe = report_and_answer
+
+
+for name, run in (("ignore", ignore), ("eeprom", eeprom), ("report", report)):
+    table._BY_NAME[name] = FaultCommand(name, name, (1, 4), "", run)
 
 if __name__ == "__main__":
     sys.exit(cli.main())

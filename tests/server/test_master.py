@@ -7,6 +7,7 @@ import re
 import threading
 from collections.abc import Iterator, Mapping
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -37,6 +38,8 @@ from tests.tool.running import one_sentence, tool
 
 pytestmark = [pytest.mark.bus, needs_bus]
 Bench = tuple[Veth, Program]
+LAST_READ = "0x8000 6"
+"""The object that is read last before the mapping."""
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +87,10 @@ def start(
         for text in commands:
             command(sensor, text)
         with opened(veth.near, make) as backend:
+            bus = Bus(backend)
+            backend.on_emergency = bus.emergencies.note
             try:
-                return bring_up(Bus(backend), Asked(settings), check_interrupt).sensors
+                return bring_up(bus, Asked(settings), check_interrupt).sensors
             except BusError as error:
                 expected = re.search(complaint, str(error)) or not starved(str(error))
                 if expected or attempt == ATTEMPTS - 1:
@@ -141,10 +146,39 @@ def test_a_name_that_is_no_utf_8_and_a_slave_without_a_mailbox(bench: Bench) -> 
 
 def test_an_object_that_aborts_is_named(bench: Bench) -> None:
     """An SDO abort as pysoem raises it; INIT as it asks for it."""
-    complaint = "sinc_length = 128 did not take.*0x06090030"
+    complaint = "sinc_length = 128 did not take.*: the value is out of range .*0x06090030"
     with pytest.raises(BusError, match=complaint):
         start(bench, "abort 0x8006 1 0x06090030", complaint=complaint, settings={"sinc_length": 128})
     wait_until(lambda: stats(bench[1])["al_state"] == "INIT", "INIT")
+
+
+@pytest.mark.parametrize("count", [1, 6, 15])
+@pytest.mark.parametrize("index", [0x1008, 0x8011, 0x1C12], ids=hex)
+def test_emergencies_in_place_of_an_answer_cost_a_retry_and_are_said_in_words(
+    bench: Bench, caplog: pytest.LogCaptureFixture, index: int, count: int
+) -> None:
+    """0x1C12 is read by SOEM's mapping, and pysoem tells nothing of those."""
+    assert start(bench, f"report {index} 0 {count} 0")[0].pdo_size
+    said = [record.getMessage() for record in caplog.records]
+    assert [
+        text for text in said if ("an emergency, or" if index == 0x1C12 else "emergency 0x4210") in text
+    ], said
+    assert "unexpected" not in " ".join(said)
+
+
+def test_emergencies_that_wait_for_the_mapping_are_no_failure(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert start(bench, f"report {LAST_READ} 0 12")[0].pdo_size
+    assert [record.getMessage()[:34] for record in caplog.records] == ["sensor 0 reports emergency 0x4210 "]
+
+
+def test_what_pysoem_finds_of_another_slave_is_no_answer() -> None:
+    """It asserts that what it takes from its error ring is of the slave that was asked."""
+    found: list[bytes | Exception] = [AssertionError(), b"\x01"]
+    backend = SoemBackend("never opened")
+    backend._slaves = [mock.Mock(sdo_read=mock.Mock(side_effect=found))]
+    assert backend.sdo_read(0, 0x8011, 0) == b"\x01"
 
 
 def test_a_slave_that_vanishes_during_the_scan_does_not_hang_the_server(

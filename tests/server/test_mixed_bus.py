@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import random
+import struct
 from typing import Final
 
 import pytest
@@ -155,3 +156,13 @@ def test_addresses_that_others_answer_to_are_not_taken() -> None:
     assert bus.working_counter(0) == 3
     bus.send(backend.clock.monotonic_ns())
     assert bus.receive(0.01) == 3, "no FMMU of another answers to it"
+    taken = [range(start, start + size) for image in (before[0], before[2]) for start, size in fmmus(image)]
+    assert taken
+    (own, _), *_ = fmmus(bytes(reg.FMMU) + bus.fmmus[0])
+    assert not any(own in area for area in taken)
+
+
+def fmmus(registers: bytes) -> list[tuple[int, int]]:
+    """Logical start and length of those that are active."""
+    rows = (struct.unpack_from("<IH", registers, reg.FMMU + at * reg.FMMU_SIZE) for at in range(2))
+    return [(start, size) for start, size in rows if size]

@@ -16,6 +16,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -107,7 +108,7 @@ def test_what_needs_root_is_done_first_and_all_before_a_frame_is_read(
 
     monkeypatch.setattr(daemon, "claimed", contextlib.nullcontext)
     monkeypatch.setattr(daemon, "SoemBackend", Backend)
-    monkeypatch.setattr(daemon, "Bus", lambda backend: backend)
+    monkeypatch.setattr(daemon, "Bus", lambda _: MagicMock())
     monkeypatch.setattr(daemon, "bring_up", bring_up)
     monkeypatch.setattr(realtime, "prepare", prepare)
     monkeypatch.setattr(daemon, "become", lambda user: done.append(f"became {user}"))

@@ -10,6 +10,7 @@ import pytest
 from ethercat_server.errors import SdoAbortError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
+from ethercat_server.ethercat.mailbox.mailbox import Mailbox
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, T, finish
 from ethercat_server.ethercat.slave.registers import MAILBOX_IN_STATUS
 
@@ -47,7 +48,7 @@ def run(bus: GivenBus, steps: Steps[T]) -> T:
 
 
 def mailbox(bus: GivenBus) -> MailboxSdo:
-    return MailboxSdo(cast(Bus, bus), 0, MAILBOXES)
+    return MailboxSdo(Mailbox(cast(Bus, bus), 0, MAILBOXES))
 
 
 def test_a_read_leaves_the_late_answer_to_a_repeated_write_alone() -> None:
@@ -62,5 +63,12 @@ def test_a_write_leaves_the_late_answer_to_a_repeated_read_alone() -> None:
 
 def test_an_answer_about_another_object_is_left_alone_and_a_refusal_is_not() -> None:
     bus = GivenBus((READ, 0x8000, b"abcd"), (ABORTED, 0x8001, struct.pack("<I", 0x06090030)))
-    with pytest.raises(SdoAbortError, match="refused reading object 0x8001:1 "):
+    with pytest.raises(SdoAbortError, match="refused reading object 0x8001:1: the value is out of range "):
         finish(mailbox(bus).read(0x8001, 1))
+
+
+@pytest.mark.parametrize(("code", "words"), [(0x06020000, "does not exist"), (0x12345678, "does not define")])
+def test_a_refusal_says_why_in_words_and_as_a_number(code: int, words: str) -> None:
+    bus = GivenBus((ABORTED, 0x8001, struct.pack("<I", code)))
+    with pytest.raises(SdoAbortError, match=rf"sensor 0 refused writing .*{words} \(abort 0x{code:08X}\)"):
+        finish(mailbox(bus).write(0x8001, 1, b"efgh"))

@@ -13,6 +13,7 @@ from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.mailbox.emergencies import Emergencies
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import finish
@@ -33,6 +34,7 @@ class GivenBus:
 
     def __init__(self) -> None:
         self.clock = SimulatedClock(Machine())
+        self.emergencies = Emergencies(self.clock)
         self.looked_for = False
         self.states: list[AlState | None] = [AlState.OP, AlState.OP]
         self.error = 0

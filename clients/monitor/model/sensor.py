@@ -62,6 +62,8 @@ class SensorModel:
         self._newest: bytes | None = None
         self._trace: dict[int, tuple[Range, ...]] = {}
         self._started_s: float | None = None
+        self._emergencies: int | None = 0
+        """How many the sensor had sent when `_emergency` was the last one."""
         self.reset()
 
     def reset(self) -> None:
@@ -70,6 +72,8 @@ class SensorModel:
         self._warned_s: dict[int, float] = {}
         self._saturated_s: dict[str, float] = {}
         self._not_finite_s: float | None = None
+        self._emergency: tuple[str, float] | None = None
+        """The last one that is not over, in words, and when it came."""
 
     def describe(self, row: JsonObject, now_s: float) -> None:
         """Take the sensor's row of `describe`."""
@@ -88,8 +92,14 @@ class SensorModel:
         """The server has lost the sensor, for this reason; None: it is back."""
         self._lost = message
 
-    def take_status(self, row: JsonObject, last_10s: Any) -> None:
+    def take_status(self, row: JsonObject, last_10s: Any, now_s: float) -> None:
         """The sensor's row of `status`, and its distribution of ages of the last ten seconds."""
+        before, after = whole(self._status.get("not_finite")), whole(row.get("not_finite"))
+        if before is not None and after is not None and after > before:
+            self._not_finite_s = now_s
+        count, last = whole(row.get("emergencies")), row.get("emergency")
+        if count != self._emergencies and isinstance(last, dict):
+            self._emergencies, self._emergency = count, _emergency(last, now_s)
         self._status, self._last_10s = row, last_10s
 
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
@@ -174,7 +184,10 @@ class SensorModel:
         if self._not_finite_s is not None:
             ago = _ago(self._not_finite_s, now_s)
             remedy = "Power-cycle the sensor; if it persists, contact support"
-            alerts.append(Alert("error", "Force/torque is not a finite number", remedy, ago))
+            alerts.append(Alert("error", "A measured value is not a finite number", remedy, ago))
+        if self._emergency is not None:
+            said, at_s = self._emergency
+            alerts.append(Alert("warning", said, "If it comes again, contact support", _ago(at_s, now_s)))
         for bit in {**self._warned_s, **self._saturation_bits()}:
             (row,) = explain(bit)
             axes = [name for name in _AXES_OF.get(bit, ()) if name in self._saturated_s]
@@ -206,6 +219,13 @@ def spread(values: Any) -> Spread | None:
         return None
     middle, end = number(values.get("p50")), number(values.get("p99"))
     return None if middle is None or end is None else Spread(middle, end)
+
+
+def _emergency(row: JsonObject, now_s: float) -> tuple[str, float] | None:
+    """The one in a reply to `status`; None if it says that an error is over."""
+    code = whole(row.get("code")) or 0
+    said = f"Emergency 0x{code:04X}: {text(row.get('text'))}"
+    return (said, now_s - (number(row.get("ago_s")) or 0.0)) if code & 0xFF00 else None
 
 
 def _clock(row: JsonObject) -> Clock:

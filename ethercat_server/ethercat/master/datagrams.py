@@ -13,6 +13,7 @@ from typing import Final, TypeVar
 from ethercat_server.errors import BusError, SdoAbortError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.mailbox.mailbox import Mailbox
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
@@ -69,7 +70,8 @@ class DatagramMaster:
             states.write(reg.FMMU, bytes(len(_ASSIGNMENTS) * reg.FMMU_SIZE))
             rows = [(*content["mailboxes"][way], control) for control, way in _MAILBOXES]
             out, back = (row[:2] for row in rows)
-            self._sdos.append(MailboxSdo(self._bus, number, (out, back)) if out[1] else None)
+            has_mailbox = out[1] > 0
+            self._sdos.append(MailboxSdo(Mailbox(self._bus, number, (out, back))) if has_mailbox else None)
             managers = b"".join(reg.pack_sync_manager(*row) for row in rows)
             states.write(reg.SYNC_MANAGER, managers.ljust(4 * reg.SYNC_MANAGER_SIZE, b"\0"))
             states.write(reg.SII_OWNER, OF_FIRMWARE)  # a slave reads its SII on the way to PREOP

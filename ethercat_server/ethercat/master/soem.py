@@ -8,25 +8,29 @@ next.
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import socket
+import struct
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import pysoem
 
-from ethercat_server.errors import BusError, SdoAbortError, SetUpError
+from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt, Master
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
+from ethercat_server.ethercat.mailbox.emergency import Emergency
 from ethercat_server.ethercat.nic.interface import check_present, why_silent
 from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
 from ethercat_server.ethercat.slave import times
+from ethercat_server.ethercat.slave.abort_codes import abort_meaning, refused
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
 
 _SDO_ATTEMPTS: Final = 3
+_MOST_WAITING: Final = 16
+"""Emergencies of a sensor that are taken before the mapping, or that an SDO survives."""
 _SCAN_TIMEOUT_S: Final = 15.0
 _STATE_CHECK_S: Final = 0.05
 _IMAGE_BYTES: Final = 4096
@@ -39,8 +43,10 @@ _PYSOEM_ERRORS: Final = (
     pysoem.WkcError,
     pysoem.ConfigMapError,
     pysoem.NetworkInterfaceNotOpenError,
+    AssertionError,  # an entry of the error ring about another slave
 )
-log = logging.getLogger(__name__)
+_UNEXPECTED: Final = "unexpected error"
+"""What pysoem makes of entries of its error ring that it does not expect after a mapping."""
 
 
 class SoemBackend:
@@ -58,6 +64,9 @@ class SoemBackend:
         self._abandoned = False
         """A thread that never ended still uses the socket: it must not be closed."""
         self._socket: RawSocket
+        self._emergency_count = 0
+        self.on_emergency: Callable[[int, Emergency], None] = lambda _number, _emergency: None
+        """Told of each emergency of a sensor until OP."""
 
     @property
     def master(self) -> Master:
@@ -111,7 +120,13 @@ class SoemBackend:
             )
         self._slaves = list(self._master.slaves)
         for slave in self._slaves:
-            slave.add_emergency_callback(_log_emergency)
+            slave.add_emergency_callback(self._take_emergency)
+
+    def _take_emergency(self, emergency: Any) -> None:
+        self._emergency_count += 1
+        data = struct.pack("<BHH", emergency.b1, emergency.w1, emergency.w2)
+        found = Emergency(emergency.error_code, emergency.error_reg, data)
+        self.on_emergency(emergency.slave_pos - 1, found)
 
     def _config_init(self, check_interrupt: CheckInterrupt) -> int:
         # SOEM tries every byte of the SII for long if a slave goes away meanwhile, two minutes in all, and no
@@ -153,6 +168,7 @@ class SoemBackend:
     def map_process_data(self, check_interrupt: CheckInterrupt) -> list[int]:
         """See `Master`."""
         check_interrupt()
+        self._empty_mailboxes()
         try:
             mapped = self._master.config_map()
         except pysoem.ConfigMapError as error:
@@ -164,6 +180,16 @@ class SoemBackend:
         for slave in self._slaves:
             slave.output = bytes(len(slave.output))
         return [len(slave.input) for slave in self._slaves]
+
+    def _empty_mailboxes(self) -> None:
+        """Take the emergencies that wait: pysoem takes one that it meets in the mapping for a failure."""
+        for slave in self._slaves:
+            for _ in range(_MOST_WAITING):
+                before = self._emergency_count
+                with contextlib.suppress(*_PYSOEM_ERRORS):
+                    slave.mbx_receive()
+                if self._emergency_count == before:
+                    break
 
     def _unmapped(self, why: str) -> SetUpError:
         return SetUpError(
@@ -206,8 +232,10 @@ class SoemBackend:
         self._master.close()
 
     def _sdo(self, number: int, index: int, subindex: int, what: str, data: bytes | None) -> Any:
-        target, last = self._slaves[number], "no answer"
-        for _ in range(_SDO_ATTEMPTS):
+        target, last, left = self._slaves[number], "no answer", _SDO_ATTEMPTS
+        most_emergencies = self._emergency_count + _MOST_WAITING
+        while left:
+            emergencies = self._emergency_count
             try:
                 if data is None:
                     return target.sdo_read(index, subindex)
@@ -215,15 +243,15 @@ class SoemBackend:
             except pysoem.SdoError as error:
                 # Another object's abort is a stale entry of the error ring, not an answer to this call.
                 if (error.index, error.subindex) == (index, subindex):
-                    code = error.abort_code & 0xFFFFFFFF
-                    text = f"sensor {number} refused {what}: {error.desc.strip()} (abort 0x{code:08X})"
-                    raise SdoAbortError(text, code) from None
+                    raise refused(number, what, error.abort_code & 0xFFFFFFFF) from None
                 last = "an answer about another object"
             except Exception as error:
                 # pysoem raises a plain Exception for an entry of its error ring that it does not know.
                 if not isinstance(error, _PYSOEM_ERRORS) and type(error) is not Exception:
                     raise
                 last = _texts([error])
+            # An emergency in place of the answer is no failure, but a flood of them is.
+            left -= not emergencies < self._emergency_count <= most_emergencies
         raise SetUpError(f"sensor {number} did not answer {what}: {last}; check cable and power")
 
     def _wait_state(self, state: AlState, check_interrupt: CheckInterrupt) -> None:
@@ -252,13 +280,15 @@ def _al_status(slave: Any) -> AlStatus:
     return AlStatus.of(slave.state, slave.al_status)
 
 
-def _log_emergency(emergency: Any) -> None:
-    log.warning(
-        "sensor %d reports an emergency: error code 0x%04X", emergency.slave_pos - 1, emergency.error_code
-    )
-
-
 def _texts(errors: list[Any]) -> str:
-    texts = [str(getattr(error, "desc", None) or error).strip() for error in errors]
+    texts = [_text(error) for error in errors]
     meant = [text for text in texts if text and text != "No error"]
     return "; ".join(dict.fromkeys(meant)) or "no answer"
+
+
+def _text(error: Any) -> str:
+    if isinstance(error, pysoem.SdoError):
+        return abort_meaning(error.abort_code & 0xFFFFFFFF)
+    if str(error) == _UNEXPECTED:
+        return "an emergency, or another message that was not asked for, came meanwhile"
+    return str(getattr(error, "desc", None) or error).strip()

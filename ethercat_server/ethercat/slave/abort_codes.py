@@ -5,6 +5,8 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Self
 
+from ethercat_server.errors import SdoAbortError
+
 
 class AbortCode(IntEnum):
     """Reason why a slave aborted an SDO transfer."""
@@ -51,6 +53,12 @@ class AbortCode(IntEnum):
 
 
 def abort_meaning(code: int) -> str:
-    """The meaning of an abort code; its number if the standard does not define it."""
+    """The meaning of an abort code."""
     known = next((row for row in AbortCode if row == code), None)
-    return known.meaning if known else f"abort code 0x{code:08X}, not defined by the standard"
+    return known.meaning if known else "a reason that the standard does not define"
+
+
+def refused(number: int, doing: str, code: int) -> SdoAbortError:
+    """Sensor `number` aborted an SDO; `doing` is such as "reading object 0x8011:0"."""
+    text = f"sensor {number} refused {doing}: {abort_meaning(code)} (abort 0x{code:08X})"
+    return SdoAbortError(text, code)

@@ -7,26 +7,24 @@ Code that configures a sensor is written once, with `yield from`, and `finish` r
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Generator
 from typing import Final, Protocol, TypeVar
 
-from ethercat_server.errors import BusError, SdoAbortError
+from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
+from ethercat_server.ethercat.mailbox.mailbox import Mailbox, MessageLostError
 from ethercat_server.ethercat.slave import times
-from ethercat_server.ethercat.slave.registers import MAILBOX_FULL, MAILBOX_IN_STATUS
+from ethercat_server.ethercat.slave.abort_codes import refused
 
 T = TypeVar("T")
 Steps = Generator[None, None, T]
 """Work in steps: yields when the loop should have its turn, returns the result."""
 
-_SHORTEST_MAILBOX: Final = 16
-_LONGEST_MAILBOX: Final = 1486
-_MAILBOX_HEADER: Final = struct.Struct("<HHBB")
 _SDO_HEADER: Final = struct.Struct("<HBHB")
-_TYPE_COE: Final = 3
 _COE_SDO_REQUEST: Final = 2
 _COE_SDO_RESPONSE: Final = 3
 _UPLOAD: Final = 0x40
@@ -37,6 +35,7 @@ _EXPEDITED: Final = 0x03
 _SIZE_GIVEN: Final = 0x01
 _ABORT: Final = 0x80
 _LONGEST_EXPEDITED: Final = 4
+_MOST_DRAINED: Final = 4
 _SIZE_BYTES: Final = 4
 """The size goes before what is longer."""
 
@@ -56,10 +55,6 @@ class Sdo(Protocol):
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """Download an object; raises as `read`."""
         ...
-
-
-class _AnswerLostError(Exception):
-    """The answer was taken from the mailbox and lost on its way."""
 
 
 def finish(steps: Steps[T], pause_s: float = 0.001, clock: Clock = SYSTEM_CLOCK) -> T:
@@ -97,18 +92,11 @@ class BlockingSdo:
 
 
 class MailboxSdo:
-    """SDO by single datagrams. `mailboxes`: offset and size of the one to the slave and the one from it."""
+    """SDO by single datagrams."""
 
-    def __init__(self, bus: Bus, number: int, mailboxes: tuple[tuple[int, int], tuple[int, int]]) -> None:
-        self._bus, self._number = bus, number
-        self.clock = bus.clock
-        (self._out, self._out_size), (self._in, self._in_size) = mailboxes
-        if not all(_SHORTEST_MAILBOX <= size <= _LONGEST_MAILBOX for _, size in mailboxes):
-            raise BusError(
-                f"sensor {number} has mailboxes of {self._out_size} and {self._in_size} bytes, which no "
-                "frame can carry: power it off and on"
-            )
-        self._counter = 0
+    def __init__(self, mailbox: Mailbox) -> None:
+        self._mailbox, self._number = mailbox, mailbox.number
+        self.clock = mailbox.clock
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """See `Sdo`."""
@@ -124,7 +112,7 @@ class MailboxSdo:
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """See `Sdo`; at most what fits the mailbox in one piece."""
-        most = self._out_size - _MAILBOX_HEADER.size - _SDO_HEADER.size - _SIZE_BYTES
+        most = self._mailbox.most - _SDO_HEADER.size - _SIZE_BYTES
         if not 0 < len(data) <= most:
             raise BusError(
                 f"object 0x{index:04X}:{subindex} of sensor {self._number} cannot be written: 1 to {most} "
@@ -137,42 +125,41 @@ class MailboxSdo:
         yield from self._transfer(index, subindex, command, data)
 
     def _transfer(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
+        self._mailbox.is_in_use = True
+        try:
+            return (yield from self._ask(index, subindex, command, data))
+        finally:
+            self._mailbox.is_in_use = False
+
+    def _ask(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
         doing, expected = ("reading", _UPLOAD) if command == _UPLOAD else ("writing", _DOWNLOADED)
         give_up = Deadline(self.clock, times.SDO_S)
+        body = _SDO_HEADER.pack(_COE_SDO_REQUEST << 12, command, index, subindex) + data.ljust(4, b"\0")
         while not give_up.passed:
             yield from self._drain()
-            self._counter = self._counter % 7 + 1
-            body = _SDO_HEADER.pack(_COE_SDO_REQUEST << 12, command, index, subindex) + data.ljust(4, b"\0")
-            header = _MAILBOX_HEADER.pack(len(body), 0, 0, _TYPE_COE | self._counter << 4)
-            message = (header + body).ljust(self._out_size, b"\0")
-            if self._bus.write_register(self._number, self._out, message):
+            if self._mailbox.put(body):
                 deadline = Deadline(self.clock, times.SDO_ANSWER_S)
                 while not deadline.passed:
                     yield
                     try:
                         answer = self._answer(index, subindex, expected)
-                    except _AnswerLostError:
+                    except MessageLostError:
                         break  # ask again: reading and writing twice does no harm
                     if answer is None:
                         continue
-                    code = int.from_bytes(answer[1][:4], "little")
                     if answer[0] == _ABORT:
-                        raise SdoAbortError(
-                            f"sensor {self._number} refused {doing} object 0x{index:04X}:{subindex} "
-                            f"(abort 0x{code:08X})",
-                            code,
-                        )
+                        code = int.from_bytes(answer[1][:4], "little")
+                        raise refused(self._number, f"{doing} object 0x{index:04X}:{subindex}", code)
                     return answer
             yield
         raise BusError(self._unanswered(doing, index, subindex, "no answer"))
 
     def _drain(self) -> Steps[None]:
         """Read away what was left in the mailbox from before."""
-        for _ in range(4):
-            status = self._bus.read_register(self._number, MAILBOX_IN_STATUS, 1)
-            if status is None or not status[0] & MAILBOX_FULL:
-                return
-            self._bus.read_register(self._number, self._in, self._in_size)
+        for _ in range(_MOST_DRAINED):
+            with contextlib.suppress(MessageLostError):
+                if self._mailbox.take() is None:
+                    return
             yield
 
     def _answer(self, index: int, subindex: int, expected: int) -> tuple[int, bytes] | None:
@@ -180,16 +167,8 @@ class MailboxSdo:
 
         Such as the late answer to a request that was repeated: about the same object, but another command's.
         """
-        status = self._bus.read_register(self._number, MAILBOX_IN_STATUS, 1)
-        if status is None or not status[0] & MAILBOX_FULL:
-            return None
-        message = self._bus.read_register(self._number, self._in, self._in_size)
-        if message is None:
-            # The datagram that took the answer out of the mailbox did not come back in time.
-            raise _AnswerLostError
-        length, _, _, kind = _MAILBOX_HEADER.unpack_from(message)
-        body = message[_MAILBOX_HEADER.size : _MAILBOX_HEADER.size + length]
-        if kind & 0x0F != _TYPE_COE or len(body) < _SDO_HEADER.size + 4:
+        body = self._mailbox.take()
+        if body is None or len(body) < _SDO_HEADER.size + 4:
             return None
         coe, command, its_index, its_subindex = _SDO_HEADER.unpack_from(body)
         is_sdo = coe >> 12 == _COE_SDO_RESPONSE or (coe >> 12 == _COE_SDO_REQUEST and command == _ABORT)

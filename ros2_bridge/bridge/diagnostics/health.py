@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 from bridge.diagnostics.snapshot import Snapshot, mapping, row_of
 from bridge.parameters.table import Thresholds
 from protocol.sensor.warnings_register import Severity, explain
+from protocol.text.untrusted import number, whole
 from protocol.text.visible import printable
 
 Values = dict[str, object]
@@ -36,6 +37,10 @@ class Status(NamedTuple):
 
 
 _SLOW_ANSWER_S: Final = 2.0
+_EMERGENCY_S: Final = 60.0
+"""How long an emergency of the sensor is a warning."""
+_ERROR_CLASS: Final = 0xFF00
+"""Bits of its code; none of them in one that says that an error is over."""
 _SATURATIONS: Final = ("force_torque_saturated", "acceleration_saturated", "angular_rate_saturated")
 _LEVELS: Final = {
     Severity.WARNING: Level.WARN, Severity.ERROR: Level.ERROR, Severity.FATAL: Level.ERROR,
@@ -118,6 +123,7 @@ def _stream(s: Snapshot, t: Thresholds) -> Status:
         "repeated": s.counts.repeated,
         "invalid": s.counts.invalid,
         "not_finite": s.not_finite,
+        "server_not_finite": mine.get("not_finite", ""),
         "server_lost": mine.get("lost_samples", ""),
         "server_recoveries": mine.get("recoveries", ""),
         "server_missed_deadlines": s.server.get("missed_deadlines", ""),
@@ -144,13 +150,18 @@ def _judge_samples(verdict: _Verdict, s: Snapshot, t: Thresholds) -> None:
 
 
 def _judge_losses(verdict: _Verdict, s: Snapshot, t: Thresholds) -> None:
-    missing = max(s.new.missing, s.new_server_lost)
+    missing = max(s.new.missing, s.new_server.lost_samples)
     if missing >= t.lost_warn:
         verdict.add(Level.WARN, f"{missing} samples lost at the server or on the way")
     if s.new.stale >= t.lost_warn:
         verdict.add(Level.WARN, f"{s.new.stale} old samples skipped: the node or the server was stopped")
-    if s.new_not_finite:
-        verdict.add(Level.WARN, f"{s.new_not_finite} samples had values that are not finite")
+    # The node checks those that it publishes, the server all.
+    if not_finite := max(s.new_not_finite, s.new_server.not_finite):
+        verdict.add(
+            Level.ERROR,
+            f"{not_finite} samples had values that are not finite: power-cycle the sensor; if that does not "
+            "help, ask Bota",
+        )
 
 
 def _lost_text(lost: str) -> str:
@@ -189,6 +200,11 @@ def _sensor(s: Snapshot, t: Thresholds) -> Status:
         if s.temperature is not None and s.temperature >= t.temperature_warn:
             level = Level.ERROR if s.temperature >= t.temperature_error else Level.WARN
             verdict.add(level, f"{s.temperature:.1f} °C: let the sensor cool down")
+    last = mapping(s.server_row.get("emergency"))
+    code, ago_s = whole(last.get("code")), number(last.get("ago_s"))
+    emergency = "" if code is None else f"emergency 0x{code:04X} ({printable(last.get('text'), 80)})"
+    if code is not None and code & _ERROR_CLASS and ago_s is not None and 0 <= ago_s < _EMERGENCY_S:
+        verdict.add(Level.WARN, f"{emergency} {ago_s:.0f} s ago: if it comes again, ask Bota")
     info = s.info
     values: Values = {
         "name": info.name if info else "",
@@ -200,6 +216,9 @@ def _sensor(s: Snapshot, t: Thresholds) -> Status:
         "status_byte": f"{s.flags.status:#04x}",
         "warnings_register": f"{s.flags.warnings:#010x}",
         **{name: f"{getattr(s.flags, name):#x}" for name in _SATURATIONS},
+        "emergencies": s.server_row.get("emergencies", ""),
+        "last_emergency": emergency,
+        "last_emergency_ago_s": "" if ago_s is None else ago_s,
     }
     return verdict.status("sensor", "as it should be", values)
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.server_status import ServerStatus
-from bridge.diagnostics.snapshot import Snapshot, server_lost
+from bridge.diagnostics.snapshot import ServerCounts, Snapshot
 from bridge.stream.connection import find_sensor
 from bridge.stream.frame_selector import FrameCounts
 from bridge.stream.reader import Reader
@@ -34,7 +34,8 @@ class Observer:
         self._rate_fresh, self._rate_s = 0, self._fresh_s
         """Where the rate is measured from."""
         self._then, self._then_not_finite = FrameCounts(), 0
-        self._then_connects, self._then_server_lost, self._then_withheld = 0, -1, 0
+        self._then_connects, self._then_withheld = 0, 0
+        self._then_server: ServerCounts | None = None
 
     def look(self, now_s: float) -> Snapshot:
         """How things are now."""
@@ -50,7 +51,8 @@ class Observer:
         if counts.new != self._fresh:
             self._fresh, self._fresh_s = counts.new, now_s
         self._flags = self._flags.merge(reader.watch.take_flags())
-        lost = server_lost(self._poll.status, link.sensor) if self._poll.status else self._then_server_lost
+        status = self._poll.status
+        counted = ServerCounts.of(status, link.sensor).since(self._then_server) if status else ServerCounts()
         silent_since_s = max(self._fresh_s, link.since_s)
         sample, compensation = reader.watch.sample, self._compensation()
         return Snapshot(
@@ -74,8 +76,8 @@ class Observer:
             new_not_finite=reader.not_finite - self._then_not_finite,
             flags=self._flags,
             temperature=None if sample is None else sample.temperature,
-            server=self._poll.status,
-            new_server_lost=max(lost - self._then_server_lost, 0) if self._then_server_lost >= 0 else 0,
+            server=status,
+            new_server=counted,
             answer_s=self._poll.owed_s(now_s),
             compensation=compensation,
             new_withheld=compensation.withheld - self._then_withheld,
@@ -100,9 +102,9 @@ class Observer:
         self._then, self._then_not_finite = reported.counts, reported.not_finite
         self._then_connects, self._then_withheld = reported.connects, reported.compensation.withheld
         if reported.server:
-            self._then_server_lost = server_lost(reported.server, self._link.sensor)
+            self._then_server = ServerCounts.of(reported.server, self._link.sensor)
         elif not reported.connected:
-            self._then_server_lost = -1  # the next server counts from 0
+            self._then_server = None  # the next server counts from 0
         self._poll.ask(now_s)
 
     def _take_description(self, description: Mapping[str, Any]) -> None:

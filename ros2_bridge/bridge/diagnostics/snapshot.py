@@ -41,7 +41,7 @@ class Snapshot(NamedTuple):
     temperature: float | None
     server: Mapping[str, Any]
     """The latest `status` reply of this connection; empty if there is none yet."""
-    new_server_lost: int
+    new_server: ServerCounts
     answer_s: float
     """How long the server has owed an answer; 0 if it owes none."""
     compensation: CompensationState = CompensationState()
@@ -64,7 +64,20 @@ def row_of(rows: object, position: int) -> Mapping[str, Any]:
     return mapping(rows[position] if isinstance(rows, list) and position < len(rows) else None)
 
 
-def server_lost(status: Mapping[str, Any], position: int) -> int:
-    """The samples that a `status` reply says the server itself has lost."""
-    lost = row_of(status.get("sensors"), position).get("lost_samples")
-    return lost if type(lost) is int else 0
+class ServerCounts(NamedTuple):
+    """What the server itself has counted of our sensor, by the names in `status`."""
+
+    lost_samples: int = 0
+    not_finite: int = 0
+
+    @classmethod
+    def of(cls, status: Mapping[str, Any], position: int) -> ServerCounts:
+        """Those in a `status` reply; 0 for what it does not say."""
+        row = row_of(status.get("sensors"), position)
+        return cls(*(value if type(value := row.get(name)) is int else 0 for name in cls._fields))
+
+    def since(self, then: ServerCounts | None) -> ServerCounts:
+        """What was added since `then`, if that is known."""
+        if then is None:
+            return ServerCounts()
+        return ServerCounts(*(max(now - before, 0) for now, before in zip(self, then, strict=True)))

@@ -232,7 +232,7 @@ class Reader:
         details = {key: value for key, value in message.items() if key != "event"}
         text = EVENTS.get(event, f"the server says {event}") + (f" {printable(details)}" if details else "")
         # A line of source has one severity: rclpy insists.
-        if event == Event.SENSOR_LOST:
+        if event in {Event.SENSOR_LOST, Event.EMERGENCY}:
             self._log.warning(text)
         else:
             self._log.info(text)
@@ -255,6 +255,7 @@ EVENTS: Final[Mapping[str, str]] = {
     Event.SENSOR_LOST: "the server has lost the sensor",
     Event.SENSOR_BACK: "the sensor is back",
     Event.RECONFIGURED: "the sensor was reconfigured",
+    Event.EMERGENCY: "the sensor reports an emergency",
     Event.SHUTTING_DOWN: "the server is shutting down",
 }
 """What the server's events are called in the log."""

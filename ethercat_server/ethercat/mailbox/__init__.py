@@ -1,0 +1,1 @@
+"""The CoE mailbox of a slave, and what it says there unasked."""

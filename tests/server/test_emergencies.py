@@ -1,0 +1,199 @@
+"""CoE emergencies: read from the mailbox, kept, counted, logged and told, whatever else goes on there."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from ethercat_server.ethercat.mailbox.emergency import ERROR_CLASSES, Emergency
+from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.simulation.machine import Machine
+from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.text.json_text import JsonObject
+from tests.simulation import Simulation, check_frames
+
+HOT = "emergency 0x4210 0x09 0102030405"
+CLOCK = SensorOptions(signal="clock")
+
+
+@pytest.fixture
+def log(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
+    caplog.set_level("INFO")
+    return caplog
+
+
+def said(log: pytest.LogCaptureFixture, words: str) -> list[str]:
+    return [record.getMessage() for record in log.records if words in record.getMessage()]
+
+
+def told(simulation: Simulation) -> list[JsonObject]:
+    return [event for event in simulation.events if event["event"] == "emergency"]
+
+
+def flood(simulation: Simulation, seconds: float, every_s: float, codes: int = 1) -> None:
+    """One emergency after the other, for so long."""
+    for n in range(int(seconds / every_s)):
+        simulation.at(n * every_s, f"emergency {0x4210 + n % codes}")
+    simulation.run(seconds)
+
+
+def test_an_emergency_is_told_logged_and_kept(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation(CLOCK, CLOCK)
+    client = simulation.connect()
+    client.ask("subscribe")
+    simulation.run(1.0)
+    assert client.ask("status")["sensors"][1]["emergencies"] == 0
+    assert client.ask("status")["sensors"][1]["emergency"] is None
+    simulation.command(f"{HOT} @1")
+    reported = {"code": 0x4210, "text": "temperature of the device", "register": 9, "data": "0102030405"}
+    event = client.wait_event("emergency", 1)
+    words = (
+        "sensor 1 reports emergency 0x4210 (temperature of the device), error register 0x09, data 0102030405"
+    )
+    assert event == {"event": "emergency", "sensor": 1, **reported, "count": 1, "message": words}
+    assert said(log, "emergency") == [words]
+    simulation.run(2.0)
+    first, second = client.ask("status")["sensors"]
+    assert (first["emergencies"], first["emergency"]) == (0, None)
+    assert second["emergencies"] == 1
+    assert second["emergency"].pop("ago_s") == pytest.approx(2.0, abs=0.2)
+    assert second["emergency"] == reported
+    for number in range(2):
+        check_frames(frame for frame in simulation.frames if frame.sensor == number)
+    assert [stream.lost_samples for stream in simulation.streams] == [0, 0]
+
+
+def test_what_waits_in_the_mailbox_is_read_within_a_tenth_of_a_second() -> None:
+    simulation = Simulation()
+    simulation.run(1.0)
+    for _ in range(10):
+        simulation.command(HOT)
+        simulation.run(0.11)
+    assert simulation.status()["sensors"][0]["emergencies"] == 10
+
+
+def test_a_flood_floods_neither_log_nor_clients_nor_the_bus(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation(CLOCK)
+    flood(simulation, 61.0, 0.02)
+    counted = simulation.status()["sensors"][0]["emergencies"]
+    assert counted == pytest.approx(610, rel=0.05), "ten a second are read"
+    assert len(told(simulation)) == 7, "one in ten seconds"
+    assert told(simulation)[-1]["count"] > 550
+    assert len(said(log, "reports emergency")) == 2, "one a minute"
+    assert simulation.streams[0].lost_samples == 0
+
+
+def test_a_flood_of_different_codes_is_bounded_too(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation()
+    flood(simulation, 50.0, 0.1, codes=1000)
+    assert len(said(log, "reports emergency")) == 16
+    assert 50 <= len(told(simulation)) <= 50 + 5, "one a second"
+    assert simulation.status()["sensors"][0]["emergencies"] == pytest.approx(500, rel=0.05)
+
+
+def test_no_answer_is_taken_from_a_job_and_no_emergency_is_lost_to_it() -> None:
+    """The answer would be asked for again after 0.7 s."""
+    simulation = Simulation(CLOCK)
+    client = simulation.connect()
+    simulation.run(1.0)
+    for n in range(200):
+        simulation.at(n * 0.025, HOT)
+    for _ in range(200):
+        asked_ns = simulation.clock.now_ns
+        assert client.ask("sdo_read", index=0x8011, type="u16")["value"] == 800
+        assert simulation.clock.now_ns - asked_ns < 400_000_000
+    simulation.run_until(lambda: simulation.status()["sensors"][0]["emergencies"] == 200, "all of them")
+    assert simulation.streams[0].lost_samples == 0
+
+
+def test_emergencies_before_an_answer_are_read_by_the_job() -> None:
+    simulation = Simulation()
+    client = simulation.connect()
+    simulation.run(1.0)
+    for n in range(30):
+        simulation.command(f"emergency {n}")
+    assert client.ask("sdo_read", index=0x8011, type="u16")["value"] == 800
+    row = client.ask("status")["sensors"][0]
+    assert row["emergencies"] == 30
+    simulation.run(1.0)
+    assert len(told(simulation)) == 5
+
+
+def test_each_change_is_told() -> None:
+    simulation = Simulation()
+    simulation.run(1.0)
+    for code in (0x4210, 0, 0x4210, 0):
+        simulation.command(f"emergency {code}")
+        simulation.run(0.5)
+    assert [event["code"] for event in told(simulation)] == [0x4210, 0, 0x4210, 0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_start_survives_emergencies_and_keeps_the_last(log: pytest.LogCaptureFixture, seed: int) -> None:
+    backend = MemoryBackend(machine=Machine(seed=seed))
+
+    def report() -> None:
+        backend.command(HOT)
+
+    for n in range(400):  # from before the start until it is over; without a mailbox in INIT
+        backend.clock.at(backend.clock.now_ns + n * 7_000_000, report)
+    simulation = Simulation(backend=backend)
+    row = simulation.status()["sensors"][0]
+    assert row["emergencies"] > 0
+    assert row["emergency"]["code"] == 0x4210
+    assert len(said(log, "sensor 0 reports emergency 0x4210")) == 1
+    simulation.run(1.0)
+    assert simulation.streams[0].fresh > 0
+
+
+def test_a_lost_sensor_is_set_up_again_in_spite_of_emergencies() -> None:
+    simulation = Simulation()
+    simulation.run(1.0)
+    for n in range(300):  # without power there is no mailbox
+        simulation.at(n * 0.005, lambda: simulation.backend.command(HOT))
+    simulation.at(0.0, "power cycle 0.5")
+    simulation.run_until(
+        lambda: [e for e in simulation.events if e["event"] == "sensor_back"], "it back", 10.0
+    )
+    assert simulation.status()["sensors"][0]["emergencies"] > 0
+
+
+def test_what_says_that_an_error_is_over_is_no_warning(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation()
+    simulation.run(1.0)
+    simulation.command("emergency 0")
+    simulation.run(0.2)
+    (record,) = [record for record in log.records if "emergency 0x0000 (error reset" in record.getMessage()]
+    assert record.levelname == "INFO"
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        (0x0000, "error reset, or no error"),
+        (0x2310, "current on the output side"),
+        (0x2400, "current"),
+        (0x4210, "temperature of the device"),
+        (0xFF07, "device-specific"),
+        (0xB000, "of no class that CiA 301 defines"),
+    ],
+)
+def test_every_code_has_words(code: int, text: str) -> None:
+    assert Emergency(code, 0, b"").text == text
+
+
+@pytest.mark.parametrize("length", range(12))
+def test_messages_of_every_length_are_parsed_or_not(length: int) -> None:
+    body = (struct.pack("<HHB", 0x1000, 0x1234, 0x81) + b"abcdefg")[:length]
+    parsed = Emergency.parse(body)
+    assert parsed == (Emergency(0x1234, 0x81, b"abcde"[: length - 5]) if length >= 5 else None)
+
+
+@pytest.mark.parametrize("service", [0, 2, 3, 4, 8, 15])
+def test_other_services_are_no_emergencies(service: int) -> None:
+    assert Emergency.parse(struct.pack("<HHB5s", service << 12, 1, 1, b"")) is None
+
+
+def test_no_two_classes_have_the_same_words() -> None:
+    assert len(set(ERROR_CLASSES.values())) == len(ERROR_CLASSES)
