@@ -120,14 +120,16 @@ def test_a_sensor_that_is_stuck_from_the_start_is_seen() -> None:
     assert all(f.flags & DataFlag.REPEATED for f in client.collect(10))
 
 
-def test_another_sensor_is_refused_and_the_right_one_taken_back() -> None:
+@pytest.mark.parametrize("model", ["BFT-ROKS-ECAT-M8", "BFT-SENS-ECAT-M8"])
+def test_another_sensor_is_refused_and_the_right_one_taken_back(model: str) -> None:
+    """Of another model, and of the same."""
     simulation, client = streaming()
     written = simulation.stats()["sdo_writes"]
-    simulation.command("swap BFT-ROKS-ECAT-M8 4711")
+    simulation.command(f"swap {model} 4711")
     client.wait_event("sensor_lost")
     refused = client.wait_event("sensor_lost")
     assert refused["reason"] == "different_sensor"
-    assert refused["found"] == {"name": "BFT-ROKS-ECAT-M8", "serial": 4711}
+    assert refused["found"] == {"name": model, "serial": 4711}
     assert "4711" in refused["message"]
     assert state(client) == "REFUSED"
     frames = client.collect(30)

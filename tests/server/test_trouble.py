@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,7 +26,9 @@ from ethercat_server.ethercat.nic import claim
 from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE
 from ethercat_server.process import realtime
 from ethercat_server.sensor import look
+from ethercat_server.sensor.objects.dictionary import BY_SETTING
 from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.virtual_sensor.firmware.dictionary import Dictionary
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.ended import run_here
 from tests.server.commands import command
@@ -198,6 +201,20 @@ def test_an_fmmu_that_was_not_written(monkeypatch: pytest.MonkeyPatch, unit: int
         assert bring_up(Bus(MemoryBackend()), Asked(), lambda: None).sensors[0].streams
     else:
         assert "sensor 0 did not answer when it was mapped" in refused(MemoryBackend())
+
+
+def test_a_setting_that_is_accepted_and_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    write, range_of = Dictionary.write, BY_SETTING["acceleration_range_g"].address
+
+    def forgetful(self: Dictionary, index: int, subindex: int, data: bytes, state: Any) -> None:
+        if (index, subindex) != range_of:
+            write(self, index, subindex, data, state)
+
+    monkeypatch.setattr(Dictionary, "write", forgetful)
+    said = refused(MemoryBackend(), Asked({"acceleration_range_g": 8}))
+    assert re.search(
+        "the setting acceleration_range_g = 8 did not take: sensor 0 holds .. after .. was", said
+    )
 
 
 def test_models_and_their_names() -> None:
