@@ -99,7 +99,7 @@ def test_an_unfinished_bare_line_is_refused_when_the_client_half_closes(served: 
         (b'{"action": "describe", "colour": 1}', "takes no key 'colour'"),
         (b'{"action": "subscribe", "every": 0}', "'every' must be"),
         (b"\xff\xfe", "not UTF-8"),
-        (b"[" * 2000 + b"]" * 2000, "nested"),
+        (b'{"a":' + b"[" * 2000 + b"]" * 2000 + b"}", "nested"),
         (b'{"action":"describe","id":1e999}', "too large"),
         (b'{"action":"describe","id":NaN}', "NaN is no JSON number"),
     ],

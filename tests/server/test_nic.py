@@ -43,7 +43,6 @@ def veth() -> Iterator[Veth]:
 @pytest.fixture
 def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """In place of the one in /run."""
-    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     found = tmp_path / "ethercat-server"
     monkeypatch.setattr(lock, "DIRECTORY", found)
     return found
@@ -177,19 +176,16 @@ def test_a_file_that_may_be_anothers_is_not_touched(veth: Veth, directory: Path,
         os.mkfifo(place)
     else:
         directory.chmod(0o777)
-    with claimed(veth.near):  # without a lock: whether another has it open is seen all the same
-        assert lock._open_any() is None
+    with claimed(veth.near), pytest.raises(OSError):  # noqa: PT011 - any
+        lock._open(lock.DIRECTORY)
     assert (victim.stat().st_uid, victim.stat().st_mode) == (before.st_uid, before.st_mode)
 
 
-def test_without_run_it_is_the_users_own_runtime_directory(
-    veth: Veth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_without_run_it_is_a_name_in_the_network_namespace(
+    veth: Veth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As for the root of a user namespace."""
     monkeypatch.setattr(lock, "DIRECTORY", Path("/proc/ethercat-server"))
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    with claimed(veth.near):
-        assert (tmp_path / "ethercat-server" / "lock").exists()
-    monkeypatch.delenv("XDG_RUNTIME_DIR")
-    with claimed(veth.near):
-        pass
+    for _ in range(2):
+        with claimed(veth.near), pytest.raises(InterfaceError, match="in use"), claimed(veth.near):
+            pass

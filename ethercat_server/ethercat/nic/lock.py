@@ -1,8 +1,8 @@
 """The lock that keeps two masters of this project from opening one interface: a byte of a file for each.
 
 The file is root's, or the service's, so that no other user can take it. The kernel knows which process has
-it, and releases it with the process. A process that may write neither directory, such as the root of a user
-namespace, goes without: it is then only seen whether another master has the interface open already.
+it, and releases it with the process. The root of a user namespace may not write it, and takes an abstract
+socket of its network namespace instead.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import socket
 import stat
 import struct
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ from ethercat_server.errors import InterfaceError
 DIRECTORY: Final = Path("/run/ethercat-server")
 """RuntimeDirectory= of the service, which then owns it."""
 _FILE: Final = "lock"
+_NAME: Final = "\0ethercat-server/ifindex/{}"
 _INDEX_BITS: Final = 31
 _NAMESPACE: Final = 0xFFFFFFFF
 _FLOCK: Final = struct.Struct("@hhqqi0q")
@@ -33,9 +35,15 @@ def locked(ifname: str, index: int) -> Iterator[None]:
 
     For one interface at a time: closing the file releases all locks that this process has on it.
     """
-    file = _open_any()
-    if file is None:
-        yield
+    try:
+        file = _open(DIRECTORY)
+    except OSError:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:
+            try:
+                name.bind(_NAME.format(index))
+            except OSError:
+                raise in_use(ifname) from None
+            yield
         return
     try:
         place = (_network_namespace() & _NAMESPACE) << _INDEX_BITS | index
@@ -60,14 +68,6 @@ def in_use(ifname: str, process: int = 0) -> InterfaceError:
 
 def _network_namespace() -> int:
     return Path("/proc/self/ns/net").stat().st_ino
-
-
-def _open_any() -> int | None:
-    own = os.environ.get("XDG_RUNTIME_DIR")
-    for directory in (DIRECTORY, *([Path(own) / DIRECTORY.name] if own else [])):
-        with contextlib.suppress(OSError):
-            return _open(directory)
-    return None
 
 
 def _open(directory: Path) -> int:
