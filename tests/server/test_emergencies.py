@@ -15,6 +15,8 @@ from tests.simulation import Simulation, check_frames
 
 HOT = "emergency 0x4210 0x09 0102030405"
 CLOCK = SensorOptions(signal="clock")
+SLOW = {"sinc_length": 512}
+"""The fewer samples, the faster it is simulated."""
 
 
 @pytest.fixture
@@ -74,7 +76,7 @@ def test_what_waits_in_the_mailbox_is_read_within_a_tenth_of_a_second() -> None:
 
 
 def test_a_flood_floods_neither_log_nor_clients_nor_the_bus(log: pytest.LogCaptureFixture) -> None:
-    simulation = Simulation(CLOCK)
+    simulation = Simulation(CLOCK, settings=SLOW)
     flood(simulation, 61.0, 0.02)
     counted = simulation.status()["sensors"][0]["emergencies"]
     assert counted == pytest.approx(610, rel=0.05), "ten a second are read"
@@ -85,7 +87,7 @@ def test_a_flood_floods_neither_log_nor_clients_nor_the_bus(log: pytest.LogCaptu
 
 
 def test_a_flood_of_different_codes_is_bounded_too(log: pytest.LogCaptureFixture) -> None:
-    simulation = Simulation()
+    simulation = Simulation(settings=SLOW)
     flood(simulation, 50.0, 0.1, codes=1000)
     assert len(said(log, "reports emergency")) == 16
     assert 50 <= len(told(simulation)) <= 50 + 5, "one a second"

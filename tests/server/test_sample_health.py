@@ -26,7 +26,7 @@ def said(log: pytest.LogCaptureFixture, words: str) -> list[str]:
 def test_a_sensor_that_gives_nothing_new_is_logged_once_and_again_when_it_does(
     log: pytest.LogCaptureFixture,
 ) -> None:
-    simulation = Simulation()
+    simulation = Simulation(settings={"sinc_length": 512})
     simulation.run(2.0)
     simulation.command("stick")
     simulation.run(0.5)
@@ -40,7 +40,7 @@ def test_a_sensor_that_gives_nothing_new_is_logged_once_and_again_when_it_does(
 
 
 def test_a_sensor_that_is_lost_is_not_also_silent(log: pytest.LogCaptureFixture) -> None:
-    simulation = Simulation()
+    simulation = Simulation(settings={"sinc_length": 512})
     simulation.run(2.0)
     simulation.command("power cycle 5")
     simulation.run(10.0)
@@ -90,7 +90,7 @@ def test_what_is_discarded_after_a_start_is_not_counted() -> None:
 
 
 def test_not_finite_is_logged_when_it_begins_and_when_it_is_over(log: pytest.LogCaptureFixture) -> None:
-    simulation = Simulation()
+    simulation = Simulation(settings={"sinc_length": 512})
     simulation.run(2.0)
     for _ in range(4):  # on and off, but never for long
         measure(simulation, **{"force.x": math.nan})

@@ -299,7 +299,7 @@ def test_noise_does_not_make_a_tare_worse(bench: tuple[Bench, Client]) -> None:
     for channel, deviation in (("force.x", 0.5), ("force.z", 0.1), ("torque.y", 0.02)):
         sensor.command(f"noise {channel} {deviation}")
     for samples in (20, 200):
-        for _ in range(40):
+        for _ in range(15):
             tared = asking.ask("tare", samples=samples)
             assert tared["ok"], tared
 
