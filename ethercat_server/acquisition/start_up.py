@@ -6,7 +6,7 @@ What the sensors must be is checked before anything is written to one of them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final, NamedTuple, Protocol, TypeVar
 
 from ethercat_server.errors import BusError, SdoAbortError, SetUpError, UsageError
@@ -24,6 +24,7 @@ from protocol.pdo import layout_for
 from protocol.settings import SettingValue
 
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 _ATTEMPTS: Final = 3
 
 log = logging.getLogger(__name__)
@@ -99,8 +100,8 @@ def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> S
     if not of_sensors:
         raise BusError(_none_of_ours(bus.ifname, others))
 
-    def find() -> list[Sensor]:
-        scan(bus, slaves, check_interrupt)
+    def find(*, again: bool) -> list[Sensor]:
+        scan(bus, slaves, check_interrupt, again=again)
         return [_find(bus, number, slave, wanted, check_interrupt) for number, slave in enumerate(of_sensors)]
 
     sensors = _again(find)
@@ -113,7 +114,9 @@ def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> S
 def enter_op(bus: Bus, sensors: list[Sensor], check_interrupt: CheckInterrupt) -> None:
     """Map the process data of all `sensors` and take them from PREOP to OP, set as they are."""
 
-    def enter() -> None:
+    def enter(*, again: bool) -> None:
+        if again:
+            bus.scan(bus.spare, bus.positions, check_interrupt)
         for sensor, size in zip(sensors, bus.master.map_process_data(check_interrupt), strict=True):
             try:
                 sensor.pdo_size = layout_for(size).size
@@ -122,21 +125,27 @@ def enter_op(bus: Bus, sensors: list[Sensor], check_interrupt: CheckInterrupt) -
                 raise SetUpError(f"sensor {sensor.number} ({sensor.identity.name}) maps {error}") from None
         bus.go_operational(check_interrupt)
 
-    _again(enter, lambda: bus.scan(bus.master, bus.positions, check_interrupt))
+    _again(enter)
     for sensor in sensors:
         sensor.enter(SensorState.STREAMING)
         sensor.settle(bus.clock)
 
 
-def _again(attempt: Callable[[], T], prepare: Callable[[], None] = lambda: None) -> T:
-    """What `attempt` returns; a failure that lost frames explain is tried again, after `prepare`."""
-    for _ in range(_ATTEMPTS - 1):
+class Attempt(Protocol[T_co]):
+    """Part of the start; `again` after it has failed."""
+
+    def __call__(self, *, again: bool) -> T_co:
+        """SetUpError for what lost frames explain."""
+
+
+def _again(attempt: Attempt[T]) -> T:
+    """What `attempt` returns; a failure that lost frames explain is tried again."""
+    for number in range(_ATTEMPTS - 1):
         try:
-            return attempt()
+            return attempt(again=number > 0)
         except SetUpError as error:
             log.warning("%s: trying again", error)
-        prepare()
-    return attempt()
+    return attempt(again=True)
 
 
 def _none_of_ours(ifname: str, others: list[Slave]) -> str:

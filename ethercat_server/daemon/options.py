@@ -121,7 +121,7 @@ def build_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument(
         "--force", action="store_true",
-        help="take every slave on IFACE to INIT, even if another master is using the bus",
+        help="take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop",
     )  # fmt: skip
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",

@@ -41,6 +41,8 @@ class Bus(Datagrams):
         super().__init__(backend)
         self.master: Master
         """Whoever scanned it."""
+        self.spare: Master
+        """Who scans it again if that went wrong: one that repeats what lost frames spoil."""
         self._is_scanned = False
         self.emergencies = Emergencies(backend.clock)
         """What the sensors report unasked."""

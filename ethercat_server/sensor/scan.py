@@ -47,18 +47,18 @@ def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = Fals
     return found
 
 
-def scan(bus: Bus, slaves: Sequence[Slave], check_interrupt: CheckInterrupt) -> None:
+def scan(bus: Bus, slaves: Sequence[Slave], check_interrupt: CheckInterrupt, *, again: bool = False) -> None:
     """Take these slaves to PREOP, numbered in this order. `slaves` has all that are on the wire.
 
-    pysoem is the master where all are sensors; where there are others, they are not written to.
+    pysoem is the master where all are sensors; where there are others, they are not written to. `again`: after
+    a failure, with the master that repeats what lost frames spoil.
     """
     numbered = [slave for slave in slaves if slave.is_sensor] or list(slaves)
     for slave in numbered:
         _check_sii(bus.ifname, slave)
-    own = bus.backend.master
-    shared = len(numbered) < len(slaves)
-    master = DatagramMaster(bus, [slave.sii for slave in slaves]) if shared or own is None else own
-    bus.scan(master, [slave.position for slave in numbered], check_interrupt)
+    bus.spare = DatagramMaster(bus, [slave.sii for slave in slaves])
+    own = None if again or len(numbered) < len(slaves) else bus.backend.master
+    bus.scan(own or bus.spare, [slave.position for slave in numbered], check_interrupt)
 
 
 def _check_sii(ifname: str, slave: Slave) -> None:

@@ -38,7 +38,7 @@ def add_link_arguments(
     if take_over:
         parser.add_argument(
             "--force", action="store_true", dest="take_over",
-            help="take every slave on IFACE to INIT, even if another master is using the bus",
+            help="take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop",
         )  # fmt: skip
     parser.set_defaults(take_over=False)
     default = "all" if all_if_none else "the only one"

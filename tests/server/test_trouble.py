@@ -18,7 +18,7 @@ import pytest
 from ethercat_server.acquisition.start_up import Wanted, bring_up
 from ethercat_server.daemon.cli import main
 from ethercat_server.daemon.options import parse_options
-from ethercat_server.errors import ServerError
+from ethercat_server.errors import ServerError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.master.datagrams import DatagramMaster
@@ -27,6 +27,7 @@ from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE
 from ethercat_server.process import realtime
 from ethercat_server.sensor import look
 from ethercat_server.sensor.objects.dictionary import BY_SETTING
+from ethercat_server.sensor.scan import look_safely
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.firmware.dictionary import Dictionary
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -201,6 +202,22 @@ def test_an_fmmu_that_was_not_written(monkeypatch: pytest.MonkeyPatch, unit: int
         assert bring_up(Bus(MemoryBackend()), Asked(), lambda: None).sensors[0].streams
     else:
         assert "sensor 0 did not answer when it was mapped" in refused(MemoryBackend())
+
+
+@pytest.mark.parametrize("step", ["scan", "enter_preop", "sdo_read", "map_process_data", "go_operational"])
+def test_a_master_that_lost_frames_has_misled_is_replaced(step: str) -> None:
+    """As pysoem is, which does not repeat what it writes."""
+
+    class Misled(DatagramMaster):
+        def fail(self, *_: object) -> None:
+            raise SetUpError("sensor 0 maps process data of 57 bytes")
+
+    backend = MemoryBackend()
+    bus = Bus(backend)
+    backend.master = Misled(bus, [slave.sii for slave in look_safely(bus, lambda: None)])  # type: ignore[assignment]
+    setattr(Misled, step, Misled.fail)
+    assert bring_up(bus, Asked(), lambda: None).sensors[0].streams
+    assert bus.master is bus.spare is not backend.master
 
 
 def test_a_setting_that_is_accepted_and_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
