@@ -50,8 +50,8 @@ def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = Fals
 def scan(bus: Bus, slaves: Sequence[Slave], check_interrupt: CheckInterrupt, *, again: bool = False) -> None:
     """Take these slaves to PREOP, numbered in this order. `slaves` has all that are on the wire.
 
-    pysoem is the master where all are sensors; where there are others, they are not written to. `again`: after
-    a failure, with the master that repeats what lost frames spoil.
+    pysoem is the master where all are sensors; where there are others, they are not written to. `again`:
+    after a failure, with the master that repeats what lost frames spoil.
     """
     numbered = [slave for slave in slaves if slave.is_sensor] or list(slaves)
     for slave in numbered:
