@@ -79,6 +79,7 @@ class Bus(Datagrams):
     def close(self) -> None:
         """Take the sensors to INIT if they were scanned, and close the wire."""
         if self._is_scanned:
+            self._is_scanned = False
             self.master.release()
         self.backend.close()
 

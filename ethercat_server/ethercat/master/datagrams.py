@@ -16,7 +16,7 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.mailbox.mailbox import Mailbox
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
+from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, finish
 from ethercat_server.ethercat.slave.sii import OF_FIRMWARE
 from ethercat_server.ethercat.slave.sii_content import Sii
 from ethercat_server.ethercat.slave.states import StateMachine
@@ -121,12 +121,11 @@ class DatagramMaster:
 
     def release(self) -> None:
         """See `Master`."""
-        for number in range(len(self._states)):
+        for number in range(len(self._bus.stations)):
             any(
                 self._bus.write_register(number, reg.AL_CONTROL, AlState.INIT.request())
                 for _ in range(_ATTEMPTS)
             )
-        self._states = []
 
     def _sdo(self, number: int) -> MailboxSdo:
         sdo = self._sdos[number]
@@ -156,14 +155,7 @@ class DatagramMaster:
         return int.from_bytes(self.sdo_read(number, index, subindex), "little")
 
     def _run(self, steps: Steps[T], check_interrupt: CheckInterrupt = lambda: None) -> T:
-        while True:
-            check_interrupt()
-            try:
-                next(steps)
-            except StopIteration as stop:
-                result: T = stop.value
-                return result
-            self._bus.clock.sleep(_PAUSE_S)
+        return finish(steps, _PAUSE_S, self._bus.clock, check_interrupt)
 
 
 def _is_done(steps: Steps[None]) -> bool:
