@@ -166,3 +166,22 @@ def fmmus(registers: bytes) -> list[tuple[int, int]]:
     """Logical start and length of those that are active."""
     rows = (struct.unpack_from("<IH", registers, reg.FMMU + at * reg.FMMU_SIZE) for at in range(2))
     return [(start, size) for start, size in rows if size]
+
+
+@pytest.mark.parametrize("state", ["INIT", "PREOP"])
+def test_a_device_in_the_place_of_a_sensor_keeps_its_eeprom(state: str) -> None:
+    """The sensor was taken out, and the cable goes to the next device."""
+    simulation = mixed(f"BOTA,BOTA,DRIVE:{state}")
+    simulation.run(0.3)
+    (drive,) = foreign(simulation)
+    assert drive.life is not None
+    esc = drive.life.esc
+    esc.memory[reg.SII_OWNER] = 1
+    del simulation.backend.sensors.slaves[1]
+    simulation.backend.sensors.rewire()
+    drive.writes.clear()
+    simulation.run(2.0)
+    assert esc.memory[reg.SII_OWNER] == 1
+    assert len(drive.writes) < 60
+    assert {address for address, _ in drive.writes} <= (set(READING_THE_SII) if state == "INIT" else set())
+    assert [sensor.streams for sensor in simulation.sensors] == [True, False]
