@@ -25,6 +25,7 @@ from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.doctor.bus import measurement
 from ethercat_server.doctor.bus.receiver import MESSAGE
+from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.coe import finish
@@ -107,12 +108,12 @@ class SimulatedBus:
 _READ_IMAGE = look.read_image
 
 
-def _read_image(bus: Bus, position: int) -> bytes:
+def _read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda: None) -> bytes:
     """The SII, on which most of a start would be spent; nothing else reads it like this."""
     finish(read_sii(ByPosition(bus), position, 0, 4), clock=bus.clock)
     assert isinstance(bus.backend, MemoryBackend)
     life = bus.backend.sensors.slaves[position].life
-    return _READ_IMAGE(bus, position) if life is None else life.esc.sii.image
+    return _READ_IMAGE(bus, position, check_interrupt) if life is None else life.esc.sii.image
 
 
 def chain(text: str) -> MemoryBackend:

@@ -128,9 +128,10 @@ class Cycle:
             back = monotonic_ns()
             complete = wkc >= recovery.alive_wkc
             for sensor, stream in each:
-                valid = complete and sensor.state is SensorState.STREAMING
-                number = stream.number
-                if made := stream.take(bus.process_data(number), wkc, valid, sent, back):
+                data = bus.process_data(number := stream.number)
+                # One that is out may be counted in place of one that is not there any more.
+                valid = complete and sensor.state is SensorState.STREAMING and data != bus.untouched[number]
+                if made := stream.take(data, wkc, valid, sent, back):
                     hub.publish(made[0], number, made[1], back)
             for stream in streams:
                 stream.learn()

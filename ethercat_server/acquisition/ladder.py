@@ -15,9 +15,9 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.mailbox.mailbox import Mailbox
 from ethercat_server.ethercat.slave import registers as reg
-from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.slave.al import AlState, AlStatus
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
-from ethercat_server.ethercat.slave.sii import OF_FIRMWARE, OF_MASTER, ByPosition, read_sii
+from ethercat_server.ethercat.slave.sii import OF_FIRMWARE, ByPosition, read_sii
 from ethercat_server.ethercat.slave.states import StateMachine
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import PRODUCT_CODE, VENDOR_ID
@@ -26,6 +26,8 @@ from ethercat_server.sensor.set_up import identify, put_right, set_up
 
 _ABSENT_PAUSE_S: Final = 0.005
 _REFUSED_PAUSE_S: Final = 0.1
+_STRANGER_PAUSE_S: Final = 0.25
+"""Reading the SII of a device in the sensor's place writes to its controller."""
 _REMOVED_READS: Final = 3
 """Unanswered reads in a row that mean removal; one is a lost datagram."""
 _MAILBOXES_END: Final = 2 * reg.SYNC_MANAGER_SIZE
@@ -99,8 +101,8 @@ class Ladder:
     def _restore_station(self) -> Steps[bool]:
         """Give a sensor that lost its station address with its power the address again; whether it has it.
 
-        One that has another slave's address, or is no Bota sensor, is left alone; which sensor it is remains
-        to be asked.
+        One that has another slave's address, is not in INIT, or is no Bota sensor, is left alone; which
+        sensor it is remains to be asked.
         """
         bus, number, position = self._bus, self._sensor.number, self._sensor.position
         data = bus.read_at(position, reg.STATION_ADDRESS, 2)
@@ -109,11 +111,17 @@ class Ladder:
         if int.from_bytes(data, "little") in bus.stations:
             return bool(int.from_bytes(data, "little") == bus.stations[number])
         yield
+        status = bus.read_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
+        owner = bus.read_at(position, reg.SII_OWNER, 1)
+        if status is None or owner is None or AlStatus.parse(status).state is not AlState.INIT:
+            return False
+        yield
         try:
-            words = yield from read_sii(ByPosition(bus), position, _SII_IDENTITY, 4, OF_MASTER)
+            words = yield from read_sii(ByPosition(bus), position, _SII_IDENTITY, 4, owner)
         except BusError:
             return False
         if struct.unpack("<II", words) != (VENDOR_ID, PRODUCT_CODE):
+            yield from self._pause(_STRANGER_PAUSE_S)
             return False
         return bus.write_at(position, reg.STATION_ADDRESS, bus.stations[number].to_bytes(2, "little"))
 

@@ -24,6 +24,8 @@ _FMMU_READ, _FMMU_WRITE = 1, 2
 _SYNC_MANAGER: Final = struct.Struct("<2xHBxBx")
 """Length, control, activation."""
 _SM_WRITE, _SM_MAILBOX = 0x04, 0x02
+_NEVER: Final = b"\xff"
+"""What is sent where the inputs will be; no sensor says it, for its numbers would be NaN throughout."""
 
 
 class _Area(NamedTuple):
@@ -58,6 +60,8 @@ class Bus(Datagrams):
         self._answers: list[bytes] = []
         self._inputs: list[tuple[int, int, int]] = []
         """Which frame, where the inputs begin in it, where they end."""
+        self.untouched: list[bytes] = []
+        """By number: what `process_data` is after an exchange in which the sensor did not take part."""
         self._sent: dict[int, int] = {}
         """Which frame went out under which index."""
 
@@ -81,6 +85,7 @@ class Bus(Datagrams):
     def close(self) -> None:
         """Take the sensors to INIT if they were scanned, and close the wire."""
         if self._is_scanned:
+            self._is_scanned = False
             self.master.release()
         self.backend.close()
 
@@ -124,11 +129,20 @@ class Bus(Datagrams):
         self._answers = [bytes(frame) for frame in self._frames]
         self._ends = [FIRST_DATA + end - start for start, end in spans]
         self._inputs = []
-        for each in areas:
+        for number, each in enumerate(areas):
             inputs = [area for area in each if area.kind == _FMMU_READ]
             first, last = min(area.start for area in inputs), max(area.end for area in inputs)
-            n = next(n for n, (start, end) in enumerate(spans) if start <= first and last <= end)
-            self._inputs.append((n, FIRST_DATA + first - spans[n][0], FIRST_DATA + last - spans[n][0]))
+            n = next((n for n, (start, end) in enumerate(spans) if start <= first and last <= end), -1)
+            if n < 0:
+                raise SetUpError(
+                    f"the process data of sensor {number} lies among that of others: start again"
+                )
+            at, end = (FIRST_DATA + address - spans[n][0] for address in (first, last))
+            self._inputs.append((n, at, end))
+            for area in inputs:
+                here = at + area.start - first
+                self._frames[n][here : here + area.end - area.start] = _NEVER * (area.end - area.start)
+        self.untouched = [bytes(self._frames[n][at:end]) for n, at, end in self._inputs]
 
     # -- the exchange
 

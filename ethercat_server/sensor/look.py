@@ -106,10 +106,10 @@ def look_at(bus: Bus, position: int) -> Slave:
     return Slave(position, status, None, at_work=at_work)
 
 
-def with_sii(bus: Bus, slave: Slave) -> Slave:
+def with_sii(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt = lambda: None) -> Slave:
     """The same slave with its SII; access to the SII returns to its owner afterwards."""
     try:
-        content = sii_content.decode(read_image(bus, slave.position))
+        content = sii_content.decode(read_image(bus, slave.position, check_interrupt))
     except BusError as error:
         return slave._replace(problem=str(error))
     if not content["vendor"] and not content["product"]:
@@ -117,13 +117,14 @@ def with_sii(bus: Bus, slave: Slave) -> Slave:
     return slave._replace(sii=content)
 
 
-def read_image(bus: Bus, position: int) -> bytes:
+def read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda: None) -> bytes:
     """The SII of the slave at `position`; BusError if it cannot be read."""
     owner = bus.read_surely_at(position, reg.SII_OWNER, 1)
     registers = ByPosition(bus)
 
     def read(word: int, words: int) -> bytes:
-        return finish(read_sii(registers, position, word, words, owner), pause_s=0, clock=bus.clock)
+        steps = read_sii(registers, position, word, words, owner)
+        return finish(steps, pause_s=0, clock=bus.clock, check_interrupt=check_interrupt)
 
     return sii_content.read_image(read)
 

@@ -43,7 +43,8 @@ def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = Fals
     found = []
     for slave in slaves:
         check_interrupt()
-        found.append(with_sii(bus, _stopped(bus, slave, check_interrupt) if slave.at_work else slave))
+        stopped = _stopped(bus, slave, check_interrupt) if slave.at_work else slave
+        found.append(with_sii(bus, stopped, check_interrupt))
     return found
 
 

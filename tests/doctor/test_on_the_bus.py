@@ -14,7 +14,7 @@ from ethercat_server.doctor.machine.facts import Routes
 from ethercat_server.links.holder import Holder
 from tests.doctor.made_up import but
 from tests.doctor.running import examined
-from tests.simulated_links import MESSAGE_NS, SimulatedBus, simulated_bus, simulated_server
+from tests.simulated_links import MESSAGE_NS, SimulatedBus, registers, simulated_bus, simulated_server
 
 LOOK = 0.0
 """No measurement."""
@@ -192,3 +192,13 @@ def test_a_drive_at_work_is_not_touched(tmp_path: Path) -> None:
         assert found.level is Level.BAD
         assert "not a Bota sensor, and in OP" in found.found
         assert bus.stats_of_foreign(1)["write_count"] == 0
+
+
+def test_nothing_is_written_beside_a_drive_at_work(tmp_path: Path) -> None:
+    """Its master has the whole bus, and may be in the middle of anything with the others."""
+    with simulated_bus("--chain", "EK1100,DRIVE:OP,EL3102:PREOP,BOTA") as bus:
+        before = registers(bus.backend)
+        result = examined(bus, tmp_path)
+        assert result.of("bus")["slave 1"].level is Level.BAD
+        assert [bus.stats_of_foreign(place)["write_count"] for place in (0, 1, 2)] == [0, 0, 0]
+        assert registers(bus.backend)[3] == before[3]

@@ -166,3 +166,54 @@ def fmmus(registers: bytes) -> list[tuple[int, int]]:
     """Logical start and length of those that are active."""
     rows = (struct.unpack_from("<IH", registers, reg.FMMU + at * reg.FMMU_SIZE) for at in range(2))
     return [(start, size) for start, size in rows if size]
+
+
+def test_a_station_that_another_sensor_has_as_its_alias_is_not_taken() -> None:
+    backend = chain("BOTA,DRIVE,BOTA")
+    memory = backend.sensors.slaves[2].life.esc.memory  # type: ignore[union-attr]
+    memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = b"\x01\x10"
+    simulation = Simulation(backend=backend)
+    assert simulation.bus.stations == [0x1002, 0x1003]
+
+
+def test_more_fmmus_than_ours_were_used_by_the_master_before() -> None:
+    """Such as the one with which masters watch for a full mailbox."""
+    backend = chain("BOTA,DRIVE")
+    unit = struct.pack("<IHBBHBBB3x", 0x5000, 1, 0, 7, reg.MAILBOX_IN_STATUS, 0, 1, 1)
+    backend.sensors.slaves[0].life.esc.write(reg.FMMU + 2 * reg.FMMU_SIZE, unit)  # type: ignore[union-attr]
+    simulation = Simulation(backend=backend)
+    simulation.run(0.3)
+    assert {len(frame.process_data) for frame in simulation.frames} == {61}
+
+
+@pytest.mark.parametrize(
+    ("index", "subindex"), [(0x1C13, 0), (0x1C13, 1), (0x1A00, 0)], ids=lambda number: f"{number:#x}"
+)
+def test_a_mapping_that_cannot_be_is_one_sentence(index: int, subindex: int) -> None:
+    backend = chain("BOTA,DRIVE")
+    life = backend.sensors.sensors[0].life
+    assert life is not None
+    read = life.read
+    life.read = lambda *address: bytes(4 * [0xFF]) if address == (index, subindex) else read(*address)  # type: ignore[method-assign]
+    life.length = lambda *address: len(life.read(*address))  # type: ignore[method-assign]
+    with pytest.raises(BusError, match=f"sensor 0 has 0xffffffff in object 0x{index:04X}:{subindex}"):
+        bring_up(Bus(backend), Asked(), lambda: None)
+
+
+@pytest.mark.parametrize("state", ["INIT", "PREOP"])
+def test_a_device_in_the_place_of_a_sensor_keeps_its_eeprom(state: str) -> None:
+    """The sensor was taken out, and the cable goes to the next device."""
+    simulation = mixed(f"BOTA,BOTA,DRIVE:{state}")
+    simulation.run(0.3)
+    (drive,) = foreign(simulation)
+    assert drive.life is not None
+    esc = drive.life.esc
+    esc.memory[reg.SII_OWNER] = 1
+    del simulation.backend.sensors.slaves[1]
+    simulation.backend.sensors.rewire()
+    drive.writes.clear()
+    simulation.run(2.0)
+    assert esc.memory[reg.SII_OWNER] == 1
+    assert len(drive.writes) < 60
+    assert {address for address, _ in drive.writes} <= (set(READING_THE_SII) if state == "INIT" else set())
+    assert [sensor.streams for sensor in simulation.sensors] == [True, False]

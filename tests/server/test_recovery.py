@@ -410,3 +410,20 @@ def test_one_that_returns_with_a_slow_eeprom_costs_the_other_nothing(seed: int) 
         return int(first["lost_samples"])
 
     assert lost(20) <= lost(0)
+
+
+def test_one_that_is_on_its_way_back_is_not_counted_in_place_of_another() -> None:
+    """Both add the same to the working counter, and in the frame the other's place is as it was sent."""
+    sensors = [SensorOptions(signal="clock", serial=1 + n) for n in range(2)]
+    simulation = Simulation(*sensors)
+    simulation.run(0.3)
+    simulation.sensors[0].offset = (1.0,) * 6
+    simulation.sensors[0].unsettled = True  # so that it is in OP for a while before it streams
+    simulation.recovery._lose(0, "its settings are to be put right")
+    simulation.run(0.005)
+    assert not simulation.sensors[0].streams
+    simulation.frames.clear()
+    simulation.command("power off @1")
+    simulation.run(0.2)
+    check_frames([frame for frame in simulation.frames if frame.sensor == 1], complete=False)
+    assert [sensor.streams for sensor in simulation.sensors] == [True, False]

@@ -157,7 +157,7 @@ def test_what_the_eeprom_does_not_say(
     monkeypatch: pytest.MonkeyPatch, identity: bytes, complaint: str
 ) -> None:
     image = (bytes(16) + identity).ljust(128, b"\0").ljust(130, b"\xff")
-    monkeypatch.setattr(look, "read_image", lambda _bus, _position: image)
+    monkeypatch.setattr(look, "read_image", lambda *_: image)
     assert re.search(complaint, refused(MemoryBackend()))
 
 
@@ -166,8 +166,8 @@ def test_mailboxes_that_no_frame_can_carry(monkeypatch: pytest.MonkeyPatch, size
     """pysoem would write beyond its buffers."""
     read_image = look.read_image
 
-    def odd_image(bus: Bus, position: int) -> bytes:
-        image = bytearray(read_image(bus, position))
+    def odd_image(bus: Bus, position: int, check_interrupt: CheckInterrupt) -> bytes:
+        image = bytearray(read_image(bus, position, check_interrupt))
         image[0x18 * 2 + 6 : 0x18 * 2 + 8] = size.to_bytes(2, "little")
         return bytes(image)
 

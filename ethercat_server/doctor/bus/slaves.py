@@ -113,7 +113,7 @@ def look(bus: Bus, position: int, *, in_use: bool) -> Slave:
         "links": tuple(bool(links >> (4 + port) & 1) for port in range(MOST_PORTS)),
     }  # fmt: skip
     looked = look_at(bus, position)
-    if in_use and looked.status.is_above_preop:
+    if in_use:
         return Slave(**found, at_work=looked.at_work, left_alone=True)
     looked = with_sii(bus, looked)
     if looked.sii is None:

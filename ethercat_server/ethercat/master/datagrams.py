@@ -16,7 +16,7 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.mailbox.mailbox import Mailbox
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
+from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, finish
 from ethercat_server.ethercat.slave.sii import OF_FIRMWARE
 from ethercat_server.ethercat.slave.sii_content import Sii
 from ethercat_server.ethercat.slave.states import StateMachine
@@ -34,6 +34,7 @@ _MAILBOXES: Final = ((reg.SM_CONTROL_MAILBOX_OUT, "out"), (reg.SM_CONTROL_MAILBO
 _ASSIGNMENTS: Final = (("outputs", 0x1C12, _WRITE), ("inputs", 0x1C13, _READ))
 """Kind of the sync manager, the object with its PDOs, kind of the FMMU."""
 _MOST_BYTES: Final = 1486
+_MOST_SUBINDEX, _MOST_INDEX, _MOST_ENTRY = 0xFF, 0xFFFF, 0xFFFFFFFF
 
 
 class DatagramMaster:
@@ -52,7 +53,7 @@ class DatagramMaster:
         """See `Master`."""
         others = [position for position in range(len(self._all)) if position not in positions]
         self._logical = _free_logical(self._bus, others)
-        free = _free_stations(self._bus, others)
+        free = _free_stations(self._bus, others, positions)
         self._sii, self._states, self._sdos = [], [], []
         for position, station in zip(positions, free, strict=False):
             check_interrupt()
@@ -67,15 +68,24 @@ class DatagramMaster:
             states = StateMachine(self._bus, number, _ATTEMPTS)
             self._states.append(states)
             self._run(states.go(AlState.INIT), check_interrupt)
-            states.write(reg.FMMU, bytes(len(_ASSIGNMENTS) * reg.FMMU_SIZE))
+            self._clear(states, number)
             rows = [(*content["mailboxes"][way], control) for control, way in _MAILBOXES]
             out, back = (row[:2] for row in rows)
             has_mailbox = out[1] > 0
             self._sdos.append(MailboxSdo(Mailbox(self._bus, number, (out, back))) if has_mailbox else None)
             managers = b"".join(reg.pack_sync_manager(*row) for row in rows)
-            states.write(reg.SYNC_MANAGER, managers.ljust(4 * reg.SYNC_MANAGER_SIZE, b"\0"))
+            states.write(reg.SYNC_MANAGER, managers)
             states.write(reg.SII_OWNER, OF_FIRMWARE)  # a slave reads its SII on the way to PREOP
             self._run(states.go(AlState.PREOP), check_interrupt)
+
+    def _clear(self, states: StateMachine, number: int) -> None:
+        """Clear all FMMUs and sync managers: the master before may have used more than this one does."""
+        units, managers = self._bus.read_surely(number, reg.FMMU_AND_SM_COUNT, 2)
+        if units:
+            states.write(reg.FMMU, bytes(min(units, reg.MOST_FMMUS) * reg.FMMU_SIZE))
+        if managers:
+            count = min(managers, reg.MOST_SYNC_MANAGERS)
+            states.write(reg.SYNC_MANAGER, bytes(count * reg.SYNC_MANAGER_SIZE))
 
     def sdo_read(self, number: int, index: int, subindex: int) -> bytes:
         """See `Master`."""
@@ -94,7 +104,9 @@ class DatagramMaster:
             found = dict.fromkeys((kind for kind, _, _ in _ASSIGNMENTS), 0)
             for kind, assignment, direction in _ASSIGNMENTS:
                 row = next((row for row in self._sii[number]["sync_managers"] if row["kind"] == kind), None)
-                size = 0 if row is None else self._mapped_size(number, assignment, row["size"])
+                size = 0
+                if row is not None:
+                    size = self._mapped_size(number, assignment, row["size"], check_interrupt)
                 if row is None or not size:
                     managers += bytes(reg.SYNC_MANAGER_SIZE)
                     continue
@@ -121,12 +133,11 @@ class DatagramMaster:
 
     def release(self) -> None:
         """See `Master`."""
-        for number in range(len(self._states)):
+        for number in range(len(self._bus.stations)):
             any(
                 self._bus.write_register(number, reg.AL_CONTROL, AlState.INIT.request())
                 for _ in range(_ATTEMPTS)
             )
-        self._states = []
 
     def _sdo(self, number: int) -> MailboxSdo:
         sdo = self._sdos[number]
@@ -134,36 +145,35 @@ class DatagramMaster:
             raise BusError(f"sensor {number} has no mailbox, and so no objects")
         return sdo
 
-    def _mapped_size(self, number: int, assignment: int, in_sii: int) -> int:
+    def _mapped_size(self, number: int, assignment: int, in_sii: int, check_interrupt: CheckInterrupt) -> int:
         """Bytes of process data according to the PDO mapping; to the SII if there are no such objects."""
+
+        def read(index: int, subindex: int, most: int) -> int:
+            data = self._run(self._sdo(number).read(index, subindex), check_interrupt)
+            if (value := int.from_bytes(data, "little")) > most:
+                raise BusError(
+                    f"sensor {number} has {value:#x} in object 0x{index:04X}:{subindex}, which cannot be: "
+                    "power it off and on"
+                )
+            return value
+
         bits = 0
         try:
-            for at in range(1, 1 + self._sdo_number(number, assignment, 0)):
-                pdo = self._sdo_number(number, assignment, at)
-                for entry in range(1, 1 + self._sdo_number(number, pdo, 0)):
-                    bits += self._sdo_number(number, pdo, entry) & 0xFF
+            for at in range(1, 1 + read(assignment, 0, _MOST_SUBINDEX)):
+                pdo = read(assignment, at, _MOST_INDEX)
+                for entry in range(1, 1 + read(pdo, 0, _MOST_SUBINDEX)):
+                    bits += read(pdo, entry, _MOST_ENTRY) & 0xFF
+                    if bits > 8 * _MOST_BYTES:
+                        raise BusError(
+                            f"sensor {number} maps more than {_MOST_BYTES} bytes of process data, which fit "
+                            "no frame: power it off and on"
+                        )
         except SdoAbortError:
             return in_sii
-        size = (bits + 7) // 8
-        if size > _MOST_BYTES:
-            raise BusError(
-                f"sensor {number} maps {size} bytes of process data, more than fit a frame: "
-                "power it off and on"
-            )
-        return size
-
-    def _sdo_number(self, number: int, index: int, subindex: int) -> int:
-        return int.from_bytes(self.sdo_read(number, index, subindex), "little")
+        return (bits + 7) // 8
 
     def _run(self, steps: Steps[T], check_interrupt: CheckInterrupt = lambda: None) -> T:
-        while True:
-            check_interrupt()
-            try:
-                next(steps)
-            except StopIteration as stop:
-                result: T = stop.value
-                return result
-            self._bus.clock.sleep(_PAUSE_S)
+        return finish(steps, _PAUSE_S, self._bus.clock, check_interrupt)
 
 
 def _is_done(steps: Steps[None]) -> bool:
@@ -174,11 +184,13 @@ def _is_done(steps: Steps[None]) -> bool:
     return False
 
 
-def _free_stations(bus: Bus, others: Sequence[int]) -> Iterator[int]:
-    """Station addresses that no other slave answers to, by its configured address or its alias."""
+def _free_stations(bus: Bus, others: Sequence[int], sensors: Sequence[int]) -> Iterator[int]:
+    """Station addresses that nobody answers to: another slave's configured address, or any alias."""
     taken: set[int] = set()
     for position in others:
         taken.update(struct.unpack("<HH", bus.read_surely_at(position, reg.STATION_ADDRESS, 4)))
+    for position in sensors:
+        taken.update(struct.unpack("<H", bus.read_surely_at(position, reg.STATION_ALIAS, 2)))
     return (station for station in range(_FIRST_STATION, 0xFFFF) if station not in taken)
 
 

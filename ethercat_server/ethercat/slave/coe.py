@@ -57,15 +57,24 @@ class Sdo(Protocol):
         ...
 
 
-def finish(steps: Steps[T], pause_s: float = 0.001, clock: Clock = SYSTEM_CLOCK) -> T:
+def finish(
+    steps: Steps[T],
+    pause_s: float = 0.001,
+    clock: Clock = SYSTEM_CLOCK,
+    check_interrupt: CheckInterrupt = lambda: None,
+) -> T:
     """Run `steps` to their end, `pause_s` apart; returns their result."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as stop:
-            result: T = stop.value
-            return result
-        clock.sleep(pause_s)
+    try:
+        while True:
+            check_interrupt()
+            try:
+                next(steps)
+            except StopIteration as stop:
+                result: T = stop.value
+                return result
+            clock.sleep(pause_s)
+    finally:
+        steps.close()  # given up between two steps, they undo what is half done while the bus is open
 
 
 class BlockingSdo:
