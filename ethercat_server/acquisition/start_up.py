@@ -107,7 +107,9 @@ def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> S
     sensors = _again(find)
     _check_places(bus.ifname, sensors, wanted)
     for slave in others:
-        log.info("%s is left alone: it stays in %s", slave, slave.status)
+        # It might be a sensor: those behind it would have other numbers than they had.
+        level = logging.WARNING if slave.sii is None else logging.INFO
+        log.log(level, "%s is left alone: it stays in %s", slave, slave.status)
     return Started(sensors, others)
 
 

@@ -217,3 +217,13 @@ def test_a_device_in_the_place_of_a_sensor_keeps_its_eeprom(state: str) -> None:
     assert len(drive.writes) < 60
     assert {address for address, _ in drive.writes} <= (set(READING_THE_SII) if state == "INIT" else set())
     assert [sensor.streams for sensor in simulation.sensors] == [True, False]
+
+
+def test_one_that_does_not_say_what_it_is_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    """It may be a sensor, and then the one behind it is sensor 0 now."""
+    backend = chain("BOTA,BOTA,EK1100")
+    backend.command("sii busy @0")
+    simulation = Simulation(backend=backend)
+    assert [sensor.position for sensor in simulation.sensors] == [1]
+    warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert warnings == ["'nameless' at position 0 (its SII cannot be read) is left alone: it stays in INIT"]
