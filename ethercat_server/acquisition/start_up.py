@@ -97,6 +97,10 @@ def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> S
     slaves = look_safely(bus, check_interrupt, force=wanted.force)
     of_sensors = [slave for slave in slaves if slave.is_sensor]
     others = [slave for slave in slaves if not slave.is_sensor]
+    unread = next((slave for slave in others if slave.sii is None), None)
+    if unread is not None and (not of_sensors or unread.position < of_sensors[-1].position):
+        # It may be a sensor: those behind it would have other numbers, and settings, than they should.
+        raise BusError(unreadable(bus.ifname, unread))
     if not of_sensors:
         raise BusError(_none_of_ours(bus.ifname, others))
 
@@ -107,7 +111,6 @@ def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> S
     sensors = _again(find)
     _check_places(bus.ifname, sensors, wanted)
     for slave in others:
-        # It might be a sensor: those behind it would have other numbers than they had.
         level = logging.WARNING if slave.sii is None else logging.INFO
         log.log(level, "%s is left alone: it stays in %s", slave, slave.status)
     return Started(sensors, others)
@@ -151,9 +154,6 @@ def _again(attempt: Attempt[T]) -> T:
 
 
 def _none_of_ours(ifname: str, others: list[Slave]) -> str:
-    unread = next((slave for slave in others if slave.sii is None), None)
-    if unread is not None:
-        return unreadable(ifname, unread)
     return (
         f"no Bota Gen-0 sensor (vendor 0x{dictionary.VENDOR_ID:08X}, product {dictionary.PRODUCT_CODE}) is "
         f"on {ifname}, only {', '.join(map(str, others))}: check the sensor's cable and power, and that this "

@@ -15,7 +15,7 @@ from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave import sii_content
-from ethercat_server.ethercat.slave.al import AlStatus
+from ethercat_server.ethercat.slave.al import AlState, AlStatus
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
 from ethercat_server.sensor.objects.dictionary import PRODUCT_CODE, VENDOR_ID
@@ -102,7 +102,8 @@ def look(bus: Bus, check_interrupt: CheckInterrupt) -> list[Slave]:
 def look_at(bus: Bus, position: int) -> Slave:
     """The slave at `position`, without its SII; BusError if it does not answer."""
     status = AlStatus.parse(bus.read_surely_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE))
-    at_work = status.is_above_preop and not _has_sensors_managers(bus, position)
+    busy = status.is_above_preop or status.state is AlState.BOOT  # its firmware may be being written
+    at_work = busy and not _has_sensors_managers(bus, position)
     return Slave(position, status, None, at_work=at_work)
 
 

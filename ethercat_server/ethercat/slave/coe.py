@@ -12,7 +12,7 @@ import struct
 from collections.abc import Generator
 from typing import Final, Protocol, TypeVar
 
-from ethercat_server.errors import BusError
+from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
@@ -161,7 +161,7 @@ class MailboxSdo:
                         raise refused(self._number, f"{doing} object 0x{index:04X}:{subindex}", code)
                     return answer
             yield
-        raise BusError(self._unanswered(doing, index, subindex, "no answer"))
+        raise SetUpError(self._unanswered(doing, index, subindex, "no answer"))
 
     def _drain(self) -> Steps[None]:
         """Read away what was left in the mailbox from before."""

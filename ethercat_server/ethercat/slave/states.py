@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ethercat_server.errors import BusError
+from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.slave import registers as reg
@@ -11,7 +11,7 @@ from ethercat_server.ethercat.slave.al import AlState, AlStatus
 from ethercat_server.ethercat.slave.coe import Steps
 
 
-class GoneError(BusError):
+class GoneError(SetUpError):
     """The slave stopped answering in the middle."""
 
 
