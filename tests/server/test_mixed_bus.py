@@ -240,6 +240,38 @@ def test_one_that_does_not_say_what_it_is(caplog: pytest.LogCaptureFixture) -> N
     assert warnings == ["'nameless' at position 2 (its SII cannot be read) is left alone: it stays in INIT"]
 
 
+def test_sync_signals_that_another_master_left_are_switched_off() -> None:
+    """A sensor would wait for SYNC0."""
+    backend = chain("BOTA:OP,EK1100")
+    sensor, coupler = (slave.life for slave in backend.sensors.slaves)
+    assert sensor is not None
+    assert coupler is not None
+    for life in (sensor, coupler):
+        life.esc.memory[reg.DC_ACTIVATION + 1] = 3
+    assert bring_up(Bus(backend), Asked(), lambda: None).sensors[0].streams
+    assert (sensor.esc.memory[reg.DC_ACTIVATION + 1], coupler.esc.memory[reg.DC_ACTIVATION + 1]) == (0, 3)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.4, 60.0])
+def test_firmware_that_reads_its_eeprom_may_finish(seconds: float) -> None:
+    backend = chain("DRIVE,BOTA")
+    drive = backend.sensors.slaves[0]
+    assert isinstance(drive, ForeignSlave)
+    assert drive.life is not None
+    memory = drive.life.esc.memory
+    memory[reg.SII_OWNER : reg.SII_OWNER + 2] = b"\1\1"
+    began_ns = backend.clock.now_ns
+
+    def finish() -> None:
+        assert not drive.writes
+        memory[reg.SII_OWNER + 1] = 0
+
+    if seconds < 1:
+        backend.clock.at(began_ns + round(seconds * 1e9), finish)
+    assert bring_up(Bus(backend), Asked(), lambda: None).others[0].name == "DRIVE"
+    assert memory[reg.SII_OWNER] == 1, "it is the firmware's again"
+
+
 def test_a_device_in_boot_is_not_touched() -> None:
     """Its firmware may be being written."""
     backend = chain("BOTA,DRIVE")

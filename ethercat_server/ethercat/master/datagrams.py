@@ -79,13 +79,14 @@ class DatagramMaster:
             self._run(states.go(AlState.PREOP), check_interrupt)
 
     def _clear(self, states: StateMachine, number: int) -> None:
-        """Clear all FMMUs and sync managers: the master before may have used more than this one does."""
+        """Clear what the master before may have used and this one does not: FMMUs, sync managers, SYNC0."""
         units, managers = self._bus.read_surely(number, reg.FMMU_AND_SM_COUNT, 2)
         if units:
             states.write(reg.FMMU, bytes(min(units, reg.MOST_FMMUS) * reg.FMMU_SIZE))
         if managers:
             count = min(managers, reg.MOST_SYNC_MANAGERS)
             states.write(reg.SYNC_MANAGER, bytes(count * reg.SYNC_MANAGER_SIZE))
+        self._bus.write_register(number, reg.DC_ACTIVATION, b"\0\0")  # a controller without DC refuses
 
     def sdo_read(self, number: int, index: int, subindex: int) -> bytes:
         """See `Master`."""

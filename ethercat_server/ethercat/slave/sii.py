@@ -19,6 +19,8 @@ from ethercat_server.ethercat.slave.registers import SII_CONTROL, SII_OWNER
 OF_FIRMWARE: Final = b"\x01"
 OF_MASTER: Final = b"\x00"
 _TAKE: Final = b"\x02"
+_IN_USE: Final = 0x01
+"""Of the byte after the owner: the firmware is accessing it."""
 
 _REGISTERS: Final = struct.Struct("<HI8s")
 """Control and status, the word's address, the data."""
@@ -60,6 +62,7 @@ def read_sii(bus: Registers, slave: int, word: int, count: int, owner: bytes = O
     """
     data = bytearray()
     try:
+        yield from _wait_for_firmware(bus, slave)
         yield from _write(bus, slave, SII_OWNER, _TAKE, word)
         yield from _write(bus, slave, SII_OWNER, OF_MASTER, word)
         while len(data) < 2 * count:
@@ -68,6 +71,16 @@ def read_sii(bus: Registers, slave: int, word: int, count: int, owner: bytes = O
         # No waiting here: the one who reads may have given up.
         any(bus.write_register(slave, SII_OWNER, owner) for _ in range(_ATTEMPTS_TO_GIVE_BACK))
     return bytes(data[: 2 * count])
+
+
+def _wait_for_firmware(bus: Registers, slave: int) -> Steps[None]:
+    """Let the slave's own firmware finish an access; one that never does is interrupted."""
+    deadline = Deadline(bus.clock, times.SII_WORD_S)
+    while not deadline.passed:
+        found = bus.read_register(slave, SII_OWNER, 2)
+        if found is not None and not (found[0] & 1 and found[1] & _IN_USE):
+            return
+        yield
 
 
 def _read_word(bus: Registers, slave: int, word: int) -> Steps[bytes]:
