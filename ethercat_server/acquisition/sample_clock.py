@@ -172,7 +172,9 @@ class SampleClock:
             into = min((received_ns - sent_ns) / 2, _LONGEST_LOOK * period)
             self.steps = max(1, 1 + int((sent_ns + into - expected) // period))
         self.uncertain = unwatched - 2 * looking >= period and (
-            not self._trusted or received_ns - looking - self._low >= _SURELY_ONE * period
+            not self._trusted
+            or received_ns - looking - self._low >= _SURELY_ONE * period
+            or received_ns - sent_ns - self._least_flight_ns > _LONGEST_LOOK * period
         )
         self.instant_ns = min(max(expected + (self.steps - 1) * period, after), received_ns)
 
