@@ -20,7 +20,7 @@ from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
 from ethercat_server.ethercat.slave.sii import OF_FIRMWARE, ByPosition, read_sii
 from ethercat_server.ethercat.slave.states import StateMachine
 from ethercat_server.sensor.guard import GuardedSdo
-from ethercat_server.sensor.objects.dictionary import PRODUCT_CODE, VENDOR_ID
+from ethercat_server.sensor.objects.dictionary import is_sensor
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.sensor.set_up import identify, put_right, set_up
 
@@ -120,7 +120,7 @@ class Ladder:
             words = yield from read_sii(ByPosition(bus), position, _SII_IDENTITY, 4, owner)
         except BusError:
             return False
-        if struct.unpack("<II", words) != (VENDOR_ID, PRODUCT_CODE):
+        if not is_sensor(*struct.unpack("<II", words)):
             yield from self._pause(_STRANGER_PAUSE_S)
             return False
         return bus.write_at(position, reg.STATION_ADDRESS, bus.stations[number].to_bytes(2, "little"))

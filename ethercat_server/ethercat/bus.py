@@ -19,8 +19,6 @@ from ethercat_server.ethercat.wire import COUNTER_SIZE, DATAGRAM_INDEX, FIRST_DA
 _LONGEST_DATA: Final = 1486
 """Bytes of process data that fit one frame with one datagram."""
 _U16: Final = struct.Struct("<H")
-_FMMU: Final = struct.Struct("<IHBBHBBB3x")
-_FMMU_READ, _FMMU_WRITE = 1, 2
 _SYNC_MANAGER: Final = struct.Struct("<2xHBxBx")
 """Length, control, activation."""
 _SM_WRITE, _SM_MAILBOX = 0x04, 0x02
@@ -96,10 +94,10 @@ class Bus(Datagrams):
         for number in range(len(self.stations)):
             count = min(self.read_surely(number, reg.FMMU_AND_SM_COUNT, 2)[0], reg.MOST_FMMUS)
             self.fmmus.append(self.read_surely(number, reg.FMMU, count * reg.FMMU_SIZE))
-            rows = (_FMMU.unpack_from(self.fmmus[-1], at * reg.FMMU_SIZE) for at in range(count))
+            rows = (reg.FMMU_LAYOUT.unpack_from(self.fmmus[-1], at * reg.FMMU_SIZE) for at in range(count))
             areas.append([_Area(row[0], row[0] + row[1], row[6]) for row in rows if row[7] & 1])
             kinds = {area.kind for area in areas[-1]}
-            if kinds != self._kinds(number) or _FMMU_READ not in kinds or _is_too_long(areas[-1]):
+            if kinds != self._kinds(number) or reg.FMMU_READ not in kinds or _is_too_long(areas[-1]):
                 # SOEM writes them once, and does not look whether that worked.
                 raise SetUpError(f"sensor {number} did not answer when it was mapped: check cable and power")
         self._counters = [_working_counter(each) for each in areas]
@@ -111,7 +109,7 @@ class Bus(Datagrams):
         data = self.read_surely(number, reg.SYNC_MANAGER, count * reg.SYNC_MANAGER_SIZE)
         rows = [_SYNC_MANAGER.unpack_from(data, at * reg.SYNC_MANAGER_SIZE) for at in range(count)]
         return {
-            _FMMU_WRITE if control & _SM_WRITE else _FMMU_READ
+            reg.FMMU_WRITE if control & _SM_WRITE else reg.FMMU_READ
             for length, control, active in rows
             if length and active & 1 and not control & _SM_MAILBOX
         }
@@ -130,7 +128,7 @@ class Bus(Datagrams):
         self._ends = [FIRST_DATA + end - start for start, end in spans]
         self._inputs = []
         for number, each in enumerate(areas):
-            inputs = [area for area in each if area.kind == _FMMU_READ]
+            inputs = [area for area in each if area.kind == reg.FMMU_READ]
             first, last = min(area.start for area in inputs), max(area.end for area in inputs)
             n = next((n for n, (start, end) in enumerate(spans) if start <= first and last <= end), -1)
             if n < 0:
@@ -193,7 +191,7 @@ class Bus(Datagrams):
 
 def _working_counter(areas: list[_Area]) -> int:
     kinds = {area.kind for area in areas}
-    return 2 * (_FMMU_WRITE in kinds) + (_FMMU_READ in kinds)
+    return 2 * (reg.FMMU_WRITE in kinds) + (reg.FMMU_READ in kinds)
 
 
 def _is_too_long(areas: list[_Area]) -> bool:

@@ -78,12 +78,8 @@ class Datagrams:
 
         Needs no scan and changes nothing, so it also serves to measure the round trip of such a frame.
         """
-        answer = self.read_all(0, size, timeout_s)
+        answer = self._datagram(Command.BRD, 0, 0, bytes(size), timeout_s)
         return -1 if answer is None else answer[0]
-
-    def read_all(self, address: int, size: int, timeout_s: float) -> tuple[int, bytes] | None:
-        """How many slaves answer a broadcast read, and what they have there, ORed; None if it is lost."""
-        return self._datagram(Command.BRD, 0, address, bytes(size), timeout_s)
 
     def listen(self, seconds: float) -> int:
         """The number of frames that arrive from others in this time; nothing is sent."""

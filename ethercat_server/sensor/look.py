@@ -18,7 +18,7 @@ from ethercat_server.ethercat.slave import sii_content
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
-from ethercat_server.sensor.objects.dictionary import PRODUCT_CODE, VENDOR_ID
+from ethercat_server.sensor.objects.dictionary import is_sensor
 from protocol.pdo import LAYOUTS
 
 _LISTEN_S: Final = 0.1
@@ -56,7 +56,7 @@ class Slave(NamedTuple):
     @property
     def is_sensor(self) -> bool:
         """Whether it is a Bota Gen-0 sensor."""
-        return self.sii is not None and (self.sii["vendor"], self.sii["product"]) == (VENDOR_ID, PRODUCT_CODE)
+        return self.sii is not None and is_sensor(self.sii["vendor"], self.sii["product"])
 
     @property
     def has_coe(self) -> bool:

@@ -21,7 +21,7 @@ from ethercat_server.ethercat.slave.registers import (
     WATCHDOG_COUNTER,
 )
 from ethercat_server.sensor.look import look_at, with_sii
-from ethercat_server.sensor.objects.dictionary import PRODUCT_CODE, VENDOR_ID
+from ethercat_server.sensor.objects.dictionary import is_sensor
 
 MOST_PORTS: Final = 4
 _ATTEMPTS: Final = 10
@@ -83,7 +83,7 @@ class Slave:
     @property
     def is_sensor(self) -> bool:
         """Whether it is a Bota Gen-0 sensor."""
-        return (self.vendor, self.product) == (VENDOR_ID, PRODUCT_CODE)
+        return is_sensor(self.vendor, self.product)
 
     def as_json(self) -> dict[str, Any]:
         """Its JSON form."""

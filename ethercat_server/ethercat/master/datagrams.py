@@ -26,12 +26,10 @@ _FIRST_STATION: Final = 0x1001
 _ATTEMPTS: Final = 20
 _PAUSE_S: Final = 0.001
 _EXCHANGE_TIMEOUT_S: Final = 0.002
-_FMMU: Final = struct.Struct("<IHBBHBBB3x")
-_READ, _WRITE = 1, 2
 _LOGICAL_BYTES: Final = 0x10000
 """Of the logical address space for the sensors' process data."""
 _MAILBOXES: Final = ((reg.SM_CONTROL_MAILBOX_OUT, "out"), (reg.SM_CONTROL_MAILBOX_IN, "in"))
-_ASSIGNMENTS: Final = (("outputs", 0x1C12, _WRITE), ("inputs", 0x1C13, _READ))
+_ASSIGNMENTS: Final = (("outputs", 0x1C12, reg.FMMU_WRITE), ("inputs", 0x1C13, reg.FMMU_READ))
 """Kind of the sync manager, the object with its PDOs, kind of the FMMU."""
 _MOST_BYTES: Final = 1486
 _MOST_SUBINDEX, _MOST_INDEX, _MOST_ENTRY = 0xFF, 0xFFFF, 0xFFFFFFFF
@@ -112,7 +110,7 @@ class DatagramMaster:
                     managers += bytes(reg.SYNC_MANAGER_SIZE)
                     continue
                 managers += reg.pack_sync_manager(row["start"], size, row["control"])
-                units += _FMMU.pack(logical, size, 0, 7, row["start"], 0, direction, 1)
+                units += reg.FMMU_LAYOUT.pack(logical, size, 0, 7, row["start"], 0, direction, 1)
                 logical, found[kind] = logical + size, size
             states.write(reg.SYNC_MANAGER + 2 * reg.SYNC_MANAGER_SIZE, managers)
             states.write(reg.FMMU, units.ljust(len(_ASSIGNMENTS) * reg.FMMU_SIZE, b"\0"))
@@ -202,7 +200,7 @@ def _free_logical(bus: Bus, others: Sequence[int]) -> int:
         count = bus.read_surely_at(position, reg.FMMU_AND_SM_COUNT, 1)[0]
         for at in range(min(count, reg.MOST_FMMUS)):
             unit = bus.read_surely_at(position, reg.FMMU + at * reg.FMMU_SIZE, reg.FMMU_SIZE)
-            row: tuple[int, ...] = _FMMU.unpack(unit)
+            row: tuple[int, ...] = reg.FMMU_LAYOUT.unpack(unit)
             if row[-1] & 1:
                 taken.append((row[0], row[0] + row[1]))
     for base in sorted([0, *(end for _, end in taken)]):

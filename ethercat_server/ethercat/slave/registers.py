@@ -71,6 +71,10 @@ DC_ACTIVATION: Final = 0x0980
 USER_RAM: Final = 0x0F80
 REGISTERS_END: Final = 0x1000
 """Process data memory begins here."""
+FMMU_LAYOUT: Final = struct.Struct("<IHBBHBBB3x")
+"""Logical start, length, start and end bit, physical start and bit, type, activation."""
+FMMU_READ: Final = 1
+FMMU_WRITE: Final = 2
 MOST_FMMUS: Final = 16
 MOST_SYNC_MANAGERS: Final = 16
 SM_CONTROL_MAILBOX_OUT: Final = 0x26

@@ -256,3 +256,8 @@ SETTING_WRITE_ORDER: Final[tuple[str, ...]] = (
     "fir",
     "sinc_length",
 )
+
+
+def is_sensor(vendor: int, product: int) -> bool:
+    """Whether this is the identity of a Bota Gen-0 sensor."""
+    return (vendor, product) == (VENDOR_ID, PRODUCT_CODE)
