@@ -1,8 +1,8 @@
 """Looks at a bus before it is scanned: which slaves there are, whose they are, and whether they are at work.
 
 Looking disturbs nobody: frames of other masters are counted, registers and SIIs (EEPROMs) are read. Not the
-SII of a slave in SAFEOP or OP, for reading takes writes to its controller; what is Bota's is then told from
-its sync managers.
+SII of a slave in SAFEOP, OP or BOOT, for reading takes writes to its controller; what is Bota's is then told
+from its sync managers.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Slave(NamedTuple):
     problem: str = ""
     """Why its SII cannot be read."""
     at_work: bool = False
-    """It is no Bota sensor and in SAFEOP or OP."""
+    """It is no Bota sensor and in SAFEOP, OP or BOOT."""
 
     @property
     def name(self) -> str:

@@ -27,7 +27,7 @@ def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = Fals
     """All slaves on the wire.
 
     BusError if using the bus would stop somebody else's machine: if another master is sending, or a slave
-    that is not Bota's is in SAFEOP or OP. With `force`, such slaves are taken to PREOP instead.
+    that is not Bota's is in SAFEOP, OP or BOOT. With `force`, such slaves are taken to PREOP instead.
     """
     if not force:
         check_no_master(bus)

@@ -76,7 +76,7 @@ class Slave:
     sii_problem: str = ""
     """Why its SII, and so its identity, could not be read."""
     at_work: bool = False
-    """It is no Bota sensor and in SAFEOP or OP."""
+    """It is no Bota sensor and in SAFEOP, OP or BOOT."""
     left_alone: bool = False
     """Its SII was not read, for another master has the bus."""
 
@@ -98,7 +98,7 @@ def count(bus: Bus) -> int:
 
 
 def in_use(bus: Bus, count: int) -> bool:
-    """Whether one of the slaves is no Bota sensor and in SAFEOP or OP; BusError if one does not answer."""
+    """Whether a slave that is no Bota sensor is in SAFEOP, OP or BOOT; BusError if one does not answer."""
     return any(look_at(bus, position).at_work for position in range(count))
 
 
