@@ -154,7 +154,9 @@ class SimulatedServer:
         """Whether it is stopped by somebody."""
         ethercat = Bus(bus.backend)
         sensors = bring_up(ethercat, Asked({"sinc_length": SINC_LENGTH}), lambda: None).sensors
-        self.streams = [SensorStream(sensor.number, sensor.period_ns, bus.clock) for sensor in sensors]
+        self.streams = [
+            SensorStream(sensor.number, sensor.period_ns, ethercat.timing, bus.clock) for sensor in sensors
+        ]
         self.transport = InMemoryTransport(bus.clock)
         self.hub = Hub(self.transport, bus.clock.monotonic_ns)
         self.recovery = Recovery(ethercat, sensors, self.streams, self._announce, Others(ethercat, ()))

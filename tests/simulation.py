@@ -94,7 +94,9 @@ class Simulation:
         self.bus = Bus(self.backend)
         self.sensors, slaves = bring_up(self.bus, Asked(settings), lambda: None)
         self.others = Others(self.bus, slaves)
-        self.streams = [SensorStream(s.number, s.period_ns, self.clock) for s in self.sensors]
+        self.streams = [
+            SensorStream(s.number, s.period_ns, self.bus.timing, self.clock) for s in self.sensors
+        ]
         self.events: list[JsonObject] = []
         self.recovery = Recovery(self.bus, self.sensors, self.streams, self._announce, self.others)
         self.jobs = Jobs(self.bus, self.sensors)

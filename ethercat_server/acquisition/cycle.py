@@ -1,7 +1,8 @@
-"""The acquisition loop: exchange, hand out, serve the sockets until the next deadline.
+"""The acquisition loop: exchange, hand out, serve the sockets until the next exchange is due.
 
-The sensors' clocks say when the next exchange is due, as absolute times on CLOCK_MONOTONIC. One thread does
-everything, and `run` is all of the hot path outside `SensorStream.take` and `Connection.offer`.
+The schedule says when that is, as an absolute time on CLOCK_MONOTONIC; answers are handed out whenever they
+arrive, so that a slow network card has several exchanges on their way. One thread does everything, and
+`_step` with `_hand_out` is all of the hot path outside `SensorStream.take` and `Connection.offer`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any, Final, Protocol
 from ethercat_server.acquisition.histogram import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
+from ethercat_server.acquisition.schedule import Schedule
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.sensor import Sensor, SensorState
@@ -20,17 +22,10 @@ _SERVE_MARGIN_NS: Final = 80_000
 """Sockets are not served this shortly before a deadline: select may wake late."""
 _SERVE_EVERY_NS: Final = 10_000_000
 """Sockets are served this often even if every deadline has passed."""
-_TIMEOUT_PERIODS: Final = 0.75
-"""Timeout of a frame in shortest sample periods, so that the next one is in time."""
-_LEAST_TIMEOUT_S: Final = 300e-6
 _RECOVERY_STEP_NS: Final = 500_000
 """Time between two exchanges while all sensors are lost."""
-_RECOVERY_TIMEOUT_S: Final = 0.02
-"""Timeout of a frame meanwhile."""
 _SUMMARY_NS: Final = 200_000_000
 """Interval between summaries of the distributions, which take some 100 µs each."""
-_LATENESS_GAIN: Final = 1 / 64
-_MAX_LEAD_NS: Final = 200_000.0
 
 
 class Outlet(Protocol):
@@ -83,7 +78,13 @@ class Cycle:
         self._recovery = recovery
         self._cycles = 0
         self._missed_deadlines = 0
-        self._lost_frames = 0
+        self._timing = bus.timing
+        self._schedule = Schedule(streams, bus.timing)
+        carried = bus.process_data.inputs
+        self._carried = [[(at, sensors[at.number], streams[at.number]) for at in each] for each in carried]
+        """By frame of the exchange: what it carries of which sensor."""
+        self._answered = self._complete = False
+        """Whether the last step took an answer, and whether all sensors took part in it that are not lost."""
         self._wake = RecentDistribution()
         self._exchange = RecentDistribution()
         self._started_ns = bus.clock.monotonic_ns()
@@ -96,68 +97,101 @@ class Cycle:
 
     def run(self) -> None:
         """The loop."""
-        bus, hub, streams, recovery = self._bus, self._hub, self._streams, self._recovery
-        jobs, watchdog = self._jobs, self._watchdog
-        each = tuple(zip(self._sensors, streams, strict=True))
-        monotonic_ns, sleep = bus.clock.monotonic_ns, bus.clock.sleep
-        shortest_ns, timeout_s = self._limits()
-        lead_ns = 0.0  # usual lateness of wake-ups, by which deadlines are brought forward
+        bus, hub, recovery, jobs, watchdog = self._bus, self._hub, self._recovery, self._jobs, self._watchdog
+        process_data, monotonic_ns = bus.process_data, bus.clock.monotonic_ns
+        bus.next_frame = self._next_frame
         serve_by = roll_at = feed_at = 0
         while not self.stopping:
             now = monotonic_ns()
-            deadline = int(min([stream.clock.next_poll_ns() for stream in streams]) - lead_ns)
-            wait_s = timeout_s
-            if recovery.all_lost:
-                deadline, wait_s = now + _RECOVERY_STEP_NS, _RECOVERY_TIMEOUT_S
+            due = self._due_ns()
             if jobs.waiting:
-                jobs.step(deadline)
-            if deadline > now or now > serve_by:
-                hub.serve(deadline - _SERVE_MARGIN_NS)
+                jobs.step(due)
+            if now > serve_by or (due > now and not process_data.in_flight):
+                hub.serve(
+                    min(due - _SERVE_MARGIN_NS, now) if process_data.in_flight else due - _SERVE_MARGIN_NS
+                )
                 serve_by = now + _SERVE_EVERY_NS
-            slept = deadline > now
-            if slept and (left := deadline - monotonic_ns()) > 0:
-                sleep(left * 1e-9)
-            sent = monotonic_ns()
-            if slept:
-                late = sent - deadline
-                lead_ns += _LATENESS_GAIN * (min(late, _MAX_LEAD_NS) - lead_ns)
-                self._wake.record(late)
-                self._missed_deadlines += int(max(late, 0) // shortest_ns)
-            bus.send(sent)
-            wkc = bus.receive(wait_s)
-            back = monotonic_ns()
-            complete = wkc >= recovery.alive_wkc
-            for sensor, stream in each:
-                data = bus.process_data(number := stream.number)
-                # One that is out may be counted in place of one that is not there any more.
-                valid = complete and sensor.state is SensorState.STREAMING and data != bus.untouched[number]
-                if made := stream.take(data, wkc, valid, sent, back):
-                    hub.publish(made[0], number, made[1], back)
-            for stream in streams:
-                stream.learn()
-            recovery.attend(wkc, back)
-            if back >= roll_at:
-                roll_at = back + SLOT_NS
+            self._answered = False
+            self._step(due + _RECOVERY_STEP_NS)
+            now = monotonic_ns()
+            if self._answered:
+                recovery.attend(self._complete, now)
+            elif process_data.unanswered > 1:
+                recovery.miss(now - process_data.waiting_since_ns, now)
+            if now >= roll_at:
+                roll_at = now + SLOT_NS
                 self._roll()
-                shortest_ns, timeout_s = self._limits()
-            if back >= feed_at:
-                feed_at = back + watchdog.feed_every_ns
+            if now >= feed_at:
+                feed_at = now + watchdog.feed_every_ns
                 watchdog.feed()
-            self._cycles += 1
-            self._lost_frames += wkc < 0
-            self._exchange.record(back - sent)
-            if back - sent > shortest_ns and wkc >= 0:  # the computer stood still meanwhile
-                self._missed_deadlines += int((back - sent) // shortest_ns)
+        bus.next_frame = bus.next_on_wire
 
-    def _limits(self) -> tuple[float, float]:
-        """The shortest sample period in ns and how long a frame may take in s; both change with the rates."""
-        shortest_ns = min(stream.clock.period_ns for stream in self._streams)
-        return shortest_ns, max(_LEAST_TIMEOUT_S, _TIMEOUT_PERIODS * 1e-9 * shortest_ns)
+    def _due_ns(self) -> int:
+        if self._recovery.all_lost:
+            return self._timing.sent_ns + _RECOVERY_STEP_NS
+        return int(self._schedule.next_ns())
+
+    def _next_frame(self, until_ns: int) -> bytes | None:
+        """The next frame before `until_ns` that is no answer to an exchange; the exchanges go on meanwhile."""
+        while self._bus.clock.monotonic_ns() < until_ns:
+            if (frame := self._step(until_ns)) is not None:
+                return frame
+        return None
+
+    def _step(self, until_ns: int) -> bytes | None:
+        """Hand out what arrives, or send the next exchange once it is due; return at `until_ns` at the latest.
+
+        Returns a frame that is no answer to an exchange.
+        """
+        bus, monotonic_ns = self._bus, self._bus.clock.monotonic_ns
+        process_data, timing = bus.process_data, self._timing
+        due, now, frame = self._due_ns(), monotonic_ns(), None
+        if (wait := min(due, until_ns) - now) > 0 or process_data.in_flight:
+            frame = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0)
+            now = monotonic_ns()
+            if frame is not None and (sent := process_data.take(frame)):
+                timing.took(sent, now)
+                self._exchange.record(now - sent)
+                self._hand_out(sent, now)
+                self._schedule.cost(monotonic_ns() - now)
+                self._missed_deadlines += max(0, int((now - due) // self._schedule.shortest_ns))
+                return None
+            if now < due:
+                return frame
+            if wait > 0:
+                timing.woke(now - due)
+                self._wake.record(now - due)
+        self._missed_deadlines += int((now - due) // self._schedule.shortest_ns)
+        timing.sent_ns, timing.in_flight = now, True
+        self._cycles += 1
+        process_data.send(now)
+        for stream in self._streams:
+            if now >= stream.idle_at_ns and (made := stream.idle(now)):
+                self._hub.publish(made[0], stream.number, made[1], now)
+        return frame
+
+    def _hand_out(self, sent: int, back: int) -> None:
+        """Hand out what the exchange that was taken last brought."""
+        process_data = self._bus.process_data
+        frame, wkc, which = process_data.frame, process_data.wkc, process_data.which
+        self._answered = True
+        self._complete = complete = wkc >= self._recovery.alive_wkc[which]
+        carried = self._carried[which]
+        for at, sensor, stream in carried:
+            data = frame[at.start : at.end]
+            # One that is out may be counted in place of one that is not there any more.
+            if not complete or sensor.state is not SensorState.STREAMING or data == at.untouched:
+                stream.invalid(wkc)
+            elif made := stream.take(data, wkc, sent, back):
+                self._hub.publish(made[0], at.number, made[1], back)
+        for _, _, stream in carried:
+            stream.learn()
 
     def _roll(self) -> None:
         """Once a second."""
         self._wake.roll()
         self._exchange.roll()
+        self._schedule.roll()
         for stream in self._streams:
             stream.age.roll()
             stream.check()
@@ -174,7 +208,7 @@ class Cycle:
         return {
             "cycles": self._cycles,
             "missed_deadlines": self._missed_deadlines,
-            "lost_frames": self._lost_frames,
+            "lost_frames": self._bus.process_data.lost,
             "wake_us": wake,
             "exchange_us": exchange,
             "last_10s": {

@@ -91,17 +91,16 @@ class Jobs:
         for _ in self._queues:
             self._turn = (self._turn + 1) % len(self._queues)
             if self._queues[self._turn]:
-                self._step(self._turn, until_ns)
+                self._step(self._turn)
                 return
 
-    def _step(self, number: int, until_ns: int) -> None:
+    def _step(self, number: int) -> None:
         steps, done, _ = self._queues[number][0]
         result: Any = None
         error: RequestError | None = None
         try:
             if self._sensors[number].streams:
-                with self._bus.in_time(until_ns):
-                    next(steps)
+                next(steps)
                 return
             steps.throw(CutOffError(f"sensor {number} {_AWAY}"))
             raise CutOffError(f"sensor {number} {_AWAY}")

@@ -28,7 +28,7 @@ from protocol.settings import SettingValue
 from protocol.text.json_text import JsonObject
 
 _SHORT_EXCHANGES: Final = 2
-"""Exchanges in a row with a short working counter before the sensors' states are read."""
+"""Short working counters, almost in a row, before the sensors' states are read."""
 _SILENCE_NS: Final = 50_000_000
 """Time without a frame coming back after which all sensors are lost; a single lost frame never suffices."""
 _SILENT_CHANGE_NS: Final = 1_000_000_000
@@ -77,15 +77,12 @@ class Recovery:
         self._lost_at_ns: dict[int, int] = {}
         self._changing: dict[int, _Reconfiguration] = {}
         self._short = 0
-        self._frame_ns = bus.clock.monotonic_ns()
-        self._missed_since_ns = 0
-        """When the frame came that was the last before the first that is missing."""
         self._watch_ns = 0
         self._watched = 0
         self._looks_at_states = False
         """Or at the mailboxes: in turns, so that no exchange has to wait for both."""
-        self.alive_wkc: int
-        """The working counter of all sensors that are not lost."""
+        self.alive_wkc: list[int]
+        """The working counter of each frame if all sensors that are not lost take part."""
         self.all_lost: bool
         """Whether no sensor is left to be read."""
         self._count_alive()
@@ -109,30 +106,13 @@ class Recovery:
         """SDO transfers to a sensor that is not lost, in steps."""
         return self._ladders[number].sdo
 
-    def attend(self, wkc: int, now_ns: int) -> None:
-        """To be called after every exchange; almost always it has nothing to do.
+    def attend(self, complete: bool, now_ns: int) -> None:
+        """To be called after every exchange that is back; almost always it has nothing to do.
 
-        InterfaceError if the network interface is gone for good.
+        `complete`: all sensors took part that are not lost.
         """
-        if wkc < 0:
-            # Without frames coming back there is nothing that could be done.
-            if self.all_lost:
-                if now_ns >= self._watch_ns:
-                    self._watch_ns = now_ns + _WATCH_EVERY_NS
-                    self._bus.backend.check_present()
-                    if now_ns - self._frame_ns > _SILENT_CHANGE_NS:
-                        for number in list(self._changing):
-                            self._lose_in_change(number, self._silence())
-            elif self._missed_since_ns != self._frame_ns:
-                self._missed_since_ns = self._frame_ns  # one only: at a low rate the time alone says nothing
-            elif now_ns - self._frame_ns > _SILENCE_NS:
-                why = self._silence()
-                for number in range(len(self._sensors)):
-                    self._lose(number, why)
-            return
-        self._frame_ns = now_ns
-        self._short = self._short + 1 if wkc < self.alive_wkc else 0
-        if self._short >= _SHORT_EXCHANGES:
+        self._short = max(0, self._short - 1) if complete else self._short + 2
+        if self._short >= 2 * _SHORT_EXCHANGES:
             self._short = 0
             self._look_for_lost()
         if self._work:
@@ -146,6 +126,24 @@ class Recovery:
                 return
             self._watch_next()
             self._others.look_at_next()
+
+    def miss(self, silent_ns: int, now_ns: int) -> None:
+        """To be called while exchanges are not answered, and have not been for `silent_ns`.
+
+        Without frames coming back there is nothing that could be done. InterfaceError if the network
+        interface is gone for good.
+        """
+        if not self.all_lost:
+            if silent_ns > _SILENCE_NS:
+                why = self._silence()
+                for number in range(len(self._sensors)):
+                    self._lose(number, why)
+        elif now_ns >= self._watch_ns:
+            self._watch_ns = now_ns + _WATCH_EVERY_NS
+            self._bus.backend.check_present()
+            if silent_ns > _SILENT_CHANGE_NS:
+                for number in list(self._changing):
+                    self._lose_in_change(number, self._silence())
 
     def _silence(self) -> str:
         return f"no frame comes back: {self._bus.backend.why_silent()}"
@@ -199,7 +197,9 @@ class Recovery:
 
     def _count_alive(self) -> None:
         alive = self._alive()
-        self.alive_wkc = sum(self._bus.working_counter(number) for number in alive)
+        counters = self._bus.process_data.counters
+        frames = range(len(self._bus.process_data.inputs))
+        self.alive_wkc = [sum(counters[number][which] for number in alive) for which in frames]
         self.all_lost = not alive
         self._bus.be_patient(self.all_lost)
 

@@ -1,85 +1,89 @@
 """Follows a sensor's own sampling clock, so that a poll falls right after each sample came to be.
 
-The sensor samples freely; an exchange only tells whether the process data changed since the one before. The
-change then happened after the earlier exchange was sent and before the later one was back: a bracket that
-is valid however late either of them was. Brackets of successive samples, moved on by the period, are
-intersected; what remains is where the next sample is expected. A poll is aimed just after that instant. If it
-sees the change it was late, and bounds the instant from above; if it does not it was early, bounds it from
-below, and a second one follows at once: a single-gate early-late tracker. As the bounds are let
-grow, the poll creeps earlier until it is early once in a while, so it stays at the edge. Stalls and lost
-frames only make a bracket wide: they teach nothing wrong.
+The sensor samples freely; an exchange only tells whether its process data changed since the one before: one
+bit. The model is a crystal's: samples come to be at phase + k * period, the period constant but for a slow
+wander. The estimate is a Kalman filter's (phase, period and their covariance) whose measurements are those
+bits, each taken for the sign of a normally distributed difference. docs/sample-clock.md derives it.
+
+What is not known well, because a frame was lost or the machine stood still, leaves the estimate as it is:
+it holds over, and its uncertainty grows at the rate at which crystals wander.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
+from ethercat_server.ethercat.exchange_timing import ExchangeTiming
+
+_ROOT_2_PI: Final = math.sqrt(2 * math.pi)
+_ROOT_HALF: Final = math.sqrt(0.5)
+_LOCKED: Final = 0.125
+"""The clock is followed while the phase is known to this part of a period (standard deviation)."""
 _POLLS_UNLOCKED: Final = 4
-"""Exchanges a sample while the clock is unknown."""
+"""Exchanges a sample while it is not."""
 _SEARCH_STEPS: Final = 8
 """Exchanges a sample once one is overdue."""
-_NARROW: Final = 0.4
-"""A bracket narrower than this part of a period contains one instant for certain."""
-_WATCHED: Final = 0.9
-"""A bracket narrower than this many periods begins with a poll that was early."""
-_UNDISTURBED: Final = 1.25
-"""A bracket wider than this many periods comes from a stall."""
-_NEAR_TO_LOCK: Final = 0.03
-_NEAR_TO_HOLD: Final = 0.08
-"""A sample is as expected when it moves the estimate by less than this part of a period."""
-_SLACK_NS: Final = 500.0
-"""How far a period may differ from the estimate: the expected bracket grows by this at each end."""
-_SILENT: Final = 8
-"""A sensor that has given nothing new for this many periods is no longer followed."""
-AIM_NS: Final = 25_000.0
-"""Delay of a poll after the expected instant: about the jitter of wake-ups."""
-_EARLY_NS: Final = 50_000.0
-"""A poll this much before its aim was another sensor's, and is not counted as this one's first."""
-_FLIGHT_GAIN: Final = 1 / 64
-_HALF: Final = 0.45
-_SURELY_ONE: Final = 0.8
-"""Only one sample can have come in this part of a period, even if the bracket is somewhat off."""
-_UNEVEN: Final = 0.2
-"""Exchanges that take so much longer than the shortest on average do not say when a sample came to be."""
-_LONGEST_LOOK: Final = 0.5
-"""The sensor looks at its data within this part of a period after the frame was sent."""
-_CREEP_NS: Final = 150.0
-_MAX_CREEP: Final = 0.2
-_MIN_WIDTH_NS: Final = 10_000.0
-_PHASE_GAIN: Final = 0.5
-_PERIOD_GAIN: Final = 0.03
-_PERIOD_GAIN_LEAST: Final = 0.001
-_PERIOD_LEARNING: Final = 200
-"""Samples after which the gain has come down by half."""
-_MAX_PULL: Final = 0.12
+_JITTER_NS: Final = 30.0
+"""How much each period of a crystal differs from the one before, at most."""
+_WANDER: Final = 3e-9
+"""By what part of it the period changes from sample to sample: 1 ppm in a minute at 1600 Hz."""
+_LEAST_LOOK_VARIANCE: Final = 2_000.0**2
+_WRONG: Final = 0.005
+"""Chance that a bit says nothing: it came from a stall, or was another sample's."""
+_MOST_RESTLESS: Final = math.log(1e7)
+_RESTLESS_GAIN: Final = 0.05
+_RESTLESS_STEP: Final = 0.2
+_UNLIKELY_RUN: Final = 7.0
+"""Polls in a row that were all late have this negative log-likelihood: about one in a thousand."""
+_CONTRADICTS: Final = 3.0
+"""A measurement further out than so many standard deviations contradicts the model."""
+_CONTRADICTIONS: Final = 4
+"""So many in a row mean that the sensor's clock started anew."""
+_CERTAIN: Final = 5.0
+"""Beyond so many standard deviations a bit that is as expected teaches nothing."""
+_UNKNOWN_PHASE: Final = 0.3
+"""Standard deviation of a phase of which nothing is known, in periods: 1/sqrt(12)."""
+_FIRST_PULL: Final = 0.001
+_MOST_PULL: Final = 0.03
+"""Standard deviation of the period at first, and after contradictions, as part of it."""
+_LARGEST_PULL: Final = 0.12
 """The period may differ from the nominal one by this part. Oscillators are off by 0.0005 at most, but a
 simulated sensor that sleeps between its samples is slower by much more."""
 PLAUSIBLE_PULL: Final = 0.002
 """A real sensor's period differs from the nominal one by less than this part."""
-_MAX_ERROR: Final = 0.1
-"""The period learns nothing from what a phase is off by more than this part of it."""
-_LOCK_GAIN: Final = 1 / 32
-_LOCK_AT: Final = 0.85
-_UNLOCK_AT: Final = 0.6
+_PRICE_NS: Final = 50_000.0
+"""Age that is given up to save an exchange."""
+_LOSS_PERIODS: Final = 10.0
+"""Age that is given up to lose no sample, in periods, where there is no time for a second poll."""
+_NO_TIME: Final = 0.5
+"""There is none if a round trip takes more than this part of a period."""
+_LARGEST_MARGIN: Final = 0.4
+_LONGEST_LOOK: Final = 0.5
+"""The sensor looks at its data within this part of a period after the frame usually has reached it."""
+_ONE_ONLY: Final = 0.8
+"""Only one sample can have come in this part of a period."""
 
 
 class SampleClock:
     """The sampling clock of one sensor, as far as the exchanges have shown it. Times are CLOCK_MONOTONIC ns.
 
     Call `observe` after every valid exchange, before it `predict` if that brought a new sample; ask
-    `next_poll_ns` when the next exchange is wanted.
+    `next_poll_ns` when the next exchange is wanted. Exchanges come in the order in which they were sent.
     """
 
     __slots__ = (
-        "_doubtful", "_flight_ns", "_high", "_hits", "_learned", "_least_flight_ns", "_low",
-        "_nominal_ns", "_polled_ns", "_quality", "_tried_ns", "instant_ns", "locked", "period_ns", "steps",
-        "uncertain",
+        "_absent", "_aim_ns", "_begun", "_contradictions", "_covariance", "_doubtful", "_jitter", "_looked_ns",
+        "_margin_ns", "_newest", "_nominal_ns", "_overdue", "_period_variance", "_phase_ns", "_phase_variance",
+        "_probing", "_pull", "_restless", "_run", "_single", "_timing", "_wander", "instant_ns", "locked",
+        "period_ns", "quiet_until_ns", "steps", "uncertain",
     )  # fmt: skip
 
-    def __init__(self, period_ns: float, start_ns: int = 0) -> None:
-        """`period_ns` is the nominal sample period; the first poll is due soon after `start_ns`."""
+    def __init__(self, period_ns: float, timing: ExchangeTiming) -> None:
+        """`period_ns` is the nominal sample period."""
         self._nominal_ns = period_ns
         self.period_ns = period_ns
+        self._timing = timing
         self.locked = False
         self.instant_ns = 0.0
         """Estimated instant of the newest sample, from those before it."""
@@ -87,30 +91,47 @@ class SampleClock:
         """How many samples the newest one is after the one handed out before it: more than 1, some were
         lost; 0, one was counted as lost that was not."""
         self.uncertain = False
-        """Whether more may have been lost than `steps` says: the sensor may have looked at its data early or
-        late in a slow exchange. The samples after it tell, and their `steps` put it right."""
-        self._doubtful = False
-        """Whether the bracket may be another sample's: one was `uncertain`, or a frame was lost before the
-        rate was known, and no sample was watched since."""
-        self._quality = 0.0
-        self._learned = 0
-        self._hits = 0
-        """Samples in a row that the first poll saw."""
-        self._polled_ns = start_ns
+        """Whether more may have been lost than `steps` says. The samples after it tell, and their `steps` put
+        it right."""
+        self.quiet_until_ns = 0.0
+        """An exchange that is back before this has certainly nothing new."""
+        self._phase_ns = 0.0
+        """When the next sample comes to be, less the outward part of the shortest round trip."""
+        self._phase_variance = (_UNKNOWN_PHASE * period_ns) ** 2
+        self._covariance = 0.0
+        self._period_variance = (_FIRST_PULL * period_ns) ** 2
+        self._pull = _FIRST_PULL
+        self._restless = 0.0
+        """Logarithm of how much more the clock wanders than a crystal: a program that sleeps does."""
+        self._jitter = _JITTER_NS**2
+        self._wander = (_WANDER * period_ns) ** 2
+        """Variances that phase and period gain with each sample."""
+        self._looked_ns = 0
         """When the last valid exchange was sent."""
-        self._tried_ns = start_ns
-        """When the last exchange was sent, valid or not."""
-        self._flight_ns = 0.0
-        """How long an exchange usually takes."""
-        self._least_flight_ns = period_ns
-        """How long the shortest took: half of it is the least a frame needs to the slave or back."""
-        self._low = self._high = 0.0
-        """Bracket in which the next sample is expected."""
+        self._newest = 1
+        """Number of the newest sample, counted from the one handed out before it by the phase alone."""
+        self._absent = 0
+        """Samples that were watched for and did not come."""
+        self._begun = False
+        """Whether a sample was seen coming."""
+        self._doubtful = False
+        """Whether the sample before was `uncertain`."""
+        self._overdue = False
+        self._run = 0.0
+        self._contradictions = 0
+        self._single = True
+        """Whether there is no time for a second poll of a sample."""
+        self._probing = False
+        """Whether the phase is known worse than polls can tell it."""
+        self._margin_ns = 0.0
+        self._aim_ns = 0.0
+        """When the next poll should be sent."""
+        self._settle()
 
     @property
     def uncertainty_ns(self) -> float:
-        """Half the width of the bracket that the newest sample's instant was estimated from."""
-        return (self._high - self._low) / 2 - _SLACK_NS
+        """How far `instant_ns` may be off: two standard deviations, and where the slave is on the way."""
+        return 2 * math.sqrt(self._phase_variance) + self._timing.least_ns / 2
 
     @property
     def pull(self) -> float:
@@ -126,132 +147,212 @@ class SampleClock:
             "uncertainty_us": round(self.uncertainty_ns / 1000, 1) if self.locked else None,
         }
 
+    # -- when to poll
+
     def next_poll_ns(self) -> float:
         """When the next exchange should be sent, as far as this sensor is concerned."""
-        tried_ns = self._tried_ns
+        timing, aim_ns, period_ns = self._timing, self._aim_ns, self.period_ns
+        sent_ns = timing.sent_ns
         if not self.locked:
-            return tried_ns + self.period_ns / _POLLS_UNLOCKED
-        # So that the sensor, half-way through the exchange, looks at its data just after the instant.
-        # Polls that only ever see the change do not say how late they are: with each in a row the next is
-        # aimed earlier by more, until one is early and bounds the instant from below again.
-        creep_ns = min(_CREEP_NS * self._hits * self._hits, _MAX_CREEP * self.period_ns)
-        first = (self._low + self._high - self._flight_ns) / 2 + AIM_NS - creep_ns
-        if self._doubtful:
-            first = self._low - self._flight_ns  # early for certain: then the next sample is watched coming
-        if tried_ns < first - _EARLY_NS:
-            return first
-        if tried_ns < self._high:
-            return tried_ns  # it was early: again, at once
-        overdue = tried_ns > self._high + self.period_ns
-        return tried_ns + self.period_ns / (_POLLS_UNLOCKED if overdue else _SEARCH_STEPS)
+            return sent_ns + period_ns / _POLLS_UNLOCKED
+        if self._single:
+            # The polls that are on their way are for the samples before: the first that has none is next.
+            guard_ns = self._margin_ns / 2
+            ahead_ns = max(0, int((sent_ns - aim_ns + guard_ns) // period_ns) + 1) * period_ns
+            probe_ns = self._phase_ns - timing.look_ns + ahead_ns
+            if self._probing and probe_ns > sent_ns + guard_ns:
+                return probe_ns
+            return aim_ns + ahead_ns
+        if timing.in_flight:
+            return max(aim_ns, sent_ns + timing.patience_ns)
+        if sent_ns < aim_ns:
+            return aim_ns
+        # It was early: again, at once, or in steps if the sample is overdue.
+        return sent_ns + period_ns / _SEARCH_STEPS if self._overdue else sent_ns
 
-    def predict(self, sent_ns: int, received_ns: int) -> None:
+    def _settle(self) -> None:
+        """Derive from the estimate what the next poll needs."""
+        timing, period_ns = self._timing, self.period_ns
+        self.locked = self._begun and self._phase_variance < (_LOCKED * period_ns) ** 2
+        self._single = timing.usual_ns > _NO_TIME * period_ns
+        self._margin_ns = margin_ns(timing, period_ns, self._phase_variance)
+        self._aim_ns = self._phase_ns + self._margin_ns - timing.look_ns
+        self._probing = self._phase_variance > (timing.look_variance + 6 * _LEAST_LOOK_VARIANCE) / 4
+        self.quiet_until_ns = (
+            self._phase_ns - _CERTAIN * math.sqrt(self._phase_variance) if self.locked else 0.0
+        )
+
+    # -- what an exchange says
+
+    def predict(self, sent_ns: int, back_ns: int) -> None:
         """Say of the new sample that an exchange brought what can be said before learning from it.
 
-        Sets `steps`, `uncertain` and `instant_ns`, and nothing else.
+        Sets `steps`, `uncertain` and `instant_ns`.
         """
-        after, period = self._polled_ns, self.period_ns
-        unwatched = received_ns - after
-        if self._begins_anew(after):
+        period_ns, looked_ns, least_ns = self.period_ns, self._looked_ns, self._timing.least_ns
+        unwatched_ns = back_ns - looked_ns
+        if not self._begun:
+            self._newest = 1
             # Only what fell into the time the sensor was not watched can have been lost.
-            self.steps = 1 + int(unwatched // period)
-            self.uncertain = unwatched >= period
-            self.instant_ns = min(received_ns, sent_ns + period) - min(unwatched, period) / 2
+            self.steps = 1 + int(unwatched_ns // period_ns)
+            self.uncertain = unwatched_ns >= period_ns
+            self.instant_ns = min(back_ns, sent_ns + period_ns) - min(unwatched_ns, period_ns) / 2
             return
-        expected = (self._low + self._high) / 2
-        # What makes an exchange longer than the shortest may be before the sensor looks at its data or after.
-        looking = _HALF * self._least_flight_ns
-        if unwatched < _NARROW * period:
-            self.steps = max(0, 1 + round(((after + received_ns) / 2 - expected) / period))
-        elif self._doubtful and self.locked and received_ns - looking < self._low - _NEAR_TO_HOLD * period:
-            self.steps = 0  # too early for the next one: what was uncertain was the one before it
+        excess_ns = max(0.0, back_ns - sent_ns - least_ns)
+        # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought is
+        # dated from before, never as younger than it may be.
+        late = (sent_ns + min(excess_ns / 2, _LONGEST_LOOK * period_ns) - self._phase_ns) / period_ns
+        newest = 1 + math.floor(late)
+        self.uncertain = False
+        if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
+            newest = min(newest, 1)
         else:
-            # Several samples may lie in a wide bracket: the newest is the last one due before the exchange.
-            # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought
-            # is dated from before, never as younger than it may be.
-            into = min((received_ns - sent_ns) / 2, _LONGEST_LOOK * period)
-            self.steps = max(1, 1 + int((sent_ns + into - expected) // period))
-        self.uncertain = unwatched - 2 * looking >= period and (
-            not self._trusted
-            or received_ns - looking - self._low >= _SURELY_ONE * period
-            or received_ns - sent_ns - self._least_flight_ns > _LONGEST_LOOK * period
-        )
-        self.instant_ns = min(max(expected + (self.steps - 1) * period, after), received_ns)
+            doubt_ns = _CONTRADICTS * math.sqrt(self._phase_variance)
+            least = math.floor((sent_ns - self._phase_ns - doubt_ns) / period_ns)
+            most = math.floor((sent_ns + excess_ns - self._phase_ns + doubt_ns) / period_ns)
+            self.uncertain = self._doubtful or (most > 0 and least < most)
+        if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
+            newest = 0 if self._doubtful and late < -0.5 else 1
+        self._newest = newest
+        self.steps = max(0, newest - self._absent)
+        instant_ns = self._phase_ns + (newest - 1) * period_ns
+        self.instant_ns = min(max(instant_ns, looked_ns) + least_ns / 2, back_ns)
 
-    @property
-    def _trusted(self) -> bool:
-        """Whether the next sample comes to be within the bracket for certain."""
-        uneven_ns = self._flight_ns - self._least_flight_ns
-        return self.locked and not self._doubtful and uneven_ns < _UNEVEN * self.period_ns
-
-    def _begins_anew(self, after: int) -> bool:
-        """Whether nothing was expected, or the sensor was watched and silent for longer than a period."""
-        return self._high == 0.0 or after > self._high + self.period_ns
-
-    def observe(self, sent_ns: int, received_ns: int, fresh: bool) -> None:
+    def observe(self, sent_ns: int, back_ns: int, fresh: bool) -> None:
         """Learn from one valid exchange whether it brought a new sample (`fresh`: after `predict`)."""
-        took_ns = min(received_ns - sent_ns, self.period_ns)
-        self._flight_ns += _FLIGHT_GAIN * (took_ns - self._flight_ns)
-        self._least_flight_ns = min(self._least_flight_ns, took_ns)
-        if not fresh:
-            self._polled_ns = self._tried_ns = sent_ns
-            if self.locked and sent_ns > self._high + _SILENT * self.period_ns:
-                self.restart()
-            return
-        after, self._polled_ns, self._tried_ns = self._polled_ns, sent_ns, sent_ns
-        watched = received_ns - after < _WATCHED * self.period_ns
-        self._doubtful = self.uncertain or (self._doubtful and not watched)
-        if self._begins_anew(after):
-            self._low, self._high = max(after, received_ns - self.period_ns), float(received_ns)
-            self._expect_next()
-            return
-        self._hits = 0 if watched else self._hits + 1
-        moved = (self.steps - 1) * self.period_ns
-        low, high = self._low + moved, self._high + moved
-        believed = (low + high) / 2
-        if after > high:  # the sample came later than was thought possible
-            self._low, self._high = low + _PHASE_GAIN * (after - high), high + _PHASE_GAIN * (after - high)
-        elif received_ns < low:  # earlier
-            self._low = low - _PHASE_GAIN * (low - received_ns)
-            self._high = high - _PHASE_GAIN * (low - received_ns)
+        look_ns, variance = self._timing.look(sent_ns, back_ns)
+        variance += _LEAST_LOOK_VARIANCE
+        looked_ns, self._looked_ns = self._looked_ns, sent_ns
+        if not self._begun:
+            # The first exchange brings what was there before: it has no instant.
+            if fresh and looked_ns:
+                self._begun = True
+                self._begin(max(looked_ns, look_ns - self.period_ns), look_ns)
+        elif fresh:
+            self._advance(self._newest - 1)
+            if self.uncertain:
+                pass  # it may be another sample's
+            elif self.locked:
+                self._learn_bit(look_ns, variance, 1)
+            elif look_ns - looked_ns < self.period_ns:
+                self._learn_bracket(looked_ns, look_ns, variance)
+            self._doubtful = self.uncertain
+            self._advance(1)
+            self._absent = 0
+            self._overdue = False
         else:
-            self._low, self._high = max(low, after), min(high, received_ns)
-        error = (self._low + self._high) / 2 - believed
-        undisturbed = received_ns - after < _UNDISTURBED * self.period_ns
-        if undisturbed:
-            self._learn_period(error)
-        near = _NEAR_TO_HOLD if self.locked else _NEAR_TO_LOCK
-        self._judge(undisturbed and abs(error) < near * self.period_ns)
-        self._expect_next()
+            while sent_ns > self._phase_ns + self.period_ns + _CONTRADICTS * math.sqrt(self._phase_variance):
+                self._advance(1)
+                self._absent += 1
+            self._overdue = look_ns > self._phase_ns + 2 * math.sqrt(self._phase_variance + variance)
+            if self.locked:
+                self._learn_bit(look_ns, variance, -1)
+        self._settle()
 
-    def missed(self, sent_ns: int) -> None:
-        """An exchange brought nothing valid: nothing is learned from it, but the next poll counts from it."""
-        self._tried_ns = sent_ns
-        self._doubtful |= self._learned < _PERIOD_LEARNING  # the rate is not known well enough to bridge it
+    def _begin(self, low_ns: float, high_ns: float) -> None:
+        self._phase_ns = (low_ns + high_ns) / 2
+        self._phase_variance = (high_ns - low_ns) ** 2 / 12
+        self._covariance = 0.0
+        self._advance(1)
 
-    def restart(self) -> None:
-        """The sensor's clock starts again (its power was cut, say): keep only what is known of its rate."""
-        self.locked = False
-        self._quality = 0.0
-        self._low = self._high = 0.0
+    def _advance(self, samples: int) -> None:
+        """Expect a later sample (an earlier one if negative)."""
+        many = abs(samples)
+        self._phase_ns += samples * self.period_ns
+        self._phase_variance += (
+            2 * samples * self._covariance + samples * samples * self._period_variance + many * self._jitter
+        )
+        self._covariance += samples * self._period_variance
+        self._period_variance += many * self._wander
+        self._keep_in_bounds()
 
-    def _learn_period(self, error_ns: float) -> None:
-        pull, most = _MAX_PULL * self._nominal_ns, _MAX_ERROR * self._nominal_ns
-        # Quickly while little is known, then ever more steadily.
-        self._learned += 1
-        gain = max(_PERIOD_GAIN_LEAST, _PERIOD_GAIN / (1 + self._learned / _PERIOD_LEARNING))
-        period = self.period_ns + gain * max(-most, min(most, error_ns))
-        self.period_ns = max(self._nominal_ns - pull, min(self._nominal_ns + pull, period))
+    def _keep_in_bounds(self) -> None:
+        most = (_UNKNOWN_PHASE * self.period_ns) ** 2
+        if self._phase_variance > most:
+            self._covariance *= math.sqrt(most / self._phase_variance)
+            self._phase_variance = most
+        most = (self._pull * self.period_ns) ** 2
+        if self._period_variance > most:
+            self._covariance *= math.sqrt(most / self._period_variance)
+            self._period_variance = most
 
-    def _judge(self, as_expected: bool) -> None:
-        self._quality += _LOCK_GAIN * (as_expected - self._quality)
-        if self.locked:
-            self.locked = self._quality > _UNLOCK_AT
+    def _learn_bracket(self, low_ns: float, high_ns: float, variance: float) -> None:
+        """While little is known: the sample came to be between these two, anywhere."""
+        variance += (high_ns - low_ns) ** 2 / 12
+        error_ns = (low_ns + high_ns) / 2 - self._phase_ns
+        total = self._phase_variance + variance
+        if error_ns * error_ns > _CONTRADICTS * _CONTRADICTS * total:
+            if self._contradicted():
+                self._phase_ns += error_ns
+                self._phase_variance = variance
+            return
+        self._contradictions = 0
+        self._move(error_ns / total)
+        self._narrow(1 / total)
+
+    def _learn_bit(self, look_ns: float, variance: float, sign: int) -> None:
+        """The sample had come to be at the look (`sign` 1), or had not (-1)."""
+        deviation_ns = math.sqrt(self._phase_variance + variance)
+        late = (look_ns - self._phase_ns) / deviation_ns
+        if sign * late > _CERTAIN:
+            self._contradictions = 0
+            return
+        if sign * late > -_CONTRADICTS:
+            self._contradictions = 0
+        elif self._contradicted():
+            return
+        late = max(-8.0, min(8.0, late))
+        chance = _WRONG + (0.5 - _WRONG) * math.erfc(-sign * late * _ROOT_HALF)
+        slope = (1 - 2 * _WRONG) * sign * math.exp(-late * late / 2) / (_ROOT_2_PI * chance * deviation_ns)
+        self._move(-slope)
+        surprise = -math.log(chance)
+        excess = surprise * (1 - chance) + (1 - chance) * math.log(1 - chance)
+        if sign > 0 and late > 0:
+            # That a poll was late says nothing of how late: it pulls, but makes nothing more certain.
+            self._run += surprise
+            if self._run > _UNLIKELY_RUN:
+                self._restless += _RESTLESS_STEP
         else:
-            self.locked = self._quality > _LOCK_AT
+            self._run = 0.0
+            self._narrow(slope * slope + slope * late / deviation_ns)
+        self._restless = min(max(self._restless + _RESTLESS_GAIN * excess, 0.0), _MOST_RESTLESS)
+        times = math.exp(self._restless)
+        self._jitter = times * _JITTER_NS**2
+        self._wander = times * (_WANDER * self._nominal_ns) ** 2
 
-    def _expect_next(self) -> None:
-        middle, half = (self._low + self._high) / 2, (self._high - self._low) / 2
-        half = max(half, _MIN_WIDTH_NS / 2) + _SLACK_NS
-        self._low = middle + self.period_ns - half
-        self._high = middle + self.period_ns + half
+    def _move(self, weight: float) -> None:
+        self._phase_ns += self._phase_variance * weight
+        period_ns, most = self.period_ns + self._covariance * weight, _LARGEST_PULL * self._nominal_ns
+        self.period_ns = min(max(period_ns, self._nominal_ns - most), self._nominal_ns + most)
+
+    def _narrow(self, information: float) -> None:
+        self._period_variance -= self._covariance * self._covariance * information
+        self._covariance -= self._phase_variance * self._covariance * information
+        self._phase_variance -= self._phase_variance * self._phase_variance * information
+
+    def _contradicted(self) -> bool:
+        """Something did not fit; whether that happened so often that the clock is unknown from here on."""
+        self._contradictions += 1
+        if self._contradictions < _CONTRADICTIONS:
+            return False
+        self._contradictions = 0
+        self._pull = min(2 * self._pull, _MOST_PULL)
+        self._phase_variance = (_UNKNOWN_PHASE * self.period_ns) ** 2
+        self._covariance = 0.0
+        self._period_variance = max(self._period_variance, (self._pull * self.period_ns) ** 2)
+        return True
+
+
+def margin_ns(timing: ExchangeTiming, period_ns: float, phase_variance: float) -> float:
+    """How long after the expected instant a poll should look, so that samples are youngest on the whole.
+
+    An early look costs a second exchange, or the sample where there is no time for one. The margin is where
+    a little more of it costs as much as it saves: where the density of the look's instant is 1 / cost.
+    """
+    single = timing.usual_ns > _NO_TIME * period_ns
+    cost_ns = _LOSS_PERIODS * period_ns if single else timing.usual_ns + _PRICE_NS
+    deviation_ns = math.sqrt(phase_variance + timing.variance)
+    ratio = cost_ns / (deviation_ns * _ROOT_2_PI)
+    return min(
+        deviation_ns * math.sqrt(2 * math.log(ratio)) if ratio > 1 else 0.0, _LARGEST_MARGIN * period_ns
+    )

@@ -2,13 +2,15 @@
 
 A frame exists for every new sample. While the sensor is silent there is one REPEATED (or INVALID)
 frame for each sample period that passes, so that its silence is visible; the polls in between samples, which
-find the same data again only because the bus is read more often than the sensor samples, make none.
+find the same data again only because the bus is read more often than the sensor samples, make none. An answer
+that was overtaken by a later one is no news.
 """
 
 from __future__ import annotations
 
 from typing import Any, Final
 
+from ethercat_server.ethercat.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.health.samples import SampleHealth
 from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.sample_clock import SampleClock
@@ -27,10 +29,13 @@ REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INV
 class SensorStream:
     """Numbers, stamps and marks the frames of the sensor `number`, which samples every `period_ns`."""
 
-    def __init__(self, number: int, period_ns: float, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(
+        self, number: int, period_ns: float, timing: ExchangeTiming, clock: Clock = SYSTEM_CLOCK
+    ) -> None:
         self.number = number
         self._monotonic_ns, self._time_ns = clock.monotonic_ns, clock.time_ns
-        self.clock = SampleClock(period_ns, clock.monotonic_ns())
+        self._timing = timing
+        self.clock = SampleClock(period_ns, timing)
         self.process_data = b""
         """The newest valid process data."""
         self._handed_out = b""
@@ -38,7 +43,7 @@ class SensorStream:
         self.sequence = 0
         self.fresh = 0
         self.repeated = 0
-        self.invalid = 0
+        self.invalid_frames = 0
         self.lost_samples = 0
         self.recoveries = 0
         self.age = RecentDistribution()
@@ -46,69 +51,91 @@ class SensorStream:
         self.health = SampleHealth(number)
         self._discard = DISCARDED_AT_START
         self._gap = False
-        self._seen = (0, 0, False, False)
-        """The last exchange, as `learn` needs it: sent, back, valid, fresh."""
+        self._learns = False
+        """Whether `learn` has something to do."""
+        self._seen = (0, 0, False)
+        """The last exchange, as `learn` needs it: sent, back, fresh."""
+        self._wkc = self._short_wkc = 0
+        """Working counters of the last valid exchange, and of one since then that was not; 0 for none."""
         self._valid_ns = 0
+        """When the last valid exchange was back."""
         self._moment_ns = 0
         """Of the newest sample."""
-        self._idle_at_ns = 0.0
+        self.idle_at_ns = 0.0
+        """`idle` is to be called from then on."""
 
-    def take(
-        self, data: bytes, wkc: int, valid: bool, sent_ns: int, back_ns: int
-    ) -> tuple[bytes, int] | None:
-        """The frame that an exchange gives, and its flags; None if it gives none. `learn` must follow.
+    def take(self, data: bytes, wkc: int, sent_ns: int, back_ns: int) -> tuple[bytes, int] | None:
+        """The frame that a valid exchange gives, and its flags; None if it gives none. `learn` must follow.
 
         `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the exchange.
         """
         clock = self.clock
-        moment_ns = back_ns
-        fresh = valid and data != self.process_data
-        self._seen = sent_ns, back_ns, valid, fresh
-        if valid:
-            self._valid_ns = back_ns
-        if fresh:
-            self.process_data = data
-            clock.predict(sent_ns, back_ns)
-            if self._discard:
-                self._discard -= 1
-                self._idle_at_ns = back_ns + _IDLE_PERIODS * clock.period_ns
-                return None
-            self._handed_out = data
-            flags = self._new_sample(back_ns)
-            # After a stall in the exchange its end says nothing of when the sample came to be.
-            moment_ns = int(clock.instant_ns if clock.locked else min(back_ns, sent_ns + clock.period_ns))
-            if moment_ns <= self._moment_ns:  # the one before was dated too young
-                moment_ns = self._moment_ns + 1
-            self._moment_ns = moment_ns
-        elif back_ns >= self._idle_at_ns and self.process_data:
-            self._discard = 0  # a sensor that is stuck from the start is to be seen too
-            self._handed_out = self._handed_out or self.process_data
-            # One lost frame is no news: INVALID is what nothing valid came for in two periods.
-            flags = self._nothing_new(back_ns - self._valid_ns < 2 * clock.period_ns, back_ns)
-        else:
+        if sent_ns < self._seen[0]:  # overtaken
             return None
-        stamp_ns = self._time_ns() - (self._monotonic_ns() - moment_ns)
-        sequence = self.sequence
-        self.sequence += 1
-        return encode_data(
-            sequence, stamp_ns, moment_ns, self.number, flags, max(wkc, 0), self._handed_out
-        ), flags  # fmt: skip
+        fresh = data != self.process_data
+        self._seen = sent_ns, back_ns, fresh
+        self._wkc, self._valid_ns = wkc, back_ns
+        self._learns = True
+        if not fresh:
+            return None
+        self.process_data = data
+        clock.predict(sent_ns, back_ns)
+        self.idle_at_ns = back_ns + _IDLE_PERIODS * clock.period_ns
+        if self._discard:
+            self._discard -= 1
+            return None
+        self._handed_out = data
+        flags = self._new_sample()
+        # After a stall in the exchange its end says nothing of when the sample came to be.
+        moment_ns = int(clock.instant_ns if clock.locked else min(back_ns, sent_ns + clock.period_ns))
+        if moment_ns <= self._moment_ns:  # the one before was dated too young
+            moment_ns = self._moment_ns + 1
+        self._moment_ns = moment_ns
+        return self._frame(moment_ns, flags, wkc)
 
     def learn(self) -> None:
         """What the last exchange teaches, which can wait until its frame is on its way."""
-        sent_ns, back_ns, valid, fresh = self._seen
-        if not valid:
-            self.clock.missed(sent_ns)
+        if not self._learns:
             return
+        self._learns = False
+        sent_ns, back_ns, fresh = self._seen
         locked = self.clock.locked
         self.clock.observe(sent_ns, back_ns, fresh)
-        if fresh and locked:
-            self.age.record(back_ns - int(self.clock.instant_ns))
-        if fresh and self._handed_out is self.process_data and not is_finite(self.process_data):
-            self.health.not_finite += 1
+        if fresh:
+            if locked:
+                self.age.record(back_ns - int(self.clock.instant_ns))
+            if self._handed_out is self.process_data and not is_finite(self.process_data):
+                self.health.not_finite += 1
 
-    def _new_sample(self, now_ns: int) -> int:
-        self._idle_at_ns = now_ns + _IDLE_PERIODS * self.clock.period_ns
+    def invalid(self, wkc: int) -> None:
+        """An exchange brought nothing of this sensor."""
+        self._short_wkc = wkc
+
+    def idle(self, now_ns: int) -> tuple[bytes, int] | None:
+        """The frame that shows the sensor's silence, and its flags; None before its first sample."""
+        if not self.process_data:
+            return None
+        self._discard = 0  # a sensor that is stuck from the start is to be seen too
+        self._handed_out = self._handed_out or self.process_data
+        period_ns = self.clock.period_ns
+        # The next slot is counted from this one, but a stall makes one frame, not a burst.
+        self.idle_at_ns = max(self.idle_at_ns + period_ns, float(now_ns))
+        # One lost frame is no news: INVALID is what nothing valid came for in two periods.
+        if now_ns - self._valid_ns < max(2 * period_ns, self._timing.patience_ns):
+            self.repeated += 1
+            return self._frame(now_ns, REPEATED, self._wkc)
+        self.invalid_frames += 1
+        wkc, self._short_wkc = self._short_wkc, 0
+        return self._frame(now_ns, INVALID, wkc)
+
+    def _frame(self, moment_ns: int, flags: int, wkc: int) -> tuple[bytes, int]:
+        stamp_ns = self._time_ns() - (self._monotonic_ns() - moment_ns)
+        sequence = self.sequence
+        self.sequence += 1
+        made = encode_data(sequence, stamp_ns, moment_ns, self.number, flags, wkc, self._handed_out)
+        return made, flags
+
+    def _new_sample(self) -> int:
         self.fresh += 1
         lost = self.clock.steps - 1 if self.sequence else 0
         # -1 takes back one that was counted after a stall but came after all.
@@ -116,15 +143,6 @@ class SensorStream:
         flags = GAP if lost > 0 or self.clock.uncertain or self._gap else 0
         self._gap = False
         return flags
-
-    def _nothing_new(self, valid: bool, now_ns: int) -> int:
-        # The next slot is counted from this one, but a stall makes one frame, not a burst.
-        self._idle_at_ns = max(self._idle_at_ns + self.clock.period_ns, float(now_ns))
-        if valid:
-            self.repeated += 1
-            return REPEATED
-        self.invalid += 1
-        return INVALID
 
     def check(self) -> None:
         """To be called once a second: log what the samples show of the sensor."""
@@ -134,7 +152,7 @@ class SensorStream:
         """The sensor is back after it was out; `period_ns` if it entered OP anew, None if it never left."""
         self.recoveries += lost
         if period_ns is not None:
-            self.clock = SampleClock(period_ns, self._monotonic_ns())
+            self.clock = SampleClock(period_ns, self._timing)
             self._discard = DISCARDED_AT_START
             self._gap = True
 
@@ -144,7 +162,7 @@ class SensorStream:
             "sensor": self.number,
             "fresh": self.fresh,
             "repeated": self.repeated,
-            "invalid": self.invalid,
+            "invalid": self.invalid_frames,
             "lost_samples": self.lost_samples,
             "not_finite": self.health.not_finite,
             "recoveries": self.recoveries,

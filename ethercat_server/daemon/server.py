@@ -54,7 +54,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         _give_up_root(user, options)
         policy.apply(hub)
         sensors, slaves = bring_up(bus, options, signals.check)
-        streams = [SensorStream(sensor.number, sensor.period_ns) for sensor in sensors]
+        streams = [SensorStream(sensor.number, sensor.period_ns, bus.timing) for sensor in sensors]
         others = Others(bus, slaves)
         recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast, others), Jobs(bus, sensors)
         cycle = Cycle(bus, sensors, streams, hub, recovery, jobs, notifier)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from ethercat_server.acquisition.sample_clock import AIM_NS
 from ethercat_server.doctor.bus.measurement import PERIOD_NS, Measured, summary_us
 from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, skipped, warning
 
@@ -19,9 +18,7 @@ _TIMEOUT_NS: Final = 0.75 * PERIOD_NS
 """Timeout of the server for a frame."""
 _MANY: Final = 0.001
 """Fraction of all cycles above which late or lost ones are `bad`."""
-FORMULA: Final = (
-    f"age = max(0, {AIM_NS / 1000:.0f} µs + lateness - its median + (exchange - its mean) / 2) + exchange / 2"
-)
+FORMULA: Final = "age = max(0, margin + lateness - its median + (exchange - its mean) / 2) + exchange / 2, margin {:.0f} µs"
 _STEADIER: Final = "see 'A steadier cycle' in docs/operations.md"
 
 
@@ -128,7 +125,9 @@ def age(measured: Measured) -> Iterator[Finding]:
     if not handed_out:
         yield skipped("it requires exchanges on the bus")
         return
-    yield age_finding("expected when sent", summary_us(handed_out), FORMULA)
+    yield age_finding(
+        "expected when sent", summary_us(handed_out), FORMULA.format(measured.margin_ns() / 1000)
+    )
     if arrived:
         yield age_finding("expected at a local client", summary_us(arrived), "the same + message")
 

@@ -6,23 +6,21 @@ is never taken for another one's answer.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Final
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.late_answers import LateAnswers
-from ethercat_server.ethercat.wire import FIRST_DATA, Command, build, is_answer
+from ethercat_server.ethercat.wire import FIRST_DATA, SHORTEST_FRAME, Command, build, is_answer
 
-FIRST_INDEX: Final = 0x80
-"""SOEM uses the indices below."""
-SHORTEST_FRAME: Final = 60
+_FIRST_INDEX: Final = 0x80
+"""SOEM uses the indices below, and the exchange of process data those from `process_data.FIRST_INDEX` on."""
+_INDICES: Final = 0x10
 _DATAGRAM_TIMEOUT_S: Final = 0.002
 _PATIENT_TIMEOUT_S: Final = 0.02
-_LEAST_TIMEOUT_S: Final = 0.0003
 _REGISTER_ATTEMPTS: Final = 20
 _U16: Final = struct.Struct("<H")
 
@@ -38,8 +36,11 @@ class Datagrams:
         self._monotonic_ns = backend.clock.monotonic_ns
         self._index = 0
         self._datagram_timeout_s = _PATIENT_TIMEOUT_S
-        self._late = LateAnswers(backend.clock, FIRST_INDEX)
+        self._late = LateAnswers(backend.clock, _FIRST_INDEX, _INDICES)
         self._pending_ns = self._late.pending_ns
+        self.next_frame = self.next_on_wire
+        """Returns the next frame before an instant in ns, None for none; the loop that exchanges process data
+        puts its own here, and goes on meanwhile."""
         self.stations: list[int] = []
         """Configured station addresses of the sensors, by number."""
 
@@ -47,15 +48,10 @@ class Datagrams:
         """Whether single datagrams may take long: no sensor is left that would have to wait for them."""
         self._datagram_timeout_s = _PATIENT_TIMEOUT_S if patient else _DATAGRAM_TIMEOUT_S
 
-    @contextlib.contextmanager
-    def in_time(self, until_ns: int) -> Iterator[None]:
-        """Within it, single datagrams wait no longer than until then: an exchange is due."""
-        usual, left_s = self._datagram_timeout_s, (until_ns - self._monotonic_ns()) * 1e-9
-        self._datagram_timeout_s = min(usual, max(_LEAST_TIMEOUT_S, left_s))
-        try:
-            yield
-        finally:
-            self._datagram_timeout_s = usual
+    def next_on_wire(self, until_ns: int) -> bytes | None:
+        """The next frame that arrives before `until_ns`; None if none does."""
+        left_ns = until_ns - self._monotonic_ns()
+        return self._receive(left_ns * 1e-9) if left_ns > 0 else None
 
     def read_register(self, number: int, address: int, size: int) -> bytes | None:
         """Read ESC registers or a mailbox of a sensor with one datagram; None if it did not do it."""
@@ -130,17 +126,16 @@ class Datagrams:
     ) -> tuple[int, bytes] | None:
         """Send one datagram and wait for it: its working counter and data; None if it does not come back."""
         self._index = (self._index + 1) % len(self._pending_ns)
-        index = self._index + FIRST_INDEX
+        index = self._index + _FIRST_INDEX
         frame = build((command, adp, ado, data), first_index=index)
         self._pending_ns[self._index] = now_ns = self._monotonic_ns()
         until_ns = now_ns + int(max(timeout_s, self._late.timeout_s) * 1e9)
         self._send(frame.ljust(SHORTEST_FRAME, b"\0"))
         end = FIRST_DATA + len(data)
-        while (left_ns := until_ns - self._monotonic_ns()) > 0:
-            answer = self._receive(left_ns * 1e-9)
-            if answer is None:
-                return None
+        while (answer := self.next_frame(until_ns)) is not None:
             if is_answer(answer, command, index, len(data)):
+                if self._late.timeout_s:
+                    self._late.in_time(self._index)
                 self._pending_ns[self._index] = 0
                 return _U16.unpack_from(answer, end)[0], answer[FIRST_DATA:end]
             self._late.note(answer)

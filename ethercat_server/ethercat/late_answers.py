@@ -18,20 +18,20 @@ _SHORTEST_TIMEOUT_S: Final = 0.0003
 
 
 class LateAnswers:
-    """The timeout of frames, which are numbered from `first_index` to 255."""
+    """The timeout of frames, of which `count` numbered from `first_index` on are told apart."""
 
-    def __init__(self, clock: Clock, first_index: int) -> None:
+    def __init__(self, clock: Clock, first_index: int, count: int) -> None:
         self.timeout_s = 0.0
         """The timeout at least; 0 on a bus that is in time."""
         self._first_index = first_index
         self._monotonic_ns = clock.monotonic_ns
-        self.pending_ns = [0] * (0x100 - first_index)
+        self.pending_ns = [0] * count
         """By index less the first: when a frame was sent that is not back; else 0."""
 
     def note(self, answer: bytes) -> None:
         """An answer, not the one that is waited for."""
         index = answer[DATAGRAM_INDEX] - self._first_index if len(answer) > DATAGRAM_INDEX else -1
-        if index >= 0 and self.pending_ns[index]:
+        if 0 <= index < len(self.pending_ns) and self.pending_ns[index]:
             self.timeout_s = min(max(self.timeout_s, _LATE_FACTOR * self._took_s(index)), _LONGEST_TIMEOUT_S)
             self.pending_ns[index] = 0
 

@@ -23,6 +23,8 @@ DATAGRAM_INDEX: Final = FRAME_HEADER + 1
 """Offset of the first datagram's index in a frame."""
 FIRST_DATA: Final = FRAME_HEADER + DATAGRAM_HEADER
 """Offset of the first datagram's data."""
+SHORTEST_FRAME: Final = 60
+"""Bytes on Ethernet, without the checksum."""
 PROCESSED_BIT: Final = 0x02
 """Set in the first byte of the source address by the first slave that a frame passes."""
 

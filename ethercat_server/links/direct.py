@@ -148,7 +148,9 @@ class _Running:
     def __init__(self, bus: Bus, sensors: list[Sensor], on_frame: OnFrame) -> None:
         self.sensors = sensors
         self._clock = bus.clock
-        self.streams = [SensorStream(sensor.number, sensor.period_ns, bus.clock) for sensor in sensors]
+        self.streams = [
+            SensorStream(sensor.number, sensor.period_ns, bus.timing, bus.clock) for sensor in sensors
+        ]
         self.recovery = Recovery(bus, sensors, self.streams, lambda _: None, Others(bus, ()))
         self.on_idle: Callable[[], bool] = lambda: True
         self._jobs = Jobs(bus, sensors)

@@ -27,6 +27,7 @@ class MemoryBackend:
         self.sensors = virtual.Bus(BusOptions(slaves or (SensorOptions(),)), self.clock.now_ns)
         self._on_the_wire: list[tuple[int, int, bytes]] = []
         self._sent = 0
+        self._last_arrival_ns = 0
 
     def command(self, line: str) -> str:
         """Do what a fault command of the virtual sensor says, now; returns its answer."""
@@ -57,11 +58,14 @@ class MemoryBackend:
             return
         outward_ns, round_trip_ns = times
         answer, now_ns = bytearray(frame), self.clock.now_ns
-        arrives_ns = now_ns + outward_ns
+        # On their way out frames queue up: none overtakes another.
+        self._last_arrival_ns = arrives_ns = max(now_ns + outward_ns, self._last_arrival_ns)
         self.sensors.idle(arrives_ns)  # the watchdogs have run meanwhile
         if self.sensors.process(answer, len(answer), arrives_ns):
             self._sent += 1
-            heapq.heappush(self._on_the_wire, (now_ns + round_trip_ns, self._sent, bytes(answer)))
+            heapq.heappush(
+                self._on_the_wire, (arrives_ns + round_trip_ns - outward_ns, self._sent, bytes(answer))
+            )
 
     def receive(self, timeout_s: float) -> bytes | None:
         """See `Backend`."""

@@ -17,6 +17,7 @@ from typing import Any, cast
 from clients.recording.columns import Columns, columns
 from clients.report.subjects.subject import Subject, subject
 from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.ethercat.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.clock import Clock
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults.table import obey
@@ -58,7 +59,8 @@ def simulate(
     assert life is not None
     wire = list[bytes]()
     end = start + round(seconds * 1e9)
-    stream = SensorStream(0, life.sampler.clock.sinc_length * 1e9 / 51200, cast(Clock, clock))
+    timing = ExchangeTiming(now)
+    stream = SensorStream(0, life.sampler.clock.sinc_length * 1e9 / 51200, timing, cast(Clock, clock))
     while now < end:
         while todo and now >= start + todo[0][0] * 1e9:
             answer = obey(bus, todo.pop(0)[1])
@@ -67,8 +69,12 @@ def simulate(
         bus.set_time(sent + _EXCHANGE_NS // 2)
         data, now = life.inputs(), sent + _EXCHANGE_NS
         valid = not (script.lost_frames and chance.random() < script.lost_frames)
-        made = stream.take(data if valid else stream.process_data, 3 if valid else -1, valid, sent, now)
+        timing.sent_ns = sent
+        timing.took(sent, now)
+        made = stream.take(data, 3, sent, now) if valid else None
         stream.learn()
+        if made is None and now >= stream.idle_at_ns:
+            made = stream.idle(now)
         if made is not None:
             wire.append(made[0])
     decoder, frames = FrameDecoder(), list[DataMessage]()

@@ -16,6 +16,7 @@ from ethercat_server.simulation.machine import Machine, SimulatedClock
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.pdo import LAYOUTS
+from tests.exchanging import Exchange
 from tests.simulation import Asked
 
 STATION = 0x1001
@@ -111,7 +112,7 @@ def test_indices_are_none_of_soems() -> None:
     bus, wire = scripted()
     for _ in range(300):
         bus.read_register(0, 0x0130, 2)
-    assert {frame[17] for frame in wire.sent} == set(range(0x80, 0x100))
+    assert {frame[17] for frame in wire.sent} == set(range(0x80, 0x90))
 
 
 def operational(*sensors: SensorOptions, machine: Machine | None = None) -> tuple[Bus, MemoryBackend]:
@@ -121,23 +122,19 @@ def operational(*sensors: SensorOptions, machine: Machine | None = None) -> tupl
     return bus, backend
 
 
-def exchange(bus: Bus) -> int:
-    bus.send(bus.clock.monotonic_ns())
-    return bus.receive(0.01)
-
-
 def test_an_exchange_brings_every_sensors_process_data() -> None:
     sensors = [
         SensorOptions(serial=n, pdo_size=size, signal="constant") for n, size in enumerate((61, 77, 61))
     ]
     bus, backend = operational(*sensors)
-    assert exchange(bus) == 9
-    assert [bus.working_counter(position) for position in range(3)] == [3, 3, 3]
+    exchange = Exchange(bus)
+    assert exchange() == 9
+    assert bus.process_data.counters == [(3,)] * 3
     for position, options in enumerate(sensors):
         life = backend.sensors.sensors[position].life
         assert life is not None
-        assert bus.process_data(position) == life.inputs()
-        assert len(bus.process_data(position)) == options.pdo_size
+        assert exchange.inputs[position] == life.inputs()
+        assert len(exchange.inputs[position]) == options.pdo_size
 
 
 def test_process_data_that_does_not_fit_one_frame_goes_in_several() -> None:
@@ -149,24 +146,26 @@ def test_process_data_that_does_not_fit_one_frame_goes_in_several() -> None:
         sent.append(len(frame))
         send(frame)
 
-    cast(Any, bus)._send = noted
-    assert exchange(bus) == 60
+    cast(Any, bus.process_data)._send = noted
+    exchange = Exchange(bus)
+    assert exchange() == 60
     assert len(sent) == 2
     assert max(sent) <= 1514
     for position in range(20):
         life = backend.sensors.sensors[position].life
         assert life is not None
-        assert bus.process_data(position) == life.inputs()
+        assert exchange.inputs[position] == life.inputs()
 
 
 def test_a_lost_frame_is_a_miss_and_the_data_stay_those_of_before() -> None:
     bus, backend = operational(SensorOptions(signal="constant"))
-    assert exchange(bus) == 3
-    before = bus.process_data(0)
+    exchange = Exchange(bus)
+    assert exchange() == 3
+    before = exchange.inputs[0]
     backend.command("lose 1")
-    assert exchange(bus) == -1
-    assert bus.process_data(0) == before
-    assert exchange(bus) == 3
+    assert exchange() == -1
+    assert exchange.inputs[0] == before
+    assert exchange() == 3
 
 
 @pytest.mark.parametrize("late", [0.2, 0.9])
@@ -174,12 +173,13 @@ def test_a_frame_that_comes_too_late_is_never_taken_for_the_next_ones(late: floa
     bus, backend = operational(SensorOptions(signal="clock"))
     backend.wire = type(backend.wire)(Machine(seed=5, late=late, late_ns=15_000_000, frame_jitter_ns=0))
     seen: list[bytes] = []
+    exchange = Exchange(bus)
     for _ in range(300):
         sent_ns = backend.clock.now_ns
-        if exchange(bus) == 3:
-            instant_ns = decode_clock(LAYOUTS[61].struct.unpack(bus.process_data(0))[2:8]).instant_ns
+        if exchange() == 3:
+            instant_ns = decode_clock(LAYOUTS[61].struct.unpack(exchange.inputs[0])[2:8]).instant_ns
             assert sent_ns - 1_250_000 <= instant_ns <= backend.clock.now_ns
-            seen.append(bus.process_data(0))
+            seen.append(exchange.inputs[0])
         backend.clock.sleep(0.00125)
     assert len(seen) > 10
     assert len(set(seen)) > 0.9 * len(seen), "each brought what the sensor had then"
@@ -193,8 +193,8 @@ def test_a_frame_that_is_cut_short_is_a_miss() -> None:
         frame = receive(timeout_s)
         return frame[:40] if frame is not None else None
 
-    cast(Any, bus)._receive = cut
-    assert exchange(bus) == -1
+    cast(Any, backend).receive = cut
+    assert Exchange(bus)() == -1
 
 
 def test_working_counters_add_up() -> None:

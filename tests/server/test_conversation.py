@@ -35,7 +35,8 @@ def test_process_data_is_byte_for_byte_what_the_sensor_sent(size: int) -> None:
         assert layout.struct.pack(*layout.struct.unpack(frame.process_data)) == frame.process_data
     life = simulation.backend.sensors.sensors[0].life
     assert life is not None
-    assert simulation.bus.process_data(0) == life.inputs()
+    stream = simulation.streams[0]
+    simulation.run_until(lambda: stream.process_data == life.inputs(), "what the sensor has now")
 
 
 def test_several_clients_get_the_same_frames() -> None:

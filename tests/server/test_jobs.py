@@ -15,6 +15,7 @@ import pytest
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError
+from ethercat_server.ethercat.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.mailbox.mailbox import Mailbox
@@ -117,7 +118,7 @@ def run_tare(
     sdo: ScriptedSdo, samples: int, target: list[float], force: Iterator[float], rate_dps: float = 0.0
 ) -> dict[str, Any]:
     """Tare a sensor whose Fx, without offset, is the next of `force` with every step; it turns about z."""
-    stream, layout = SensorStream(0, 1_250_000), LAYOUTS[61]
+    stream, layout = SensorStream(0, 1_250_000, ExchangeTiming()), LAYOUTS[61]
     steps = tare(sdo, new_sensor(), stream, samples, target)
     while True:
         values = list(layout.struct.unpack(bytes(layout.size)))

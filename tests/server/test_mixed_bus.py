@@ -19,6 +19,7 @@ from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
 from ethercat_server.virtual_sensor.foreign.slave import ForeignSlave
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.slave.al import AlState
+from tests.exchanging import Exchange
 from tests.simulated_links import chain, registers
 from tests.simulation import OLD, Asked, Simulation, check_frames, more_if_long, reading
 
@@ -156,9 +157,8 @@ def test_addresses_that_others_answer_to_are_not_taken() -> None:
     assert [slave.status.state.name for slave in others] == ["PREOP"] * 2
     theirs = {before[at][reg.STATION_ADDRESS : reg.STATION_ADDRESS + 2] for at in (0, 2)}
     assert bus.stations[0].to_bytes(2, "little") not in theirs
-    assert bus.working_counter(0) == 3
-    bus.send(backend.clock.monotonic_ns())
-    assert bus.receive(0.01) == 3, "no FMMU of another answers to it"
+    assert bus.process_data.counters == [(3,)]
+    assert Exchange(bus)() == 3, "no FMMU of another answers to it"
     taken = [range(start, start + size) for image in (before[0], before[2]) for start, size in fmmus(image)]
     assert taken
     (own, _), *_ = fmmus(bytes(reg.FMMU) + bus.fmmus[0])

@@ -89,6 +89,7 @@ def test_a_single_lost_frame_costs_no_sensor_and_no_sample() -> None:
     for _ in range(50):
         simulation.command("lose 1")
         client.fresh(10)
+    simulation.run(0.3)  # a frame is given up after a while
     after = client.ask("status")
     assert after["lost_frames"] - before["lost_frames"] >= 40, (
         "now and then it is a register access that gets lost"
@@ -244,7 +245,7 @@ def test_a_sensor_that_is_slow_to_change_its_state_comes_back_too(
 
 @pytest.mark.parametrize("times", more_if_long([5], [5, 20]))
 @pytest.mark.parametrize(
-    ("fault", "seconds"), [("deaf 2", 2.0), ("power cycle 2", 2.0), ("safeop 0x1B", 0.0), ("lose 60", 0.5)]
+    ("fault", "seconds"), [("deaf 2", 2.0), ("power cycle 2", 2.0), ("safeop 0x1B", 0.0), ("lose 300", 0.5)]
 )
 def test_samples_flow_within_half_a_second_of_the_sensor_being_able_to_answer(
     fault: str, seconds: float, times: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ethercat_server.acquisition.stream import DISCARDED_AT_START, GAP, INVALID, REPEATED, SensorStream
+from ethercat_server.ethercat.exchange_timing import ExchangeTiming
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 from protocol.framing import DataMessage, FrameDecoder
 
@@ -14,7 +15,8 @@ class Feeder:
 
     def __init__(self) -> None:
         clock = SimulatedClock(Machine())
-        self.stream = SensorStream(0, PERIOD_NS, clock)
+        self.timing = ExchangeTiming(clock.now_ns)
+        self.stream = SensorStream(0, PERIOD_NS, self.timing, clock)
         self.now = clock.now_ns
         self.sample = 0
 
@@ -24,8 +26,12 @@ class Feeder:
         self.now += after_ns
         self.sample += new
         data = self.sample.to_bytes(61, "little")
-        made = self.stream.take(data, 3 if valid else -1, valid, self.now - took_ns, self.now)
+        self.timing.sent_ns = self.now - took_ns
+        self.timing.took(self.now - took_ns, self.now)
+        made = self.stream.take(data, 3, self.now - took_ns, self.now) if valid else None
         self.stream.learn()
+        if made is None and self.now >= self.stream.idle_at_ns:
+            made = self.stream.idle(self.now)
         if made is None:
             return None
         decoder = FrameDecoder()
@@ -58,7 +64,8 @@ def test_each_sample_makes_one_frame_and_polls_between_make_none() -> None:
 def test_what_an_exchange_brought_that_was_held_up_is_not_dated_from_its_end() -> None:
     feeder, stall_ns = Feeder().start(), 50 * PERIOD_NS
     for _ in range(2000):  # before the clock is locked, and after
-        assert feeder.exchange(new=True, after_ns=PERIOD_NS) is not None
+        assert feeder.exchange(new=True) is not None
+        assert [feeder.exchange(new=False) for _ in range(3)] == [None] * 3
         if feeder.stream.clock.locked or feeder.sample == DISCARDED_AT_START + 2:
             held_up = feeder.exchange(new=True, after_ns=stall_ns + PERIOD_NS, took_ns=stall_ns)
             assert held_up is not None

@@ -18,9 +18,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from ethercat_server.acquisition.histogram import Distribution
-from ethercat_server.acquisition.sample_clock import AIM_NS
+from ethercat_server.acquisition.sample_clock import margin_ns
 from ethercat_server.doctor.bus.receiver import MESSAGE
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
+from ethercat_server.ethercat.exchange_timing import ExchangeTiming
 from ethercat_server.process import realtime
 
 PERIOD_NS: Final = 1_250_000
@@ -50,21 +51,32 @@ class Measured:
         """Number of lost frames."""
         return self.exchanges.count(-1)
 
+    def margin_ns(self) -> float:
+        """The margin that the server would have taken in the end."""
+        timing, now_ns = ExchangeTiming(), 1
+        for late, exchange in zip(self.late, self.exchanges, strict=True):
+            now_ns += PERIOD_NS
+            timing.woke(late)
+            if exchange >= 0:
+                timing.took(now_ns - exchange, now_ns)
+        return margin_ns(timing, PERIOD_NS, 0.0)
+
     def ages(self) -> tuple[list[float], list[float]]:
         """Age that each cycle's sample would have had when sent, and at a client: docs/doctor.md.
 
-        The server times each exchange so that the sensor, half-way through it, reads its data AIM_NS after
-        the sample's instant, and compensates its deadlines for its usual lateness.
+        The server times each exchange so that the sensor, half-way through it, reads its data some margin
+        after the sample's instant, and compensates its deadlines for its usual lateness.
         """
         whole = [time_ns for time_ns in self.exchanges if time_ns >= 0]
         if not whole:
             return [], []
         usual_late = sorted(self.late)[len(self.late) // 2]
         usual_look = sum(whole) / len(whole) / 2
+        margin = self.margin_ns()
         handed_out, arrived = [], []
         for number, (late, exchange) in enumerate(zip(self.late, self.exchanges, strict=True)):
             if exchange >= 0:
-                looked = max(0.0, AIM_NS + late - usual_late + exchange / 2 - usual_look)
+                looked = max(0.0, margin + late - usual_late + exchange / 2 - usual_look)
                 handed_out.append(looked + exchange / 2)
                 if number in self.messages:
                     arrived.append(handed_out[-1] + self.messages[number])

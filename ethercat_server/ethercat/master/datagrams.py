@@ -25,7 +25,6 @@ T = TypeVar("T")
 _FIRST_STATION: Final = 0x1001
 _ATTEMPTS: Final = 20
 _PAUSE_S: Final = 0.001
-_EXCHANGE_TIMEOUT_S: Final = 0.002
 _LOGICAL_BYTES: Final = 0x10000
 """Of the logical address space for the sensors' process data."""
 _MAILBOXES: Final = ((reg.SM_CONTROL_MAILBOX_OUT, "out"), (reg.SM_CONTROL_MAILBOX_IN, "in"))
@@ -125,8 +124,7 @@ class DatagramMaster:
         waiting = [states.go(AlState.OP) for states in self._states]
         while waiting:
             check_interrupt()
-            bus.send(bus.clock.monotonic_ns())
-            bus.receive(_EXCHANGE_TIMEOUT_S)
+            bus.process_data.send(bus.clock.monotonic_ns())
             waiting = [steps for steps in waiting if not _is_done(steps)]
             bus.clock.sleep(_PAUSE_S)
 

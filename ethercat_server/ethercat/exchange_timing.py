@@ -1,0 +1,103 @@
+"""How long exchanges take on this bus and how late this machine wakes, measured all the time.
+
+The shortest recent round trip is what the wire, the slaves and the network card need at least. What an
+exchange took beyond it was spent somewhere on its way, before the slaves looked at their data or after.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+_GAIN: Final = 1 / 64
+_WINDOW_NS: Final = 2_000_000_000
+"""The shortest round trip is that of the last one or two of these."""
+_FIRST_GUESS_NS: Final = 100_000.0
+_FIRST_EXCESS_NS: Final = 20_000.0
+_FIRST_LATE_NS: Final = 15_000.0
+_LEAST_VARIANCE: Final = 1_000.0**2
+_OUTLIER: Final = 4.0
+"""What lies further out than so many standard deviations counts as that far: a stall is no jitter."""
+_ROOM_NS: Final = 10_000.0
+_PATIENCE_NS: Final = 100_000.0
+SLOW_NS: Final = 300_000.0
+"""A usual round trip above this is a slow network card's."""
+
+
+class ExchangeTiming:
+    """Round trips, and lateness of wake-ups, of one bus. All in ns; variances in ns²."""
+
+    __slots__ = (
+        "_excess_square", "_late_variance", "_least_now_ns", "_roll_at_ns", "excess_ns", "in_flight", "late_ns",
+        "least_ns", "look_ns", "look_variance", "patience_ns", "sent_ns", "usual_ns", "variance",
+    )  # fmt: skip
+
+    def __init__(self, now_ns: int = 0) -> None:
+        self.sent_ns = now_ns
+        """When the last exchange was sent."""
+        self.in_flight = False
+        """Whether it is not back."""
+        self.least_ns = math.inf
+        """The shortest recent round trip."""
+        self.late_ns = 0.0
+        """Usual lateness of a wake-up."""
+        self.excess_ns = _FIRST_EXCESS_NS
+        """What an exchange usually takes beyond the shortest."""
+        self._excess_square = 2 * _FIRST_EXCESS_NS**2
+        self._late_variance = _FIRST_LATE_NS**2
+        self._least_now_ns = math.inf
+        self._roll_at_ns = 0
+        self._derive()
+
+    def _derive(self) -> None:
+        self.look_ns = self.excess_ns / 2
+        """Usual delay of the slaves' look at their data by what an exchange takes beyond the shortest."""
+        # Uniform within the excess: E[(x·e)²] = E[e²]/3.
+        self.look_variance = max(self._excess_square / 3 - self.look_ns * self.look_ns, _LEAST_VARIANCE)
+        self.variance = self.look_variance + self._late_variance
+        """Of the difference between the instant aimed at and that of the look."""
+        least_ns = self.least_ns if self.least_ns < math.inf else _FIRST_GUESS_NS
+        self.usual_ns = least_ns + self.excess_ns
+        self.patience_ns = self.usual_ns + 3 * self.excess_ns + _PATIENCE_NS
+        """After this time an answer is overdue."""
+
+    def took(self, sent_ns: int, back_ns: int) -> None:
+        """An exchange is back."""
+        took_ns = back_ns - sent_ns
+        if sent_ns >= self.sent_ns:
+            self.in_flight = False
+        if back_ns >= self._roll_at_ns:
+            self._roll_at_ns = back_ns + _WINDOW_NS
+            if self._least_now_ns < math.inf:
+                self.least_ns = self._least_now_ns
+            self._least_now_ns = math.inf
+        if took_ns < self._least_now_ns:
+            self._least_now_ns = took_ns
+            self.least_ns = min(self.least_ns, took_ns)
+        excess_ns = min(took_ns - self.least_ns, _OUTLIER * math.sqrt(self._excess_square) + _ROOM_NS)
+        self.excess_ns += _GAIN * (excess_ns - self.excess_ns)
+        self._excess_square += _GAIN * (excess_ns * excess_ns - self._excess_square)
+        self._derive()
+
+    def woke(self, late_ns: float) -> None:
+        """The loop woke so long after it had wanted to."""
+        most = _OUTLIER * math.sqrt(self._late_variance) + _ROOM_NS
+        error = min(max(late_ns - self.late_ns, -most), most)
+        self.late_ns += _GAIN * error
+        self._late_variance += _GAIN * (error * error - self._late_variance)
+
+    def look(self, sent_ns: int, back_ns: int) -> tuple[float, float]:
+        """When the slaves looked at their data in an exchange, less the outward part of the shortest one.
+
+        Returns the instant and its variance.
+        """
+        excess_ns = max(0.0, back_ns - sent_ns - self.least_ns)
+        return sent_ns + excess_ns / 2, excess_ns * excess_ns / 12
+
+    def describe(self) -> dict[str, Any]:
+        """What `status` says of it."""
+        known = self.least_ns < math.inf
+        return {
+            "least_us": round(self.least_ns / 1000, 1) if known else None,
+            "usual_us": round(self.usual_ns / 1000, 1) if known else None,
+        }
