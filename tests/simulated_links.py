@@ -23,6 +23,7 @@ from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.doctor.bus import measurement
 from ethercat_server.doctor.bus.receiver import MESSAGE
 from ethercat_server.ethercat.backend import CheckInterrupt
@@ -154,14 +155,17 @@ class SimulatedServer:
         """Whether it is stopped by somebody."""
         ethercat = Bus(bus.backend)
         sensors = bring_up(ethercat, Asked({"sinc_length": SINC_LENGTH}), lambda: None).sensors
+        timing = ExchangeTiming(bus.clock.now_ns)
         self.streams = [
-            SensorStream(sensor.number, sensor.period_ns, ethercat.timing, bus.clock) for sensor in sensors
+            SensorStream(sensor.number, sensor.period_ns, timing, bus.clock) for sensor in sensors
         ]
         self.transport = InMemoryTransport(bus.clock)
         self.hub = Hub(self.transport, bus.clock.monotonic_ns)
         self.recovery = Recovery(ethercat, sensors, self.streams, self._announce, Others(ethercat, ()))
         self.jobs = Jobs(ethercat, sensors)
-        self.cycle = Cycle(ethercat, sensors, self.streams, self, self.recovery, self.jobs, NoWatchdog())
+        self.cycle = Cycle(
+            ethercat, sensors, self.streams, timing, self, self.recovery, self.jobs, NoWatchdog()
+        )
         actions = SensorActions(ethercat, self.hub, self.recovery, self.jobs, sensors, self.streams)
         self.hub.start(Actions(self.hub, self.cycle, actions).handle)
         self._stop_if: Callable[[], object] = lambda: False

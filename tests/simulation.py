@@ -25,6 +25,7 @@ from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.others import Others
 from ethercat_server.sensor.sensor import Identity
@@ -94,13 +95,14 @@ class Simulation:
         self.bus = Bus(self.backend)
         self.sensors, slaves = bring_up(self.bus, Asked(settings), lambda: None)
         self.others = Others(self.bus, slaves)
-        self.streams = [
-            SensorStream(s.number, s.period_ns, self.bus.timing, self.clock) for s in self.sensors
-        ]
+        timing = ExchangeTiming(self.clock.now_ns)
+        self.streams = [SensorStream(s.number, s.period_ns, timing, self.clock) for s in self.sensors]
         self.events: list[JsonObject] = []
         self.recovery = Recovery(self.bus, self.sensors, self.streams, self._announce, self.others)
         self.jobs = Jobs(self.bus, self.sensors)
-        self.cycle = Cycle(self.bus, self.sensors, self.streams, self, self.recovery, self.jobs, NoWatchdog())
+        self.cycle = Cycle(
+            self.bus, self.sensors, self.streams, timing, self, self.recovery, self.jobs, NoWatchdog()
+        )
         actions = SensorActions(self.bus, self.hub, self.recovery, self.jobs, self.sensors, self.streams)
         self.hub.start(Actions(self.hub, self.cycle, actions, {"others": self.others.rows}).handle)
         self.clients: list[Client] = []

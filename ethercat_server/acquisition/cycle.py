@@ -13,8 +13,9 @@ from typing import Any, Final, Protocol
 from ethercat_server.acquisition.histogram import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
-from ethercat_server.acquisition.schedule import Schedule
 from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.timing.schedule import Schedule
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
@@ -61,6 +62,7 @@ class Cycle:
         bus: Bus,
         sensors: Sequence[Sensor],
         streams: Sequence[SensorStream],
+        timing: ExchangeTiming,
         hub: Outlet,
         recovery: Recovery,
         jobs: Jobs,
@@ -78,8 +80,8 @@ class Cycle:
         self._recovery = recovery
         self._cycles = 0
         self._missed_deadlines = 0
-        self._timing = bus.timing
-        self._schedule = Schedule(streams, bus.timing)
+        self._timing = timing
+        self._schedule = Schedule(streams, timing)
         carried = bus.process_data.inputs
         self._carried = [[(at, sensors[at.number], streams[at.number]) for at in each] for each in carried]
         """By frame of the exchange: what it carries of which sensor."""
@@ -132,14 +134,14 @@ class Cycle:
         return int(self._schedule.next_ns())
 
     def _next_frame(self, until_ns: int) -> bytes | None:
-        """The next frame before `until_ns` that is no answer to an exchange; the exchanges go on meanwhile."""
+        """The next frame before `until_ns` that answers no exchange; the exchanges go on meanwhile."""
         while self._bus.clock.monotonic_ns() < until_ns:
             if (frame := self._step(until_ns)) is not None:
                 return frame
         return None
 
     def _step(self, until_ns: int) -> bytes | None:
-        """Hand out what arrives, or send the next exchange once it is due; return at `until_ns` at the latest.
+        """Hand out what arrives, or send the next exchange once it is due; return by `until_ns`.
 
         Returns a frame that is no answer to an exchange.
         """

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from ethercat_server.ethercat.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.health.samples import SampleHealth
 from ethercat_server.acquisition.histogram import RecentDistribution
-from ethercat_server.acquisition.sample_clock import SampleClock
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.timing.sample_clock import SampleClock
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
 from protocol.framing import DataFlag, encode_data
 from protocol.pdo import is_finite

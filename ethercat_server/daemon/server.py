@@ -13,6 +13,7 @@ from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.daemon.options import ServerOptions, parse_options
 from ethercat_server.daemon.service import Policy, Service
 from ethercat_server.ethercat.bus import Bus
@@ -54,10 +55,11 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         _give_up_root(user, options)
         policy.apply(hub)
         sensors, slaves = bring_up(bus, options, signals.check)
-        streams = [SensorStream(sensor.number, sensor.period_ns, bus.timing) for sensor in sensors]
+        timing = ExchangeTiming(bus.clock.monotonic_ns())
+        streams = [SensorStream(sensor.number, sensor.period_ns, timing) for sensor in sensors]
         others = Others(bus, slaves)
         recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast, others), Jobs(bus, sensors)
-        cycle = Cycle(bus, sensors, streams, hub, recovery, jobs, notifier)
+        cycle = Cycle(bus, sensors, streams, timing, hub, recovery, jobs, notifier)
         on_sensors = SensorActions(bus, hub, recovery, jobs, sensors, streams)
         service = Service(argv, policy, hub, on_sensors, notifier)
         cycle.every_second = service.every_second

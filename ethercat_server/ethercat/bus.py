@@ -12,7 +12,6 @@ from typing import Final
 from ethercat_server.errors import SetUpError
 from ethercat_server.ethercat.backend import Backend, CheckInterrupt, Master
 from ethercat_server.ethercat.datagrams import Datagrams
-from ethercat_server.ethercat.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.mailbox.emergencies import Emergencies
 from ethercat_server.ethercat.process_data import Area, ProcessData, fit_a_frame
 from ethercat_server.ethercat.slave import registers as reg
@@ -41,8 +40,6 @@ class Bus(Datagrams):
         """FMMU registers as they must be in OP."""
         self.process_data = ProcessData((), backend.send)
         """The exchange, once the sensors are mapped."""
-        self.timing = ExchangeTiming(backend.clock.monotonic_ns())
-        """How long exchanges take."""
 
     def next_on_wire(self, until_ns: int) -> bytes | None:
         """The next frame that arrives before `until_ns` and carries no process data; None if none does."""

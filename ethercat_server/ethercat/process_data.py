@@ -1,4 +1,4 @@
-"""The exchange of process data: frames of our own, several on the wire at a time, each matched by its index."""
+"""The exchange of process data: frames of our own, several at a time, each matched by its index."""
 
 from __future__ import annotations
 

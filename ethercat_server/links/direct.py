@@ -11,6 +11,7 @@ from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import AsFound, enter_op, find_sensors
 from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.errors import BusError, ServerError, UsageError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
@@ -148,13 +149,14 @@ class _Running:
     def __init__(self, bus: Bus, sensors: list[Sensor], on_frame: OnFrame) -> None:
         self.sensors = sensors
         self._clock = bus.clock
+        timing = ExchangeTiming(bus.clock.monotonic_ns())
         self.streams = [
-            SensorStream(sensor.number, sensor.period_ns, bus.timing, bus.clock) for sensor in sensors
+            SensorStream(sensor.number, sensor.period_ns, timing, bus.clock) for sensor in sensors
         ]
         self.recovery = Recovery(bus, sensors, self.streams, lambda _: None, Others(bus, ()))
         self.on_idle: Callable[[], bool] = lambda: True
         self._jobs = Jobs(bus, sensors)
-        self._cycle = Cycle(bus, sensors, self.streams, self, self.recovery, self._jobs, Notifier())
+        self._cycle = Cycle(bus, sensors, self.streams, timing, self, self.recovery, self._jobs, Notifier())
         self._on_frame = on_frame
         self._decoder = FrameDecoder()
         self._stopped = False

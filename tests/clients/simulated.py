@@ -17,7 +17,7 @@ from typing import Any, cast
 from clients.recording.columns import Columns, columns
 from clients.report.subjects.subject import Subject, subject
 from ethercat_server.acquisition.stream import SensorStream
-from ethercat_server.ethercat.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.clock import Clock
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults.table import obey

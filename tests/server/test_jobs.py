@@ -14,8 +14,8 @@ import pytest
 
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.errors import BusError
-from ethercat_server.ethercat.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.mailbox.mailbox import Mailbox

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from ethercat_server.acquisition.sample_clock import SampleClock
+from ethercat_server.acquisition.timing.sample_clock import SampleClock
 
 NOMINAL_NS = 1_250_000.0
 SECOND = 1_000_000_000

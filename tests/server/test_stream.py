@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ethercat_server.acquisition.stream import DISCARDED_AT_START, GAP, INVALID, REPEATED, SensorStream
-from ethercat_server.ethercat.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 from protocol.framing import DataMessage, FrameDecoder
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from typing import Final
 
-from ethercat_server.acquisition.sample_clock import PLAUSIBLE_PULL, SampleClock
+from ethercat_server.acquisition.timing.sample_clock import PLAUSIBLE_PULL, SampleClock
 
 _DEVIATING_SECONDS: Final = 10
 """Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment."""

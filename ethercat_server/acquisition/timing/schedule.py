@@ -1,7 +1,7 @@
-"""When the next exchange is due, for all sensors of the bus: each has a clock of its own, an exchange reads all.
+"""When the next exchange is due: each sensor has a clock of its own, an exchange reads all of them.
 
 Polls that lie close together are merged: the earlier one waits for the later, by no more than the time that
-two exchanges cost this machine, as measured. So the loop has half of its time left, whatever the sensors' phases.
+two exchanges cost this machine, as measured. So half of its time is left, whatever the sensors' phases.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from ethercat_server.ethercat.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 
 _COST_GAIN: Final = 1 / 64
 _FIRST_COST_NS: Final = 50_000.0

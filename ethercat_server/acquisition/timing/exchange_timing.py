@@ -28,8 +28,8 @@ class ExchangeTiming:
     """Round trips, and lateness of wake-ups, of one bus. All in ns; variances in ns²."""
 
     __slots__ = (
-        "_excess_square", "_late_variance", "_least_now_ns", "_roll_at_ns", "excess_ns", "in_flight", "late_ns",
-        "least_ns", "look_ns", "look_variance", "patience_ns", "sent_ns", "usual_ns", "variance",
+        "_excess_square", "_late_variance", "_least_now_ns", "_roll_at_ns", "excess_ns", "in_flight",
+        "late_ns", "least_ns", "look_ns", "look_variance", "patience_ns", "sent_ns", "usual_ns", "variance",
     )  # fmt: skip
 
     def __init__(self, now_ns: int = 0) -> None:

@@ -1,0 +1,232 @@
+"""Follows a sensor's own sampling clock, so that a poll falls right after each sample came to be.
+
+The sensor samples freely; an exchange only tells whether its process data changed since the one before. From
+that `Estimate` says when the next sample comes to be. What is not known well, because a frame was lost or the
+machine stood still, leaves it as it is: it holds over, and its uncertainty grows as crystals wander.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from ethercat_server.acquisition.timing.estimate import CERTAIN, CONTRADICTS, ROOT_2_PI, Estimate
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
+
+_LOCKED: Final = 0.125
+"""The clock is followed while the phase is known to this part of a period (standard deviation)."""
+_POLLS_UNLOCKED: Final = 4
+"""Exchanges a sample while it is not."""
+_SEARCH_STEPS: Final = 8
+"""Exchanges a sample once one is overdue."""
+_OVERDUE: Final = 2.0
+"""It is, so many standard deviations after it was expected."""
+PLAUSIBLE_PULL: Final = 0.002
+"""A real sensor's period differs from the nominal one by less than this part."""
+_PRICE_NS: Final = 50_000.0
+"""Age that is given up to save an exchange."""
+_LOSS_PERIODS: Final = 10.0
+"""Age that is given up to lose no sample, in periods, where there is no time for a second poll."""
+_NO_TIME: Final = 0.5
+"""There is none if a round trip takes more than this part of a period."""
+_LARGEST_MARGIN: Final = 0.4
+_PROBE_BELOW: Final = 5_000.0**2
+"""A phase known so well needs no probes, however well polls could tell it."""
+_LONGEST_LOOK: Final = 0.5
+"""The sensor looks at its data within this part of a period after the frame usually has reached it."""
+_ONE_ONLY: Final = 0.8
+"""Only one sample can have come in this part of a period."""
+
+
+class SampleClock:
+    """The sampling clock of one sensor, as far as the exchanges have shown it. Times are CLOCK_MONOTONIC ns.
+
+    Call `observe` after every valid exchange, before it `predict` if that brought a new sample; ask
+    `next_poll_ns` when the next exchange is wanted. Exchanges come in the order in which they were sent.
+    """
+
+    __slots__ = (
+        "_absent", "_aim_ns", "_begun", "_doubtful", "_estimate", "_looked_ns", "_margin_ns", "_newest",
+        "_nominal_ns", "_overdue", "_probing", "_single", "_timing", "instant_ns", "locked", "quiet_until_ns",
+        "steps", "uncertain",
+    )  # fmt: skip
+
+    def __init__(self, period_ns: float, timing: ExchangeTiming) -> None:
+        """`period_ns` is the nominal sample period; `timing` that of the bus."""
+        self._nominal_ns = period_ns
+        self._estimate = Estimate(period_ns)
+        """Its phase is the next sample's instant less the outward part of the shortest round trip."""
+        self._timing = timing
+        self.locked = False
+        self.instant_ns = 0.0
+        """Estimated instant of the newest sample, from those before it."""
+        self.steps = 1
+        """How many samples the newest one is after the one handed out before it: more than 1, some were
+        lost; 0, one was counted as lost that was not."""
+        self.uncertain = False
+        """Whether more may have been lost than `steps` says. The samples after it tell, and their `steps` put
+        it right."""
+        self.quiet_until_ns = 0.0
+        """An exchange that is back before this has certainly nothing new."""
+        self._looked_ns = 0
+        """When the last valid exchange was sent."""
+        self._newest = 1
+        """Number of the newest sample, counted from the one before it by the phase alone."""
+        self._absent = 0
+        """Samples that were watched for and did not come."""
+        self._begun = False
+        """Whether a sample was seen coming."""
+        self._doubtful = False
+        """Whether the sample before was `uncertain`."""
+        self._overdue = False
+        self._single = True
+        """Whether there is no time for a second poll of a sample."""
+        self._probing = False
+        """Whether the phase is known worse than polls can tell it."""
+        self._margin_ns = 0.0
+        self._aim_ns = 0.0
+        """When the next poll should be sent."""
+        self._settle()
+
+    @property
+    def period_ns(self) -> float:
+        """Estimated period."""
+        return self._estimate.period_ns
+
+    @property
+    def uncertainty_ns(self) -> float:
+        """How far `instant_ns` may be off: two standard deviations, and where the slave is on the way."""
+        return 2 * math.sqrt(self._estimate.variance) + self._timing.least_ns / 2
+
+    @property
+    def pull(self) -> float:
+        """By what part the period differs from the nominal one."""
+        return self._estimate.pull
+
+    def describe(self) -> dict[str, Any]:
+        """What `status` says of it."""
+        return {
+            "mode": "locked" if self.locked else "oversampling",
+            "period_us": self.period_ns / 1000,
+            "offset_ppm": round((self._nominal_ns / self.period_ns - 1) * 1e6, 1),
+            "uncertainty_us": round(self.uncertainty_ns / 1000, 1) if self.locked else None,
+        }
+
+    # -- when to poll
+
+    def next_poll_ns(self) -> float:
+        """When the next exchange should be sent, as far as this sensor is concerned."""
+        timing, aim_ns, period_ns = self._timing, self._aim_ns, self._estimate.period_ns
+        sent_ns = timing.sent_ns
+        if not self.locked:
+            return sent_ns + period_ns / _POLLS_UNLOCKED
+        if self._single:
+            # The polls that are on their way are for the samples before: the first that has none is next.
+            guard_ns = self._margin_ns / 2
+            ahead_ns = max(0, int((sent_ns - aim_ns + guard_ns) // period_ns) + 1) * period_ns
+            probe_ns = self._estimate.phase_ns - timing.look_ns + ahead_ns
+            if self._probing and probe_ns > sent_ns + guard_ns:
+                return probe_ns
+            return aim_ns + ahead_ns
+        if timing.in_flight:
+            return max(aim_ns, sent_ns + timing.patience_ns)
+        if sent_ns < aim_ns:
+            return aim_ns
+        # It was early: again, at once, or in steps if the sample is overdue.
+        return sent_ns + period_ns / _SEARCH_STEPS if self._overdue else sent_ns
+
+    def _settle(self) -> None:
+        """Derive from the estimate what the next poll needs."""
+        timing, variance, period_ns = self._timing, self._estimate.variance, self._estimate.period_ns
+        phase_ns = self._estimate.phase_ns
+        deviation_ns = math.sqrt(variance)
+        self.locked = self._begun and deviation_ns < _LOCKED * period_ns
+        self._single = timing.usual_ns > _NO_TIME * period_ns
+        self._margin_ns = margin_ns(timing, period_ns, variance)
+        self._aim_ns = phase_ns + self._margin_ns - timing.look_ns
+        self._probing = variance > (timing.look_variance + _PROBE_BELOW) / 4
+        self.quiet_until_ns = phase_ns - CERTAIN * deviation_ns if self.locked else 0.0
+
+    # -- what an exchange says
+
+    def predict(self, sent_ns: int, back_ns: int) -> None:
+        """Say of the new sample that an exchange brought what can be said before learning from it.
+
+        Sets `steps`, `uncertain` and `instant_ns`.
+        """
+        phase_ns, period_ns = self._estimate.phase_ns, self._estimate.period_ns
+        looked_ns, least_ns = self._looked_ns, self._timing.least_ns
+        unwatched_ns = back_ns - looked_ns
+        if not self._begun:
+            self._newest = 1
+            # Only what fell into the time the sensor was not watched can have been lost.
+            self.steps = 1 + int(unwatched_ns // period_ns)
+            self.uncertain = unwatched_ns >= period_ns
+            self.instant_ns = min(back_ns, sent_ns + period_ns) - min(unwatched_ns, period_ns) / 2
+            return
+        excess_ns = max(0.0, back_ns - sent_ns - least_ns)
+        # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought is
+        # dated from before, never as younger than it may be.
+        late = (sent_ns + min(excess_ns / 2, _LONGEST_LOOK * period_ns) - phase_ns) / period_ns
+        newest = 1 + math.floor(late)
+        self.uncertain = False
+        if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
+            newest = min(newest, 1)
+        else:
+            doubt_ns = CONTRADICTS * math.sqrt(self._estimate.variance)
+            least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
+            most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
+            self.uncertain = self._doubtful or (most > 0 and least < most)
+        if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
+            newest = 0 if self._doubtful and late < -0.5 else 1
+        self._newest = newest
+        self.steps = max(0, newest - self._absent)
+        self.instant_ns = min(max(phase_ns + (newest - 1) * period_ns, looked_ns) + least_ns / 2, back_ns)
+
+    def observe(self, sent_ns: int, back_ns: int, fresh: bool) -> None:
+        """Learn from one valid exchange whether it brought a new sample (`fresh`: after `predict`)."""
+        estimate = self._estimate
+        look_ns, variance = self._timing.look(sent_ns, back_ns)
+        looked_ns, self._looked_ns = self._looked_ns, sent_ns
+        if not self._begun:
+            # The first exchange brings what was there before: it has no instant.
+            if fresh and looked_ns:
+                self._begun = True
+                estimate.begin(max(looked_ns, look_ns - estimate.period_ns), look_ns)
+        elif fresh:
+            if self._newest != 1:
+                estimate.advance(self._newest - 1)
+            if self.uncertain:
+                pass  # it may be another sample's
+            elif self.locked:
+                estimate.learn_bit(look_ns, variance, 1)
+            elif look_ns - looked_ns < estimate.period_ns:
+                estimate.learn_bracket(looked_ns, look_ns, variance)
+            estimate.advance(1)
+            self._doubtful = self.uncertain
+            self._absent = 0
+            self._overdue = False
+        else:
+            doubt_ns = CONTRADICTS * math.sqrt(estimate.variance)
+            while sent_ns > estimate.phase_ns + estimate.period_ns + doubt_ns:
+                estimate.advance(1)
+                self._absent += 1
+            self._overdue = look_ns > estimate.phase_ns + _OVERDUE * math.sqrt(estimate.variance + variance)
+            if self.locked:
+                estimate.learn_bit(look_ns, variance, -1)
+        self._settle()
+
+
+def margin_ns(timing: ExchangeTiming, period_ns: float, phase_variance: float) -> float:
+    """How long after the expected instant a poll should look, so that samples are youngest on the whole.
+
+    An early look costs a second exchange, or the sample where there is no time for one. The margin is where
+    a little more of it costs as much as it saves: where the density of the look's instant is 1 / cost.
+    """
+    single = timing.usual_ns > _NO_TIME * period_ns
+    cost_ns = _LOSS_PERIODS * period_ns if single else timing.usual_ns + _PRICE_NS
+    deviation_ns = math.sqrt(phase_variance + timing.variance)
+    ratio = cost_ns / (deviation_ns * ROOT_2_PI)
+    if ratio <= 1:
+        return 0.0
+    return min(deviation_ns * math.sqrt(2 * math.log(ratio)), _LARGEST_MARGIN * period_ns)
