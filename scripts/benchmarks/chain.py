@@ -25,6 +25,7 @@ from scripts.benchmarks.statistics import Floats, Ints
 from scripts.demonstration.program import Child, DemoError
 
 PORT: Final = 12001
+SERVER: Final = "ethercat_server.daemon.cli"
 OVERSAMPLING_HZ: Final = 51200
 """The sensor's rate is this over its SINC length."""
 _PATIENCE_S: Final = 30.0
@@ -209,11 +210,11 @@ def virtual_bus(setup: Setup) -> Iterator[tuple[str, int]]:
         yield bus.ifname, sensor.pid
 
 
-def start_server(running: Chain, ifname: str) -> Client:
+def start_server(running: Chain, ifname: str, module: str = SERVER) -> Client:
     """ethercat-server, ready, and a connection to it."""
     setup = running.setup
     server = running.start(
-        "server", "ethercat_server.daemon.cli", ifname, PORT,
+        "server", module, ifname, PORT,
         "--set", f"sinc_length={setup.sinc}", "--rt-priority", setup.priority,
     )  # fmt: skip
     running.watch("server", server.pid)

@@ -24,6 +24,7 @@ from rich.console import Console
 from ethercat_server.errors import ServerError
 from scripts.benchmarks import chains
 from scripts.benchmarks.chain import OVERSAMPLING_HZ, Setup, virtual_bus
+from scripts.benchmarks.modes import cards
 from scripts.benchmarks.modes.cpp import measure_cpp
 from scripts.benchmarks.modes.node import measure_node
 from scripts.benchmarks.modes.soak import soak
@@ -141,6 +142,13 @@ def run(options: argparse.Namespace, console: Console) -> None:
         write_json(options.json, options, priority, soak=result)
         print(f"written: {options.json}")
         return
+    if options.cards is not None:
+        length = options.seconds or (cards.QUICK_SECONDS if options.quick else cards.SECONDS)
+        setups = [replace(setup(rate, options.sensors[0]), seconds=length) for rate in options.rates]
+        measured = cards.measure_cards(setups, options.cards, console)
+        write_json(options.json, options, priority, seconds=length, cards=measured)
+        print(f"written: {options.json}")
+        return
     for name, mode in MODES.items():
         if getattr(options, name):
             one = replace(
@@ -207,6 +215,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--soak", type=float, metavar="MINUTES", help="only the server: losses, memory")
     for name, mode in MODES.items():
         parser.add_argument(f"--{name}", action="store_true", help=mode.help)
+    parser.add_argument("--cards", type=_round_trips, nargs="?", const=(), metavar="MS,...",
+                        help="only slow network cards, of these round trips (all)")  # fmt: skip
     parser.add_argument("--no-ros", dest="ros", action="store_false", help="TCP only")
     parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
                         help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip
@@ -214,7 +224,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     options.json, options.plot = here / options.json, here / options.plot
     only_one = options.quick or options.soak or any(getattr(options, name) for name in MODES)
     options.rates = options.rates or ([800] if only_one else [800, 1600])
-    options.sensors = options.sensors or ([1] if only_one else [1, 2])
+    options.sensors = options.sensors or ([1] if only_one or options.cards is not None else [1, 2])
     return options
 
 
@@ -230,6 +240,14 @@ def _rates(text: str) -> list[int]:
     if not set(rates) <= set(_RATES):
         raise argparse.ArgumentTypeError(f"rates must be among {', '.join(map(str, sorted(_RATES)))}")
     return rates
+
+
+def _round_trips(text: str) -> list[float]:
+    round_trips = [float(word) for word in text.split(",")]
+    known = {card.round_trip_ms for card in cards.CARDS}
+    if not set(round_trips) <= known:
+        raise argparse.ArgumentTypeError(f"must be among {', '.join(f'{each:g}' for each in sorted(known))}")
+    return round_trips
 
 
 def _counts(text: str) -> list[int]:
