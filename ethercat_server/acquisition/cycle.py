@@ -131,14 +131,17 @@ class Cycle:
     def _due_ns(self) -> int:
         if self._recovery.all_lost:
             return self._timing.sent_ns + _RECOVERY_STEP_NS
-        return int(self._schedule.next_ns())
+        return max(int(self._schedule.next_ns()), self._bus.process_data.blocked_until_ns)
 
     def _next_frame(self, until_ns: int) -> bytes | None:
         """The next frame before `until_ns` that answers no exchange; the exchanges go on meanwhile."""
-        while self._bus.clock.monotonic_ns() < until_ns:
+        while True:
+            in_time = self._bus.clock.monotonic_ns() < until_ns
+            self._answered = False
             if (frame := self._step(until_ns)) is not None:
                 return frame
-        return None
+            if not (in_time or self._answered):  # what had arrived by then is taken though this is late
+                return None
 
     def _step(self, until_ns: int) -> bytes | None:
         """Hand out what arrives, or send the next exchange once it is due; return by `until_ns`.
@@ -148,7 +151,7 @@ class Cycle:
         bus, monotonic_ns = self._bus, self._bus.clock.monotonic_ns
         process_data, timing = bus.process_data, self._timing
         due, now, frame = self._due_ns(), monotonic_ns(), None
-        if (wait := min(due, until_ns) - now) > 0 or process_data.in_flight:
+        if (wait := min(due, until_ns) - now) > 0 or process_data.in_flight or until_ns <= now:
             frame = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0)
             now = monotonic_ns()
             if frame is not None and (sent := process_data.take(frame)):

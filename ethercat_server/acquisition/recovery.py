@@ -201,7 +201,6 @@ class Recovery:
         frames = range(len(self._bus.process_data.inputs))
         self.alive_wkc = [sum(counters[number][which] for number in alive) for which in frames]
         self.all_lost = not alive
-        self._bus.be_patient(self.all_lost)
 
     def _step(self, number: int) -> None:
         change = self._changing.get(number)

@@ -18,7 +18,7 @@ _TIMEOUT_NS: Final = 0.75 * PERIOD_NS
 """Timeout of the server for a frame."""
 _MANY: Final = 0.001
 """Fraction of all cycles above which late or lost ones are `bad`."""
-FORMULA: Final = "age = max(0, margin + lateness - its median + (exchange - its mean) / 2) + exchange / 2, margin {:.0f} µs"
+FORMULA: Final = "age = max(0, margin + lateness - its median + (exchange - its mean) / 2) + exchange / 2"
 _STEADIER: Final = "see 'A steadier cycle' in docs/operations.md"
 
 
@@ -126,7 +126,9 @@ def age(measured: Measured) -> Iterator[Finding]:
         yield skipped("it requires exchanges on the bus")
         return
     yield age_finding(
-        "expected when sent", summary_us(handed_out), FORMULA.format(measured.margin_ns() / 1000)
+        "expected when sent",
+        summary_us(handed_out),
+        f"{FORMULA}; margin {measured.margin_ns() / 1000:.0f} µs",
     )
     if arrived:
         yield age_finding("expected at a local client", summary_us(arrived), "the same + message")

@@ -19,8 +19,7 @@ from ethercat_server.ethercat.wire import FIRST_DATA, SHORTEST_FRAME, Command, b
 _FIRST_INDEX: Final = 0x80
 """SOEM uses the indices below, and the exchange of process data those from `process_data.FIRST_INDEX` on."""
 _INDICES: Final = 0x10
-_DATAGRAM_TIMEOUT_S: Final = 0.002
-_PATIENT_TIMEOUT_S: Final = 0.02
+_TIMEOUT_S: Final = 0.02
 _REGISTER_ATTEMPTS: Final = 20
 _U16: Final = struct.Struct("<H")
 
@@ -35,7 +34,6 @@ class Datagrams:
         self._send, self._receive = backend.send, backend.receive
         self._monotonic_ns = backend.clock.monotonic_ns
         self._index = 0
-        self._datagram_timeout_s = _PATIENT_TIMEOUT_S
         self._late = LateAnswers(backend.clock, _FIRST_INDEX, _INDICES)
         self._pending_ns = self._late.pending_ns
         self.next_frame = self.next_on_wire
@@ -44,10 +42,6 @@ class Datagrams:
         self.stations: list[int] = []
         """Configured station addresses of the sensors, by number."""
 
-    def be_patient(self, patient: bool) -> None:
-        """Whether single datagrams may take long: no sensor is left that would have to wait for them."""
-        self._datagram_timeout_s = _PATIENT_TIMEOUT_S if patient else _DATAGRAM_TIMEOUT_S
-
     def next_on_wire(self, until_ns: int) -> bytes | None:
         """The next frame that arrives before `until_ns`; None if none does."""
         left_ns = until_ns - self._monotonic_ns()
@@ -55,19 +49,19 @@ class Datagrams:
 
     def read_register(self, number: int, address: int, size: int) -> bytes | None:
         """Read ESC registers or a mailbox of a sensor with one datagram; None if it did not do it."""
-        return self._read(Command.FPRD, self.stations[number], address, size, self._datagram_timeout_s)
+        return self._read(Command.FPRD, self.stations[number], address, size, _TIMEOUT_S)
 
     def write_register(self, number: int, address: int, data: bytes) -> bool:
         """Write ESC registers or a mailbox of a sensor with one datagram; False if it did not."""
-        return self._write(Command.FPWR, self.stations[number], address, data, self._datagram_timeout_s)
+        return self._write(Command.FPWR, self.stations[number], address, data, _TIMEOUT_S)
 
     def read_at(self, position: int, address: int, size: int) -> bytes | None:
         """Read ESC registers of the slave at a position, scanned or not; None if it did not do it."""
-        return self._read(Command.APRD, -position, address, size, self._datagram_timeout_s)
+        return self._read(Command.APRD, -position, address, size, _TIMEOUT_S)
 
     def write_at(self, position: int, address: int, data: bytes) -> bool:
         """Write ESC registers of the slave at a position, scanned or not; False if it did not do it."""
-        return self._write(Command.APWR, -position, address, data, self._datagram_timeout_s)
+        return self._write(Command.APWR, -position, address, data, _TIMEOUT_S)
 
     def count_slaves(self, size: int, timeout_s: float) -> int:
         """How many slaves answer a broadcast read of `size` bytes from register 0 on; -1 if it is lost.

@@ -10,6 +10,7 @@ from ethercat_server.errors import SetUpError
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import (
     COUNTER_SIZE,
+    DATAGRAM_HEADER,
     DATAGRAM_INDEX,
     FIRST_DATA,
     FRAME_HEADER,
@@ -24,11 +25,18 @@ _INDICES: Final = 0x100 - FIRST_INDEX
 MOST_IN_FLIGHT = 100
 """Frames on the wire; a limit for a bus that does not answer."""
 _LOST_NS: Final = 100_000_000
-"""A frame that is not back after this time does not come back: its index is used again."""
-_LONGEST_DATA: Final = 1486
-"""Bytes of process data that fit one frame with one datagram."""
+"""A frame that is not back after this time counts as lost: its index is used again."""
+_TAG_SIZE: Final = 4
+"""Each frame carries its number in a second datagram (NOP), which comes back as it was sent: by the index
+alone one that comes back very late would be taken for a later one."""
+_BEFORE_TAG: Final = COUNTER_SIZE + DATAGRAM_HEADER
+_LONGEST_DATA: Final = 1486 - _BEFORE_TAG - _TAG_SIZE
+"""Bytes of process data that fit one frame with these two datagrams."""
 _NEVER: Final = b"\xff"
 """What is sent where the inputs will be; no sensor says it, for its numbers would be NaN throughout."""
+
+
+_NOTHING: Final = (0, 0, b"")
 
 
 class Area(NamedTuple):
@@ -65,16 +73,18 @@ class ProcessData:
         for number, each in enumerate(areas):
             self._lay_out(number, each, spans)
         self._ends = [FIRST_DATA + end - start for start, end in spans]
-        """Where the data ends in each."""
-        self._index = 0
-        self._sent = [(0, 0)] * _INDICES
-        """By index less the first: when a frame was sent that is not back, else 0; and which it was."""
+        """Where the process data ends in each."""
+        self._index = self._number = 0
+        self._sent = [_NOTHING] * _INDICES
+        """By index less the first: when a frame was sent that is not back, else 0; which it was; its tag."""
         self._flying: deque[tuple[int, int]] = deque()
         """When frames were sent, and under which index: the oldest first; some are back."""
         self.in_flight = 0
         """Frames that are not back, and not lost."""
         self.lost = 0
         """Frames that did not come back."""
+        self.blocked_until_ns = 0
+        """Nothing can be sent before, as long as nothing comes back."""
         self.waiting_since_ns = 0
         """When the first was sent of those since the last answer; 0 for none."""
         self.unanswered = 0
@@ -104,12 +114,16 @@ class ProcessData:
             self._forget(now_ns)
         for which, frame in enumerate(self._frames):
             if self.in_flight >= MOST_IN_FLIGHT:
+                self.blocked_until_ns = self._flying[0][0] + _LOST_NS
                 return
             index = self._index
-            while self._sent[index][0]:  # that frame may come back still
+            while self._sent[index][0]:
                 index = (index + 1) % _INDICES
             self._index = (index + 1) % _INDICES
-            self._sent[index] = now_ns, which
+            self._number = (self._number + 1) & 0xFFFFFFFF
+            tag, at = self._number.to_bytes(_TAG_SIZE, "little"), self._ends[which] + _BEFORE_TAG
+            frame[at : at + _TAG_SIZE] = tag
+            self._sent[index] = now_ns, which, tag
             self._flying.append((now_ns, index))
             self.in_flight += 1
             self.waiting_since_ns = self.waiting_since_ns or now_ns
@@ -126,30 +140,28 @@ class ProcessData:
         ):
             return 0
         index = frame[DATAGRAM_INDEX] - FIRST_INDEX
-        sent_ns, which = self._sent[index]
+        sent_ns, which, tag = self._sent[index]
         end = self._ends[which]
-        if not sent_ns or len(frame) < end + COUNTER_SIZE:
+        at = end + _BEFORE_TAG
+        if not sent_ns or frame[at : at + _TAG_SIZE] != tag:  # shorter, or an older one
             return 0
-        self._sent[index] = 0, 0
+        self._sent[index] = _NOTHING
+        self.blocked_until_ns = 0
         self.in_flight -= 1
         self.waiting_since_ns = self.unanswered = 0
         self.frame, self.which = frame, which
         self.wkc = frame[end] | frame[end + 1] << 8
         return sent_ns
 
-    def forget_all(self) -> None:
-        """Nothing that is on the wire is awaited any more."""
-        self.waiting_since_ns = self.unanswered = 0
-
     def _forget(self, now_ns: int) -> None:
-        """Give up the frames that have been away for too long. What has arrived must have been taken."""
+        """Give up the frames that have been away for too long."""
         flying = self._flying
         while flying:
             sent_ns, index = flying[0]
             if self._sent[index][0] == sent_ns:
                 if now_ns - sent_ns < _LOST_NS:
                     return
-                self._sent[index] = 0, 0
+                self._sent[index] = _NOTHING
                 self.in_flight -= 1
                 self.lost += 1
             flying.popleft()
@@ -167,7 +179,8 @@ def _spans(areas: Iterable[Area]) -> list[tuple[int, int]]:
 
 def _frame(span: tuple[int, int]) -> bytearray:
     start, end = span
-    return build((Command.LRW, start & 0xFFFF, start >> 16, bytes(end - start))).ljust(SHORTEST_FRAME, b"\0")
+    exchange = Command.LRW, start & 0xFFFF, start >> 16, bytes(end - start)
+    return build(exchange, (Command.NOP, 0, 0, bytes(_TAG_SIZE))).ljust(SHORTEST_FRAME, b"\0")
 
 
 def _working_counter(areas: Sequence[Area], span: tuple[int, int]) -> int:

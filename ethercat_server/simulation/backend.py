@@ -74,5 +74,6 @@ class MemoryBackend:
             arrives_ns, _, frame = heapq.heappop(self._on_the_wire)
             clock.advance(arrives_ns)
             return frame
-        clock.wake_at(until_ns)
+        if timeout_s > 0:  # a look does not go to sleep
+            clock.wake_at(until_ns)
         return None

@@ -68,7 +68,7 @@ def test_losses_show(bench: Bench, tmp_path: Path) -> None:
 
 def test_losses_while_it_looks_are_told(bench: Bench, tmp_path: Path) -> None:
     bus, _ = bench
-    bus.at(0.5, "lose 5")
+    bus.at(0.5, "deaf 0.04")
     sensor = examined(bus, tmp_path, 1.0).of("server")["sensors"]
     assert sensor.level is Level.BAD
     assert sensor.values["new_invalid"] > 0

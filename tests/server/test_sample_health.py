@@ -84,7 +84,7 @@ def test_what_is_discarded_after_a_start_is_not_counted() -> None:
     simulation = Simulation()
     measure(simulation, **{"force.x": math.nan})
     simulation.run_until(lambda: simulation.streams[0].process_data, "a sample")
-    simulation.run_until(lambda: simulation.streams[0].clock.locked, "a sensor that is followed")
+    simulation.run_until(lambda: simulation.streams[0].fresh, "a frame")
     row = simulation.status()["sensors"][0]
     assert row["not_finite"] == row["fresh"] > 0
 

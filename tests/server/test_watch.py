@@ -69,9 +69,6 @@ class GivenBus:
         self.looked_for = True
         return None
 
-    def be_patient(self, patient: bool) -> None:
-        pass
-
 
 def a_sensor(position: int) -> Sensor:
     sensor = Sensor(position, Identity("a sensor", position, "", ""), {})

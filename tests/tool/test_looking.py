@@ -167,7 +167,7 @@ def test_watch_gives_si_units_rate_and_warnings() -> None:
 
 
 def test_watch_counts_the_samples_that_the_bus_lost(chain: SimulatedBus) -> None:
-    chain.at(0.5, "lose 5")
+    chain.at(0.5, "deaf 0.02")
     ended = tool_here("watch", chain.near, "--seconds", 0.9, "--interval", 10, "--json")
     assert [json.loads(line)["gaps"] for line in ended.out.splitlines()] == [1, 1]
 

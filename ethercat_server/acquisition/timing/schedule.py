@@ -18,6 +18,8 @@ _BUDGET: Final = 0.5
 """Part of the time that exchanges may take."""
 _LARGEST_WAIT: Final = 0.25
 """What a poll may wait for another, in shortest sample periods."""
+_LONGEST_LEAD_NS: Final = 200_000.0
+"""By how much polls are brought forward at most because this machine wakes late."""
 
 
 class Schedule:
@@ -42,8 +44,8 @@ class Schedule:
             due_ns = min(wanted)
             latest_ns = due_ns + self._spacing_ns
             due_ns = max([each for each in wanted if each <= latest_ns])
-            # One that waits for another must not be waited for by a third.
-        return max(due_ns, self._timing.sent_ns + self._spacing_ns) - self._timing.late_ns
+        timing = self._timing
+        return max(due_ns - min(timing.late_ns, _LONGEST_LEAD_NS), timing.sent_ns + self._spacing_ns)
 
     def cost(self, busy_ns: int) -> None:
         """An exchange has kept the loop busy for so long."""
