@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Final, Protocol
 
+from ethercat_server.acquisition.health.round_trip import RoundTripHealth
 from ethercat_server.acquisition.histogram import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
@@ -23,6 +24,8 @@ _SERVE_MARGIN_NS: Final = 80_000
 """Sockets are not served this shortly before a deadline: select may wake late."""
 _SERVE_EVERY_NS: Final = 10_000_000
 """Sockets are served this often even if every deadline has passed."""
+_SERVE_IN_FLIGHT_NS: Final = 2_000_000
+"""Sockets are served this often, without waiting, while an exchange is on its way."""
 _RECOVERY_STEP_NS: Final = 500_000
 """Time between two exchanges while all sensors are lost."""
 _SUMMARY_NS: Final = 200_000_000
@@ -82,9 +85,11 @@ class Cycle:
         self._missed_deadlines = 0
         self._timing = timing
         self._schedule = Schedule(streams, timing)
+        self._round_trip = RoundTripHealth(timing, bus.ifname)
         carried = bus.process_data.inputs
-        self._carried = [[(at, sensors[at.number], streams[at.number]) for at in each] for each in carried]
-        """By frame of the exchange: what it carries of which sensor."""
+        self._carried = [[(*at, sensors[at.number], streams[at.number]) for at in each] for each in carried]
+        """By frame of the exchange: where it carries what of which sensor."""
+        self._streams_of = [[streams[at.number] for at in each] for each in carried]
         self._answered = self._complete = False
         """Whether the last step took an answer, and whether all sensors took part in it that are not lost."""
         self._wake = RecentDistribution()
@@ -100,21 +105,24 @@ class Cycle:
     def run(self) -> None:
         """The loop."""
         bus, hub, recovery, jobs, watchdog = self._bus, self._hub, self._recovery, self._jobs, self._watchdog
-        process_data, monotonic_ns = bus.process_data, bus.clock.monotonic_ns
+        process_data, timing, monotonic_ns = bus.process_data, self._timing, bus.clock.monotonic_ns
         bus.next_frame = self._next_frame
         serve_by = roll_at = feed_at = 0
         while not self.stopping:
-            now = monotonic_ns()
             due = self._due_ns()
             if jobs.waiting:
                 jobs.step(due)
-            if now > serve_by or (due > now and not process_data.in_flight):
-                hub.serve(
-                    min(due - _SERVE_MARGIN_NS, now) if process_data.in_flight else due - _SERVE_MARGIN_NS
-                )
-                serve_by = now + _SERVE_EVERY_NS
+                due = self._due_ns()
+            now = monotonic_ns()
+            if not timing.in_flight:
+                if due > now or now > serve_by:
+                    hub.serve(due - _SERVE_MARGIN_NS)
+                    serve_by = now + _SERVE_EVERY_NS
+            elif now > serve_by:
+                hub.serve(now)
+                serve_by = now + _SERVE_IN_FLIGHT_NS
             self._answered = False
-            self._step(due + _RECOVERY_STEP_NS)
+            self._step(due, due)
             now = monotonic_ns()
             if self._answered:
                 recovery.attend(self._complete, now)
@@ -129,51 +137,69 @@ class Cycle:
         bus.next_frame = bus.next_on_wire
 
     def _due_ns(self) -> int:
+        """When the next exchange is due."""
         if self._recovery.all_lost:
             return self._timing.sent_ns + _RECOVERY_STEP_NS
-        return max(int(self._schedule.next_ns()), self._bus.process_data.blocked_until_ns)
+        due = int(self._schedule.next_ns())
+        blocked_until = self._bus.process_data.blocked_until_ns
+        return due if due > blocked_until else blocked_until
 
     def _next_frame(self, until_ns: int) -> bytes | None:
         """The next frame before `until_ns` that answers no exchange; the exchanges go on meanwhile."""
         while True:
             in_time = self._bus.clock.monotonic_ns() < until_ns
             self._answered = False
-            if (frame := self._step(until_ns)) is not None:
+            if (frame := self._step(self._due_ns(), until_ns)) is not None:
                 return frame
             if not (in_time or self._answered):  # what had arrived by then is taken though this is late
                 return None
 
-    def _step(self, until_ns: int) -> bytes | None:
-        """Hand out what arrives, or send the next exchange once it is due; return by `until_ns`.
+    def _step(self, due: int, until_ns: int) -> bytes | None:
+        """Hand out what arrives until the next exchange is `due`, then send it; return by `until_ns`.
 
-        Returns a frame that is no answer to an exchange.
+        After it is sent its answer is awaited, until yet another one is due. Returns a frame that answers no
+        exchange.
         """
-        bus, monotonic_ns = self._bus, self._bus.clock.monotonic_ns
-        process_data, timing = bus.process_data, self._timing
-        due, now, frame = self._due_ns(), monotonic_ns(), None
-        if (wait := min(due, until_ns) - now) > 0 or process_data.in_flight or until_ns <= now:
-            frame = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0)
-            now = monotonic_ns()
-            if frame is not None and (sent := process_data.take(frame)):
-                timing.took(sent, now)
-                self._exchange.record(now - sent)
-                self._hand_out(sent, now)
-                self._schedule.cost(monotonic_ns() - now)
-                self._missed_deadlines += max(0, int((now - due) // self._schedule.shortest_ns))
-                return None
-            if now < due:
+        process_data, timing, monotonic_ns = (
+            self._bus.process_data,
+            self._timing,
+            self._bus.clock.monotonic_ns,
+        )
+        frame, now = None, monotonic_ns()
+        wait = (due if due < until_ns else until_ns) - now
+        if wait > 0 or process_data.in_flight or until_ns <= now:
+            frame = self._receive(wait)
+            if self._answered or (now := monotonic_ns()) < due:
                 return frame
             if wait > 0:
                 timing.woke(now - due)
                 self._wake.record(now - due)
-        self._missed_deadlines += int((now - due) // self._schedule.shortest_ns)
+        if (late := now - due) > self._schedule.shortest_ns:
+            self._missed_deadlines += int(late // self._schedule.shortest_ns)
         timing.sent_ns, timing.in_flight = now, True
         self._cycles += 1
         process_data.send(now)
         for stream in self._streams:
             if now >= stream.idle_at_ns and (made := stream.idle(now)):
                 self._hub.publish(made[0], stream.number, made[1], now)
+        if frame is None and (wait := self._due_ns() - monotonic_ns()) > 0:
+            return self._receive(wait)
         return frame
+
+    def _receive(self, wait: int) -> bytes | None:
+        """Wait for a frame, `wait` ns at most, and hand it out; returns one that answers no exchange."""
+        bus = self._bus
+        frame = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0)
+        if frame is None or not (sent := bus.process_data.take(frame)):
+            return frame
+        back = bus.clock.monotonic_ns()
+        self._timing.took(sent, back)
+        self._exchange.record(back - sent)
+        if back - sent > wait + self._schedule.shortest_ns:  # the computer stood still meanwhile
+            self._missed_deadlines += int((back - sent - wait) // self._schedule.shortest_ns)
+        self._hand_out(sent, back)
+        self._schedule.cost(bus.clock.monotonic_ns() - back)
+        return None
 
     def _hand_out(self, sent: int, back: int) -> None:
         """Hand out what the exchange that was taken last brought."""
@@ -181,15 +207,16 @@ class Cycle:
         frame, wkc, which = process_data.frame, process_data.wkc, process_data.which
         self._answered = True
         self._complete = complete = wkc >= self._recovery.alive_wkc[which]
-        carried = self._carried[which]
-        for at, sensor, stream in carried:
-            data = frame[at.start : at.end]
+        for number, start, end, untouched, sensor, stream in self._carried[which]:
+            if back < stream.clock.quiet_until_ns:
+                continue  # the poll was for another sensor
+            data = frame[start:end]
             # One that is out may be counted in place of one that is not there any more.
-            if not complete or sensor.state is not SensorState.STREAMING or data == at.untouched:
+            if not complete or sensor.state is not SensorState.STREAMING or data == untouched:
                 stream.invalid(wkc)
             elif made := stream.take(data, wkc, sent, back):
-                self._hub.publish(made[0], at.number, made[1], back)
-        for _, _, stream in carried:
+                self._hub.publish(made[0], number, made[1], back)
+        for stream in self._streams_of[which]:
             stream.learn()
 
     def _roll(self) -> None:
@@ -197,6 +224,7 @@ class Cycle:
         self._wake.roll()
         self._exchange.roll()
         self._schedule.roll()
+        self._round_trip.check()
         for stream in self._streams:
             stream.age.roll()
             stream.check()
@@ -212,6 +240,7 @@ class Cycle:
         (wake, recent_wake), (exchange, recent_exchange), *ages = self._summaries
         return {
             "cycles": self._cycles,
+            "round_trip": self._timing.describe(),
             "missed_deadlines": self._missed_deadlines,
             "lost_frames": self._bus.process_data.lost,
             "wake_us": wake,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
+from ethercat_server.acquisition.health.round_trip import SLOW_US, cost
 from ethercat_server.doctor.bus.measurement import PERIOD_NS, Measured, summary_us
 from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, skipped, warning
 
@@ -12,10 +13,7 @@ _PERIOD_US: Final = PERIOD_NS / 1000
 _WAKE_NOTE_US: Final = 100
 _WAKE_WARNING_US: Final = 250
 _EXCHANGE_NOTE_US: Final = 250
-_EXCHANGE_WARNING_US: Final = 500
 _MESSAGE_NOTE_US: Final = 500
-_TIMEOUT_NS: Final = 0.75 * PERIOD_NS
-"""Timeout of the server for a frame."""
 _MANY: Final = 0.001
 """Fraction of all cycles above which late or lost ones are `bad`."""
 FORMULA: Final = "age = max(0, margin + lateness - its median + (exchange - its mean) / 2) + exchange / 2"
@@ -84,22 +82,19 @@ def exchanges(measured: Measured, size: int) -> Iterator[Finding]:
         return
     summary = summary_us(whole)
     text = f"{points(summary)} for frames with {size} bytes of data"
-    late = sum(value > _TIMEOUT_NS for value in whole)
-    yield exchange_finding(text, summary, measured.lost, late, len(measured.exchanges))
+    yield exchange_finding(text, summary, measured.lost, len(measured.exchanges))
 
 
-def exchange_finding(text: str, summary: Mapping[str, Any], lost: int, late: int, count: int) -> Finding:
-    """The finding for a summary: `late` exchanges exceeded the timeout of the server."""
-    values: dict[str, Any] = {**summary, "exchanges": count, "lost": lost, "late": late}
-    if lost or late:
-        make = bad if lost + late > _MANY * count else warning
-        why = (
-            "each may lose a sample: check the cable; on a virtual machine or under load frames are late, too"
-        )
-        missing = ([f"{lost} frames lost"] if lost else []) + ([f"{late} too late"] if late else [])
-        return make(f"{text}; {' and '.join(missing)} of {count}", why, **values)
-    if summary["p99"] > _EXCHANGE_WARNING_US:
-        return warning(text, "slow network card or driver: see coalescing, interrupts", **values)
+def exchange_finding(text: str, summary: Mapping[str, Any], lost: int, count: int) -> Finding:
+    """The finding for a summary: `lost` of `count` exchanges did not come back."""
+    values: dict[str, Any] = {**summary, "exchanges": count, "lost": lost}
+    if lost:
+        make = bad if lost > _MANY * count else warning
+        why = "each may cost a sample: check the cable; a busy virtual machine loses frames, too"
+        return make(f"{text}; {lost} frames lost of {count}", why, **values)
+    if summary["p50"] > SLOW_US:
+        why = f"slow network card or driver: {cost(summary['p50'])}; see coalescing, interrupts"
+        return warning(text, why, **values)
     if summary["p99"] > _EXCHANGE_NOTE_US:
         return note(text, "network card, driver or load: see coalescing, interrupts", **values)
     return ok(text, **values)

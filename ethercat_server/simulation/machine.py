@@ -34,6 +34,8 @@ class Machine:
     """Round trip of a frame at least."""
     frame_jitter_ns: float = 10_000.0
     """Mean of what comes on top; exponentially distributed."""
+    even_jitter_ns: float = 0.0
+    """Up to so much comes on top, too; evenly distributed."""
     lost: float = 0.0
     """Chance that a frame does not come back."""
     late: float = 0.0
@@ -121,6 +123,8 @@ class Wire:
             return None
         late_ns = machine.late_ns if machine.late and chance.random() < machine.late else 0.0
         delay_ns = chance.expovariate(1) * machine.frame_jitter_ns + late_ns
+        if machine.even_jitter_ns:
+            delay_ns += chance.random() * machine.even_jitter_ns
         # It may be held up on its way out, on its way back, or by a slave in between.
         return (
             round(machine.frame_ns / 2 + chance.random() * delay_ns),

@@ -122,7 +122,8 @@ class Estimate:
             self._contradictions = 0
         elif self._is_contradicted():
             return
-        late = max(-_FARTHEST, min(_FARTHEST, late))
+        if not -_FARTHEST < late < _FARTHEST:
+            late = math.copysign(_FARTHEST, late)
         chance = _WRONG + (0.5 - _WRONG) * math.erfc(-sign * late * _ROOT_HALF)
         slope = (1 - 2 * _WRONG) * sign * math.exp(-late * late / 2) / (ROOT_2_PI * chance * deviation_ns)
         self._move(-slope)
@@ -136,15 +137,18 @@ class Estimate:
             self._run = 0.0
             self._narrow(slope * slope + slope * late / deviation_ns)
         excess = (1 - chance) * (surprise + math.log(1 - chance))
-        self._restless = min(max(self._restless + _RESTLESS_GAIN * excess, 0.0), _MOST_RESTLESS)
-        times = math.exp(self._restless)
-        self._jitter = times * _JITTER_NS**2
-        self._wander = times * (_WANDER * self._nominal_ns) ** 2
+        restless = self._restless + _RESTLESS_GAIN * excess
+        if restless > 0 or self._restless > 0:
+            self._restless = min(max(restless, 0.0), _MOST_RESTLESS)
+            times = math.exp(self._restless)
+            self._jitter = times * _JITTER_NS**2
+            self._wander = times * (_WANDER * self._nominal_ns) ** 2
 
     def _move(self, weight: float) -> None:
         self.phase_ns += self.variance * weight
         period_ns, most = self.period_ns + self._covariance * weight, _LARGEST_PULL * self._nominal_ns
-        self.period_ns = min(max(period_ns, self._nominal_ns - most), self._nominal_ns + most)
+        if -most < period_ns - self._nominal_ns < most:
+            self.period_ns = period_ns
 
     def _narrow(self, information: float) -> None:
         self._period_variance -= self._covariance * self._covariance * information

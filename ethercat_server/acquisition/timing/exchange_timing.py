@@ -10,6 +10,8 @@ import math
 from typing import Any, Final
 
 _GAIN: Final = 1 / 64
+_TURNS: Final = 7
+"""What follows from the averages is derived anew every so many exchanges."""
 _WINDOW_NS: Final = 2_000_000_000
 """The shortest round trip is that of the last one or two of these."""
 _FIRST_GUESS_NS: Final = 100_000.0
@@ -20,16 +22,28 @@ _OUTLIER: Final = 4.0
 """What lies further out than so many standard deviations counts as that far: a stall is no jitter."""
 _ROOM_NS: Final = 10_000.0
 _PATIENCE_NS: Final = 100_000.0
-SLOW_NS: Final = 300_000.0
-"""A usual round trip above this is a slow network card's."""
 
 
 class ExchangeTiming:
     """Round trips, and lateness of wake-ups, of one bus. All in ns; variances in ns²."""
 
     __slots__ = (
-        "_excess_square", "_late_variance", "_least_now_ns", "_roll_at_ns", "excess_ns", "in_flight",
-        "late_ns", "least_ns", "look_ns", "look_variance", "patience_ns", "sent_ns", "usual_ns", "variance",
+        "_excess_square",
+        "_late_variance",
+        "_least_now_ns",
+        "_most_excess_ns",
+        "_roll_at_ns",
+        "_turn",
+        "excess_ns",
+        "in_flight",
+        "late_ns",
+        "least_ns",
+        "look_ns",
+        "look_variance",
+        "patience_ns",
+        "sent_ns",
+        "usual_ns",
+        "variance",
     )  # fmt: skip
 
     def __init__(self, now_ns: int = 0) -> None:
@@ -46,7 +60,7 @@ class ExchangeTiming:
         self._excess_square = 2 * _FIRST_EXCESS_NS**2
         self._late_variance = _FIRST_LATE_NS**2
         self._least_now_ns = math.inf
-        self._roll_at_ns = 0
+        self._roll_at_ns = self._turn = 0
         self._derive()
 
     def _derive(self) -> None:
@@ -58,6 +72,7 @@ class ExchangeTiming:
         """Of the difference between the instant aimed at and that of the look."""
         least_ns = self.least_ns if self.least_ns < math.inf else _FIRST_GUESS_NS
         self.usual_ns = least_ns + self.excess_ns
+        self._most_excess_ns = _OUTLIER * math.sqrt(self._excess_square) + _ROOM_NS
         self.patience_ns = self.usual_ns + 3 * self.excess_ns + _PATIENCE_NS
         """After this time an answer is overdue."""
 
@@ -74,10 +89,14 @@ class ExchangeTiming:
         if took_ns < self._least_now_ns:
             self._least_now_ns = took_ns
             self.least_ns = min(self.least_ns, took_ns)
-        excess_ns = min(took_ns - self.least_ns, _OUTLIER * math.sqrt(self._excess_square) + _ROOM_NS)
+        excess_ns = took_ns - self.least_ns
+        excess_ns = min(excess_ns, self._most_excess_ns)
         self.excess_ns += _GAIN * (excess_ns - self.excess_ns)
         self._excess_square += _GAIN * (excess_ns * excess_ns - self._excess_square)
-        self._derive()
+        self._turn -= 1
+        if self._turn < 0:
+            self._turn = _TURNS
+            self._derive()
 
     def woke(self, late_ns: float) -> None:
         """The loop woke so long after it had wanted to."""
@@ -91,7 +110,9 @@ class ExchangeTiming:
 
         Returns the instant and its variance.
         """
-        excess_ns = max(0.0, back_ns - sent_ns - self.least_ns)
+        excess_ns = back_ns - sent_ns - self.least_ns
+        if excess_ns < 0:
+            excess_ns = 0.0
         return sent_ns + excess_ns / 2, excess_ns * excess_ns / 12
 
     def describe(self) -> dict[str, Any]:

@@ -45,7 +45,9 @@ class Schedule:
             latest_ns = due_ns + self._spacing_ns
             due_ns = max([each for each in wanted if each <= latest_ns])
         timing = self._timing
-        return max(due_ns - min(timing.late_ns, _LONGEST_LEAD_NS), timing.sent_ns + self._spacing_ns)
+        due_ns -= timing.late_ns if timing.late_ns < _LONGEST_LEAD_NS else _LONGEST_LEAD_NS
+        earliest_ns = timing.sent_ns + self._spacing_ns
+        return due_ns if due_ns > earliest_ns else earliest_ns
 
     def cost(self, busy_ns: int) -> None:
         """An exchange has kept the loop busy for so long."""

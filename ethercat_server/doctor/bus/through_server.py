@@ -90,7 +90,7 @@ class ServerView:
         summary = self.after["last_10s"]["exchange_us"]
         lost, count = self.grown("lost_frames"), max(1, self.grown("cycles"))
         text = "".join(f"{name} {summary[key]:.0f}, " for name, key in (("p50", "p50"), ("p99", "p99")))
-        yield exchange_finding(f"{text}max {summary['max']:.0f} µs in the last 10 s", summary, lost, 0, count)
+        yield exchange_finding(f"{text}max {summary['max']:.0f} µs in the last 10 s", summary, lost, count)
 
     def ages(self) -> Iterator[Finding]:
         """The age of samples when the server sends them."""
