@@ -104,9 +104,15 @@ class Cycle:
 
     def run(self) -> None:
         """The loop."""
+        self._bus.next_frame = self._next_frame
+        try:
+            self._run()
+        finally:
+            self._bus.next_frame = self._bus.next_on_wire
+
+    def _run(self) -> None:
         bus, hub, recovery, jobs, watchdog = self._bus, self._hub, self._recovery, self._jobs, self._watchdog
-        process_data, timing, monotonic_ns = bus.process_data, self._timing, bus.clock.monotonic_ns
-        bus.next_frame = self._next_frame
+        timing, monotonic_ns = self._timing, bus.clock.monotonic_ns
         serve_by = roll_at = feed_at = 0
         while not self.stopping:
             due = self._due_ns()
@@ -122,19 +128,18 @@ class Cycle:
                 hub.serve(now)
                 serve_by = now + _SERVE_IN_FLIGHT_NS
             self._answered = False
-            self._step(due, due)
+            self._step(due, (now if timing.in_flight else due) + _SERVE_EVERY_NS)
             now = monotonic_ns()
             if self._answered:
                 recovery.attend(self._complete, now)
-            elif process_data.unanswered > 1:
-                recovery.miss(now - process_data.waiting_since_ns, now)
+            elif timing.unanswered > 1:
+                recovery.miss(now - timing.unanswered_since_ns, now)
             if now >= roll_at:
                 roll_at = now + SLOT_NS
                 self._roll()
             if now >= feed_at:
                 feed_at = now + watchdog.feed_every_ns
                 watchdog.feed()
-        bus.next_frame = bus.next_on_wire
 
     def _due_ns(self) -> int:
         """When the next exchange is due."""
@@ -160,14 +165,10 @@ class Cycle:
         After it is sent its answer is awaited, until yet another one is due. Returns a frame that answers no
         exchange.
         """
-        process_data, timing, monotonic_ns = (
-            self._bus.process_data,
-            self._timing,
-            self._bus.clock.monotonic_ns,
-        )
+        bus, timing, monotonic_ns = self._bus, self._timing, self._bus.clock.monotonic_ns
         frame, now = None, monotonic_ns()
         wait = (due if due < until_ns else until_ns) - now
-        if wait > 0 or process_data.in_flight or until_ns <= now:
+        if wait > 0 or bus.process_data.in_flight or until_ns <= now:
             frame = self._receive(wait)
             if self._answered or (now := monotonic_ns()) < due:
                 return frame
@@ -176,13 +177,13 @@ class Cycle:
                 self._wake.record(now - due)
         if (late := now - due) > self._schedule.shortest_ns:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
-        timing.sent_ns, timing.in_flight = now, True
+        timing.sends(now)
         self._cycles += 1
-        process_data.send(now)
+        bus.process_data.send(now)
         for stream in self._streams:
             if now >= stream.idle_at_ns and (made := stream.idle(now)):
                 self._hub.publish(made[0], stream.number, made[1], now)
-        if frame is None and (wait := self._due_ns() - monotonic_ns()) > 0:
+        if frame is None and (wait := min(self._due_ns(), until_ns) - monotonic_ns()) > 0:
             return self._receive(wait)
         return frame
 
@@ -195,8 +196,10 @@ class Cycle:
         back = bus.clock.monotonic_ns()
         self._timing.took(sent, back)
         self._exchange.record(back - sent)
-        if back - sent > wait + self._schedule.shortest_ns:  # the computer stood still meanwhile
-            self._missed_deadlines += int((back - sent - wait) // self._schedule.shortest_ns)
+        if (
+            late := back - sent - self._timing.usual_ns
+        ) > self._schedule.shortest_ns:  # the computer stood still
+            self._missed_deadlines += int(late // self._schedule.shortest_ns)
         self._hand_out(sent, back)
         self._schedule.cost(bus.clock.monotonic_ns() - back)
         return None

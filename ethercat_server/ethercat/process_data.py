@@ -85,10 +85,6 @@ class ProcessData:
         """Frames that did not come back."""
         self.blocked_until_ns = 0
         """Nothing can be sent before, as long as nothing comes back."""
-        self.waiting_since_ns = 0
-        """When the first was sent of those since the last answer; 0 for none."""
-        self.unanswered = 0
-        """How many those are."""
         self.frame = b""
         """The answer that `take` took last."""
         self.wkc = 0
@@ -126,8 +122,6 @@ class ProcessData:
             self._sent[index] = now_ns, which, tag
             self._flying.append((now_ns, index))
             self.in_flight += 1
-            self.waiting_since_ns = self.waiting_since_ns or now_ns
-            self.unanswered += 1
             frame[DATAGRAM_INDEX] = index + FIRST_INDEX
             self._send(frame)
 
@@ -148,7 +142,6 @@ class ProcessData:
         self._sent[index] = _NOTHING
         self.blocked_until_ns = 0
         self.in_flight -= 1
-        self.waiting_since_ns = self.unanswered = 0
         self.frame, self.which = frame, which
         self.wkc = frame[end] | frame[end + 1] << 8
         return sent_ns

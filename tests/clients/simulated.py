@@ -69,7 +69,7 @@ def simulate(
         bus.set_time(sent + _EXCHANGE_NS // 2)
         data, now = life.inputs(), sent + _EXCHANGE_NS
         valid = not (script.lost_frames and chance.random() < script.lost_frames)
-        timing.sent_ns = sent
+        timing.sends(sent)
         timing.took(sent, now)
         made = stream.take(data, 3, sent, now) if valid else None
         stream.learn()

@@ -35,7 +35,7 @@ def state(client: Client, sensor: int = 0) -> str:
 
 FAULTS = {
     # what happens, and whether the sensor loses its settings by it
-    "frames lost": ("lose 100", False),
+    "frames lost": ("lose 300", False),
     "deaf": ("deaf 0.5", False),
     "power cut": ("power cycle 0.5", True),
     "SAFEOP with error": ("safeop 0x1B", False),

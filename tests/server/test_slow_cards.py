@@ -17,9 +17,9 @@ from tests.simulation import Simulation, check_frames, fresh, more_if_long, read
 SETTLED_S = 5.0
 
 
-def card(milliseconds: float, jitter_us: float = 0.0, **more: float) -> Machine:
+def card(milliseconds: float, jitter_us: float = 0.0) -> Machine:
     """Round trips of this time, with up to so much more on either way."""
-    return Machine(frame_ns=milliseconds * 1e6, frame_jitter_ns=5e3, even_jitter_ns=jitter_us * 1e3, **more)
+    return Machine(frame_ns=milliseconds * 1e6, frame_jitter_ns=5e3, even_jitter_ns=jitter_us * 1e3)
 
 
 def run(machine: Machine, sinc_length: int, seconds: float = 4.0, ppm: float = -300.0) -> Simulation:

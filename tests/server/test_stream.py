@@ -26,7 +26,7 @@ class Feeder:
         self.now += after_ns
         self.sample += new
         data = self.sample.to_bytes(61, "little")
-        self.timing.sent_ns = self.now - took_ns
+        self.timing.sends(self.now - took_ns)
         self.timing.took(self.now - took_ns, self.now)
         made = self.stream.take(data, 3, self.now - took_ns, self.now) if valid else None
         self.stream.learn()

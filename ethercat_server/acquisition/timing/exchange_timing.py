@@ -42,6 +42,8 @@ class ExchangeTiming:
         "look_variance",
         "patience_ns",
         "sent_ns",
+        "unanswered",
+        "unanswered_since_ns",
         "usual_ns",
         "variance",
     )  # fmt: skip
@@ -51,6 +53,10 @@ class ExchangeTiming:
         """When the last exchange was sent."""
         self.in_flight = False
         """Whether it is not back."""
+        self.unanswered = 0
+        """Exchanges that were sent since one was back."""
+        self.unanswered_since_ns = now_ns
+        """When the first of them was sent."""
         self.least_ns = math.inf
         """The shortest recent round trip."""
         self.late_ns = 0.0
@@ -76,11 +82,20 @@ class ExchangeTiming:
         self.patience_ns = self.usual_ns + 3 * self.excess_ns + _PATIENCE_NS
         """After this time an answer is overdue."""
 
+    def sends(self, now_ns: int) -> None:
+        """An exchange is sent."""
+        self.sent_ns = now_ns
+        self.in_flight = True
+        if not self.unanswered:
+            self.unanswered_since_ns = now_ns
+        self.unanswered += 1
+
     def took(self, sent_ns: int, back_ns: int) -> None:
         """An exchange is back."""
         took_ns = back_ns - sent_ns
         if sent_ns >= self.sent_ns:
             self.in_flight = False
+        self.unanswered = 0
         if back_ns >= self._roll_at_ns:
             self._roll_at_ns = back_ns + _WINDOW_NS
             if self._least_now_ns < math.inf:

@@ -129,7 +129,8 @@ class SampleClock:
                 return probe_ns
             return aim_ns + ahead_ns
         if timing.in_flight:
-            return max(aim_ns, sent_ns + timing.patience_ns)
+            # One frame was lost, or all are: then there is no hurry.
+            return max(aim_ns, sent_ns + min(timing.unanswered * timing.patience_ns, period_ns))
         if sent_ns < aim_ns:
             return aim_ns
         # It was early: again, at once, or in steps if the sample is overdue.
