@@ -171,9 +171,8 @@ class SampleClock:
         late = (sent_ns + min(excess_ns / 2, _LONGEST_LOOK * period_ns) - phase_ns) / period_ns
         newest = 1 + math.floor(late)
         self.uncertain = False
-        if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
-            newest = min(newest, 1)
-        else:
+        watched = unwatched_ns - least_ns < _ONE_ONLY * period_ns
+        if not watched:
             doubt_ns = CONTRADICTS * math.sqrt(self._estimate.variance)
             least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
@@ -181,7 +180,8 @@ class SampleClock:
         if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
             newest = 0 if self._doubtful and late < -0.5 else 1
         self._newest = newest
-        self.steps = max(0, newest - self._absent)
+        # What was watched for and did not come is not lost, unless it had been taken for the one before.
+        self.steps = min(newest, 1) if watched and not self._doubtful else max(0, newest - self._absent)
         self.instant_ns = min(max(phase_ns + (newest - 1) * period_ns, looked_ns) + least_ns / 2, back_ns)
 
     def observe(self, sent_ns: int, back_ns: int, fresh: bool) -> None:
@@ -211,9 +211,9 @@ class SampleClock:
             doubt_ns = CONTRADICTS * math.sqrt(estimate.variance)
             while sent_ns > estimate.phase_ns + estimate.period_ns + doubt_ns:
                 estimate.advance(1)
-                self._absent += 1
+                self._absent += not self._doubtful
             self._overdue = look_ns > estimate.phase_ns + _OVERDUE * math.sqrt(estimate.variance + variance)
-            if self.locked:
+            if self.locked and not self._doubtful:  # else it may have been seen already
                 estimate.learn_bit(look_ns, variance, -1)
         self._settle()
 
