@@ -13,15 +13,13 @@ from typing import Any, Final
 from ethercat_server.acquisition.health.samples import SampleHealth
 from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.timing.sample_clock import SampleClock
+from ethercat_server.acquisition.timing.sample_clock import SILENT_PERIODS, SampleClock
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
 from protocol.framing import DataFlag, encode_data
 from protocol.pdo import is_finite
 
 DISCARDED_AT_START: Final = 3
 """Bota's own driver discards the first three frames after entering OP."""
-_IDLE_PERIODS: Final = 3.0
-"""Periods without a new sample after which a sensor counts as silent, not just late."""
 
 REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))
 
@@ -80,7 +78,7 @@ class SensorStream:
             return None
         self.process_data = data
         clock.predict(sent_ns, back_ns)
-        self.idle_at_ns = back_ns + _IDLE_PERIODS * clock.period_ns
+        self.idle_at_ns = back_ns + SILENT_PERIODS * clock.period_ns
         if self._discard:
             self._discard -= 1
             return None

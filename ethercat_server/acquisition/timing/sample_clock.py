@@ -23,6 +23,8 @@ _OVERDUE: Final = 2.0
 """It is, so many standard deviations after it was expected."""
 PLAUSIBLE_PULL: Final = 0.002
 """A real sensor's period differs from the nominal one by less than this part."""
+SILENT_PERIODS: Final = 3
+"""A sensor that has given nothing new for so long counts as silent, not just late."""
 _PRICE_NS: Final = 50_000.0
 """Age that is given up to save an exchange."""
 _LOSS_PERIODS: Final = 10.0
@@ -73,7 +75,7 @@ class SampleClock:
         self._newest = 1
         """Number of the newest sample, counted from the one before it by the phase alone."""
         self._absent = 0
-        """Samples that were watched for and did not come."""
+        """Samples in a row that were watched for and did not come."""
         self._begun = False
         """Whether a sample was seen coming."""
         self._doubtful = False
@@ -171,8 +173,7 @@ class SampleClock:
         late = (sent_ns + min(excess_ns / 2, _LONGEST_LOOK * period_ns) - phase_ns) / period_ns
         newest = 1 + math.floor(late)
         self.uncertain = False
-        watched = unwatched_ns - least_ns < _ONE_ONLY * period_ns
-        if not watched:
+        if unwatched_ns - least_ns >= _ONE_ONLY * period_ns:
             doubt_ns = CONTRADICTS * math.sqrt(self._estimate.variance)
             least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
@@ -180,8 +181,8 @@ class SampleClock:
         if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
             newest = 0 if self._doubtful and late < -0.5 else 1
         self._newest = newest
-        # What was watched for and did not come is not lost, unless it had been taken for the one before.
-        self.steps = min(newest, 1) if watched and not self._doubtful else max(0, newest - self._absent)
+        # Those that did not come are missing, too, unless the sensor was silent, which is told as such.
+        self.steps = newest + (self._absent if self._absent < SILENT_PERIODS else 0)
         self.instant_ns = min(max(phase_ns + (newest - 1) * period_ns, looked_ns) + least_ns / 2, back_ns)
 
     def observe(self, sent_ns: int, back_ns: int, fresh: bool) -> None:
@@ -211,7 +212,7 @@ class SampleClock:
             doubt_ns = CONTRADICTS * math.sqrt(estimate.variance)
             while sent_ns > estimate.phase_ns + estimate.period_ns + doubt_ns:
                 estimate.advance(1)
-                self._absent += not self._doubtful
+                self._absent += 1
             self._overdue = look_ns > estimate.phase_ns + _OVERDUE * math.sqrt(estimate.variance + variance)
             if self.locked and not self._doubtful:  # else it may have been seen already
                 estimate.learn_bit(look_ns, variance, -1)
