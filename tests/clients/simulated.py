@@ -59,7 +59,7 @@ def simulate(
     assert life is not None
     wire = list[bytes]()
     end = start + round(seconds * 1e9)
-    timing, lost_until = ExchangeTiming(now), 0.0
+    timing = ExchangeTiming(now)
     stream = SensorStream(0, life.sampler.clock.sinc_length * 1e9 / 51200, timing, cast(Clock, clock))
     while now < end:
         while todo and now >= start + todo[0][0] * 1e9:
@@ -68,9 +68,7 @@ def simulate(
         sent = max(now, int(stream.clock.next_poll_ns())) + round(chance.expovariate(1 / 8_000))
         bus.set_time(sent + _EXCHANGE_NS // 2)
         data, now = life.inputs(), sent + _EXCHANGE_NS
-        if now > lost_until and script.lost_frames and chance.random() < script.lost_frames:
-            lost_until = now + stream.clock.period_ns  # those that follow at once, too
-        valid = now > lost_until
+        valid = not (script.lost_frames and chance.random() < script.lost_frames)
         timing.sends(sent)
         if valid:
             timing.took(sent, now)

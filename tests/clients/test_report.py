@@ -98,7 +98,7 @@ def test_frames_that_the_bus_loses_are_no_lost_samples() -> None:
 @pytest.mark.parametrize(
     ("command", "check", "words"),
     [
-        ("noise force.y 0.6", "Noise of force and torque", "Force y has a noise of 0.586"),
+        ("noise force.y 0.6", "Noise of force and torque", "Force y has a noise of 0.58"),
         ("noise torque.z 0.02", "Noise of force and torque", "Torque z has a noise of 0.0193"),
         ("noise acceleration.x 0.02", "Noise of the IMU", "Acceleration x has a noise of 0.19"),
         ("noise angular_rate.z 10", "Noise of the IMU", "Angular rate z has a noise of 0.17"),
@@ -208,7 +208,7 @@ def test_warnings_are_told_with_their_remedy() -> None:
     examination = examine(sensor(5, script=script, sinc_length=SINC))
     assert wrong(examination) == {"Warnings": Level.FAULT}
     words = found(examination, "Warnings")
-    assert "Overtemperature (warning) in 80 samples, first 1.99 s after the start" in words
+    assert "Overtemperature (warning) in 80 samples, first 2.00 s after the start" in words
     assert "Wrong supply voltage (fatal) in 8 samples" in words
     [check] = [check for check in examination.checks if check.name == "Warnings"]
     assert "let it cool down" in check.remedy

@@ -185,6 +185,11 @@ class SampleClock:
         self.steps = newest + (self._absent if self._absent < SILENT_PERIODS else 0)
         self.instant_ns = min(max(phase_ns + (newest - 1) * period_ns, looked_ns) + least_ns / 2, back_ns)
 
+    def _is_late(self, look_ns: float, variance: float) -> bool:
+        """Whether the sample that is expected should have been there at a look."""
+        estimate = self._estimate
+        return look_ns > estimate.phase_ns + CONTRADICTS * math.sqrt(estimate.variance + variance)
+
     def observe(self, sent_ns: int, back_ns: int, fresh: bool) -> None:
         """Learn from one valid exchange whether it brought a new sample (`fresh`: after `predict`)."""
         estimate = self._estimate
@@ -200,7 +205,7 @@ class SampleClock:
                 estimate.advance(self._newest - 1)
             if self.uncertain:
                 pass  # it may be another sample's
-            elif self.locked:
+            elif self.locked and not self._is_late(looked_ns, variance):
                 estimate.learn_bit(look_ns, variance, 1)
             elif look_ns - looked_ns < estimate.period_ns:
                 estimate.learn_bracket(looked_ns, look_ns, variance)
@@ -214,7 +219,8 @@ class SampleClock:
                 estimate.advance(1)
                 self._absent += 1
             self._overdue = look_ns > estimate.phase_ns + _OVERDUE * math.sqrt(estimate.variance + variance)
-            if self.locked and not self._doubtful:  # else it may have been seen already
+            # One in doubt may have been seen already; one that is late may be missing. The next one tells.
+            if self.locked and not (self._doubtful or self._is_late(look_ns, variance)):
                 estimate.learn_bit(look_ns, variance, -1)
         self._settle()
 
