@@ -1,0 +1,255 @@
+"""A SampleClock against a simulated machine, network card and sensor, event by event, from a seed.
+
+Polls and answers come in the order in which `Cycle` would handle them, without the rest of the server: a
+simulated second takes some hundredths of one. What really happened is kept beside what the clock said.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.timing.sample_clock import SampleClock
+
+SECOND: Final = 1e9
+_SEND_NS: Final = 8_000.0
+_HAND_OUT_NS: Final = 30_000.0
+"""What the program needs for a poll, and for an answer."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """How the program gets to run. Times in ns."""
+
+    wake_ns: float = 12_000.0
+    """Mean lateness of a wake-up; exponentially distributed."""
+    stolen: float = 0.0
+    """Part of the time that others take away,"""
+    steal_ns: float = 1_000_000.0
+    """on average so much at once; exponentially distributed."""
+    stops: tuple[tuple[float, float], ...] = ()
+    """When it stands still besides, in s from the start, and for how long."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """What an exchange takes. Answers come in the order of the polls."""
+
+    round_trip_ns: float = 110_000.0
+    spread: float = 0.25
+    """Standard deviation of the logarithm of the round trip; 0: it is constant,"""
+    jitter_ns: float = 0.0
+    """but for up to so much on top; uniformly distributed."""
+    lost: float = 0.0
+    """Chance that an exchange does not come back."""
+
+    def exchange(self, chance: random.Random) -> tuple[float, float]:
+        """From sending until the sensor looks at its data, and until the answer is there, in ns."""
+        if self.spread:
+            took_ns = self.round_trip_ns * math.exp(chance.gauss(0, self.spread))
+            return took_ns * chance.uniform(1 / 3, 2 / 3), took_ns
+        extra_ns = chance.uniform(0, self.jitter_ns)
+        return self.round_trip_ns / 2 + extra_ns * chance.random(), self.round_trip_ns + extra_ns
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """When samples come to be. Times in ns where nothing else is said."""
+
+    rate_hz: float = 1600.0
+    ppm: float = -300.0
+    """How much faster it really samples."""
+    ppm_per_minute: float = -1.0
+    """How much faster it gets as its temperature changes."""
+    white_ns: float = 0.0
+    """Standard deviation of each instant alone."""
+    sleep_ns: float = 0.0
+    """Mean of what each period takes longer: a program that sleeps in between; gamma distributed."""
+    scatter: float = 0.0
+    """Each period differs by up to this part of it: 0.9 is no clock at all."""
+    silent_s: tuple[float, float] = (math.inf, math.inf)
+    """No samples between these."""
+    restart_s: float = math.inf
+    """The clock starts again with another phase."""
+
+    def instants(self, chance: random.Random) -> Iterator[float]:
+        """When they come to be, without end."""
+        first_ns = SECOND / self.rate_hz / (1 + self.ppm * 1e-6)
+        wander = -self.ppm_per_minute * 1e-6 / (60 * SECOND)
+        silent, until = (each * SECOND for each in self.silent_s)
+        restart, at = self.restart_s * SECOND, chance.random() * first_ns + 1
+        while True:
+            if not silent <= at < until:
+                yield at + (chance.gauss(0, self.white_ns) if self.white_ns else 0)
+            at += first_ns * (1 + wander * at)
+            if self.sleep_ns:
+                at += chance.gammavariate(4, self.sleep_ns / 4)
+            if self.scatter:
+                at += chance.uniform(-self.scatter, self.scatter) * first_ns
+            if at > restart:
+                at, restart = restart + chance.random() * first_ns, math.inf
+
+
+class Sample(NamedTuple):
+    """One that was handed out. Times in ns."""
+
+    number: int
+    """Counted by the sensor, from 0."""
+    instant_ns: float
+    """When it really came to be."""
+    back_ns: float
+    """When its exchange was back."""
+    stamp_ns: float
+    uncertainty_ns: float
+    """What the clock said of its instant."""
+    locked: bool
+    steps: int
+    uncertain: bool
+
+    @property
+    def age_ns(self) -> float:
+        """At its hand-out."""
+        return self.back_ns - self.instant_ns
+
+    @property
+    def error_ns(self) -> float:
+        """Of the stamp: positive if it says too late."""
+        return self.stamp_ns - self.instant_ns
+
+
+class Outcome:
+    """What a run showed from some time on."""
+
+    def __init__(self, samples: Sequence[Sample], polls: int) -> None:
+        self.samples = samples
+        self.polls = polls
+        pairs = [(after.number - before.number - 1, after) for before, after in pairwise(samples)]
+        self.lost = sum(missing for missing, _ in pairs)
+        """Samples that were not handed out,"""
+        self.counted = sum(after.steps - 1 for _, after in pairs)
+        """and how many the clock said that were."""
+        self.unflagged = sum(
+            missing > 0 and after.steps < 2 and not after.uncertain for missing, after in pairs
+        )
+        """Times that some were lost and the clock did not say that they may be."""
+        self.unlocked = sum(not sample.locked for sample in samples)
+        self.ages_ns = sorted(sample.age_ns for sample in samples)
+        self.errors_ns = sorted(abs(sample.error_ns) for sample in samples)
+        self.outside = sum(abs(sample.error_ns) > sample.uncertainty_ns for sample in samples)
+        """Stamps that were off by more than the clock said."""
+
+    @property
+    def exchanges(self) -> float:
+        """For each sample."""
+        return self.polls / len(self.samples)
+
+
+class Exchange(NamedTuple):
+    """On its way, or with what is known once it is back. Times in ns."""
+
+    sent_ns: float
+    back_ns: float
+    number: int
+    """Of the newest sample when the sensor looked."""
+
+
+class ClockSimulation:
+    """One sensor, one card, one machine. Times in ns from the start."""
+
+    def __init__(self, sensor: Sensor, card: Card, machine: Machine, seed: int) -> None:
+        self.card = card
+        self.machine = machine
+        self.timing = ExchangeTiming()
+        self.clock = SampleClock(SECOND / sensor.rate_hz, self.timing)
+        self.now_ns = 1.0
+        self.polls_ns: list[float] = []
+        """When they were sent."""
+        self.samples: list[Sample] = []
+        """All that were handed out."""
+        self.unlocked_ns: list[float] = []
+        """When exchanges came back after which the clock was not locked."""
+        self.instants_ns: list[float] = []
+        """When samples really came to be, by number; the last is yet to come."""
+        self._chance = random.Random(seed)
+        self._instants = sensor.instants(random.Random(seed + 1))
+        self._flying: deque[Exchange] = deque()
+        self._last_look_ns = self._last_back_ns = 0.0
+        self._stops = deque((at_s * SECOND, length_ns) for at_s, length_ns in sorted(machine.stops))
+        self._steal_at_ns = math.inf
+        self._plan_theft(0.0)
+        self._newest(0.0)
+
+    def run(self, until_s: float) -> ClockSimulation:
+        """Go on until then; this simulation."""
+        clock, timing, flying = self.clock, self.timing, self._flying
+        while self.now_ns < until_s * SECOND:
+            due_ns = int(clock.next_poll_ns() - timing.late_ns)
+            if flying and flying[0].back_ns <= max(due_ns, self.now_ns):
+                self.now_ns = max(self.now_ns, self._awake(flying[0].back_ns))
+                self._take(flying.popleft())
+                self.now_ns += _HAND_OUT_NS
+                continue
+            if due_ns > self.now_ns:
+                self.now_ns = self._awake(due_ns + self._chance.expovariate(1) * self.machine.wake_ns)
+                timing.woke(self.now_ns - due_ns)
+            self._send()
+            self.now_ns += _SEND_NS
+        return self
+
+    def outcome(self, since_s: float) -> Outcome:
+        """What the run showed from then on."""
+        samples = [sample for sample in self.samples if sample.back_ns > since_s * SECOND]
+        return Outcome(samples, sum(at_ns > since_s * SECOND for at_ns in self.polls_ns))
+
+    def _send(self) -> None:
+        sent_ns = self.now_ns
+        self.timing.sent_ns, self.timing.in_flight = int(sent_ns), True
+        self.polls_ns.append(sent_ns)
+        out_ns, took_ns = self.card.exchange(self._chance)
+        if self._chance.random() < self.card.lost:
+            return
+        self._last_look_ns = max(sent_ns + out_ns, self._last_look_ns)
+        self._last_back_ns = max(sent_ns + took_ns, self._last_look_ns, self._last_back_ns)
+        self._flying.append(Exchange(sent_ns, self._last_back_ns, self._newest(self._last_look_ns)))
+
+    def _take(self, exchange: Exchange) -> None:
+        clock, sent, back, number = self.clock, int(exchange.sent_ns), int(self.now_ns), exchange.number
+        self.timing.took(sent, back)
+        fresh = number > (self.samples[-1].number if self.samples else -1)
+        if fresh:
+            clock.predict(sent, back)
+            stamp_ns = clock.instant_ns if clock.locked else min(back, sent + clock.period_ns)
+            told = clock.uncertainty_ns, clock.locked, clock.steps, clock.uncertain
+            self.samples.append(Sample(number, self.instants_ns[number], back, stamp_ns, *told))
+        clock.observe(sent, back, fresh)
+        if not clock.locked:
+            self.unlocked_ns.append(back)
+
+    def _newest(self, at_ns: float) -> int:
+        """Number of the newest sample then; -1 before the first."""
+        instants = self.instants_ns
+        while not instants or instants[-1] <= at_ns:
+            instants.append(next(self._instants))
+        return len(instants) - 2
+
+    def _awake(self, at_ns: float) -> float:
+        """When the program runs that would at `at_ns`: then, or when it is let."""
+        while True:
+            if self._stops and at_ns >= self._stops[0][0]:
+                at_ns = max(at_ns, sum(self._stops.popleft()))
+            elif at_ns >= self._steal_at_ns:
+                at_ns = max(at_ns, self._steal_at_ns + self._chance.expovariate(1) * self.machine.steal_ns)
+                self._plan_theft(at_ns)
+            else:
+                return at_ns
+
+    def _plan_theft(self, from_ns: float) -> None:
+        if stolen := self.machine.stolen:
+            mean_ns = self.machine.steal_ns * (1 - stolen) / stolen
+            self._steal_at_ns = from_ns + self._chance.expovariate(1) * mean_ns
