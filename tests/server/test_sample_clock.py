@@ -138,9 +138,7 @@ def test_lost_frames_cost_no_lock() -> None:
 def test_a_silent_sensor_is_watched_for_and_followed_again() -> None:
     for seed in SEEDS:
         simulation = ClockSimulation(Sensor(800, silent_s=(2.5, 3.5)), Card(), QUIET, seed).run(5)
-        unlocked = [at_ns for at_ns in simulation.unlocked_ns if at_ns > SETTLED_S * SECOND]
-        assert min(unlocked) > 2.5 * SECOND
-        assert max(unlocked) < 3.5 * SECOND + 20 * SECOND / 800
+        assert not [at_ns for at_ns in simulation.unlocked_ns if at_ns > SETTLED_S * SECOND]
         # What was watched for and did not come did not exist: the silence counts as no loss.
         assert simulation.outcome(SETTLED_S).counted <= 0
 
@@ -151,7 +149,8 @@ def test_follows_a_simulated_sensor_that_sleeps_between_its_samples(sleep_ns: fl
     for seed in SEEDS:
         simulation = ClockSimulation(Sensor(800, sleep_ns=sleep_ns), Card(), QUIET, seed).run(5)
         whole = simulation.outcome(0)
-        assert whole.lost == whole.counted == 0
+        assert whole.lost == 0
+        assert whole.counted <= 1, "while the rate is not known"
         assert simulation.outcome(1).unlocked == 0
         assert simulation.clock.pull == pytest.approx(sleep_ns / 1.25e6, rel=0.1)
 

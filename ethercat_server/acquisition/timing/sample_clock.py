@@ -34,8 +34,12 @@ _NO_TIME: Final = 0.5
 _LARGEST_MARGIN: Final = 0.4
 _PROBE_BELOW: Final = 5_000.0**2
 """A phase known so well needs no probes, however well polls could tell it."""
+_UNPROBED: Final = 500
+"""After so many samples without an early look it is tried whether the phase is still what it was."""
 _LONGEST_LOOK: Final = 0.5
 """The sensor looks at its data within this part of a period after the frame usually has reached it."""
+_EARLY: Final = -0.25
+"""A sample so much before the expected one, in periods, is the one that was watched for before."""
 _ONE_ONLY: Final = 0.8
 """Only one sample can have come in this part of a period."""
 
@@ -48,7 +52,7 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_absent", "_aim_ns", "_begun", "_doubtful", "_estimate", "_looked_ns", "_margin_ns", "_newest",
+        "_absent", "_aim_ns", "_begun", "_doubtful", "_estimate", "_hits", "_looked_ns", "_margin_ns", "_newest",
         "_nominal_ns", "_overdue", "_probing", "_single", "_timing", "instant_ns", "locked", "quiet_until_ns",
         "steps", "uncertain",
     )  # fmt: skip
@@ -64,7 +68,7 @@ class SampleClock:
         """Estimated instant of the newest sample, from those before it."""
         self.steps = 1
         """How many samples the newest one is after the one handed out before it: more than 1, some were
-        lost; 0, one was counted as lost that was not."""
+        lost."""
         self.uncertain = False
         """Whether more may have been lost than `steps` says. The samples after it tell, and their `steps` put
         it right."""
@@ -84,7 +88,9 @@ class SampleClock:
         self._single = True
         """Whether there is no time for a second poll of a sample."""
         self._probing = False
-        """Whether the phase is known worse than polls can tell it."""
+        """Whether the phase is known worse than polls can tell it, or has not been tried for long."""
+        self._hits = 0
+        """Samples since a look was early."""
         self._margin_ns = 0.0
         self._aim_ns = 0.0
         """When the next poll should be sent."""
@@ -147,7 +153,7 @@ class SampleClock:
         self._single = timing.usual_ns > _NO_TIME * period_ns
         self._margin_ns = margin_ns(timing, period_ns, variance)
         self._aim_ns = phase_ns + self._margin_ns - timing.look_ns
-        self._probing = variance > (timing.look_variance + _PROBE_BELOW) / 4
+        self._probing = self._hits > _UNPROBED or variance > (timing.look_variance + _PROBE_BELOW) / 4
         self.quiet_until_ns = phase_ns - CERTAIN * deviation_ns if self.locked else 0.0
 
     # -- what an exchange says
@@ -168,21 +174,21 @@ class SampleClock:
             self.instant_ns = min(back_ns, sent_ns + period_ns) - min(unwatched_ns, period_ns) / 2
             return
         excess_ns = max(0.0, back_ns - sent_ns - least_ns)
-        # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought is
-        # dated from before, never as younger than it may be.
         late = (sent_ns + min(excess_ns / 2, _LONGEST_LOOK * period_ns) - phase_ns) / period_ns
-        newest = 1 + math.floor(late)
+        newest = math.floor(late)
         self.uncertain = False
         if unwatched_ns - least_ns >= _ONE_ONLY * period_ns:
             doubt_ns = CONTRADICTS * math.sqrt(self._estimate.variance)
             least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
-            self.uncertain = self._doubtful or (most > 0 and least < most)
-        if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
-            newest = 0 if self._doubtful and late < -0.5 else 1
-        self._newest = newest
-        # Those that did not come are missing, too, unless the sensor was silent, which is told as such.
-        self.steps = newest + (self._absent if self._absent < SILENT_PERIODS else 0)
+            if self._doubtful or (most > 0 and least < most):
+                # Dated as the oldest that it may be. The next ones tell which it was.
+                self.uncertain, newest = True, least
+        self._newest = newest = 1 + max(newest, 0)
+        self.steps = newest
+        if self._absent < SILENT_PERIODS and late > _EARLY:
+            # Those that did not come are missing, too; a silent sensor is told as such.
+            self.steps += self._absent
         self.instant_ns = min(max(phase_ns + (newest - 1) * period_ns, looked_ns) + least_ns / 2, back_ns)
 
     def _is_late(self, look_ns: float, variance: float) -> bool:
@@ -211,9 +217,11 @@ class SampleClock:
                 estimate.learn_bracket(looked_ns, look_ns, variance)
             estimate.advance(1)
             self._doubtful = self.uncertain
+            self._hits += 1
             self._absent = 0
             self._overdue = False
         else:
+            self._hits = 0
             doubt_ns = CONTRADICTS * math.sqrt(estimate.variance)
             while sent_ns > estimate.phase_ns + estimate.period_ns + doubt_ns:
                 estimate.advance(1)
