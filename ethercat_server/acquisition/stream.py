@@ -136,7 +136,8 @@ class SensorStream:
     def _new_sample(self) -> int:
         self.fresh += 1
         lost = self.clock.steps - 1 if self.sequence else 0
-        self.lost_samples += lost
+        # -1 takes back one that was counted after a stall but came after all.
+        self.lost_samples = max(0, self.lost_samples + lost)
         flags = GAP if lost > 0 or self.clock.uncertain or self._gap else 0
         self._gap = False
         return flags

@@ -54,7 +54,7 @@ def test_one_exchange_a_sample_nearly_always_suffices(rate_hz: float, round_trip
     for seed in SEEDS:
         shown = simulate(Sensor(rate_hz), Card(round_trip_ns), seed=seed)
         assert shown.unlocked == 0
-        assert shown.exchanges <= 1.15
+        assert shown.exchanges <= 1.2
         assert shown.lost == shown.counted == shown.outside == 0
         assert shown.ages_ns[len(shown.samples) // 2] < 0.9 * round_trip_ns
 
@@ -66,7 +66,7 @@ def test_a_tenth_of_the_time_stolen_costs_little_more(round_trip_ns: float) -> N
         simulate(Sensor(800), Card(round_trip_ns), Machine(stolen=0.1), seed, seconds=8) for seed in SEEDS
     ]
     samples = sum(len(shown.samples) for shown in runs)
-    assert sum(shown.polls for shown in runs) / samples <= 1.15
+    assert sum(shown.polls for shown in runs) / samples <= 1.2
     assert sum(shown.unlocked for shown in runs) < 0.01 * samples
     assert sum(shown.outside for shown in runs) < 0.01 * samples
     assert sum(shown.unflagged for shown in runs) == 0
@@ -90,7 +90,7 @@ def test_a_slow_network_card_costs_the_way_back_only(rate_hz: float, card: Card)
     for seed in SEEDS:
         shown = simulate(Sensor(rate_hz), card, seed=seed)
         assert shown.unlocked == 0
-        assert shown.exchanges <= 1.15
+        assert shown.exchanges <= 1.2
         assert shown.lost <= 0.001 * len(shown.samples)
         assert shown.counted == shown.lost
         assert all(sample.steps > 0 for sample in shown.samples), "none is handed out twice"
@@ -124,7 +124,7 @@ def test_stalls_are_counted_exactly_and_no_sample_is_dated_into_one(stolen: floa
         assert shown.lost > 0, "the stalls must be long enough to matter"
         assert shown.counted == shown.lost
         assert shown.unlocked == 0
-        assert shown.errors_ns[-1] < 100e3
+        assert max(sample.error_ns for sample in shown.samples) < 100e3
     assert oldest_ns > SECOND / 800, "some stalls must come between the sensor's look and the hand-out"
 
 

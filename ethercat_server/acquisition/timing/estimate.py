@@ -23,7 +23,9 @@ _WRONG: Final = 0.005
 """Chance that a bit says nothing: it came from a stall, or was another sample's."""
 _FARTHEST: Final = 8.0
 _RESTLESS_GAIN: Final = 0.05
-_RESTLESS_STEP: Final = 0.2
+_RESTLESS_STEP: Final = 0.4
+_RESTLESS_RATE: Final = 1.4
+"""A clock whose phase walks is of unknown rate, too."""
 _MOST_RESTLESS: Final = math.log(1e7)
 _UNLIKELY_RUN: Final = 7.0
 """Looks in a row that were all late have this negative log-likelihood: about one in a thousand."""
@@ -93,7 +95,7 @@ class Estimate:
         if self.variance > (most := (_UNKNOWN * self.period_ns) ** 2):
             self._covariance *= math.sqrt(most / self.variance)
             self.variance = most
-        if self._period_variance > (most := (self._pull * self.period_ns) ** 2):
+        if self._period_variance > (most := (_MOST_PULL * self.period_ns) ** 2):
             self._covariance *= math.sqrt(most / self._period_variance)
             self._period_variance = most
 
@@ -116,12 +118,12 @@ class Estimate:
         deviation_ns = math.sqrt(self.variance + variance + _LEAST_VARIANCE)
         late = (look_ns - self.phase_ns) / deviation_ns
         if sign * late > CERTAIN:
-            self._contradictions = 0
             return
-        if sign * late > -CONTRADICTS:
+        if sign * late < -CONTRADICTS:
+            if self._is_contradicted():
+                return
+        elif sign > 0:
             self._contradictions = 0
-        elif self._is_contradicted():
-            return
         if not -_FARTHEST < late < _FARTHEST:
             late = math.copysign(_FARTHEST, late)
         chance = _WRONG + (0.5 - _WRONG) * math.erfc(-sign * late * _ROOT_HALF)
@@ -140,9 +142,8 @@ class Estimate:
         restless = self._restless + _RESTLESS_GAIN * excess
         if restless > 0 or self._restless > 0:
             self._restless = min(max(restless, 0.0), _MOST_RESTLESS)
-            times = math.exp(self._restless)
-            self._jitter = times * _JITTER_NS**2
-            self._wander = times * (_WANDER * self._nominal_ns) ** 2
+            self._jitter = math.exp(self._restless) * _JITTER_NS**2
+            self._wander = math.exp(_RESTLESS_RATE * self._restless) * (_WANDER * self._nominal_ns) ** 2
 
     def _move(self, weight: float) -> None:
         self.phase_ns += self.variance * weight

@@ -25,7 +25,7 @@ PLAUSIBLE_PULL: Final = 0.002
 """A real sensor's period differs from the nominal one by less than this part."""
 SILENT_PERIODS: Final = 3
 """A sensor that has given nothing new for so long counts as silent, not just late."""
-_PRICE_NS: Final = 50_000.0
+_PRICE_NS: Final = 15_000.0
 """Age that is given up to save an exchange."""
 _LOSS_PERIODS: Final = 10.0
 """Age that is given up to lose no sample, in periods, where there is no time for a second poll."""
@@ -68,7 +68,7 @@ class SampleClock:
         """Estimated instant of the newest sample, from those before it."""
         self.steps = 1
         """How many samples the newest one is after the one handed out before it: more than 1, some were
-        lost."""
+        lost; 0, one was counted as lost that was not."""
         self.uncertain = False
         """Whether more may have been lost than `steps` says. The samples after it tell, and their `steps` put
         it right."""
@@ -174,21 +174,26 @@ class SampleClock:
             self.instant_ns = min(back_ns, sent_ns + period_ns) - min(unwatched_ns, period_ns) / 2
             return
         excess_ns = max(0.0, back_ns - sent_ns - least_ns)
-        late = (sent_ns + min(excess_ns / 2, _LONGEST_LOOK * period_ns) - phase_ns) / period_ns
-        newest = math.floor(late)
+        # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought is
+        # dated from before, never as younger than it may be.
+        looked_at_ns = sent_ns + (excess_ns / 2 if excess_ns < _LONGEST_LOOK * period_ns else 0.0)
+        late = (looked_at_ns - phase_ns) / period_ns
+        newest = 1 + math.floor(late)
         self.uncertain = False
         if unwatched_ns - least_ns >= _ONE_ONLY * period_ns:
             doubt_ns = CONTRADICTS * math.sqrt(self._estimate.variance)
+            if not self._single:
+                doubt_ns += least_ns / 4  # the outward part of a short round trip varies, too
             least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
-            if self._doubtful or (most > 0 and least < most):
-                # Dated as the oldest that it may be. The next ones tell which it was.
-                self.uncertain, newest = True, least
-        self._newest = newest = 1 + max(newest, 0)
-        self.steps = newest
-        if self._absent < SILENT_PERIODS and late > _EARLY:
-            # Those that did not come are missing, too; a silent sensor is told as such.
-            self.steps += self._absent
+            self.uncertain = self._doubtful or (most > 0 and least < most)
+        if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
+            newest = 0 if self._doubtful and late < -0.5 else 1
+        self._newest = self.steps = newest
+        if self._absent >= SILENT_PERIODS:
+            self.steps = 1  # a silent sensor is told as such
+        elif late > _EARLY:
+            self.steps += self._absent  # those that did not come are missing, too
         self.instant_ns = min(max(phase_ns + (newest - 1) * period_ns, looked_ns) + least_ns / 2, back_ns)
 
     def _is_late(self, look_ns: float, variance: float) -> bool:
@@ -221,7 +226,6 @@ class SampleClock:
             self._absent = 0
             self._overdue = False
         else:
-            self._hits = 0
             doubt_ns = CONTRADICTS * math.sqrt(estimate.variance)
             while sent_ns > estimate.phase_ns + estimate.period_ns + doubt_ns:
                 estimate.advance(1)
@@ -230,6 +234,8 @@ class SampleClock:
             # One in doubt may have been seen already; one that is late may be missing. The next one tells.
             if self.locked and not (self._doubtful or self._is_late(look_ns, variance)):
                 estimate.learn_bit(look_ns, variance, -1)
+                if look_ns > estimate.phase_ns - doubt_ns - self._margin_ns:
+                    self._hits = 0
         self._settle()
 
 
