@@ -17,16 +17,14 @@ class Exchange:
         """The working counter of all frames; -1 if one did not come back in time."""
         process_data, clock = self.bus.process_data, self.bus.clock
         until_ns = clock.monotonic_ns() + round(timeout_s * 1e9)
-        awaited = {clock.monotonic_ns(): len(process_data.inputs)}
-        (sent_ns,) = awaited
-        process_data.send(sent_ns)
-        total = 0
-        while awaited[sent_ns]:
+        began_ns, awaited, total = clock.monotonic_ns(), len(process_data.inputs), 0
+        process_data.send()
+        while awaited:
             left_ns = until_ns - clock.monotonic_ns()
             if left_ns <= 0 or (frame := self.bus.backend.receive(left_ns * 1e-9)) is None:
                 return -1
-            if process_data.take(frame) == sent_ns:
-                awaited[sent_ns] -= 1
+            if process_data.take(frame) > began_ns:
+                awaited -= 1
                 total += process_data.wkc
                 for at in process_data.inputs[process_data.which]:
                     self.inputs[at.number] = process_data.frame[at.start : at.end]

@@ -112,7 +112,7 @@ class Cycle:
 
     def _run(self) -> None:
         bus, hub, recovery, jobs, watchdog = self._bus, self._hub, self._recovery, self._jobs, self._watchdog
-        timing, monotonic_ns = self._timing, bus.clock.monotonic_ns
+        timing, monotonic_ns, sleep = self._timing, bus.clock.monotonic_ns, bus.clock.sleep
         serve_by = roll_at = feed_at = 0
         while not self.stopping:
             due = self._due_ns()
@@ -127,6 +127,11 @@ class Cycle:
             elif now > serve_by:
                 hub.serve(now)
                 serve_by = now + _SERVE_IN_FLIGHT_NS
+            if not self._bus.process_data.in_flight and (left := due - monotonic_ns()) > 0:
+                sleep(left * 1e-9)
+                late = monotonic_ns() - due
+                timing.woke(late)
+                self._wake.record(late)
             self._answered = False
             self._step(due, (now if timing.in_flight else due) + _SERVE_EVERY_NS)
             now = monotonic_ns()
@@ -177,9 +182,8 @@ class Cycle:
                 self._wake.record(now - due)
         if (late := now - due) > self._schedule.shortest_ns:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
-        timing.sends(now)
+        timing.sends(bus.process_data.send())
         self._cycles += 1
-        bus.process_data.send(now)
         for stream in self._streams:
             if now >= stream.idle_at_ns and (made := stream.idle(now)):
                 self._hub.publish(made[0], stream.number, made[1], now)
@@ -191,9 +195,9 @@ class Cycle:
         """Wait for a frame, `wait` ns at most, and hand it out; returns one that answers no exchange."""
         bus = self._bus
         frame = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0)
+        back = bus.clock.monotonic_ns()
         if frame is None or not (sent := bus.process_data.take(frame)):
             return frame
-        back = bus.clock.monotonic_ns()
         self._timing.took(sent, back)
         self._exchange.record(back - sent)
         if (
@@ -201,7 +205,8 @@ class Cycle:
         ) > self._schedule.shortest_ns:  # the computer stood still
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
         self._hand_out(sent, back)
-        self._schedule.cost(bus.clock.monotonic_ns() - back)
+        if len(self._streams) > 1:
+            self._schedule.cost(bus.clock.monotonic_ns() - back)
         return None
 
     def _hand_out(self, sent: int, back: int) -> None:

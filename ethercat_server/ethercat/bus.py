@@ -38,7 +38,7 @@ class Bus(Datagrams):
         """Where the sensors are on the wire: by number, as everything below."""
         self.fmmus: list[bytes] = []
         """FMMU registers as they must be in OP."""
-        self.process_data = ProcessData((), backend.send)
+        self.process_data = ProcessData((), backend)
         """The exchange, once the sensors are mapped."""
 
     def next_on_wire(self, until_ns: int) -> bytes | None:
@@ -85,7 +85,7 @@ class Bus(Datagrams):
             if kinds != self._kinds(number) or reg.FMMU_READ not in kinds or not fit_a_frame(areas[-1]):
                 # SOEM writes them once, and does not look whether that worked.
                 raise SetUpError(f"sensor {number} did not answer when it was mapped: check cable and power")
-        self.process_data = ProcessData(areas, self.backend.send)
+        self.process_data = ProcessData(areas, self.backend)
 
     def _kinds(self, number: int) -> set[int]:
         """What a sensor has according to its sync managers: inputs, outputs, or both."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 from ethercat_server.errors import SetUpError
+from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import (
     COUNTER_SIZE,
@@ -61,9 +62,9 @@ class Inputs(NamedTuple):
 class ProcessData:
     """The frames of an exchange, and those that are on the wire."""
 
-    def __init__(self, areas: Sequence[Sequence[Area]], send: Callable[[bytearray], None]) -> None:
+    def __init__(self, areas: Sequence[Sequence[Area]], backend: Backend) -> None:
         """`areas` are those of each sensor by number; SetUpError if they cannot be read frame by frame."""
-        self._send = send
+        self._send, self._monotonic_ns = backend.send, backend.clock.monotonic_ns
         spans = _spans(area for each in areas for area in each)
         self.counters = [tuple(_working_counter(each, span) for span in spans) for each in areas]
         """What a sensor adds to the working counter of each frame: 2 for its outputs, 1 for its inputs."""
@@ -104,14 +105,17 @@ class ProcessData:
         start, end = first + offset, last + offset
         self.inputs[which].append(Inputs(number, start, end, bytes(frame[start:end])))
 
-    def send(self, now_ns: int) -> None:
-        """Send an exchange, unless too many are on the wire."""
-        if self._flying:
-            self._forget(now_ns)
+    def send(self) -> int:
+        """Send an exchange, unless too many are on the wire. Returns when."""
+        if not self.in_flight:
+            self._flying.clear()
+        elif self._flying:
+            self._forget(self._monotonic_ns())
+        now_ns = 0
         for which, frame in enumerate(self._frames):
             if self.in_flight >= MOST_IN_FLIGHT:
                 self.blocked_until_ns = self._flying[0][0] + _LOST_NS
-                return
+                return self._monotonic_ns()
             index = self._index
             while self._sent[index][0]:
                 index = (index + 1) % _INDICES
@@ -119,11 +123,13 @@ class ProcessData:
             self._number = (self._number + 1) & 0xFFFFFFFF
             tag, at = self._number.to_bytes(_TAG_SIZE, "little"), self._ends[which] + _BEFORE_TAG
             frame[at : at + _TAG_SIZE] = tag
+            frame[DATAGRAM_INDEX] = index + FIRST_INDEX
+            self.in_flight += 1
+            now_ns = self._monotonic_ns()
+            self._send(frame)
             self._sent[index] = now_ns, which, tag
             self._flying.append((now_ns, index))
-            self.in_flight += 1
-            frame[DATAGRAM_INDEX] = index + FIRST_INDEX
-            self._send(frame)
+        return now_ns
 
     def take(self, frame: bytes) -> int:
         """Take a frame that has arrived: returns when it was sent; 0 if it is no answer that is awaited."""

@@ -32,6 +32,9 @@ _LOSS_PERIODS: Final = 10.0
 _NO_TIME: Final = 0.5
 """There is none if a round trip takes more than this part of a period."""
 _LARGEST_MARGIN: Final = 0.4
+_EARLY_POLLS: Final = 0.08
+"""Part of the samples whose first poll is to be early."""
+_CAUTION_GAIN: Final = 0.05
 _PROBE_BELOW: Final = 5_000.0**2
 """A phase known so well needs no probes, however well polls could tell it."""
 _UNPROBED: Final = 500
@@ -52,8 +55,8 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_absent", "_aim_ns", "_begun", "_doubtful", "_estimate", "_hits", "_looked_ns", "_margin_ns", "_newest",
-        "_nominal_ns", "_overdue", "_probing", "_single", "_timing", "instant_ns", "locked", "quiet_until_ns",
+        "_absent", "_aim_ns", "_begun", "_caution", "_doubtful", "_estimate", "_hits", "_looked_ns",
+        "_margin_ns", "_newest", "_nominal_ns", "_overdue", "_probing", "_single", "_timing", "instant_ns", "locked", "quiet_until_ns",
         "steps", "uncertain",
     )  # fmt: skip
 
@@ -91,6 +94,8 @@ class SampleClock:
         """Whether the phase is known worse than polls can tell it, or has not been tried for long."""
         self._hits = 0
         """Samples since a look was early."""
+        self._caution = 1.0
+        """Part of the margin that is needed: looks are spread less evenly than a margin assumes."""
         self._margin_ns = 0.0
         self._aim_ns = 0.0
         """When the next poll should be sent."""
@@ -152,6 +157,8 @@ class SampleClock:
         self.locked = self._begun and deviation_ns < _LOCKED * period_ns
         self._single = timing.usual_ns > _NO_TIME * period_ns
         self._margin_ns = margin_ns(timing, period_ns, variance)
+        if not self._single:
+            self._margin_ns *= self._caution
         self._aim_ns = phase_ns + self._margin_ns - timing.look_ns
         self._probing = self._hits > _UNPROBED or variance > (timing.look_variance + _PROBE_BELOW) / 4
         self.quiet_until_ns = phase_ns - CERTAIN * deviation_ns if self.locked else 0.0
@@ -181,7 +188,7 @@ class SampleClock:
         newest = 1 + math.floor(late)
         self.uncertain = False
         if unwatched_ns - least_ns >= _ONE_ONLY * period_ns:
-            doubt_ns = CONTRADICTS * math.sqrt(self._estimate.variance)
+            doubt_ns = CERTAIN * math.sqrt(self._estimate.variance)
             if not self._single:
                 doubt_ns += least_ns / 4  # the outward part of a short round trip varies, too
             least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
@@ -222,6 +229,8 @@ class SampleClock:
                 estimate.learn_bracket(looked_ns, look_ns, variance)
             estimate.advance(1)
             self._doubtful = self.uncertain
+            if self._hits:
+                self._caution -= _CAUTION_GAIN * _EARLY_POLLS * self._caution
             self._hits += 1
             self._absent = 0
             self._overdue = False
@@ -235,6 +244,9 @@ class SampleClock:
             if self.locked and not (self._doubtful or self._is_late(look_ns, variance)):
                 estimate.learn_bit(look_ns, variance, -1)
                 if look_ns > estimate.phase_ns - doubt_ns - self._margin_ns:
+                    if self._hits:
+                        self._caution += _CAUTION_GAIN * self._caution
+                        self._caution = min(self._caution, 1.0)
                     self._hits = 0
         self._settle()
 

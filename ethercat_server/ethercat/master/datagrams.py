@@ -124,7 +124,7 @@ class DatagramMaster:
         waiting = [states.go(AlState.OP) for states in self._states]
         while waiting:
             check_interrupt()
-            bus.process_data.send(bus.clock.monotonic_ns())
+            bus.process_data.send()
             waiting = [steps for steps in waiting if not _is_done(steps)]
             bus.clock.sleep(_PAUSE_S)
 
