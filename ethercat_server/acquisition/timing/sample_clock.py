@@ -56,8 +56,8 @@ class SampleClock:
 
     __slots__ = (
         "_absent", "_aim_ns", "_begun", "_caution", "_doubtful", "_estimate", "_hits", "_looked_ns",
-        "_margin_ns", "_newest", "_nominal_ns", "_overdue", "_probing", "_single", "_timing", "instant_ns", "locked", "quiet_until_ns",
-        "steps", "uncertain",
+        "_margin_ns", "_newest", "_nominal_ns", "_overdue", "_probing", "_single", "_timing", "instant_ns",
+        "locked", "quiet_until_ns", "steps", "uncertain",
     )  # fmt: skip
 
     def __init__(self, period_ns: float, timing: ExchangeTiming) -> None:
@@ -185,9 +185,12 @@ class SampleClock:
         # dated from before, never as younger than it may be.
         looked_at_ns = sent_ns + (excess_ns / 2 if excess_ns < _LONGEST_LOOK * period_ns else 0.0)
         late = (looked_at_ns - phase_ns) / period_ns
-        newest = 1 + math.floor(late)
         self.uncertain = False
-        if unwatched_ns - least_ns >= _ONE_ONLY * period_ns:
+        if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
+            # It was seen coming: whichever it was expected next to.
+            newest = 1 + round(((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns)
+        else:
+            newest = 1 + math.floor(late)
             doubt_ns = CERTAIN * math.sqrt(self._estimate.variance)
             if not self._single:
                 doubt_ns += least_ns / 4  # the outward part of a short round trip varies, too
