@@ -64,7 +64,7 @@ def test_the_age_follows_the_formula() -> None:
         "aim, half an exchange; the message"
     )
     late = of([30] * 99 + [130], [100] * 100, message_us=40)
-    assert late.ages()[0][-1] == late.margin_ns() + 50_000 + 100_000
+    assert late.ages()[0][-1] == pytest.approx(late.margin_ns() + 50_000 + 100_000)
     early = of([30] * 99 + [0], [100] * 100, message_us=40)
     assert early.ages()[0][-1] == 50_000 + max(0, early.margin_ns() - 30_000), (
         "too early to see it: another exchange follows at once, none is younger"
