@@ -239,9 +239,9 @@ class SampleClock:
             self._overdue = False
         else:
             doubt_ns = CONTRADICTS * math.sqrt(estimate.variance)
-            while sent_ns > estimate.phase_ns + estimate.period_ns + doubt_ns:
-                estimate.advance(1)
-                self._absent += 1
+            if (absent := int((sent_ns - estimate.phase_ns - doubt_ns) // estimate.period_ns)) > 0:
+                estimate.advance(absent)
+                self._absent += absent
             self._overdue = look_ns > estimate.phase_ns + _OVERDUE * math.sqrt(estimate.variance + variance)
             # One in doubt may have been seen already; one that is late may be missing. The next one tells.
             if self.locked and not (self._doubtful or self._is_late(look_ns, variance)):
