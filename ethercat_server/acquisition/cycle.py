@@ -2,7 +2,8 @@
 
 The schedule says when that is, as an absolute time on CLOCK_MONOTONIC; answers are handed out whenever they
 arrive, so that a slow network card has several exchanges on their way. One thread does everything, and
-`_step` with `_hand_out` is all of the hot path outside `SensorStream.take` and `Connection.offer`.
+`_step`, `_receive` and `_hand_out` are all of the hot path outside `SensorStream.take` and
+`Connection.offer`.
 """
 
 from __future__ import annotations
@@ -129,9 +130,7 @@ class Cycle:
                 serve_by = now + _SERVE_IN_FLIGHT_NS
             if not self._bus.process_data.in_flight and (left := due - monotonic_ns()) > 0:
                 sleep(left * 1e-9)
-                late = monotonic_ns() - due
-                timing.woke(late)
-                self._wake.record(late)
+                self._woke(monotonic_ns() - due)
             self._answered = False
             self._step(due, (now if timing.in_flight else due) + _SERVE_EVERY_NS)
             now = monotonic_ns()
@@ -145,6 +144,10 @@ class Cycle:
             if now >= feed_at:
                 feed_at = now + watchdog.feed_every_ns
                 watchdog.feed()
+
+    def _woke(self, late: int) -> None:
+        self._timing.woke(late)
+        self._wake.record(late)
 
     def _due_ns(self) -> int:
         """When the next exchange is due."""
@@ -178,8 +181,7 @@ class Cycle:
             if self._answered or (now := monotonic_ns()) < due:
                 return frame
             if wait > 0:
-                timing.woke(now - due)
-                self._wake.record(now - due)
+                self._woke(now - due)
         if (late := now - due) > self._schedule.shortest_ns:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
         timing.sends(bus.process_data.send())

@@ -28,24 +28,9 @@ class ExchangeTiming:
     """Round trips, and lateness of wake-ups, of one bus. All in ns; variances in ns²."""
 
     __slots__ = (
-        "_excess_square",
-        "_late_variance",
-        "_least_now_ns",
-        "_most_excess_ns",
-        "_roll_at_ns",
-        "_turn",
-        "excess_ns",
-        "in_flight",
-        "late_ns",
-        "least_ns",
-        "look_ns",
-        "look_variance",
-        "patience_ns",
-        "sent_ns",
-        "unanswered",
-        "unanswered_since_ns",
-        "usual_ns",
-        "variance",
+        "_excess_square", "_late_variance", "_least_now_ns", "_most_excess_ns", "_roll_at_ns", "_turn",
+        "excess_ns", "in_flight", "late_ns", "least_ns", "look_ns", "look_variance", "patience_ns",
+        "sent_ns", "unanswered", "unanswered_since_ns", "usual_ns", "variance",
     )  # fmt: skip
 
     def __init__(self, now_ns: int = 0) -> None:
@@ -104,8 +89,7 @@ class ExchangeTiming:
         if took_ns < self._least_now_ns:
             self._least_now_ns = took_ns
             self.least_ns = min(self.least_ns, took_ns)
-        excess_ns = took_ns - self.least_ns
-        excess_ns = min(excess_ns, self._most_excess_ns)
+        excess_ns = min(took_ns - self.least_ns, self._most_excess_ns)
         self.excess_ns += _GAIN * (excess_ns - self.excess_ns)
         self._excess_square += _GAIN * (excess_ns * excess_ns - self._excess_square)
         self._turn -= 1
@@ -125,9 +109,7 @@ class ExchangeTiming:
 
         Returns the instant and its variance.
         """
-        excess_ns = back_ns - sent_ns - self.least_ns
-        if excess_ns < 0:
-            excess_ns = 0.0
+        excess_ns = max(0.0, back_ns - sent_ns - self.least_ns)
         return sent_ns + excess_ns / 2, excess_ns * excess_ns / 12
 
     def describe(self) -> dict[str, Any]:

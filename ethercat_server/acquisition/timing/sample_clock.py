@@ -155,7 +155,7 @@ class SampleClock:
         phase_ns = self._estimate.phase_ns
         deviation_ns = math.sqrt(variance)
         self.locked = self._begun and deviation_ns < _LOCKED * period_ns
-        self._single = timing.usual_ns > _NO_TIME * period_ns
+        self._single = _has_time_for_one(timing, period_ns)
         self._margin_ns = margin_ns(timing, period_ns, variance)
         if not self._single:
             self._margin_ns *= self._caution
@@ -254,13 +254,18 @@ class SampleClock:
         self._settle()
 
 
+def _has_time_for_one(timing: ExchangeTiming, period_ns: float) -> bool:
+    """Whether there is no time for a second poll of a sample."""
+    return timing.usual_ns > _NO_TIME * period_ns
+
+
 def margin_ns(timing: ExchangeTiming, period_ns: float, phase_variance: float) -> float:
     """How long after the expected instant a poll should look, so that samples are youngest on the whole.
 
     An early look costs a second exchange, or the sample where there is no time for one. The margin is where
     a little more of it costs as much as it saves: where the density of the look's instant is 1 / cost.
     """
-    single = timing.usual_ns > _NO_TIME * period_ns
+    single = _has_time_for_one(timing, period_ns)
     cost_ns = _LOSS_PERIODS * period_ns if single else timing.usual_ns + _PRICE_NS
     deviation_ns = math.sqrt(phase_variance + timing.variance)
     ratio = cost_ns / (deviation_ns * ROOT_2_PI)
