@@ -1,28 +1,36 @@
 """Where gravity points in the sensor's frame: from the sensor's accelerometer, or from an orientation.
 
-Both kinds of source answer `gravity(now)` with a vector, or with None when what they know is too old: nobody
-goes on with an old pose. Times are seconds on one clock, the same for `update` and `gravity`.
+Both kinds of source answer `gravity(now)` with a vector, or with None when what they know is too old or too
+uncertain: nobody goes on with an old pose. In between the gyroscope carries them on. Times are seconds on one
+clock, the same for everything that is told and asked.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Final
 
+import numpy as np
+
+from ft_compensation.attitude.carried import CarriedAttitude, Matrix, Quaternion, matrix_of
+from ft_compensation.attitude.tilt import BLOCK_S, GyroscopeOffset, TiltFilter
 from ft_compensation.quantities import DEFAULT_GRAVITY, ZERO
 from protocol.pdo import STANDARD_GRAVITY, Vector3
 
-_NO_DIRECTION: Final = 0.5
-"""Of g: a mean shorter than this is one of directions that contradict each other."""
+_HAIR_S: Final = 1e-6
+_AT_FIRST: Final = 0.35
+"""Of the limit to the tilt: to lose what is known takes more than to begin."""
+_MOST_RATES: Final = 4096
+"""Remembered for orientations that come late: 2.5 s at 1600 Hz."""
 
 
 class AccelerometerGravity:
-    """From the sensor's own accelerometer: right while the sensor does not accelerate much.
+    """From the sensor's own accelerometer and gyroscope.
 
-    A low-pass filter over the samples whose acceleration has nearly the length of g; the rest, jerks and
-    knocks, are left out. With the gyroscope the estimate is turned along by the measured rate between
-    corrections (a complementary filter), so that it does not lag behind a turn; the accelerometer then only
-    takes out the drift. Only the direction comes from the accelerometer, the length is `magnitude`.
+    The gyroscope turns the estimate with every sample. Means of the acceleration over `BLOCK_S`, taken in the
+    frame that the gyroscope carries along, correct it, as far as `TiltFilter` believes them. Only the
+    direction comes from the accelerometer, the length is `magnitude`.
     """
 
     def __init__(
@@ -32,96 +40,138 @@ class AccelerometerGravity:
         time_constant_s: float = 0.5,
         gate: float = 0.5,
         stale_after_s: float = 0.5,
-        gyroscope: bool = True,
-        angular_rate_offset: Vector3 = ZERO,
+        tilt_limit: float = 0.2,
+        offset: GyroscopeOffset | None = None,
     ) -> None:
         """Make a source that knows nothing yet.
 
         Args:
             magnitude: of gravity, m/s².
-            time_constant_s: of the filter, by the samples' time.
-            gate: m/s²; a sample counts only if the length of its acceleration is this near `magnitude`.
-            stale_after_s: without a sample that counts for this long, there is no answer.
-            gyroscope: whether the measured angular rate rotates the estimate. Without it the answer lags
-                behind a steady turn by the time constant.
-            angular_rate_offset: what the gyroscope reads at rest, rad/s (`StationaryMeans.angular_rate`);
-                subtracted. What is
-                left of it tilts the estimate by `time_constant_s` times it.
+            time_constant_s: with which trust grows in an accelerometer that is steady.
+            gate: m/s²; a mean counts only if its length is this near `magnitude`.
+            stale_after_s: without a sample for this long there is no answer; shorter gaps are bridged.
+            tilt_limit: rad; there is no answer while `tilt_95` is larger, nor at first until it is a third.
+            offset: what is known of the gyroscope; it is improved in place.
         """
         if not (magnitude > 0.0 and time_constant_s > 0.0):
             raise ValueError("magnitude of gravity and time constant must be greater than 0")
-        self.magnitude, self.time_constant_s, self.gate = magnitude, time_constant_s, gate
-        self.stale_after_s, self.gyroscope = stale_after_s, gyroscope
-        self.angular_rate_offset = angular_rate_offset
-        self.rejected = 0
-        self._down: Vector3 | None = None
-        self._time_s = self._accepted_s = -math.inf
-        self._began_s = 0.0
+        self.magnitude, self.gate = magnitude, gate
+        self.stale_after_s, self.tilt_limit = stale_after_s, tilt_limit
+        self.tilt_95 = math.inf
+        """The true tilt of the estimate is below this in 95 % of cases, rad."""
+        self.offset = offset or GyroscopeOffset()
+        self._filter = TiltFilter(magnitude, gate, time_constant_s, self.offset)
+        self._attitude = CarriedAttitude()
+        self._is_begun = self._is_known = False
+        self._time_s = -math.inf
+        # The block.
+        self._began_s = self._longest_s = 0.0
+        self._first: Matrix = self._attitude.matrix
+        self._sum: Vector3 = ZERO
+        self._turned: Vector3 = ZERO
+        self._count = 0
+        self._spoiled = False
 
-    def update(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> bool:
-        """Take a sample's acceleration (m/s²) and angular rate (rad/s). False: it did not count.
+    def update(self, acceleration: Vector3 | None, angular_rate: Vector3, time_s: float) -> bool:
+        """Take a sample's acceleration (m/s²; None if it was saturated) and angular rate (rad/s).
 
-        Samples that are saturated or INVALID do not belong here: leave them out.
+        False: it is not finite, or nothing is known and it has not the length of gravity. Samples whose
+        angular rate is saturated do not belong here: leave them out.
         """
-        ax, ay, az = acceleration
-        size = math.sqrt(ax * ax + ay * ay + az * az)
-        counts = abs(size - self.magnitude) <= self.gate  # False for NaN
-        down = self._down
         passed_s = time_s - self._time_s
         if -self.stale_after_s <= passed_s < 0.0:
             time_s, passed_s = self._time_s, 0.0  # a hair early; a clock that was set back is another matter
-        if down is None or passed_s < 0.0 or time_s - self._accepted_s > self.stale_after_s:
-            # Nothing to go on from: the filter begins here.
-            if not counts:
-                self.rejected += 1
-                self._down = None
-                return False
-            self._down = (-ax, -ay, -az)
-            self._time_s = self._accepted_s = self._began_s = time_s
-            return True
-        x, y, z = down
-        if self.gyroscope:
-            ox, oy, oz = self.angular_rate_offset
-            tx, ty, tz = (
-                (angular_rate[0] - ox) * passed_s,
-                (angular_rate[1] - oy) * passed_s,
-                (angular_rate[2] - oz) * passed_s,
-            )
-            # A vector that stands still in the world turns by minus the rate in the sensor: second order.
-            ux, uy, uz = ty * z - tz * y, tz * x - tx * z, tx * y - ty * x
-            vx, vy, vz = ty * uz - tz * uy, tz * ux - tx * uz, tx * uy - ty * ux
-            x, y, z = x - ux + 0.5 * vx, y - uy + 0.5 * vy, z - uz + 0.5 * vz
-            if not math.isfinite(x + y + z):
-                self.rejected += 1
-                return False
-        if counts:
-            # Until a time constant has passed, the mean of what there was.
-            since_s = time_s - self._began_s
-            share = 1.0 - math.exp(-passed_s / self.time_constant_s)
-            if since_s < self.time_constant_s and passed_s > 0.0:
-                share = max(share, passed_s / (since_s + passed_s))
-            x, y, z = x - share * (ax + x), y - share * (ay + y), z - share * (az + z)
-            self._accepted_s = time_s
-        else:
-            self.rejected += 1
-        self._down = (x, y, z)
+        if not self._is_begun or not 0.0 <= passed_s <= self.stale_after_s:
+            return self._begin(acceleration, time_s)
+        tx, ty, tz = angular_rate
+        if not math.isfinite(tx + ty + tz):
+            return False
         self._time_s = time_s
-        return counts
+        tx, ty, tz = self._attitude.advance(angular_rate, passed_s)
+        sx, sy, sz = self._turned
+        self._turned = sx + tx, sy + ty, sz + tz
+        if passed_s > self._longest_s:  # noqa: PLR1730 - twice as fast as max()
+            self._longest_s = passed_s
+        is_good = False
+        if acceleration is not None:
+            ax, ay, az = acceleration
+            (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._attitude.matrix
+            sx, sy, sz = self._sum
+            self._sum = (
+                sx + xx * ax + xy * ay + xz * az,
+                sy + yx * ax + yy * ay + yz * az,
+                sz + zx * ax + zy * ay + zz * az,
+            )
+            is_good = ax - ax == ay - ay == az - az == 0.0
+        self._count += 1
+        if not is_good:
+            self._spoiled = True
+        if time_s - self._began_s >= BLOCK_S - _HAIR_S:
+            self._close_block(time_s)
+        return is_good
+
+    def _begin(self, acceleration: Vector3 | None, time_s: float) -> bool:
+        """Guess from one sample, if it can be one of a sensor that does not accelerate."""
+        self._is_begun = self._is_known = False
+        self.tilt_95 = math.inf
+        if acceleration is None or not abs(math.hypot(*acceleration) - self.magnitude) <= self.gate:
+            return False
+        self._attitude = CarriedAttitude()
+        self._attitude.offset = self.offset.value
+        self._attitude.level(acceleration)
+        self._filter.forget()
+        self._is_begun, self._time_s = True, time_s
+        self._open_block(time_s)
+        return True
+
+    def _open_block(self, time_s: float) -> None:
+        self._began_s, self._sum, self._turned = time_s, ZERO, ZERO
+        self._count, self._longest_s, self._spoiled = 0, 0.0, False
+        self._first = self._attitude.matrix
+
+    def _close_block(self, time_s: float) -> None:
+        attitude, tilt = self._attitude, self._filter
+        passed_s = time_s - self._began_s
+        x, y, z = self._turned
+        turned = math.hypot(x, y, z)
+        rate = x / passed_s, y / passed_s, z / passed_s
+        middle = 0.5 * (np.array(self._first) + np.array(attitude.matrix))
+        tilt.predict(middle, turned, passed_s, self._longest_s)
+        mean = None
+        if not self._spoiled:
+            x, y, z = self._sum
+            mean = x / self._count, y / self._count, z / self._count
+        correction = tilt.correct(mean, rate, passed_s)
+        if correction is not None:
+            attitude.rotate((*correction, 0.0))
+            attitude.offset = self.offset.value
+        elif tilt.is_wrong:
+            self._begin_anew()
+        self.tilt_95 = tilt.tilt_95
+        self._is_known = self.tilt_95 <= self.tilt_limit * (1.0 if self._is_known else _AT_FIRST)
+        self._open_block(time_s)
+
+    def _begin_anew(self) -> None:
+        """From the steady mean of late."""
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._attitude.matrix
+        x, y, z = self._filter.steady
+        # The matrix's transpose: back into the sensor's frame.
+        self._attitude.level((xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z))
+        self._filter.begin_anew()
+        self._is_known = False
 
     def age_s(self, now_s: float) -> float:
-        """How long since a sample last counted, s; infinite if none did."""
-        return abs(now_s - self._accepted_s)
+        """How long since the accelerometer last counted, s; infinite if it never did."""
+        if not self._is_begun:
+            return math.inf
+        return abs(now_s - self._time_s) + self._filter.rejected_s
 
     def gravity(self, now_s: float) -> Vector3 | None:
-        """Gravity in the sensor's frame, m/s²; None when no sample has counted for `stale_after_s`."""
-        down = self._down
-        if down is None or not abs(now_s - self._accepted_s) <= self.stale_after_s:
+        """Gravity in the sensor's frame, m/s²; None when it is not known well enough."""
+        if not self._is_known or not abs(now_s - self._time_s) <= self.stale_after_s:
             return None
-        x, y, z = down
-        size = math.sqrt(x * x + y * y + z * z)
-        if size < _NO_DIRECTION * self.magnitude:
-            return None
-        scale = self.magnitude / size
+        x, y, z = self._attitude.matrix[2]
+        scale = -self.magnitude
         return x * scale, y * scale, z * scale
 
 
@@ -129,16 +179,37 @@ class QuaternionGravity:
     """From the orientation of the sensor in a base: the sensor's own estimate, a topic, TF.
 
     The quaternion turns vectors of the sensor's frame into the base's, as poses and Imu messages have it.
+    With `follow`, an orientation is carried on by the gyroscope from its own time to that of the sample.
     """
 
     def __init__(self, gravity: Vector3 = DEFAULT_GRAVITY, *, stale_after_s: float = 0.1) -> None:
         """`gravity` is in the base, m/s²."""
         self.base_gravity, self.stale_after_s = gravity, stale_after_s
         self._latest: tuple[Vector3, float] | None = None
+        self._still: Vector3 | None = None
+        """Gravity in the frame that the gyroscope carries."""
+        self._attitude = CarriedAttitude()
+        self._known: deque[tuple[float, Quaternion]] = deque(maxlen=_MOST_RATES)
+        """Attitudes in that frame and their times, of the last `stale_after_s`."""
 
     def reset(self) -> None:
         """Forget everything."""
-        self._latest = None
+        self._latest = self._still = None
+        self._known.clear()
+
+    def follow(self, angular_rate: Vector3, time_s: float, offset: Vector3 = ZERO) -> None:
+        """Take a sample's angular rate and what the gyroscope reads at rest, rad/s."""
+        known, attitude = self._known, self._attitude
+        passed_s = time_s - known[-1][0] if known else 0.0
+        if not (0.0 <= passed_s <= self.stale_after_s and math.isfinite(sum(angular_rate))):
+            known.clear()  # a gap, or a clock that was set: the orientation is held until the next one
+            self._still = None
+            return
+        attitude.offset = offset
+        attitude.advance(angular_rate, passed_s)
+        known.append((time_s, attitude.quaternion))
+        while time_s - known[0][0] > self.stale_after_s:
+            known.popleft()
 
     def update(self, orientation: tuple[float, float, float, float], time_s: float) -> bool:
         """Take an orientation x, y, z, w of time `time_s`. False: it is none, or older than what is known."""
@@ -153,15 +224,37 @@ class QuaternionGravity:
         # The inverse turns base vectors into the sensor's: minus the vector part. |q|² cancels in s.
         s = 2.0 / size
         tx, ty, tz = s * (gy * z - gz * y), s * (gz * x - gx * z), s * (gx * y - gy * x)
-        self._latest = (
-            (
-                gx + w * tx + (ty * z - tz * y),
-                gy + w * ty + (tz * x - tx * z),
-                gz + w * tz + (tx * y - ty * x),
-            ),
-            time_s,
+        gx, gy, gz = (
+            gx + w * tx + (ty * z - tz * y),
+            gy + w * ty + (tz * x - tx * z),
+            gz + w * tz + (tx * y - ty * x),
         )
+        self._latest, self._still = ((gx, gy, gz), time_s), None
+        then = self._attitude_at(time_s)
+        if then is not None:
+            (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix_of(*then)
+            self._still = (
+                xx * gx + xy * gy + xz * gz,
+                yx * gx + yy * gy + yz * gz,
+                zx * gx + zy * gy + zz * gz,
+            )
         return True
+
+    def _attitude_at(self, time_s: float) -> Quaternion | None:
+        """In the carried frame; None if that is not known."""
+        known = self._known
+        if not known or time_s < known[0][0]:
+            return None
+        if time_s >= known[-1][0]:
+            return self._attitude.ahead(min(time_s - known[-1][0], self.stale_after_s))
+        after_s, after = known[-1]
+        for at_s, quaternion in reversed(known):
+            if at_s <= time_s:
+                share = (time_s - at_s) / (after_s - at_s)
+                x, y, z, w = (a + share * (b - a) for a, b in zip(quaternion, after, strict=True))
+                return x, y, z, w  # between two samples a chord is as long as its arc
+            after_s, after = at_s, quaternion
+        return None
 
     def age_s(self, now_s: float) -> float:
         """How old the latest orientation is, s; infinite if there is none."""
@@ -172,4 +265,8 @@ class QuaternionGravity:
         latest = self._latest
         if latest is None or not abs(now_s - latest[1]) <= self.stale_after_s:
             return None
-        return latest[0]
+        if self._still is None:
+            return latest[0]
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._attitude.matrix
+        x, y, z = self._still
+        return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z

@@ -249,7 +249,7 @@ def test_a_bias_is_ramped_in(stages: Stages, node: SimulatedNode) -> None:
     stages.forget()
     assert node.set_parameter("bias", [0, 0, -6, 0, 0, 0]) == (True, "")
     node.run(0.7)
-    seen = [six(message)[2] for message in stages.final]
+    seen = [round(six(message)[2], 6) for message in stages.final]
     assert seen == sorted(seen)
     assert seen[-1] == pytest.approx(6.0)
     steps = [b - a for a, b in itertools.pairwise(seen)]

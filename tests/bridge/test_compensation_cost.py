@@ -14,16 +14,16 @@ from bridge.compensating.gravity_sources import AccelerometerSource
 from bridge.parameters.compensation import CompensationParameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan, RestWindow
 from bridge.publishing.messages import Outputs, make_stages
+from ft_compensation.attitude.tilt import GyroscopeOffset
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import ZERO
 from ft_compensation.stationary import StationaryLimits
 from tests.compensation.making import BIAS, TOOL
 
 pytestmark = pytest.mark.ros
 SAMPLES = 20_000
 MOST_US = 20.0
-_SOURCE = AccelerometerSource(CompensationParameters(payload=TOOL), ZERO)
+_SOURCE = AccelerometerSource(CompensationParameters(payload=TOOL), GyroscopeOffset())
 
 
 @pytest.fixture

@@ -39,7 +39,7 @@ def test_defaults_are_the_contracts() -> None:
         "orientation.topic": "orientation", "orientation.base_frame": "base_link",
         "orientation.mounting": (0.0, 0.0, 0.0, 1.0), "orientation.stale_after": 0.1,
         "accelerometer.stale_after": 0.5, "accelerometer.time_constant": 0.5, "accelerometer.gate": 0.5,
-        "accelerometer.gyroscope": True, "rest.duration": 1.0, "rest.force_spread": 0.8,
+        "accelerometer.tilt_limit": 0.2, "rest.duration": 1.0, "rest.force_spread": 0.8,
         "rest.torque_spread": 0.02, "rest.force_wander": 0.3, "rest.torque_wander": 0.01,
         "rest.angular_rate": 0.05, "rest.angular_rate_spread": 0.02, "rest.acceleration_spread": 0.3,
         "rest.acceleration_wander": 0.05, "identify.file": "auto",

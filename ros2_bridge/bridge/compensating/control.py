@@ -28,10 +28,10 @@ from bridge.parameters.row import ParameterError
 from bridge.parameters.table import Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
 from bridge.stream.link import Link
+from ft_compensation.attitude.tilt import GyroscopeOffset
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
-from protocol.pdo import Vector3
+from ft_compensation.quantities import NO_WRENCH, Payload, Wrench, length
 
 _LOOKING_UP: Final = "the bias of this sensor is being looked up"
 
@@ -59,7 +59,7 @@ class CompensationControl:
         self._node, self._log = node, node.get_logger()
         self._frame, self._on_failure = parameters.frame_id, on_failure
         self._listener: OrientationListener | None = None
-        self._angular_rate_offset = ZERO
+        self._gyroscope = GyroscopeOffset()
         self._keeper = BiasKeeper(self._log)
         self.count_not_finite = count_not_finite
         """Samples so far that were not finite somewhere."""
@@ -119,7 +119,7 @@ class CompensationControl:
         payload = self.parameters.payload
         why = None
         if output.is_stopped:
-            why = output.hold or source.why_none(output.time_s)
+            why = output.hold or output.broken or source.why_none(output.time_s)
         return CompensationState(
             has_subscribers=output.has_subscribers,
             published=output.published,
@@ -127,7 +127,9 @@ class CompensationControl:
             why_stopped=why,
             source=source.describe,
             age_s=source.age_s(output.time_s),
+            tilt=source.tilt,
             payload=payload,
+            weight=payload.mass * length(self.parameters.gravity),
             inertia=self.parameters.compensate_inertia,
             bias=self.bias,
             origin=self.origin,
@@ -160,12 +162,6 @@ class CompensationControl:
                 tool_mass=payload.mass, tool_center_of_gravity=[*payload.center], bias=[*bias.values]
             )
 
-    def note_rest(self, angular_rate: Vector3) -> None:
-        """What the gyroscope read at rest, rad/s: its offset."""
-        self._angular_rate_offset = angular_rate
-        if isinstance(self.source, AccelerometerSource):
-            self.source.set_angular_rate_offset(angular_rate)
-
     @contextlib.contextmanager
     def _origin(self, origin: str) -> Iterator[None]:
         self._next_origin = origin
@@ -197,10 +193,13 @@ class CompensationControl:
 
     def _make_plan(self) -> None:
         wanted = self.parameters
+        has_weight = wanted.payload.mass > 0.0
         compensator = Compensator(
-            wanted.payload, inertia=wanted.compensate_inertia, imu_position=wanted.imu_position
+            wanted.payload,
+            inertia=wanted.compensate_inertia and has_weight,
+            imu_position=wanted.imu_position,
         )
-        self.output.plan = Plan(self.source, compensator, self._ramp, wanted.payload.mass > 0.0)
+        self.output.plan = Plan(self.source, compensator, self._ramp, has_weight)
 
     def _open_source(self, wanted: CompensationParameters) -> Source:
         listener, self._listener = self._listener, None
@@ -210,7 +209,7 @@ class CompensationControl:
         if name == "none":
             return NoSource()
         if name == "accelerometer":
-            return AccelerometerSource(wanted, self._angular_rate_offset)
+            return AccelerometerSource(wanted, self._gyroscope)
         if name == "sensor":
             return SensorSource(wanted)
         self._listener = OrientationListener(self._node, wanted.orientation, self._frame, self._on_failure)
@@ -235,7 +234,10 @@ class CompensationControl:
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
                 self._make_plan()
             if is_another:
-                self.note_rest(ZERO)
+                self._gyroscope = GyroscopeOffset()
+                if isinstance(self.source, AccelerometerSource):
+                    self.source = AccelerometerSource(self.parameters, self._gyroscope)
+                    self._make_plan()
                 self.sensors += 1
             if not self.keeping and self.bias != NO_WRENCH:
                 self._keeper.keep(self.bias, self.parameters)

@@ -9,6 +9,7 @@ import math
 from typing import NamedTuple, Protocol
 
 from bridge.parameters.compensation import CompensationParameters, Quaternion
+from ft_compensation.attitude.tilt import GyroscopeOffset
 from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
 from ft_compensation.quantities import length
 from protocol.pdo import Sample, Vector3
@@ -29,6 +30,10 @@ class Source(Protocol):
     is_accelerometer: bool
     """Whether it is: at rest the mean of a window is better then than the filter."""
 
+    @property
+    def tilt(self) -> float | None:
+        """The largest error of the direction in 95 % of cases, rad; None if that is not known."""
+
     def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
         """m/s², for this sample; None if what is known is too old, or nothing is."""
 
@@ -44,6 +49,7 @@ class NoSource:
 
     describe = "none"
     is_accelerometer = False
+    tilt = None
 
     def __init__(self, why: str = "orientation_source is none") -> None:
         self._why = why
@@ -65,52 +71,66 @@ class NoSource:
 
 
 class AccelerometerSource:
-    """The sensor's own accelerometer, low-pass filtered and turned along by its gyroscope."""
+    """The sensor's own accelerometer and gyroscope."""
 
     describe = "accelerometer"
     is_accelerometer = True
 
-    def __init__(self, parameters: CompensationParameters, angular_rate_offset: Vector3) -> None:
-        """`angular_rate_offset`: what the gyroscope reads at rest, rad/s."""
+    def __init__(self, parameters: CompensationParameters, gyroscope: GyroscopeOffset) -> None:
+        """`gyroscope`: what is known of it, and is improved."""
         p = parameters.accelerometer
         self._filter = AccelerometerGravity(
             length(parameters.gravity),
             time_constant_s=p.time_constant,
             gate=p.gate,
             stale_after_s=p.stale_after,
-            gyroscope=p.gyroscope,
-            angular_rate_offset=angular_rate_offset,
+            tilt_limit=p.tilt_limit,
+            offset=gyroscope,
         )
-        self._imu_is_off = False
+        self._broken = ""
 
-    def set_angular_rate_offset(self, offset: Vector3) -> None:
-        """What the gyroscope reads at rest, rad/s, from the next sample on."""
-        self._filter.angular_rate_offset = offset
+    @property
+    def tilt(self) -> float | None:
+        """The largest that the estimate may have, in 95 % of cases, rad."""
+        found = self._filter.tilt_95
+        return found if math.isfinite(found) else None
 
     def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
         """From this sample and those before it."""
         acceleration = sample.acceleration
-        if not sample.acceleration_saturated and not sample.angular_rate_saturated:
-            self._filter.update(acceleration, sample.angular_rate, time_s)
+        if not sample.angular_rate_saturated:
+            usable = None if sample.acceleration_saturated else acceleration
+            good = self._filter.update(usable, sample.angular_rate, time_s)
+            if not good and not math.isfinite(sum(acceleration) + sum(sample.angular_rate)):
+                self._broken = "the IMU's numbers are not finite: see stream"
+                return None
         found = self._filter.gravity(time_s)
         if found is None:
-            self._imu_is_off = not any(acceleration)
+            self._broken = (
+                "" if any(acceleration)
+                else "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
+            )  # fmt: skip
         return found
 
     def why_none(self, time_s: float) -> str:
-        """The IMU is off, or the sensor is being accelerated."""
-        if self._imu_is_off:
-            return "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
+        """The IMU is off or broken, it is too early, or the sensor has been accelerated for long."""
+        if self._broken:
+            return self._broken
         f, age_s = self._filter, self._filter.age_s(time_s)
         since = "not yet" if math.isinf(age_s) else f"not for {age_s:.2f} s"
+        if self.tilt is not None and age_s <= f.stale_after_s:
+            return (
+                f"gravity by the accelerometer may be tilted by {math.degrees(f.tilt_95):.1f}°, too much for "
+                "a start: hold the sensor still for a second"
+            )
         return (
-            f"the accelerometer has {since} read {f.magnitude:.2f} ± {f.gate:g} m/s²: the sensor is being "
-            "moved hard, or imu_raw_units is wrong; for use in motion take the orientation from the robot "
-            "(orientation_source)"
+            f"the accelerometer has {since} agreed with {f.magnitude:.2f} ± {f.gate:g} m/s² and the "
+            "gyroscope: the sensor is being moved hard, or imu_raw_units is wrong; for use in motion take the "
+            "orientation from the robot (orientation_source)"
         )
 
     def age_s(self, time_s: float) -> float:
-        """Since the last sample that counted."""
+        """Since the accelerometer last counted."""
         return self._filter.age_s(time_s)
 
 
@@ -119,6 +139,7 @@ class SensorSource:
 
     describe = "the sensor's own estimate"
     is_accelerometer = False
+    tilt = None
 
     def __init__(self, parameters: CompensationParameters) -> None:
         self._turn = QuaternionGravity(parameters.gravity, stale_after_s=parameters.orientation.stale_after)
@@ -152,9 +173,10 @@ class Listening(Protocol):
 
 
 class ListenerSource:
-    """A topic or TF: the latest orientation that has come, if it is of nearly the sample's time."""
+    """A topic or TF: the latest orientation, carried on to the sample's time by the gyroscope."""
 
     is_accelerometer = False
+    tilt = None
 
     def __init__(self, parameters: CompensationParameters, listener: Listening) -> None:
         self._listener = listener
@@ -163,8 +185,9 @@ class ListenerSource:
         self._taken: Oriented | None = None
         self.describe = listener.describe
 
-    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:  # noqa: ARG002
-        """From the latest orientation."""
+    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
+        """From the latest orientation, if it is of nearly the sample's time."""
+        self._turn.follow(sample.angular_rate, time_s)
         latest = self._listener.latest
         if latest is not self._taken and latest is not None:
             self._taken = latest

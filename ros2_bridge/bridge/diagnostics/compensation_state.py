@@ -21,6 +21,10 @@ class CompensationState(NamedTuple):
     source: str = "none"
     age_s: float = math.inf
     """Of the orientation."""
+    tilt: float | None = None
+    """The largest that gravity's direction may have in 95 % of cases, rad; None if that is not known."""
+    weight: float = 0.0
+    """Of the payload, N."""
     payload: Payload = Payload()
     inertia: bool = False
     bias: Wrench = NO_WRENCH
@@ -50,9 +54,12 @@ class CompensationState(NamedTuple):
     def values(self) -> dict[str, object]:
         """By name."""
         uses_source = bool(self.payload.mass) and self.has_subscribers
+        tilt = self.tilt if uses_source else None
         return {
             "orientation_source": self.source,
             "orientation_age_s": round(self.age_s, 4) if uses_source and math.isfinite(self.age_s) else "",
+            "gravity_tilt_deg": "" if tilt is None else round(math.degrees(tilt), 2),
+            "gravity_tilt_force": "" if tilt is None else round(2.0 * self.weight * math.sin(0.5 * tilt), 3),
             "tool_mass": round(self.payload.mass, 4),
             "tool_center_of_gravity": _numbers(self.payload.center),
             "tared": self.bias != NO_WRENCH,

@@ -45,12 +45,13 @@ _TABLE: Final = (
     Row("orientation.stale_after", 0.1,
         "Largest difference of the stamps of orientation and sample, s", 0.001, 10),
     Row("accelerometer.stale_after", 0.5,
-        "Seconds that the source may go without a usable sample", 0.001, 10),
-    Row("accelerometer.time_constant", 0.5, "Of the accelerometer's low-pass filter, s", 0.001, 60),
+        "Longest gap between samples that the gyroscope's rate bridges, s", 0.001, 10),
+    Row("accelerometer.time_constant", 0.5,
+        "With which trust in a steady accelerometer grows, s", 0.001, 60),
     Row("accelerometer.gate", 0.5,
-        "A usable sample's acceleration differs from gravity by no more, m/s²", 0.01, 10),
-    Row("accelerometer.gyroscope", True,
-        "Whether the gyroscope rotates the estimate, so that it does not lag"),
+        "A usable mean of 50 ms differs from gravity in length by no more, m/s²", 0.01, 10),
+    Row("accelerometer.tilt_limit", 0.2,
+        "Stop when gravity may be tilted by more, rad; start at a quarter", 0.05, 3),
     Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
     Row("rest.force_spread", _REST.force_spread, "Largest standard deviation when stationary, N", 0, 1e3),
     Row("rest.torque_spread", _REST.torque_spread, "Largest standard deviation when stationary, Nm", 0, 1e3),
@@ -86,7 +87,7 @@ class AccelerometerParameters(NamedTuple):
     stale_after: float = 0.5
     time_constant: float = 0.5
     gate: float = 0.5
-    gyroscope: bool = True
+    tilt_limit: float = 0.2
 
 
 class CompensationParameters(NamedTuple):

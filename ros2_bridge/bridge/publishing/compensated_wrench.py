@@ -6,6 +6,7 @@ open. What it goes by is a `Plan`, which the executor's thread replaces as a who
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
@@ -93,7 +94,7 @@ class StageTopic(Protocol):
 class CompensatedOutput:
     """An output of the reader's."""
 
-    fields = ("force", "torque", "acceleration", "angular_rate")
+    fields = ("force", "torque")
 
     def __init__(self, topics: Sequence[StageTopic]) -> None:
         self._all = topics
@@ -103,6 +104,8 @@ class CompensatedOutput:
         """The one that is open."""
         self.hold: str | None = None
         """Why nothing may be published for now, whatever else is known."""
+        self.broken: str | None = None
+        """What of the latest sample cannot be used, though where gravity points is known; a sentence."""
         self.published = self.withheld = 0
         """Samples since the node started that were compensated, and that could not be."""
         self.is_stopped = False
@@ -144,12 +147,15 @@ class CompensatedOutput:
         self.time_s = time_s = stamp_ns * 1e-9
         plan = self.plan
         gravity = self._gravity(plan, sample, time_s)
-        if gravity is None or self.hold is not None:
+        compensator = plan.compensator
+        self.broken = None
+        if compensator.inertia and not math.isfinite(sum(sample.acceleration) + sum(sample.angular_rate)):
+            self.broken = "the IMU's numbers are not finite, which compensate_inertia needs: see stream"
+        if gravity is None or self.hold is not None or self.broken is not None:
             self.withheld += 1
             self.is_stopped = True
             return
         self.is_stopped = False
-        compensator = plan.compensator
         compensator.set_bias(plan.ramp.at(time_s))
         stages = compensator.compensate(
             sample.force, sample.torque, gravity, sample.acceleration, sample.angular_rate

@@ -32,7 +32,6 @@ class BiasServices:
         if payload.mass:
             gravity = window.gravity() or gravity_of(means.acceleration, length(control.parameters.gravity))
         control.set_bias(estimate_bias(means, payload, gravity), "tare")
-        control.note_rest(means.angular_rate)
         weight = (
             f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
             if payload.mass

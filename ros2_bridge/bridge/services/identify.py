@@ -60,7 +60,6 @@ class IdentifyServices:
         window = take_window(self._control, self._requests)
         means = window.means()
         text = session.add(means, window.gravity())
-        self._control.note_rest(means.angular_rate)
         self._result = None
         return self._said(text)
 

@@ -17,9 +17,10 @@ from bridge.compensating.gravity_sources import AccelerometerSource
 from bridge.parameters.compensation import CompensationParameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan, RestWindow
 from bridge.publishing.messages import make_stages
+from ft_compensation.attitude.tilt import GyroscopeOffset
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import ZERO, Payload, Wrench
+from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.stationary import StationaryLimits
 from protocol.pdo import Sample, SampleDecoder, encode
 from scripts.benchmarks.chain import Setup
@@ -72,7 +73,7 @@ def costs(setup: Setup) -> Costs:
         output = CompensatedOutput(make_stages(node, "ft"))
 
         def measure(name: str, *, inertia: bool, window: bool) -> None:
-            source = AccelerometerSource(CompensationParameters(payload=_TOOL), ZERO)
+            source = AccelerometerSource(CompensationParameters(payload=_TOOL), GyroscopeOffset())
             output.plan = Plan(
                 source, Compensator(_TOOL, inertia=inertia), BiasRamp(_BIAS), needs_gravity=True
             )
