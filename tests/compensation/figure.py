@@ -26,6 +26,8 @@ FIGURE: Final = Path(__file__).parents[2] / "docs" / "compensation.svg"
 BIAS: Final = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)
 """What this sensor reads without load, N and Nm."""
 _RATE: Final = 100
+_SETTLES: Final = 2
+"""Seconds of the turn's end, in which the source of gravity settles."""
 _EVERY: Final = 30
 """So many samples apart are the points that are drawn."""
 _TOUCH: Final = (20.0, 24.0)
@@ -52,13 +54,15 @@ def samples(noise: bool = True) -> Samples:
     signal = scene.Scene(1, noise, Turning())
     source = AccelerometerGravity()
     rows: list[tuple[float, ...]] = []
-    for number in range(int(TURN_LENGTH * _RATE)):
+    for number in range(-_SETTLES * _RATE, int(TURN_LENGTH * _RATE)):
         time_s = number / _RATE
         reading = signal.reading(number, 0, time_s)
         ax, ay, az = (part * STANDARD_GRAVITY for part in reading.acceleration)
         rx, ry, rz = (np.radians(part) for part in reading.angular_rate)
         source.update((ax, ay, az), (float(rx), float(ry), float(rz)), time_s)
         gravity = source.gravity(time_s)
+        if number < 0:
+            continue
         assert gravity is not None
         push = _PUSH if _TOUCH[0] <= time_s < _TOUCH[1] else (0.0, 0.0, 0.0)
         load = [*push, *scene.cross(scene.CONTACT_POINT, push)]

@@ -1,4 +1,4 @@
-"""Moves of an arm as the sensor's accelerometer and gyroscope feel them, with the truth: seeded, in closed form.
+"""Moves of an arm as the sensor's accelerometer and gyroscope feel them, with the truth; seeded.
 
 Independent of the virtual sensor: other noise, other moves. The sensor is turned about an axis of its own
 and shifted along axes of the world; between them it rests.
@@ -28,7 +28,7 @@ _SPEED_UP: Final = 10.0
 class Move(NamedTuple):
     """What the arm does for `seconds` between two rests."""
 
-    name: str
+    kind: str
     seconds: float
     acceleration: Callable[[Array], Array] = lambda t: np.zeros((len(t), 3))
     """Times (n,) in s since the move began, to (n, 3) in m/s², in the world; zero outside of the move."""
@@ -41,7 +41,7 @@ class Move(NamedTuple):
 
 
 class Imu(NamedTuple):
-    """A healthy sensor: half of the noise that its maker's test allows; a gyroscope that was never calibrated."""
+    """A healthy sensor: half of the noise that its maker's test allows, and a gyroscope that is off."""
 
     acceleration_noise: float = 0.05
     """m/s²"""
@@ -69,7 +69,10 @@ class Felt(NamedTuple):
     """(n, 3) the acceleration of the arm in the sensor's frame, m/s²"""
 
 
-def feel(move: Move, rate_hz: float = 800.0, seed: int = 0, imu: Imu = Imu(), lost: float = 0.0) -> Felt:
+HEALTHY: Final = Imu()
+
+
+def feel(move: Move, rate_hz: float = 800.0, seed: int = 0, imu: Imu = HEALTHY, lost: float = 0.0) -> Felt:
     """Make the samples of a move, in a random pose; of these a part of `lost` is missing."""
     draw = np.random.default_rng(seed)
     before = REST_S if move.rests else -0.5 * move.seconds
@@ -162,31 +165,31 @@ def free_fall(t: Array) -> Array:
     return along(2, np.where(t < 0.3, -STANDARD_GRAVITY, 3 * STANDARD_GRAVITY))
 
 
-def acceptance(size: float = 2.5, seconds: float = 0.4, axis: int = 0) -> Move:
-    """The move that the compensated wrench must survive."""
-    corners = np.cumsum((0.0, seconds, seconds))
-    sizes = np.array((0.0, size, -size, 0.0))
-    return Move("acceptance", float(corners[-1]),
-                lambda t: along(axis, sizes[np.searchsorted(corners, t, side="right")]))  # fmt: skip
+def acceptance(axis: int = 0) -> Move:
+    """0.4 s at 2.5 m/s², and braked as hard: the move that the compensated wrench must survive."""
+    corners = np.cumsum((0.0, 0.4, 0.4))
+    sizes = np.array((0.0, 2.5, -2.5, 0.0))
+
+    def acceleration(t: Array) -> Array:
+        return along(axis, sizes[np.searchsorted(corners, t, side="right")])
+
+    return Move("acceptance", float(corners[-1]), acceleration)
 
 
 def moves() -> Iterator[Move]:
     """Everything that is to be survived."""
     for axis, seconds, size in product(range(3), (0.2, 0.5, 1.0), (1.0, 2.5, 5.0)):
-        yield Move(
-            f"translation {'xyz'[axis]} {seconds:g} s {size:g} m/s²", *there_and_back(axis, seconds, size)
-        )
+        yield Move("translations", *there_and_back(axis, seconds, size))
     for axis, seconds in product(range(3), (1.0, 3.0)):
-        yield Move(f"turn {'xyz'[axis]} {seconds:g} s", seconds, rate=TURN_RATE, axis=axis)
+        yield Move("turns", seconds, rate=TURN_RATE, axis=axis)
     for axis, seconds, size in product(range(3), (0.5, 1.0), (2.5, 5.0)):
-        there = there_and_back((axis + 1) % 3, seconds, size)
-        yield Move(f"both {'xyz'[axis]} {seconds:g} s {size:g} m/s²", *there, TURN_RATE, axis)
+        yield Move("both at once", *there_and_back((axis + 1) % 3, seconds, size), TURN_RATE, axis)
     for axis, hertz in product((0, 2), (20.0, 31.0, 45.0, 60.0)):
-        yield Move(f"vibration {'xyz'[axis]} {hertz:g} Hz", 3.0, vibration(axis, hertz))
+        yield Move("vibration", 3.0, vibration(axis, hertz))
     yield Move("shocks", 2.0, shocks)
     yield Move("free fall", 0.4, free_fall)
     for axis, seconds, size in product((0, 2), (0.4, 1.0), (2.5, 5.0)):
         there = there_and_back(axis, seconds, size)
-        yield Move(f"start in motion {'xyz'[axis]} {seconds:g} s {size:g} m/s²", *there, rests=False)
-        yield Move(f"start in both {'xyz'[axis]} {seconds:g} s {size:g} m/s²", *there, TURN_RATE, axis, False)
-    yield Move("start in vibration", 6.0, vibration(0, 31.0), rests=False)
+        yield Move("start in motion", *there, rests=False)
+        yield Move("start in motion", *there, TURN_RATE, axis, rests=False)
+    yield Move("start in motion", 6.0, vibration(0, 31.0), rests=False)

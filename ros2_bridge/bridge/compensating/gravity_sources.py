@@ -125,8 +125,8 @@ class AccelerometerSource:
             )
         return (
             f"the accelerometer has {since} agreed with {f.magnitude:.2f} ± {f.gate:g} m/s² and the "
-            "gyroscope: the sensor is being moved hard, or imu_raw_units is wrong; for use in motion take the "
-            "orientation from the robot (orientation_source)"
+            "gyroscope: the sensor is being moved hard, or imu_raw_units is wrong; for use in motion take "
+            "the orientation from the robot (orientation_source)"
         )
 
     def age_s(self, time_s: float) -> float:

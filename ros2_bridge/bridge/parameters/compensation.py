@@ -51,7 +51,7 @@ _TABLE: Final = (
     Row("accelerometer.gate", 0.5,
         "A usable mean of 50 ms differs from gravity in length by no more, m/s²", 0.01, 10),
     Row("accelerometer.tilt_limit", 0.2,
-        "Stop when gravity may be tilted by more, rad; start at a quarter", 0.05, 3),
+        "Stop when gravity may be tilted by more, rad; start at a third", 0.1, 3),
     Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
     Row("rest.force_spread", _REST.force_spread, "Largest standard deviation when stationary, N", 0, 1e3),
     Row("rest.torque_spread", _REST.torque_spread, "Largest standard deviation when stationary, Nm", 0, 1e3),

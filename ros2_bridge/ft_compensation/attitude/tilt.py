@@ -155,6 +155,9 @@ class TiltFilter:
         lasted_s, size = self._steady.lasted_s, math.hypot(*self._steady.mean)
         self.forget()
         self._steady.lasted_s, self._steady.mean = lasted_s, (0.0, 0.0, size)
+        self._likely_s = min(lasted_s, 5.0 * self.time_constant_s)
+        p = self._covariance
+        p[5, 5] = p[6, 6] = _ARM * math.exp(-2.0 * self._likely_s / self.time_constant_s)
 
     @property
     def tilt_95(self) -> float:
@@ -193,7 +196,8 @@ class TiltFilter:
         if self.rejected_s > _CONTRADICTED_S:
             grows += _DOUBT * passed_s
         drift = _OFFSET_DRIFT * passed_s
-        p[range(7), range(7)] += (grows, grows, drift, drift, drift, 0.0, 0.0)
+        for axis, more in enumerate((grows, grows, drift, drift, drift)):
+            p[axis, axis] += more
         self._covariance = p
 
     def correct(self, mean: Vector3 | None, rate: Vector3, passed_s: float) -> tuple[float, float] | None:
