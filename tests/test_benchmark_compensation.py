@@ -23,6 +23,7 @@ SETUP = Setup(800, 1, 1.0, 0.0, 0, ppm=0.0)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compensation, "SAMPLES", 200)
     monkeypatch.setattr(compensation, "MOST_US", 1e9)
+    monkeypatch.setattr(compensation, "MOST_BY_DEFAULT_US", 1e9)
 
 
 def test_every_case_costs_something() -> None:
@@ -35,8 +36,9 @@ def test_every_case_costs_something() -> None:
         assert name in shown.getvalue()
 
 
-def test_too_much_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compensation, "MOST_US", 1e-6)
+@pytest.mark.parametrize("limit", ["MOST_US", "MOST_BY_DEFAULT_US"])
+def test_too_much_is_said(monkeypatch: pytest.MonkeyPatch, limit: str) -> None:
+    monkeypatch.setattr(compensation, limit, 1e-6)
     with pytest.raises(DemoError, match=r"takes \d+\.\d µs a sample, more than"):
         compensation.measure_compensation(SETUP, Console(file=io.StringIO()))
 

@@ -221,7 +221,8 @@ class TiltFilter:
         self._watch(mean, rate, passed_s, uneven)
         measured = np.array((mean[1], -mean[0])) / size
         if mean[2] < 0.0:  # more than 90°: as far off as can be
-            measured /= max(1e-9, math.hypot(*measured))
+            across = math.hypot(*measured)
+            measured = measured / across if across > 1e-6 else np.array((1.0, 0.0))
         lasted_s = self._steady.lasted_s
         agrees = (_AGREES if lasted_s else _AGREES_MOVED) + _OTHER_POSE * min(1.0, self._turned) ** 2
         if measured @ _inverse(self._covariance[:2, :2] + np.eye(2) * agrees) @ measured > _GATE:

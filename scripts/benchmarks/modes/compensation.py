@@ -28,7 +28,10 @@ from scripts.demonstration.program import DemoError
 
 SAMPLES: Final = 20_000
 SIZE: Final = 61
+DEFAULT: Final = "bias and gravity"
+"""The case of what is on by default, once there is a tool_mass."""
 MOST_US: Final = 20.0
+MOST_BY_DEFAULT_US: Final = 12.0
 """What it may cost."""
 _TOOL: Final = Payload(0.8, (0.004, -0.006, 0.055))
 _BIAS: Final = Wrench((3.0, -1.5, 7.25), (0.2, -0.05, 0.125))
@@ -51,13 +54,14 @@ def frames() -> Iterator[bytes]:
 
 
 def took(each: Callable[[int], object]) -> dict[str, float]:
-    """Median and p99, in µs, of calling `each` with the numbers from 0 on."""
+    """Median, mean and p99, in µs, of calling `each` with the numbers from 0 on."""
     times = []
     for number in range(SAMPLES):
         began = time.perf_counter_ns()
         each(number)
         times.append(time.perf_counter_ns() - began)
-    return {str(percent): float(np.percentile(times, percent)) / 1000 for percent in (50, 99)}
+    found = {str(percent): float(np.percentile(times, percent)) / 1000 for percent in (50, 99)}
+    return {**found, "mean": sum(times) / len(times) / 1000}
 
 
 def costs(setup: Setup) -> Costs:
@@ -78,12 +82,14 @@ def costs(setup: Setup) -> Costs:
                 source, Compensator(_TOOL, inertia=inertia), BiasRamp(_BIAS), needs_gravity=True
             )
             output.window = RestWindow(1e9, StationaryLimits(), source) if window else None
+            for number in range(-setup.rate_hz, 0):  # a second, until gravity is known
+                output.follow(samples[number % SAMPLES], _START_NS + number * step_ns)
             before = output.published
             found[name] = took(lambda number: output.publish(samples[number], _START_NS + number * step_ns))
             if output.published - before != SAMPLES:
                 raise DemoError(f"{name}: not all samples were compensated")
 
-        measure("bias and gravity", inertia=False, window=False)
+        measure(DEFAULT, inertia=False, window=False)
         measure("with inertia", inertia=True, window=False)
         measure("with inertia, while a tare is taken", inertia=True, window=True)
     finally:
@@ -94,12 +100,13 @@ def costs(setup: Setup) -> Costs:
 def measure_compensation(setup: Setup, console: Console) -> dict[str, Any]:
     """Measure and print. DemoError if it costs too much."""
     found = costs(setup)
-    table = Table("", "median, µs", "p99, µs", "of decoding", title="Compensation of a sample")
+    table = Table("", "median, µs", "mean, µs", "p99, µs", "of decoding", title="Compensation of a sample")
     for name, cost in found.items():
         ratio = cost["50"] / found["decoding"]["50"]
-        table.add_row(name, f"{cost['50']:.1f}", f"{cost['99']:.1f}", f"{ratio:.1f}")
+        table.add_row(name, *(f"{cost[which]:.1f}" for which in ("50", "mean", "99")), f"{ratio:.1f}")
     console.print(table)
     worst = max(found, key=lambda name: found[name]["50"])
-    if found[worst]["50"] > MOST_US:
-        raise DemoError(f"{worst} takes {found[worst]['50']:.1f} µs a sample, more than {MOST_US:g} µs")
+    for name, most_us in ((worst, MOST_US), (DEFAULT, MOST_BY_DEFAULT_US)):
+        if found[name]["50"] > most_us:
+            raise DemoError(f"{name} takes {found[name]['50']:.1f} µs a sample, more than {most_us:g} µs")
     return found
