@@ -186,8 +186,8 @@ def moves() -> Iterator[Move]:
         yield Move("both at once", *there_and_back((axis + 1) % 3, seconds, size), TURN_RATE, axis)
     for axis, hertz in product((0, 2), (20.0, 31.0, 45.0, 60.0)):
         yield Move("vibration", 3.0, vibration(axis, hertz))
-    yield Move("shocks", 2.0, shocks)
-    yield Move("free fall", 0.4, free_fall)
+    yield Move("shocks, free fall", 2.0, shocks)
+    yield Move("shocks, free fall", 0.4, free_fall)
     for axis, seconds, size in product((0, 2), (0.4, 1.0), (2.5, 5.0)):
         there = there_and_back(axis, seconds, size)
         yield Move("start in motion", *there, rests=False)

@@ -287,4 +287,5 @@ class TiltFilter:
 def _inverse(a: Array) -> Array:
     """Of a symmetric 2 by 2 matrix."""
     (xx, xy), (_, yy) = a.tolist()
-    return np.array(((yy, -xy), (-xy, xx))) / (xx * yy - xy * xy)
+    found: Array = np.array(((yy, -xy), (-xy, xx))) / (xx * yy - xy * xy)
+    return found
