@@ -11,9 +11,8 @@ import math
 from collections import deque
 from typing import Final
 
-import numpy as np
-
-from ft_compensation.attitude.carried import CarriedAttitude, Matrix, Quaternion, matrix_of
+from ft_compensation.attitude.block import BlockSum
+from ft_compensation.attitude.carried import CarriedAttitude, Quaternion, matrix_of
 from ft_compensation.attitude.tilt import BLOCK_S, GyroscopeOffset, TiltFilter
 from ft_compensation.quantities import DEFAULT_GRAVITY, ZERO
 from protocol.pdo import STANDARD_GRAVITY, Vector3
@@ -64,13 +63,7 @@ class AccelerometerGravity:
         self._attitude = CarriedAttitude()
         self._is_begun = self._is_known = False
         self._time_s = -math.inf
-        # The block.
-        self._began_s = self._longest_s = 0.0
-        self._first: Matrix = self._attitude.matrix
-        self._sum: Vector3 = ZERO
-        self._turned: Vector3 = ZERO
-        self._count = 0
-        self._spoiled = False
+        self._sum = BlockSum()
 
     def update(self, acceleration: Vector3 | None, angular_rate: Vector3, time_s: float) -> bool:
         """Take a sample's acceleration (m/s²; None if it was saturated) and angular rate (rad/s).
@@ -87,26 +80,9 @@ class AccelerometerGravity:
         if not math.isfinite(tx + ty + tz):
             return False
         self._time_s = time_s
-        tx, ty, tz = self._attitude.advance(angular_rate, passed_s)
-        sx, sy, sz = self._turned
-        self._turned = sx + tx, sy + ty, sz + tz
-        if passed_s > self._longest_s:  # noqa: PLR1730 - twice as fast as max()
-            self._longest_s = passed_s
-        is_good = False
-        if acceleration is not None:
-            ax, ay, az = acceleration
-            (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._attitude.matrix
-            sx, sy, sz = self._sum
-            self._sum = (
-                sx + xx * ax + xy * ay + xz * az,
-                sy + yx * ax + yy * ay + yz * az,
-                sz + zx * ax + zy * ay + zz * az,
-            )
-            is_good = ax - ax == ay - ay == az - az == 0.0
-        self._count += 1
-        if not is_good:
-            self._spoiled = True
-        if time_s - self._began_s >= BLOCK_S - _HAIR_S:
+        turn = self._attitude.advance(angular_rate, passed_s)
+        is_good = self._sum.add(self._attitude, acceleration, angular_rate, turn, passed_s)
+        if time_s - self._sum.began_s >= BLOCK_S - _HAIR_S:
             self._close_block(time_s)
         return is_good
 
@@ -121,27 +97,14 @@ class AccelerometerGravity:
         self._attitude.level(acceleration)
         self._filter.forget()
         self._is_begun, self._time_s = True, time_s
-        self._open_block(time_s)
+        self._sum.begin(time_s, self._attitude)
         return True
-
-    def _open_block(self, time_s: float) -> None:
-        self._began_s, self._sum, self._turned = time_s, ZERO, ZERO
-        self._count, self._longest_s, self._spoiled = 0, 0.0, False
-        self._first = self._attitude.matrix
 
     def _close_block(self, time_s: float) -> None:
         attitude, tilt = self._attitude, self._filter
-        passed_s = time_s - self._began_s
-        x, y, z = self._turned
-        turned = math.hypot(x, y, z)
-        rate = x / passed_s, y / passed_s, z / passed_s
-        middle = 0.5 * (np.array(self._first) + np.array(attitude.matrix))
-        tilt.predict(middle, turned, passed_s, self._longest_s)
-        mean = None
-        if not self._spoiled:
-            x, y, z = self._sum
-            mean = x / self._count, y / self._count, z / self._count
-        correction = tilt.correct(mean, rate, passed_s)
+        block = self._sum.end(time_s, attitude)
+        tilt.predict(block)
+        correction = tilt.correct(block)
         if correction is not None:
             attitude.rotate((*correction, 0.0))
             attitude.offset = self.offset.value
@@ -149,7 +112,7 @@ class AccelerometerGravity:
             self._begin_anew()
         self.tilt_95 = tilt.tilt_95
         self._is_known = self.tilt_95 <= self.tilt_limit * (1.0 if self._is_known else _AT_FIRST)
-        self._open_block(time_s)
+        self._sum.begin(time_s, self._attitude)
 
     def _begin_anew(self) -> None:
         """From the steady mean of late."""

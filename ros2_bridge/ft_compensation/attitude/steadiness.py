@@ -10,6 +10,7 @@ from protocol.pdo import Vector3
 
 _MEAN_S: Final = 0.3
 """Time constant of the mean that a vector is compared with: what changes slower than that is steady."""
+_NOISES: Final = 4.0
 
 
 class Steadiness:
@@ -26,10 +27,10 @@ class Steadiness:
         """The next one is the first."""
         self.lasted_s = -1.0
 
-    def watch(self, vector: Vector3, passed_s: float) -> bool:
-        """False: it is another one now."""
+    def watch(self, vector: Vector3, passed_s: float, noise: float) -> bool:
+        """`noise` is the standard deviation of its components. False: it is another one now."""
         last = self.mean
-        if self.lasted_s < 0.0 or math.dist(vector, last) > self._limit:
+        if self.lasted_s < 0.0 or math.dist(vector, last) > self._limit + _NOISES * noise:
             self.mean, self.lasted_s = vector, 0.0
             return False
         share = 1.0 - math.exp(-passed_s / _MEAN_S)

@@ -33,6 +33,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ft_compensation.attitude.block import Block
 from ft_compensation.attitude.steadiness import Steadiness
 from ft_compensation.quantities import ZERO
 from protocol.pdo import Vector3
@@ -53,8 +54,8 @@ _RATE_NOISE: Final = 1e-3**2
 """(rad/s)² per Hz: 0.03 rad/s at 800 Hz, ten times a healthy sensor's noise, because vibration adds to it."""
 _RATE_SCALE: Final = 0.01**2
 """Square of the error of the scale, over turns of about a second."""
-_LOST_TURN: Final = 5.0**2
-"""(rad/s²)²: half the angular acceleration that a gap between samples may hide."""
+_LOST_TURN: Final = 1.25**2
+"""(rad/s²)²: an eighth of the angular acceleration that the mean of two rates may miss in the gap between."""
 
 # The accelerometer, as angles: m/s² over g.
 _REST: Final = 0.005**2
@@ -135,7 +136,6 @@ class TiltFilter:
         self.rejected_s = 0.0
         """Since a block counted."""
         self._steady, self._rest, self._still = Steadiness(_STEADY), Steadiness(_AT_REST), Steadiness(_STILL)
-        self._attitude: Array = np.eye(3)
         self._covariance: Array
         self.forget()
 
@@ -177,22 +177,16 @@ class TiltFilter:
         """Whether the accelerometer has contradicted steadily, so that all must begin anew."""
         return min(self.rejected_s, self._steady.lasted_s) > _RECOVERS * self.time_constant_s
 
-    def predict(self, attitude: Array, turned: float, passed_s: float, longest_s: float) -> None:
-        """Let a block's time go by.
-
-        Args:
-            attitude: mean of the matrix that turns the sensor's vectors into the still frame, (3, 3).
-            turned: angle, rad.
-            passed_s: duration of the block.
-            longest_s: the longest time between two samples in it.
-        """
-        self._attitude = attitude
+    def predict(self, block: Block) -> None:
+        """Let a block's time go by."""
+        passed_s, turned = block.passed_s, math.hypot(*block.rate) * block.passed_s
         self._turned += turned
         self._held_s *= math.exp(-passed_s / _HELD_S)
         f = np.eye(7)
-        f[:2, 2:5] = -passed_s * attitude[:2]
+        f[:2, 2:5] = -passed_s * block.attitude[:2]
         p = f @ self._covariance @ f.T
-        grows = _RATE_NOISE * passed_s + _RATE_SCALE * turned * turned / passed_s + _LOST_TURN * longest_s**4
+        grows = _RATE_NOISE * passed_s + _RATE_SCALE * turned * turned / passed_s
+        grows += _LOST_TURN * block.longest_s**4
         if self.rejected_s > _CONTRADICTED_S:
             grows += _DOUBT * passed_s
         drift = _OFFSET_DRIFT * passed_s
@@ -200,17 +194,13 @@ class TiltFilter:
             p[axis, axis] += more
         self._covariance = p
 
-    def correct(self, mean: Vector3 | None, rate: Vector3, passed_s: float) -> tuple[float, float] | None:
-        """Take a block.
-
-        Args:
-            mean: acceleration, m/s² in the still frame; None if a sample of it could not be used.
-            rate: mean angular rate less the offset, rad/s in the sensor's frame.
-            passed_s: its duration.
+    def correct(self, block: Block) -> tuple[float, float] | None:
+        """Take a block's acceleration.
 
         Returns the rotation about x and y by which to turn the attitude, rad; None if the block does not
         count. The offset is corrected in place.
         """
+        passed_s, mean = block.passed_s, block.acceleration
         self.rejected_s += passed_s
         size = 0.0 if mean is None else math.hypot(*mean)
         uneven = abs(size - self.magnitude)
@@ -218,36 +208,39 @@ class TiltFilter:
             self._steady.forget()
             self._rest.forget()
             return None
-        self._watch(mean, rate, passed_s, uneven)
+        self._watch(block, mean, uneven)
         measured = np.array((mean[1], -mean[0])) / size
         if mean[2] < 0.0:  # more than 90°: as far off as can be
             across = math.hypot(*measured)
             measured = measured / across if across > 1e-6 else np.array((1.0, 0.0))
         lasted_s = self._steady.lasted_s
-        agrees = (_AGREES if lasted_s else _AGREES_MOVED) + _OTHER_POSE * min(1.0, self._turned) ** 2
+        scatter = (block.noise / self.magnitude) ** 2
+        agrees = (
+            (_AGREES if lasted_s else _AGREES_MOVED) + _OTHER_POSE * min(1.0, self._turned) ** 2 + scatter
+        )
         if measured @ _inverse(self._covariance[:2, :2] + np.eye(2) * agrees) @ measured > _GATE:
             self._held_s = max(self._held_s, lasted_s)
             return None
         self.rejected_s = 0.0
         is_at_rest = min(self._rest.lasted_s, self._still.lasted_s) > _RESTS_S
-        learns = is_at_rest and math.hypot(*rate) <= _TURNING
-        noise = _MOTION if not lasted_s else _REST if is_at_rest else _SWAY
+        learns = is_at_rest and math.hypot(*block.rate) <= _TURNING
+        variance = scatter + (_MOTION if not lasted_s else _REST if is_at_rest else _SWAY)
         error = np.array((0.0, 0.0, 0.0, 0.0, 0.0, *self._arm))
-        error = self._update(error, _MEASURED, measured, noise, learns)
+        error = self._update(error, _MEASURED, measured, variance, learns)
         if lasted_s > self._held_s and (is_at_rest or self._covariance[5, 5] > _SWAYING):
             error = self._update(error, _ARM_ONLY, np.zeros(2), self._less_likely(passed_s), learns)
         if lasted_s and self._covariance[5, 5] < _KNOWN_ARM:
             self._turned = 0.0
         return self._apply(error)
 
-    def _watch(self, mean: Vector3, rate: Vector3, passed_s: float, uneven: float) -> None:
+    def _watch(self, block: Block, mean: Vector3, uneven: float) -> None:
         """Follow for how long the acceleration has been steady; if it is another, `arm` is unknown again."""
-        x, y, z = (self._attitude.T @ mean).tolist()
-        self._rest.watch((x, y, z), passed_s)
-        self._still.watch(rate, passed_s)
-        if not self._steady.watch(mean, passed_s):
+        x, y, z = (block.attitude.T @ mean).tolist()
+        self._rest.watch((x, y, z), block.passed_s, block.noise)
+        self._still.watch(block.rate, block.passed_s, block.rate_noise)
+        if not self._steady.watch(mean, block.passed_s, block.noise):
             self._arm, self._likely_s = (0.0, 0.0), 0.0
-            self._first_arm = _ARM + _UNEVEN * max(0.0, uneven - _LENGTH_NOISE) / self.magnitude
+            self._first_arm = _ARM + _UNEVEN * max(0.0, uneven - _LENGTH_NOISE - block.noise) / self.magnitude
             p = self._covariance
             p[5:] = p[:, 5:] = 0.0
             p[5, 5] = p[6, 6] = self._first_arm
