@@ -68,7 +68,7 @@ class StationaryMeans(NamedTuple):
     acceleration: Vector3
     """m/s²; minus gravity in the sensor's frame"""
     angular_rate: Vector3
-    """rad/s: the gyroscope's offset"""
+    """rad/s: the gyroscope's offset, if the sensor did not turn slowly"""
     force_spread: Vector3
     """N"""
     torque_spread: Vector3

@@ -79,12 +79,12 @@ _OWN_OFFSET: Final = 0.01**2
 _START: Final = math.radians(20.0) ** 2
 """rad²: of a first guess by a sensor that may be accelerated by 3.5 m/s²."""
 
-# When is f steady, when is the sensor at rest?
+# When is f steady, when is the sensor at rest? Besides four times the noise of a block.
 _STEADY: Final = 0.2
 """m/s², in the still frame: an offset of 0.03 rad/s turns f by 0.09 m/s² within the mean's time."""
-_AT_REST: Final = 0.15
-"""m/s², in the sensor's frame: three times the noise of a block at 100 Hz."""
-_STILL: Final = 0.015
+_AT_REST: Final = 0.08
+"""m/s², in the sensor's frame."""
+_STILL: Final = 0.006
 """rad/s: change of the rate."""
 _TURNING: Final = 0.1
 """rad/s: beyond it an error of the scale would be learned as an offset."""
