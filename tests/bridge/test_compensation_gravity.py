@@ -188,3 +188,16 @@ def test_an_orientation_of_a_topic_is_carried_on_to_the_sample() -> None:
         if step > 2:
             wanted = 0.0, -STANDARD_GRAVITY * math.sin(speed * t), -STANDARD_GRAVITY * math.cos(speed * t)
             assert got == pytest.approx(wanted, abs=1e-3)
+
+
+def test_the_beginning_is_no_error(arm: Arm, node: SimulatedNode) -> None:
+    """The accelerometer needs half a second of rest."""
+    hold(arm, UP)
+    node.until(compensation=OK)
+    stages, before = Stages(node), len(node.hear("/diagnostics"))
+    node.run_until(lambda: stages.final, "wrench_compensated")
+    node.run(1.5)
+    reports = node.hear("/diagnostics")[before:]
+    levels = [s.level for report in reports for s in report.status if s.name.endswith("compensation")]
+    assert levels
+    assert bytes([ERROR]) not in levels

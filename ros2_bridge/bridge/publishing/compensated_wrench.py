@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from bridge.compensating.gravity_sources import NoSource, Source
 from ft_compensation.bias import BiasRamp
@@ -17,6 +17,9 @@ from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import ZERO, CompensationError
 from ft_compensation.stationary import StationaryLimits, StationaryMeans, StationaryWindow
 from protocol.pdo import Sample, Vector3
+
+_BEGINS_S: Final = 1.0
+"""How long it may take until gravity is known, before that is worth an error."""
 
 
 class Plan(NamedTuple):
@@ -109,7 +112,9 @@ class CompensatedOutput:
         self.published = self.withheld = 0
         """Samples since the node started that were compensated, and that could not be."""
         self.is_stopped = False
-        """Whether the latest could not."""
+        """Whether the latest could not; at the beginning, whether that has taken long."""
+        self._begins_s = math.inf
+        """When somebody subscribed and nothing has been published since, s; infinite: not known yet."""
         self.time_s = 0.0
         """The latest sample's, seconds since the Unix epoch."""
 
@@ -117,7 +122,7 @@ class CompensatedOutput:
         """Whether anybody has subscribed to any of the topics, or a window is open."""
         self._wanted = tuple(topic for topic in self._all if topic.is_wanted())
         if not self._wanted:
-            self.is_stopped = False  # nobody misses anything
+            self.is_stopped, self._begins_s = False, math.inf  # nobody misses anything
         return bool(self._wanted) or self.window is not None
 
     @property
@@ -153,9 +158,10 @@ class CompensatedOutput:
             self.broken = "the IMU's numbers are not finite, which compensate_inertia needs: see stream"
         if gravity is None or self.hold is not None or self.broken is not None:
             self.withheld += 1
-            self.is_stopped = True
+            self._begins_s = min(self._begins_s, time_s)
+            self.is_stopped = not 0.0 <= time_s - self._begins_s <= _BEGINS_S
             return
-        self.is_stopped = False
+        self.is_stopped, self._begins_s = False, -math.inf
         compensator.set_bias(plan.ramp.at(time_s))
         stages = compensator.compensate(
             sample.force, sample.torque, gravity, sample.acceleration, sample.angular_rate
