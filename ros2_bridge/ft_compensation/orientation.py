@@ -18,6 +18,8 @@ from ft_compensation.quantities import DEFAULT_GRAVITY, ZERO
 from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 _HAIR_S: Final = 1e-6
+_FASTEST: Final = 100.0
+"""rad/s: three times the largest range. A rate beyond it is none."""
 _AT_FIRST: Final = 0.35
 """Of the limit to the tilt: to lose what is known takes more than to begin."""
 _MOST_RATES: Final = 4096
@@ -68,7 +70,7 @@ class AccelerometerGravity:
     def update(self, acceleration: Vector3 | None, angular_rate: Vector3, time_s: float) -> bool:
         """Take a sample's acceleration (m/s²; None if it was saturated) and angular rate (rad/s).
 
-        False: it is not finite, or nothing is known and it has not the length of gravity. Samples whose
+        False: it cannot be, or nothing is known and it has not the length of gravity. Samples whose
         angular rate is saturated do not belong here: leave them out.
         """
         passed_s = time_s - self._time_s
@@ -77,7 +79,7 @@ class AccelerometerGravity:
         if not self._is_begun or not 0.0 <= passed_s <= self.stale_after_s:
             return self._begin(acceleration, time_s)
         tx, ty, tz = angular_rate
-        if not math.isfinite(tx + ty + tz):
+        if not tx * tx + ty * ty + tz * tz <= _FASTEST**2:  # nor NaN
             return False
         self._time_s = time_s
         turn = self._attitude.advance(angular_rate, passed_s)

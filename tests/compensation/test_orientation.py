@@ -184,13 +184,25 @@ def test_it_stops_when_the_tilt_may_be_beyond_its_limit() -> None:
 
 @pytest.mark.parametrize(
     ("acceleration", "rate"),
-    [((math.nan, 0.0, G), STILL), (UPRIGHT, (0.0, math.nan, 0.0)), ((math.inf, 0.0, 0.0), STILL)],
+    [
+        ((math.nan, 0.0, G), STILL),
+        (UPRIGHT, (0.0, math.nan, 0.0)),
+        ((math.inf, 0.0, 0.0), STILL),
+        (UPRIGHT, (0.0, 3e38, 0.0)),
+    ],
 )
-def test_numbers_that_are_not_finite_do_no_lasting_harm(acceleration: Vector3, rate: Vector3) -> None:
+def test_numbers_that_cannot_be_do_no_lasting_harm(acceleration: Vector3, rate: Vector3) -> None:
     source, t = resting()
     assert not source.update(acceleration, rate, t + 0.1)
     assert source.update(UPRIGHT, STILL, t + 0.2)
     assert tilt(source, t + 0.2) < 1e-6
+
+
+def test_the_largest_numbers_only_do_not_count() -> None:
+    source, t = resting()
+    t = feed(source, 0.2, t, (3e38, -3e38, 3e38), (99.0, 0.0, 0.0))
+    feed(source, 3.0, t)
+    assert tilt(source, t + 3.0) < 1e-3
 
 
 def test_a_saturated_accelerometer_leaves_the_gyroscope() -> None:
