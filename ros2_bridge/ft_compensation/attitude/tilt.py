@@ -55,7 +55,8 @@ _RATE_NOISE: Final = 1e-3**2
 _RATE_SCALE: Final = 0.01**2
 """Square of the error of the scale, over turns of about a second."""
 _LOST_TURN: Final = 1.25**2
-"""(rad/s²)²: an eighth of the angular acceleration that the mean of two rates may miss in the gap between."""
+"""(rad/s²)², times s⁴: an eighth of the angular acceleration, 10 rad/s², that a gap between samples may hide
+from the mean of the rates before and after it."""
 
 # The accelerometer, as angles: m/s² over g.
 _REST: Final = 0.005**2
