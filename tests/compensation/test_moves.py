@@ -61,6 +61,11 @@ def test_what_the_sensor_itself_is_off_is_covered(imu: Imu) -> None:
     assert coverage(survived(400.0, 4000, imu)) > 0.95
 
 
+def test_a_noisy_sensor_at_rest() -> None:
+    """Five times the noise that the maker allows: now and then a block contradicts by chance."""
+    check([node(feel(Move("rest", 10.0), 100.0, 3, Imu(acceleration_noise=0.5, rate_noise=0.03)))])
+
+
 @pytest.mark.parametrize("rate_hz", [100.0, 800.0])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_the_move_that_passed_for_tilt(rate_hz: float, axis: int) -> None:

@@ -220,7 +220,7 @@ class TiltFilter:
             (_AGREES if lasted_s else _AGREES_MOVED) + _OTHER_POSE * min(1.0, self._turned) ** 2 + scatter
         )
         if measured @ _inverse(self._covariance[:2, :2] + np.eye(2) * agrees) @ measured > _GATE:
-            self._held_s = max(self._held_s, lasted_s)
+            self._held_s = max(self._held_s, min(lasted_s, self.rejected_s))
             return None
         self.rejected_s = 0.0
         is_at_rest = min(self._rest.lasted_s, self._still.lasted_s) > _RESTS_S
