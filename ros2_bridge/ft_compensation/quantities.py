@@ -60,6 +60,22 @@ class Payload(NamedTuple):
 NO_PAYLOAD: Final = Payload()
 
 
+class Accelerometer(NamedTuple):
+    """What an accelerometer reads: `scale` times the truth, axis by axis, plus `offset`."""
+
+    offset: Vector3 = ZERO
+    """m/s²"""
+    scale: Vector3 = (1.0, 1.0, 1.0)
+
+    def correct(self, acceleration: Vector3) -> Vector3:
+        """The truth, m/s², of what was read."""
+        (x, y, z), (ox, oy, oz), (sx, sy, sz) = acceleration, self.offset, self.scale
+        return (x - ox) / sx, (y - oy) / sy, (z - oz) / sz
+
+
+EXACT: Final = Accelerometer()
+
+
 def length(a: Vector3) -> float:
     """The length of a vector."""
     return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])

@@ -30,7 +30,7 @@ from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
 from bridge.stream.link import Link
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
+from ft_compensation.quantities import NO_WRENCH, ZERO, Accelerometer, Payload, Wrench
 from protocol.pdo import Vector3
 
 _LOOKING_UP: Final = "the bias of this sensor is being looked up"
@@ -153,12 +153,18 @@ class CompensationControl:
         self.origin = "undone"
         return before
 
-    def set_payload(self, payload: Payload, bias: Wrench) -> None:
-        """Put an identified payload and its bias in force, both at once."""
+    def set_payload(self, payload: Payload, bias: Wrench, accelerometer: Accelerometer | None = None) -> None:
+        """Put an identified payload, its bias and the accelerometer's correction in force, all at once."""
+        values: dict[str, object] = {
+            "tool_mass": payload.mass,
+            "tool_center_of_gravity": [*payload.center],
+            "bias": [*bias.values],
+        }
+        if accelerometer is not None:
+            values["accelerometer.offset"] = [*accelerometer.offset]
+            values["accelerometer.scale"] = [*accelerometer.scale]
         with self._origin("identified"):
-            self._live.put(
-                tool_mass=payload.mass, tool_center_of_gravity=[*payload.center], bias=[*bias.values]
-            )
+            self._live.put(**values)
 
     def note_rest(self, angular_rate: Vector3) -> None:
         """What the gyroscope read at rest, rad/s: its offset."""
@@ -198,7 +204,10 @@ class CompensationControl:
     def _make_plan(self) -> None:
         wanted = self.parameters
         compensator = Compensator(
-            wanted.payload, inertia=wanted.compensate_inertia, imu_position=wanted.imu_position
+            wanted.payload,
+            inertia=wanted.compensate_inertia,
+            imu_position=wanted.imu_position,
+            accelerometer=wanted.accelerometer.reading,
         )
         self.output.plan = Plan(self.source, compensator, self._ramp, wanted.payload.mass > 0.0)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 from bridge.parameters.compensation import CompensationParameters, Quaternion
 from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
-from ft_compensation.quantities import length
+from ft_compensation.quantities import EXACT, length
 from protocol.pdo import Sample, Vector3
 
 
@@ -81,6 +81,7 @@ class AccelerometerSource:
             gyroscope=p.gyroscope,
             angular_rate_offset=angular_rate_offset,
         )
+        self._correct = None if p.reading == EXACT else p.reading.correct
         self._imu_is_off = False
 
     def set_angular_rate_offset(self, offset: Vector3) -> None:
@@ -91,7 +92,8 @@ class AccelerometerSource:
         """From this sample and those before it."""
         acceleration = sample.acceleration
         if not sample.acceleration_saturated and not sample.angular_rate_saturated:
-            self._filter.update(acceleration, sample.angular_rate, time_s)
+            true = acceleration if self._correct is None else self._correct(acceleration)
+            self._filter.update(true, sample.angular_rate, time_s)
         found = self._filter.gravity(time_s)
         if found is None:
             self._imu_is_off = not any(acceleration)

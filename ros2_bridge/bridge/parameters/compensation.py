@@ -10,7 +10,15 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from bridge.parameters.row import ParameterError, Row
-from ft_compensation.quantities import DEFAULT_GRAVITY, ZERO, Payload, Wrench, length
+from ft_compensation.quantities import (
+    DEFAULT_GRAVITY,
+    EXACT,
+    ZERO,
+    Accelerometer,
+    Payload,
+    Wrench,
+    length,
+)
 from ft_compensation.stationary import StationaryLimits
 from protocol.pdo import Vector3
 
@@ -20,6 +28,7 @@ AUTO: Final = "auto"
 TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
 SOURCES: Final = ("none", "accelerometer", "sensor", *TOPIC_SOURCES, "tf")
 _LEAST_GRAVITY: Final = 0.1
+_LEAST_SCALE: Final = 0.5
 _REST: Final = StationaryLimits()
 
 _TABLE: Final = (
@@ -51,6 +60,9 @@ _TABLE: Final = (
         "A usable sample's acceleration differs from gravity by no more, m/s²", 0.01, 10),
     Row("accelerometer.gyroscope", True,
         "Whether the gyroscope rotates the estimate, so that it does not lag"),
+    Row("accelerometer.offset", ZERO, "Read too much, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
+    Row("accelerometer.scale", EXACT.scale,
+        "What it reads, without the offset, per m/s²; ~/identify finds it", 0, 2, lengths=(3,)),
     Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
     Row("rest.force_spread", _REST.force_spread, "Largest standard deviation when stationary, N", 0, 1e3),
     Row("rest.torque_spread", _REST.torque_spread, "Largest standard deviation when stationary, Nm", 0, 1e3),
@@ -87,6 +99,13 @@ class AccelerometerParameters(NamedTuple):
     time_constant: float = 0.5
     gate: float = 0.5
     gyroscope: bool = True
+    offset: Vector3 = EXACT.offset
+    scale: Vector3 = EXACT.scale
+
+    @property
+    def reading(self) -> Accelerometer:
+        """What its readings are corrected by."""
+        return Accelerometer(self.offset, self.scale)
 
 
 class CompensationParameters(NamedTuple):
@@ -120,6 +139,12 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
         raise ParameterError(
             f"parameter orientation.mounting is {list(mounting)}: a rotation is a quaternion of length 1, "
             f"this one's is {norm:g}"
+        )
+
+    if min(values["accelerometer.scale"]) < _LEAST_SCALE:
+        raise ParameterError(
+            f"parameter accelerometer.scale is {list(values['accelerometer.scale'])}: each must be at least "
+            f"{_LEAST_SCALE}; 1 is an exact axis"
         )
 
     def group(prefix: str) -> dict[str, Any]:

@@ -30,7 +30,8 @@ class BiasServices:
         means = window.means()
         payload, gravity = control.parameters.payload, None
         if payload.mass:
-            gravity = window.gravity() or gravity_of(means.acceleration, length(control.parameters.gravity))
+            acceleration = control.parameters.accelerometer.reading.correct(means.acceleration)
+            gravity = window.gravity() or gravity_of(acceleration, length(control.parameters.gravity))
         control.set_bias(estimate_bias(means, payload, gravity), "tare")
         control.note_rest(means.angular_rate)
         weight = (

@@ -15,7 +15,7 @@ from bridge.services.window import take_window
 from bridge.stream.requests import Requests
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified
-from ft_compensation.identification.session import IdentificationSession, summary
+from ft_compensation.identification.session import IdentificationSession, accelerometer_text, summary
 from ft_compensation.quantities import CompensationError, length
 
 
@@ -81,11 +81,13 @@ class IdentifyServices:
         result = self._result
         if result is None:
             raise CompensationError("there is no result to apply: call identify/solve first")
-        self._control.set_payload(result.payload, result.bias)
+        accelerometer = result.accelerometer.calibration if result.accelerometer else None
+        self._control.set_payload(result.payload, result.bias, accelerometer)
         not_kept = self._control.keeping
         return self._said(
-            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias; the "
-            "tool lasts until the node ends, start it with the file to have it again"
+            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias"
+            + (", accelerometer.offset and accelerometer.scale" if accelerometer else "")
+            + "; the tool lasts until the node ends, start it with the file to have it again"
             + (f"; the bias is not kept: {not_kept}" if not_kept else "")
         )
 
@@ -136,6 +138,7 @@ def details(result: Identified) -> list[str]:
     ]
     return [
         f"Bias {wrench_text(result.bias)}, ± {wrench_text(result.bias_interval)}",
+        *([accelerometer_text(result.accelerometer)] if result.accelerometer else []),
         f"Residuals by pose, {', '.join(left)}",
         f"Condition {result.condition:.2f} (1.2 is ideal, beyond 10 is bad)",
         f"One more pose would help most so: {result.coverage.next_pose}",

@@ -37,6 +37,10 @@ class Pose(NamedTuple):
     torque_spread: Vector3 = ZERO
     """Likewise, Nm."""
     samples: int = 1
+    acceleration: Vector3 | None = None
+    """What the accelerometer read, m/s², where `gravity` is from it; None where it is from something else."""
+    acceleration_spread: Vector3 = ZERO
+    """Standard deviation of single samples, m/s²."""
 
     @property
     def up(self) -> Vector3:
@@ -54,11 +58,21 @@ def pose_of(
     `gravity` (in the sensor's frame, m/s²) is from the window's own accelerometer, with length `magnitude`,
     unless it is given. CompensationError if the accelerometer reads nothing like g.
     """
+    acceleration = None
     if gravity is None:
-        gravity = gravity_of(means.acceleration, magnitude)
+        acceleration = means.acceleration
+        gravity = gravity_of(acceleration, magnitude)
     elif not length(gravity) > 0.0:
         raise CompensationError("a pose without gravity says nothing about a payload")
-    return Pose(means.wrench, gravity, means.force_spread, means.torque_spread, means.samples)
+    return Pose(
+        means.wrench,
+        gravity,
+        means.force_spread,
+        means.torque_spread,
+        means.samples,
+        acceleration,
+        means.acceleration_spread,
+    )
 
 
 class Coverage(NamedTuple):

@@ -5,7 +5,7 @@ Used by the node's services. Nothing in it measures or moves: it is given window
 
 from __future__ import annotations
 
-from ft_compensation.identification.payload import Identified, identify
+from ft_compensation.identification.payload import Identified, OffsetFit, identify
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage, pose_of
 from ft_compensation.quantities import CompensationError
 from ft_compensation.stationary import StationaryMeans
@@ -71,3 +71,12 @@ def summary(result: Identified) -> str:
         f"from {result.coverage.poses} poses; residual {result.force_rms:.2g} N, {result.torque_rms:.2g} Nm"
     )
     return ". ".join([text, *result.notes])
+
+
+def accelerometer_text(fit: OffsetFit) -> str:
+    """Offset and sensitivities of the accelerometer with their confidence intervals, a sentence."""
+    axes = zip("xyz", fit.calibration.offset, fit.offset_interval, strict=True)
+    offset = ", ".join(f"{axis} {value:.3f} ± {half:.3f}" for axis, value, half in axes)
+    axes = zip("xyz", fit.calibration.scale, fit.scale_interval, strict=True)
+    scale = ", ".join(f"{axis} {value:.4f} ± {half:.4f}" for axis, value, half in axes)
+    return f"Accelerometer: offset {offset} m/s², scale {scale}"
