@@ -30,6 +30,7 @@ from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
 from bridge.stream.link import Link
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
+from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import NO_WRENCH, ZERO, Accelerometer, Payload, Wrench
 from protocol.pdo import Vector3
 
@@ -67,6 +68,8 @@ class CompensationControl:
         self._check(self.parameters)
         self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
         self.source: Source = NoSource()
+        self._watch: PayloadWatch | None = None
+        self._watched: object = None
         self._live = LiveParameters(node, self._check, self._apply)
         self._guard = node.create_guard_condition(self._follow_sensor)
 
@@ -115,7 +118,7 @@ class CompensationControl:
 
     def state(self) -> CompensationState:
         """How things are, for the diagnostics' thread."""
-        output, source = self.output, self.source
+        output, source, watch = self.output, self.source, self._watch
         payload = self.parameters.payload
         why = None
         if output.is_stopped:
@@ -133,7 +136,7 @@ class CompensationControl:
             origin=self.origin,
             is_ramping=self.is_ramping,
             keep=self.parameters.bias_keep,
-            problem=self.conflict() or self.keeping,
+            problem=self.conflict() or self.keeping or (watch.finding if watch is not None else ""),
         )
 
     @property
@@ -209,7 +212,12 @@ class CompensationControl:
             imu_position=wanted.imu_position,
             accelerometer=wanted.accelerometer.reading,
         )
-        self.output.plan = Plan(self.source, compensator, self._ramp, wanted.payload.mass > 0.0)
+        has_weight = wanted.payload.mass > 0.0
+        watched = wanted.payload, self.bias, self.sensors
+        if watched != self._watched:
+            self._watched = watched
+            self._watch = PayloadWatch(wanted.payload, self._log.warning, wanted.rest) if has_weight else None
+        self.output.plan = Plan(self.source, compensator, self._ramp, has_weight, self._watch)
 
     def _open_source(self, wanted: CompensationParameters) -> Source:
         listener, self._listener = self._listener, None

@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 from bridge.compensating.gravity_sources import NoSource, Source
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
+from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
 from ft_compensation.stationary import StationaryLimits, StationaryMeans, StationaryWindow
 from protocol.pdo import Sample, Vector3
@@ -26,6 +27,8 @@ class Plan(NamedTuple):
     ramp: BiasRamp
     needs_gravity: bool
     """Whether anything has weight."""
+    watch: PayloadWatch | None = None
+    """Who looks now and then whether the payload is the one that is compensated."""
 
 
 class RestWindow:
@@ -154,6 +157,8 @@ class CompensatedOutput:
         stages = compensator.compensate(
             sample.force, sample.torque, gravity, sample.acceleration, sample.angular_rate
         )
+        if (watch := plan.watch) is not None and watch.is_due(time_s):
+            watch.look(stages.final.force, gravity, sample.angular_rate, time_s)
         for topic in self._wanted:
             topic.send(*stages[topic.index], stamp_ns)
         self.published += 1
