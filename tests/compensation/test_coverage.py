@@ -73,9 +73,9 @@ def test_the_intervals_cover_the_truth_in_93_to_97_percent(
 @pytest.mark.long
 @pytest.mark.parametrize("poses", [6, 8, 12, 24])
 @pytest.mark.parametrize("ratio", [1, 3, 10])
-@pytest.mark.parametrize("offset", [None, 0.0, 0.1, 0.2, 0.3])
+@pytest.mark.parametrize("offset", [None, 0.0, 0.3])
 def test_the_intervals_cover_the_truth_axis_by_axis(poses: int, ratio: float, offset: float | None) -> None:
-    for name, shares in covered(simulate(6000, poses, ratio, offset)[0]).items():
+    for name, shares in covered(simulate(3000, poses, ratio, offset)[0]).items():
         assert shares.min() >= 0.93, f"{name}: {shares}"
         assert shares.max() <= 0.97, f"{name}: {shares}"
 

@@ -24,7 +24,7 @@ SCALE_PRIOR: Final = 0.005
 """Likewise of an axis' sensitivity, relative; local gravity is within it."""
 _LENGTH_DEVIATION: Final = 0.002
 """m/s²: what is assumed of the length of a mean acceleration beyond offset and sensitivities, ..."""
-_LENGTH_DEGREES: Final = 4.0
+_LENGTH_DEGREES: Final = 6.0
 """... as if it were estimated from so many residuals."""
 _FLOOR: Final = np.array([1e-6] * 3 + [1e-7] * 3 + [1e-6])
 """N, Nm, m/s²: standard deviations below which nothing is believed, where equations of all kinds meet."""
