@@ -25,14 +25,16 @@ GRAVITY_TOLERANCE: Final = 0.5
 """m/s²: how much a stationary accelerometer may differ from g."""
 
 
-def gravity_of(acceleration: Vector3, magnitude: float = STANDARD_GRAVITY) -> Vector3:
+def gravity_of(
+    acceleration: Vector3, magnitude: float = STANDARD_GRAVITY, tolerance: float = GRAVITY_TOLERANCE
+) -> Vector3:
     """Gravity in the sensor's frame, m/s², from what the stationary accelerometer reads.
 
     Only the direction is taken from it; `magnitude` is the length. CompensationError if it reads nothing
-    like g.
+    like g: by more than `tolerance`, m/s².
     """
     measured = length(acceleration)
-    if abs(measured - magnitude) > GRAVITY_TOLERANCE:
+    if abs(measured - magnitude) > tolerance:
         raise CompensationError(
             f"the stationary accelerometer reads {measured:.2f} m/s² where {magnitude:.2f} should be: check "
             "imu_raw_units, the IMU's settings and its offset"

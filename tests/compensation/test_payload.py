@@ -126,9 +126,9 @@ class Reading:
         return pose_of(still(up)._replace(acceleration=self.acceleration(up)))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_offset_of_the_accelerometer_is_found_with_the_payload(seed: int) -> None:
-    reading = Reading(seed)
+@pytest.mark.parametrize(("seed", "length"), [(0, 0.2), (1, 0.3), (2, 0.8)])
+def test_the_offset_of_the_accelerometer_is_found_with_the_payload(seed: int, length: float) -> None:
+    reading = Reading(seed, length)
     found = identify([reading.pose(up) for up in AXES])
     assert found.accelerometer is not None
     calibration = found.accelerometer.calibration

@@ -18,7 +18,7 @@ import numpy as np
 from ft_compensation.identification.student import two_sided
 from ft_compensation.identification.weighted import Array, Known, Solution, solve
 
-OFFSET_PRIOR: Final = 0.3
+OFFSET_PRIOR: Final = 0.4
 """m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered."""
 SCALE_PRIOR: Final = 0.005
 """Likewise of an axis' sensitivity, relative; local gravity is within it."""

@@ -23,6 +23,8 @@ LEAST_SPREAD: Final = 0.1
 """Of the directions of gravity, in g: less along an axis counts as not seen."""
 _SAME_POSE: Final = 0.97
 """Cosine: directions nearer than 14° are the same pose."""
+_LARGEST_OFFSET: Final = 1.5
+"""m/s²: of an accelerometer whose offset is yet to be found."""
 
 
 class Pose(NamedTuple):
@@ -61,7 +63,7 @@ def pose_of(
     acceleration = None
     if gravity is None:
         acceleration = means.acceleration
-        gravity = gravity_of(acceleration, magnitude)
+        gravity = gravity_of(acceleration, magnitude, _LARGEST_OFFSET)
     elif not length(gravity) > 0.0:
         raise CompensationError("a pose without gravity says nothing about a payload")
     return Pose(
