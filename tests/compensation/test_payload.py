@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import random
 import re
@@ -24,6 +25,7 @@ from tests.compensation import equations
 from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, pose, written_parameters
 
 Up = tuple[float, float, float]
+NOISE = np.array([0.02] * 3 + [0.0004] * 3)
 
 
 def circle(count: int = 8, tilt: float = 0.0) -> list[Up]:
@@ -186,6 +188,21 @@ def test_an_offset_that_the_poses_do_not_determine_stays_open_and_the_result_say
     assert any("do not determine the accelerometer's offset along x" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("seed", [76, 98, 168])
+def test_a_few_poses_of_any_kind_give_an_answer_or_a_sentence(seed: int) -> None:
+    """An offset can be made to fit one axis of few poses perfectly: that axis must not have all the say."""
+    draw = np.random.default_rng(seed)
+    reading = Reading(int(draw.integers(1000)), length=float(draw.choice([0.0, 0.3, 0.6])))
+    noise = NOISE * 10 ** draw.uniform(-2.0, 2.0, size=6)
+    poses = []
+    for x, y, z in draw.normal(size=(int(draw.integers(4, 7)), 3)).tolist():
+        measured = np.array(load((x, y, z)).values) + noise * draw.normal(size=6)
+        poses.append(reading.pose((x, y, z))._replace(wrench=Wrench.of(measured.tolist())))
+    with contextlib.suppress(IdentificationError):
+        found = identify(poses)
+        assert np.isfinite([found.mass_interval, *found.bias_interval.values]).all()
+
+
 # How well they fit.
 
 
@@ -293,6 +310,8 @@ def test_small_tilts_are_refused() -> None:
         (lambda up: pose(up, Payload(0.1, (3.0, 0.0, 0.0))), "3 m from the sensor"),
         (lambda up: Pose(Wrench((math.nan,) * 3, (0.0,) * 3), gravity_for(up)), "not finite"),
         (lambda up: Pose(Wrench.of([0.0] * 6), (0.0, math.inf, 0.0)), "not finite"),
+        (lambda up: pose(up)._replace(acceleration=(0.0, math.nan, 0.0)), "not finite"),
+        (lambda up: Pose(Wrench.of([0.0] * 6), gravity_for(up)), "cannot be told from zero"),
     ],
 )
 def test_absurd_answers_are_refused(make: Callable[[Up], Pose], message: str) -> None:

@@ -32,6 +32,8 @@ _FLOOR_ALONE: Final = 1e-12
 _LEAST_SHARE: Final = 0.3
 """Of an axis' variance at the offset that the lengths alone give: six poses could be made to fit one axis
 perfectly by an offset that they hardly determine."""
+_NOTHING: Final = 1e-9
+"""kg: no mass at all has its center anywhere."""
 _FEW: Final = 3
 _LENGTH_ROUNDS: Final = 3
 _ROUNDS: Final = 9
@@ -94,11 +96,12 @@ def estimate(
         gravity, solution = _with_accelerometer(measured, acceleration, gravity, acceleration_variance)
     answer, unknowns = solution.answer, solution.answer.shape[-1]
     mass = answer[..., :1]
-    center = answer[..., 4:7] / mass
+    divisor = np.where(np.abs(mass) < _NOTHING, _NOTHING, mass)
+    center = answer[..., 4:7] / divisor
     rows = np.broadcast_to(np.eye(unknowns), (*answer.shape[:-1], unknowns, unknowns)).copy()
     # The center is c / m: to first order.
-    rows[..., 4:7, :] /= mass[..., np.newaxis]
-    rows[..., 4:7, 0] = -center / mass
+    rows[..., 4:7, :] /= divisor[..., np.newaxis]
+    rows[..., 4:7, 0] = -center / divisor
     deviation, degrees = solution.student(rows)
     half = two_sided(confidence, degrees) * deviation
     if acceleration is not None:

@@ -106,7 +106,9 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
     """
     if len(poses) > MOST_POSES:
         raise IdentificationError(f"{len(poses)} poses are more than the {MOST_POSES} that are taken")
-    if not all(np.isfinite([*pose.wrench.values, *pose.gravity]).all() for pose in poses):
+    if not all(
+        np.isfinite([*pose.wrench.values, *pose.gravity, *(pose.acceleration or ())]).all() for pose in poses
+    ):
         raise IdentificationError("a pose has numbers that are not finite")
     seen = coverage(poses, one_axis=one_axis)
     if seen.missing is not None:
