@@ -68,7 +68,8 @@ def summary(result: Identified) -> str:
     text = (
         f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, center of gravity ({x:.2f} ± "
         f"{ix:.2f}, {y:.2f} ± {iy:.2f}, {z:.2f} ± {iz:.2f}) mm ({100 * result.confidence:g} % confidence) "
-        f"from {result.coverage.poses} poses; residual {result.force_rms:.2g} N, {result.torque_rms:.2g} Nm"
+        f"from {result.coverage.poses} poses; residual {result.force_rms:.2g} N "
+        f"({result.force_fit.verdict}), {result.torque_rms:.2g} Nm ({result.torque_fit.verdict})"
     )
     return ". ".join([text, *result.notes])
 
