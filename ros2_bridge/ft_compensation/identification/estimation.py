@@ -172,11 +172,11 @@ def _with_accelerometer(
     The lengths alone come first: the errors of an uncorrected direction would pass for noise.
     """
     size = np.linalg.norm(gravity, axis=-1)
-    before = np.diag([OFFSET_PRIOR**-2] * 3 + [SCALE_PRIOR**-2] * 3)
+    prior = np.diag([OFFSET_PRIOR**-2] * 3 + [SCALE_PRIOR**-2] * 3)
     assumed = np.zeros((*measured.shape[:-2], 7))
     assumed[..., 6] = _LENGTH_DEVIATION**2 + noise
     degrees = np.array([0.0] * 6 + [_LENGTH_DEGREES])
-    lengths = Known(before, _FLOOR[6:] ** 2, degrees[6:], assumed[..., 6:])
+    lengths = Known(prior, _FLOOR[6:] ** 2, degrees[6:], assumed[..., 6:])
     calibration = np.zeros((*measured.shape[:-2], 6))
     for _ in range(_LENGTH_ROUNDS):
         at = _linearize(acceleration, size, calibration)
@@ -187,7 +187,7 @@ def _with_accelerometer(
     answer = np.concatenate([first.answer, calibration], axis=-1)
     variances = np.concatenate([first.variances, only.variances], axis=-1)
     information = np.zeros((16, 16))
-    information[10:, 10:] = before
+    information[10:, 10:] = prior
     known = Known(information, np.maximum(_LEAST_SHARE * variances, _FLOOR**2), degrees, assumed)
     for _ in range(_ROUNDS):
         design = np.zeros((*measured.shape[:-2], 7, measured.shape[-1], 16))
@@ -197,9 +197,9 @@ def _with_accelerometer(
         moment = answer[..., 4:7]
         design[..., 3:6, :, 10:] = np.cross(moment[..., :, np.newaxis, np.newaxis], turn, axis=-3)
         design[..., 6:, :, 10:] = at.stretch
-        # The linear equations add what offset and scale do at the present ones, which gravity has already.
-        known_part = _times(design[..., 10:], answer[..., 10:])
-        target = np.concatenate([measured, at.excess], axis=-2) + known_part
+        # Gravity has the present offset and scale in it already, and the linear equations add them.
+        twice = _times(design[..., 10:], answer[..., 10:])
+        target = np.concatenate([measured, at.excess], axis=-2) + twice
         solution = solve(design, target, known, variances)
         moved = np.abs(solution.answer - answer)[..., 10:].max()
         answer, variances = solution.answer, solution.variances
