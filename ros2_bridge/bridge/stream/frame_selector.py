@@ -3,10 +3,12 @@
 The rules it keeps:
 
 - `protocol.accounting` says which frames are new. No other frame is ever selected.
-- When a queued frame is older than BACKLOG_NS (this process was stopped, or is slower than the stream),
-  all of them are left out, and counted as stale, up to the first frame younger than FRESH_NS.
-- Age is CLOCK_MONOTONIC now minus the frame's, if the server's clock is ours. Otherwise it is relative to
-  the least such difference seen, which may rise slowly as clocks drift apart.
+- Age is CLOCK_MONOTONIC now minus the frame's, compared with what is usual on this connection: where the
+  server's clock is another machine's, only differences mean anything.
+- When a queued frame is older than usual by BACKLOG_NS (this process was stopped, or is slower than the
+  stream), the newest is selected and the others are counted as stale. If it is not fresh either, within
+  FRESH_NS of the usual age, more is on the way: everything is stale until it is.
+- A stream that does not catch up is not behind: its age is the usual one from then on.
 - With a limit to the rate, the newest of what is queued is selected, whenever the limit allows one.
 """
 
@@ -21,10 +23,10 @@ from protocol.framing import DataMessage
 
 BACKLOG_NS: Final = 50_000_000
 FRESH_NS: Final = 4_000_000
-_LONGEST_SKIP_NS: Final = 250_000_000
-"""After this long with nothing fresh the clocks cannot be the same: ages are relative from there."""
-_DRIFT_DIVISOR: Final = 5000
-"""Two machines' clocks drift apart by less than 1/5000."""
+_CATCH_UP_NS: Final = 20_000_000
+"""After a stall the age must fall by half of this in each such time: then what waits is being read."""
+_FALL, _RISE = 8, 64
+"""The usual age follows each age by one part in so many: a low expectile, as delays only add."""
 
 
 @dataclass(slots=True)
@@ -46,10 +48,12 @@ class FrameSelector:
         self._counts = counts
         self._limit = RateLimit(limit_hz) if limit_hz > 0 else None
         self.accounting = StreamAccounting(counts)
-        self._same_clock = same_clock
-        self._offset_ns: int | None = 0 if same_clock else None
-        self._now_ns = 0
-        self._skipping_since_ns: int | None = None
+        self._least_ns = 0 if same_clock else None
+        """No frame is younger; None: the clocks differ."""
+        self._usual_ns = self._least_ns
+        """The usual age; None before the first frame."""
+        self._skipping: tuple[int, int] | None = None
+        """While all is stale: when its age was looked at last, and what it was."""
         self.passed_over: list[DataMessage] = []
         """New frames that the rate limit left out of the last `select`, older than the one selected."""
 
@@ -64,21 +68,9 @@ class FrameSelector:
         if not fresh:
             return fresh
         newest = fresh[-1]
-        age_ns = self._age_ns(newest, now_ns)
-        if self._skipping_since_ns is None:
-            if age_ns + newest.monotonic_ns - fresh[0].monotonic_ns > BACKLOG_NS:
-                self._skipping_since_ns = now_ns
-        elif now_ns - self._skipping_since_ns > _LONGEST_SKIP_NS:
-            self._same_clock = False
-            self._offset_ns = now_ns - newest.monotonic_ns
-            age_ns = 0
-        if self._skipping_since_ns is not None:
-            if age_ns > FRESH_NS:
-                self._counts.stale += len(fresh)
-                return []
-            self._skipping_since_ns = None
-            self._counts.stale += len(fresh) - 1
-            fresh = [newest]
+        fresh = self._without_old(fresh, now_ns)
+        if not fresh:
+            return fresh
         if self._limit is not None:
             allowed = self._limit.allows(newest.monotonic_ns)
             self._counts.limited += len(fresh) - allowed
@@ -87,18 +79,34 @@ class FrameSelector:
             return selected
         return fresh
 
-    def _age_ns(self, newest: DataMessage, now_ns: int) -> int:
-        difference = now_ns - newest.monotonic_ns
-        if self._same_clock:
-            return difference
-        if self._offset_ns is None:
-            self._offset_ns = difference
-        else:
-            self._offset_ns = min(
-                self._offset_ns + (now_ns - self._now_ns) // _DRIFT_DIVISOR, difference
-            )  # fmt: skip
-        self._now_ns = now_ns
-        return difference - self._offset_ns
+    def _without_old(self, fresh: list[DataMessage], now_ns: int) -> list[DataMessage]:
+        """`fresh`; after a stall its newest alone, and nothing while more is on the way."""
+        newest = fresh[-1]
+        age_ns = now_ns - newest.monotonic_ns
+        usual_ns = age_ns if self._usual_ns is None else self._usual_ns
+        late_ns = age_ns - usual_ns
+        if self._skipping is None:
+            if late_ns + newest.monotonic_ns - fresh[0].monotonic_ns <= BACKLOG_NS:
+                if late_ns < 0:
+                    usual_ns += late_ns // _FALL
+                elif len(fresh) == 1:  # it was waited for, so its delay is not this node's
+                    usual_ns += late_ns // _RISE
+                self._usual_ns = usual_ns if self._least_ns is None else max(usual_ns, self._least_ns)
+                return fresh
+            self._skipping = now_ns, age_ns
+        if late_ns > FRESH_NS:
+            since_ns, was_ns = self._skipping
+            passed_ns = now_ns - since_ns
+            catches_up = was_ns - age_ns >= passed_ns // 2
+            if passed_ns < _CATCH_UP_NS or catches_up:
+                if passed_ns >= _CATCH_UP_NS:
+                    self._skipping = now_ns, age_ns
+                self._counts.stale += len(fresh)
+                return []
+            self._usual_ns = age_ns
+        self._skipping = None
+        self._counts.stale += len(fresh) - 1
+        return [newest]
 
 
 class RateLimit:
