@@ -10,6 +10,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Final
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
 from bridge.compensating.bias_keeper import FROM_PARAMETER, BiasKeeper
@@ -46,7 +47,6 @@ class CompensationControl:
         output: CompensatedOutput,
         link: Link,
         count_not_finite: Callable[[], int],
-        on_failure: Callable[[str], object],
     ) -> None:
         """ParameterError if the parameters cannot be had here."""
         self.parameters = parameters.compensation
@@ -57,7 +57,8 @@ class CompensationControl:
         """How many have been there: what was measured on one is of no use with another."""
         self.ending = False
         self._node, self._log = node, node.get_logger()
-        self._frame, self._on_failure = parameters.frame_id, on_failure
+        self._frame = parameters.frame_id
+        self._listening = MutuallyExclusiveCallbackGroup()
         self._listener: OrientationListener | None = None
         self._angular_rate_offset = ZERO
         self._keeper = BiasKeeper(self._log)
@@ -71,16 +72,18 @@ class CompensationControl:
         self._guard = node.create_guard_condition(self._follow_sensor)
 
     def start(self) -> None:
-        """Open the orientation's source, which may take a thread; before any sample comes.
+        """Open the orientation's source; before any sample comes.
 
         ParameterError if it cannot be had.
         """
         self.source = self._open_source(self.parameters)
         self._make_plan()
 
-    def close(self) -> bool:
-        """Stop listening for orientations; False if that does not end in time."""
-        return self._listener is None or self._listener.close()
+    def close(self) -> None:
+        """Stop listening for orientations."""
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
 
     def cancel(self) -> None:
         """Make whoever waits for samples give up; from any thread: the node ends."""
@@ -176,7 +179,7 @@ class CompensationControl:
 
     def _check(self, wanted: CompensationParameters) -> None:
         """ParameterError if that cannot be had on this machine."""
-        check_can_listen(self._node, wanted.orientation)
+        check_can_listen(self._node, wanted.orientation, self._listener)
 
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted
@@ -203,9 +206,7 @@ class CompensationControl:
         self.output.plan = Plan(self.source, compensator, self._ramp, wanted.payload.mass > 0.0)
 
     def _open_source(self, wanted: CompensationParameters) -> Source:
-        listener, self._listener = self._listener, None
-        if listener is not None:
-            listener.close()
+        self.close()
         name = wanted.orientation.source
         if name == "none":
             return NoSource()
@@ -213,7 +214,7 @@ class CompensationControl:
             return AccelerometerSource(wanted, self._angular_rate_offset)
         if name == "sensor":
             return SensorSource(wanted)
-        self._listener = OrientationListener(self._node, wanted.orientation, self._frame, self._on_failure)
+        self._listener = OrientationListener(self._node, wanted.orientation, self._frame, self._listening)
         return ListenerSource(wanted, self._listener)
 
     def _is_same_sensor(self) -> bool:

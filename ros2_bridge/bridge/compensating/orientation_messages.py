@@ -87,6 +87,8 @@ class Tf(NamedTuple):
     """What a lookup raises."""
     latest: Any
     """The time that stands for the latest there is."""
+    close: Callable[[], object]
+    """Ends listening."""
 
 
 def look_up(tf: Tf, base: str, frame: str) -> Oriented:
@@ -113,10 +115,10 @@ def check_tf() -> None:
 
 
 def open_tf(node: Any) -> Tf:
-    """A buffer that `node` fills from /tf and /tf_static as it spins."""
+    """A buffer that `node` fills from /tf and /tf_static as it spins, in a callback group of tf2_ros's."""
     from rclpy.time import Time  # noqa: PLC0415
     from tf2_ros import Buffer, TransformException, TransformListener  # noqa: PLC0415 - see check_tf
 
     buffer = Buffer()
-    node.transform_listener = TransformListener(buffer, node, spin_thread=False)
-    return Tf(buffer, TransformException, Time())
+    listener = TransformListener(buffer, node, spin_thread=False)
+    return Tf(buffer, TransformException, Time(), listener.unregister)

@@ -47,6 +47,10 @@ class SensorInfo(NamedTuple):
         return f"sensor {self.sensor} ({self.name}, serial {self.serial}, {self.rate_hz} Hz, {self.state})"
 
 
+class RefusalError(ConnectionFailedError):
+    """The server refused what the connection cannot do without."""
+
+
 class Connection(FramedConnection):
     """A framed connection that several threads may ask over."""
 
@@ -102,7 +106,7 @@ class Connection(FramedConnection):
                     self.take_reply(message)
         reply = future.result()
         if reply.get("ok") is not True:
-            raise ConnectionFailedError(f"the server refused {action}: {refusal(reply)}")
+            raise RefusalError(f"the server refused {action}: {refusal(reply)}")
         return reply
 
     def subscribe(self, sensor: int) -> SensorInfo:
