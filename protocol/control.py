@@ -45,6 +45,7 @@ class Event(StrEnum):
     SENSOR_LOST = "sensor_lost"
     SENSOR_BACK = "sensor_back"
     RECONFIGURED = "reconfigured"
+    OFFSET_CHANGED = "offset_changed"
     EMERGENCY = "emergency"
     SHUTTING_DOWN = "shutting_down"
 
