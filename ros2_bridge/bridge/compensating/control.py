@@ -31,7 +31,7 @@ from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
 from bridge.stream.link import Link
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
+from ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench, wrench_text
 from protocol.pdo import Vector3
 
 _LOOKING_UP: Final = "the bias of this sensor is being looked up"
@@ -62,6 +62,8 @@ class CompensationControl:
         self._listener: OrientationListener | None = None
         self._angular_rate_offset = ZERO
         self._keeper = BiasKeeper(self._log)
+        self._offset: Wrench | None = None
+        """The sensor's own offset that the bias is for, as far as it was ever known."""
         self.count_not_finite = count_not_finite
         """Samples so far that were not finite somewhere."""
         self._next_origin = FROM_PARAMETER
@@ -95,6 +97,8 @@ class CompensationControl:
             # Not one sample of this sensor with what may be another's bias.
             self.output.hold = _LOOKING_UP
             self._guard.trigger()
+        else:
+            self._follow_offset()
 
     @property
     def keeping(self) -> str:
@@ -110,7 +114,9 @@ class CompensationControl:
         """What a new offset in the sensor itself means here, a sentence; "" if nothing."""
         if self.bias == NO_WRENCH:
             return ""
-        return "The node's own bias was for the old offset: call ~/tare or ~/clear_tare"
+        if self.link.offset is None:
+            return "The node's own bias was for the old offset: call ~/tare or ~/clear_tare"
+        return "The node's own bias was shifted by the change, so wrench_compensated is as it was"
 
     def conflict(self) -> str | None:
         """What the sensor is set to that does not go with compensation, a sentence."""
@@ -136,7 +142,7 @@ class CompensationControl:
             origin=self.origin,
             is_ramping=self.is_ramping,
             keep=self.parameters.bias_keep,
-            problem=self.conflict() or self.keeping,
+            problem=self.conflict() or self._doubt() or self.keeping,
         )
 
     @property
@@ -190,13 +196,14 @@ class CompensationControl:
                 self._log.error(str(error))
                 self.source = NoSource(str(error))
         self._ramp.seconds = wanted.bias_ramp_time
-        if wanted.bias != self.bias:
+        # A parameter that the shift of the bias has not reached yet is no wish.
+        if wanted.bias not in (was.bias, self.bias):
             self._ramp.go(wanted.bias, self.output.time_s)
             self.origin = self._next_origin
         self._make_plan()
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
             self._keeper.forget()
-        self._keeper.keep(self.bias, wanted)
+        self._keeper.keep(self.bias, wanted, self._offset)
 
     def _make_plan(self) -> None:
         wanted = self.parameters
@@ -228,7 +235,8 @@ class CompensationControl:
             if info is None:
                 break
             is_another = self._keeper.serial is not None
-            begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters)
+            self._offset = self._offset_now()
+            begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters, self._offset)
             if begin is not None:
                 self._begin_with(*begin)
             elif is_another:
@@ -239,10 +247,40 @@ class CompensationControl:
                 self.note_rest(ZERO)
                 self.sensors += 1
             if not self.keeping and self.bias != NO_WRENCH:
-                self._keeper.keep(self.bias, self.parameters)
+                self._keeper.keep(self.bias, self.parameters, self._offset)
+        self._follow_offset()
+        if self.bias != self.parameters.bias:
+            self._live.put(bias=[*self.bias.values])  # shifted
         self.output.hold = None
         if not self._is_same_sensor():
             self.link_changed()
+
+    def _offset_now(self) -> Wrench | None:
+        offset = self.link.offset
+        return None if offset is None else Wrench.of(offset)
+
+    def _follow_offset(self) -> None:
+        """Shift the bias by what the sensor itself adds now, from the next sample on; for the reader too."""
+        now, before = self._offset_now(), self._offset
+        if now is None or now == before:
+            return
+        self._offset = now
+        if before is None or self.bias == NO_WRENCH:
+            return
+        change = now.plus(before, -1.0)
+        self._ramp.shift(change)
+        self._log.info(
+            f"the sensor's own offset was changed by {wrench_text(change)}: the bias is shifted by that"
+        )
+        self._guard.trigger()
+
+    def _doubt(self) -> str:
+        """That the bias may not fit the sensor's own offset, a sentence; empty if it does."""
+        if self._offset is None or self.bias == NO_WRENCH or self.link.connection is None:
+            return ""
+        if self.link.offset is not None:
+            return ""
+        return "the sensor's own offset is not known any more, so its bias may be wrong: tare"
 
     def _begin_with(self, bias: Wrench, origin: str) -> None:
         """Put a bias in force at once, with nothing before it."""
