@@ -23,9 +23,11 @@ from rclpy.utilities import remove_ros_args
 from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics.monitor import Monitor
-from bridge.parameters.declare import declare
+from bridge.parameters.declare import declare, warn_of_others
+from bridge.parameters.live import LiveParameters
 from bridge.parameters.row import ParameterError
 from bridge.parameters.sensor_settings import SettingsParameters
+from bridge.parameters.table import Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.publishing.messages import make, make_stages
 from bridge.services.bias import BiasServices
@@ -71,8 +73,9 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
         self.requests = Requests(parameters, link)
         self.sensor_settings = SettingsParameters(self, link, self.requests)
+        live = LiveParameters(self)
         self.compensation = CompensationControl(
-            self, parameters, compensated, link, lambda: self.reader.not_finite
+            self, parameters, compensated, link, self.reader.watch, live, lambda: self.reader.not_finite
         )
         self.monitor = Monitor(
             self, parameters.thresholds, self.reader, self.compensation.state, outputs, self.fail
@@ -82,6 +85,9 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
             BiasServices(self, self.compensation, self.requests),
             IdentifyServices(self, self.compensation, self.requests),
         )
+        live.listeners.append(self._apply)
+        self._outputs = outputs
+        warn_of_others(self)
         link.on_change = self._on_link_change
         self.create_subscription(
             KeyValue,
@@ -106,6 +112,11 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
                 "qos_overrides, and that array_topic and the remappings give no two topics one name"
             ) from None
         return node
+
+    def _apply(self, parameters: Parameters) -> None:
+        self.monitor.thresholds = parameters.thresholds
+        self.reader.limit_rate(parameters.publishing_frequency)
+        self._outputs.configure(parameters)
 
     def _on_link_change(self) -> None:
         self.compensation.link_changed()

@@ -149,7 +149,7 @@ def test_the_supervisor_ends_a_node_that_has_no_server(listener: Listener, start
 def test_a_limit_and_the_notes_parameter_names() -> None:
     server = SimulatedServer()
     with SimulatedNode(server, SERVER_PORT=12345, publishing_frequency=100) as node:
-        samples = node.hear("/sensone_sensor_data")
+        samples = node.hear("sensone_sensor_data")
         node.run(0.2)
         samples.clear()
         server.paused = True

@@ -26,7 +26,7 @@ def test_defaults_are_the_contracts() -> None:
     defaults = {name: row.default for name, row in ROWS.items()}
     assert defaults == {
         "server_host": "localhost", "server_port": 12001, "SERVER_PORT": 0, "sensor": 0,
-        "publishing_frequency": 0.0, "array_topic": "/sensone_sensor_data", "frame_id": "ft_sensor",
+        "publishing_frequency": 0.0, "array_topic": "sensone_sensor_data", "frame_id": "ft_sensor",
         "imu_frame_id": "ft_sensor_imu", "imu_raw_units": "g_dps", "temperature_variance": 0.0,
         "orientation_covariance": (0.0, 0.0, 0.0), "angular_velocity_covariance": (0.0, 0.0, 0.0),
         "linear_acceleration_covariance": (0.0, 0.0, 0.0), "diagnostics.stale_after": 0.5,
@@ -35,7 +35,8 @@ def test_defaults_are_the_contracts() -> None:
         "diagnostics.temperature_error": 80.0,
         "tool_mass": 0.0, "tool_center_of_gravity": (0.0, 0.0, 0.0), "gravity": (0.0, 0.0, -9.80665),
         "bias": (0.0,) * 6, "bias_ramp_time": 0.5, "bias_keep": False, "bias_directory": "auto",
-        "compensate_inertia": False, "imu_position": (0.0, 0.0, 0.0), "orientation_source": "accelerometer",
+        "compensate_inertia": False, "imu_position": (0.0, 0.0, 0.0),
+        "on_saturation": "publish", "orientation_source": "accelerometer",
         "orientation.topic": "orientation", "orientation.base_frame": "base_link",
         "orientation.mounting": (0.0, 0.0, 0.0, 1.0), "orientation.stale_after": 0.1,
         "accelerometer.stale_after": 0.5, "accelerometer.time_constant": 0.5, "accelerometer.gate": 0.5,

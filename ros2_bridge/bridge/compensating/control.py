@@ -21,14 +21,17 @@ from bridge.compensating.gravity_sources import (
     SensorSource,
     Source,
 )
+from bridge.compensating.obstacles import SATURATED, Obstacles
 from bridge.compensating.orientation_listener import OrientationListener, check_can_listen
-from bridge.diagnostics.compensation_state import CompensationState, conflict
+from bridge.compensating.own_offset import OwnOffset
+from bridge.diagnostics.compensation_state import CompensationState
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.live import LiveParameters
 from bridge.parameters.row import ParameterError
 from bridge.parameters.table import Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
 from bridge.stream.link import Link
+from bridge.stream.watch import Watch
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench, wrench_text
@@ -46,6 +49,8 @@ class CompensationControl:
         parameters: Parameters,
         output: CompensatedOutput,
         link: Link,
+        watch: Watch,
+        live: LiveParameters,
         count_not_finite: Callable[[], int],
     ) -> None:
         """ParameterError if the parameters cannot be had here."""
@@ -62,15 +67,16 @@ class CompensationControl:
         self._listener: OrientationListener | None = None
         self._angular_rate_offset = ZERO
         self._keeper = BiasKeeper(self._log)
-        self._offset: Wrench | None = None
-        """The sensor's own offset that the bias is for, as far as it was ever known."""
+        self._own_offset = OwnOffset(link)
         self.count_not_finite = count_not_finite
         """Samples so far that were not finite somewhere."""
         self._next_origin = FROM_PARAMETER
         self._check(self.parameters)
         self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
         self.source: Source = NoSource()
-        self._live = LiveParameters(node, self._check, self._apply)
+        self._obstacles, self._live = Obstacles(link, watch), live
+        live.checks.append(lambda wanted: self._check(wanted.compensation))
+        live.listeners.append(lambda wanted: self._apply(wanted.compensation))
         self._guard = node.create_guard_condition(self._follow_sensor)
 
     def start(self) -> None:
@@ -79,6 +85,7 @@ class CompensationControl:
         ParameterError if it cannot be had.
         """
         self.source = self._open_source(self.parameters)
+        self.output.stops_on_saturation = self.parameters.on_saturation == "stop"
         self._make_plan()
 
     def close(self) -> None:
@@ -99,6 +106,8 @@ class CompensationControl:
             self._guard.trigger()
         else:
             self._follow_offset()
+            if self.output.hold is not _LOOKING_UP:
+                self._hold()
 
     @property
     def keeping(self) -> str:
@@ -112,23 +121,28 @@ class CompensationControl:
 
     def after_sensor_tare(self) -> str:
         """What a new offset in the sensor itself means here, a sentence; "" if nothing."""
-        if self.bias == NO_WRENCH:
-            return ""
-        if self.link.offset is None:
-            return "The node's own bias was for the old offset: call ~/tare or ~/clear_tare"
-        return "The node's own bias was shifted by the change, so wrench_compensated is as it was"
+        return self._own_offset.after_tare(self.bias)
 
-    def conflict(self) -> str | None:
+    def conflict(self, *, needs_gravity: bool = False) -> str | None:
         """What the sensor is set to that does not go with compensation, a sentence."""
-        return conflict(self.link.settings, self.parameters.payload)
+        obstacles, parameters = self._obstacles, self.parameters
+        return obstacles.conflict(parameters) or obstacles.blind(parameters, needs_gravity=needs_gravity)
+
+    def _hold(self) -> None:
+        """Hold everything back while gravity cannot be had in the wrench's frame."""
+        has_weight = self.parameters.payload.mass > 0.0
+        self.output.hold = self._obstacles.blind(self.parameters, needs_gravity=has_weight)
 
     def state(self) -> CompensationState:
         """How things are, for the diagnostics' thread."""
         output, source = self.output, self.source
         payload = self.parameters.payload
-        why = None
-        if output.is_stopped:
-            why = output.hold or source.why_none(output.time_s)
+        if not output.has_subscribers:
+            why = output.hold or self._obstacles.foreseen(self.parameters, source, self._listener)
+        elif output.is_stopped:
+            why = output.hold or (SATURATED if output.is_saturated else source.why_none(output.time_s))
+        else:
+            why = None
         return CompensationState(
             has_subscribers=output.has_subscribers,
             published=output.published,
@@ -142,7 +156,8 @@ class CompensationControl:
             origin=self.origin,
             is_ramping=self.is_ramping,
             keep=self.parameters.bias_keep,
-            problem=self.conflict() or self._doubt() or self.keeping,
+            stops_on_saturation=output.stops_on_saturation,
+            problem=self.conflict() or self._own_offset.doubt(self.bias) or self.keeping,
         )
 
     @property
@@ -201,9 +216,12 @@ class CompensationControl:
             self._ramp.go(wanted.bias, self.output.time_s)
             self.origin = self._next_origin
         self._make_plan()
+        self.output.stops_on_saturation = wanted.on_saturation == "stop"
+        if self.output.hold is not _LOOKING_UP:
+            self._hold()
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
             self._keeper.forget()
-        self._keeper.keep(self.bias, wanted, self._offset)
+        self._keeper.keep(self.bias, wanted, self._own_offset.of_bias)
 
     def _make_plan(self) -> None:
         wanted = self.parameters
@@ -235,8 +253,8 @@ class CompensationControl:
             if info is None:
                 break
             is_another = self._keeper.serial is not None
-            self._offset = self._offset_now()
-            begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters, self._offset)
+            offset = self._own_offset.begin()
+            begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters, offset)
             if begin is not None:
                 self._begin_with(*begin)
             elif is_another:
@@ -247,40 +265,23 @@ class CompensationControl:
                 self.note_rest(ZERO)
                 self.sensors += 1
             if not self.keeping and self.bias != NO_WRENCH:
-                self._keeper.keep(self.bias, self.parameters, self._offset)
+                self._keeper.keep(self.bias, self.parameters, self._own_offset.of_bias)
         self._follow_offset()
         if self.bias != self.parameters.bias:
             self._live.put(bias=[*self.bias.values])  # shifted
-        self.output.hold = None
+        self._hold()
         if not self._is_same_sensor():
             self.link_changed()
 
-    def _offset_now(self) -> Wrench | None:
-        offset = self.link.offset
-        return None if offset is None else Wrench.of(offset)
-
     def _follow_offset(self) -> None:
         """Shift the bias by what the sensor itself adds now, from the next sample on; for the reader too."""
-        now, before = self._offset_now(), self._offset
-        if now is None or now == before:
-            return
-        self._offset = now
-        if before is None or self.bias == NO_WRENCH:
-            return
-        change = now.plus(before, -1.0)
-        self._ramp.shift(change)
-        self._log.info(
-            f"the sensor's own offset was changed by {wrench_text(change)}: the bias is shifted by that"
-        )
-        self._guard.trigger()
-
-    def _doubt(self) -> str:
-        """That the bias may not fit the sensor's own offset, a sentence; empty if it does."""
-        if self._offset is None or self.bias == NO_WRENCH or self.link.connection is None:
-            return ""
-        if self.link.offset is not None:
-            return ""
-        return "the sensor's own offset is not known any more, so its bias may be wrong: tare"
+        change = self._own_offset.follow(self.bias)
+        if change is not None:
+            self._ramp.shift(change)
+            self._log.info(
+                f"the sensor's own offset was changed by {wrench_text(change)}: the bias is shifted by that"
+            )
+            self._guard.trigger()
 
     def _begin_with(self, bias: Wrench, origin: str) -> None:
         """Put a bias in force at once, with nothing before it."""

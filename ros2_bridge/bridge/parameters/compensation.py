@@ -36,6 +36,9 @@ _TABLE: Final = (
     Row("compensate_inertia", False, "Whether the inertial force of the tool is subtracted too"),
     Row("imu_position", ZERO,
         "Position of the IMU in frame_id, m, for compensate_inertia", 0, 1, lengths=(3,)),
+    Row("on_saturation", "publish",
+        "What wrench_compensated does on samples whose force or torque is saturated",
+        choices=("publish", "stop")),
     Row("orientation_source", "accelerometer",
         "Source of the sensor's orientation; used only with a tool_mass", choices=SOURCES),
     Row("orientation.topic", "orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}"),
@@ -100,6 +103,7 @@ class CompensationParameters(NamedTuple):
     bias_directory: str = AUTO
     compensate_inertia: bool = False
     imu_position: Vector3 = ZERO
+    on_saturation: str = "publish"
     orientation: OrientationParameters = OrientationParameters()
     accelerometer: AccelerometerParameters = AccelerometerParameters()
     rest_duration: float = 1.0
@@ -137,6 +141,7 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
         bias_directory=values["bias_directory"],
         compensate_inertia=values["compensate_inertia"],
         imu_position=values["imu_position"],
+        on_saturation=values["on_saturation"],
         orientation=OrientationParameters(values["orientation_source"], **orientation),
         accelerometer=AccelerometerParameters(**group("accelerometer.")),
         rest_duration=duration,

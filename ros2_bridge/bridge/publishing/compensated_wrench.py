@@ -103,8 +103,10 @@ class CompensatedOutput:
         """The one that is open."""
         self.hold: str | None = None
         """Why nothing may be published for now, whatever else is known."""
+        self.stops_on_saturation = self.is_saturated = False
+        """Whether saturated samples are not published, and whether the latest was one of them."""
         self.published = self.withheld = 0
-        """Samples since the node started that were compensated, and that could not be."""
+        """Samples since the node started that were compensated, and that were not."""
         self.is_stopped = False
         """Whether the latest could not."""
         self.time_s = 0.0
@@ -144,7 +146,8 @@ class CompensatedOutput:
         self.time_s = time_s = stamp_ns * 1e-9
         plan = self.plan
         gravity = self._gravity(plan, sample, time_s)
-        if gravity is None or self.hold is not None:
+        self.is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
+        if gravity is None or self.hold is not None or self.is_saturated:
             self.withheld += 1
             self.is_stopped = True
             return

@@ -60,6 +60,13 @@ class Outputs:
         """Look who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
         self.wanted = tuple(output for output in self.all if output.is_wanted())
 
+    def configure(self, parameters: Parameters) -> None:
+        """Have those outputs follow that go by parameters, such as covariances."""
+        for output in self.all:
+            configure = getattr(output, "configure", None)
+            if configure is not None:
+                configure(parameters)
+
     def publish_finite(self, sample: Sample, stamp_ns: int) -> None:
         """Publish a sample that is not finite everywhere where it is."""
         for output in self.wanted:
@@ -173,18 +180,24 @@ class ImuOutput(Topic):
 
     def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
         super().__init__(node, Imu, topic)
-        self._message = Imu()
-        self._message.header.frame_id = parameters.imu_frame_id
-        self._message.angular_velocity_covariance = _covariance(parameters.angular_velocity_covariance)
-        self._message.linear_acceleration_covariance = _covariance(parameters.linear_acceleration_covariance)
-        self._known = _covariance(parameters.orientation_covariance)
-        self._unknown = [-1.0, *[0.0] * 8]  # REP 145
-        self._message.orientation_covariance = self._unknown
         self._has_orientation = False
+        self.configure(parameters)
+
+    def configure(self, parameters: Parameters) -> None:
+        """Take these covariances, from any thread."""
+        self._parameters = parameters
         self._serialized = self._serialize()
 
     def _serialize(self) -> SerializedMessage:
-        message = self._message
+        parameters, message = self._parameters, Imu()
+        message.header.frame_id = parameters.imu_frame_id
+        message.angular_velocity_covariance = _covariance(parameters.angular_velocity_covariance)
+        message.linear_acceleration_covariance = _covariance(parameters.linear_acceleration_covariance)
+        message.orientation_covariance = (
+            _covariance(parameters.orientation_covariance)
+            if self._has_orientation
+            else [-1.0, *[0.0] * 8]  # REP 145
+        )
         positions = [
             axes(message.linear_acceleration),
             axes(message.angular_velocity),
@@ -196,7 +209,6 @@ class ImuOutput(Topic):
         """Publish acceleration, angular rate and, where there is one, the orientation."""
         if (sample.orientation is not None) is not self._has_orientation:
             self._has_orientation = sample.orientation is not None
-            self._message.orientation_covariance = self._known if self._has_orientation else self._unknown
             self._serialized = self._serialize()
         serialized = self._serialized
         serialized.stamp(stamp_ns)
@@ -213,6 +225,10 @@ class TemperatureOutput(Topic):
 
     def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
         super().__init__(node, Temperature, topic)
+        self.configure(parameters)
+
+    def configure(self, parameters: Parameters) -> None:
+        """Take this variance, from any thread."""
         message = Temperature(variance=parameters.temperature_variance)
         message.header.frame_id = parameters.frame_id
         self._serialized = SerializedMessage(message, [[(message, "temperature")]], message.header.stamp)

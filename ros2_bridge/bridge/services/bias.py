@@ -22,7 +22,7 @@ class BiasServices:
 
     def _tare(self) -> str:
         control = self._control
-        window = take_window(control, self._requests)
+        window = take_window(control, self._requests, needs_gravity=control.parameters.payload.mass > 0)
         means = window.means()
         payload, gravity = control.parameters.payload, None
         if payload.mass:

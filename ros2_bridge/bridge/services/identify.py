@@ -56,7 +56,7 @@ class IdentifyServices:
 
     def _add_pose(self) -> str:
         session = self._started()
-        window = take_window(self._control, self._requests)
+        window = take_window(self._control, self._requests, needs_gravity=True)
         means = window.means()
         text = session.add(means, window.gravity())
         self._control.note_rest(means.angular_rate)

@@ -46,7 +46,8 @@ class FrameSelector:
         """`same_clock`: the server's CLOCK_MONOTONIC is ours. `limit_hz` 0 is no limit."""
         self._sensor = sensor
         self._counts = counts
-        self._limit = RateLimit(limit_hz) if limit_hz > 0 else None
+        self._limit: RateLimit | None
+        self.limit(limit_hz)
         self.accounting = StreamAccounting(counts)
         self._least_ns = 0 if same_clock else None
         """No frame is younger; None: the clocks differ."""
@@ -57,13 +58,17 @@ class FrameSelector:
         self.passed_over: list[DataMessage] = []
         """New frames that the rate limit left out of the last `select`, older than the one selected."""
 
+    def limit(self, hz: float) -> None:
+        """Select so many a second at most, 0 = all; from any thread."""
+        self._limit = RateLimit(hz) if hz > 0 else None
+
     def select(self, frames: Sequence[DataMessage], now_ns: int) -> list[DataMessage]:
         """The frames of `frames`, all that were queued, that are to be published, oldest first.
 
         `now_ns` is CLOCK_MONOTONIC after the last was received.
         """
         fresh = self.accounting.select_new(frames, self._sensor)
-        if self._limit is not None:
+        if self.passed_over:
             self.passed_over = []
         if not fresh:
             return fresh
@@ -71,8 +76,9 @@ class FrameSelector:
         fresh = self._without_old(fresh, now_ns)
         if not fresh:
             return fresh
-        if self._limit is not None:
-            allowed = self._limit.allows(newest.monotonic_ns)
+        limit = self._limit
+        if limit is not None:
+            allowed = limit.allows(newest.monotonic_ns)
             self._counts.limited += len(fresh) - allowed
             selected = [newest] if allowed else []
             self.passed_over = fresh[: len(fresh) - len(selected)]
