@@ -158,7 +158,7 @@ def run(arguments: Sequence[str]) -> int:
     except Exception as error:  # noqa: BLE001 - rclpy raises several unrelated ones, most about arguments
         # rclpy has no public names for these.
         wrong_arguments = type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
-        return _refuse(f"ROS cannot start: {' '.join(str(error).split())}", 2 if wrong_arguments else 1)
+        return _refuse(f"ROS cannot start: {why_not_started(error)}", 2 if wrong_arguments else 1)
     try:
         node = BridgeNode.create()
         call_on_stop_signal(lambda _signal: node.finish(0))
@@ -201,6 +201,14 @@ def spin(node: BridgeNode) -> int:
         node.compensation.close()
         executor.shutdown()
         node.destroy_node()
+
+
+def why_not_started(error: Exception) -> str:
+    """What rclpy says of it, and what to do where it does not say that."""
+    text = " ".join(str(error).split())
+    if "logging directory" in text:
+        text += "; set HOME, or ROS_LOG_DIR to a directory for its log"
+    return text
 
 
 def _refuse(text: str, exit_code: int) -> int:

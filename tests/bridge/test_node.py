@@ -210,6 +210,17 @@ def test_arguments_that_are_not_understood(capsys: pytest.CaptureFixture[str]) -
         assert said.count("\n") == 1
 
 
+def test_without_a_home_it_says_what_to_set(
+    start_process: StartProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a process: rclpy is loaded once in one."""
+    for name in ("HOME", "ROS_HOME", "ROS_LOG_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    node = start_process(12001)
+    assert node.ends() == 1
+    assert "set HOME, or ROS_LOG_DIR to a directory for its log" in node.log.splitlines()[-1]
+
+
 def test_help() -> None:
     """In a process: the program blocks signals before anything else."""
     node = NodeProcess("--help")
