@@ -206,6 +206,18 @@ def test_a_change_of_the_sensors_own_offset_shifts_the_bias(bench: Bench) -> Non
         node.until(compensation=OK)
 
 
+def test_an_offset_that_was_not_known_puts_the_bias_in_doubt(bench: Bench) -> None:
+    """As of a server that was too old to tell it."""
+    with bench.start() as (node, _):
+        assert node.trigger("tare")[0]
+        node.until(compensation=OK)
+        offset_changed(bench, [0.0] * 6)
+        bench.server.drop()
+        node.until("was not known when the bias was taken", compensation=WARN)
+        assert node.trigger("tare")[0]
+        node.until(compensation=OK)
+
+
 def test_no_bias_is_not_shifted(bench: Bench) -> None:
     offset_changed(bench, [0.0] * 6)
     with bench.start() as (node, stages):

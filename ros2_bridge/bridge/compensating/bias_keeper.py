@@ -34,8 +34,8 @@ class BiasKeeper:
     def __init__(self, log: Any) -> None:
         self.serial: str | None = None
         self.problem = ""
-        self._kept: Wrench | None = None
-        """What the file has."""
+        self._kept: tuple[Wrench, Wrench | None] | None = None
+        """What the file has: a bias, and the sensor's own offset with it."""
         self._log = log
 
     def forget(self) -> None:
@@ -48,14 +48,14 @@ class BiasKeeper:
         if not parameters.bias_keep:
             self.problem = ""
             return
-        if self.serial is None or bias == self._kept:
+        if self.serial is None or (bias, offset) == self._kept:
             return
         try:
             path = _store(parameters).save(_number(self.serial), bias, parameters.payload, offset)
         except StoreError as error:
             self._say_not_kept(str(error))
             return
-        self._kept, self.problem = bias, ""
+        self._kept, self.problem = (bias, offset), ""
         self._log.info(f"the bias is kept in {path}")
 
     def take(
@@ -86,7 +86,7 @@ class BiasKeeper:
             )
             return None
         if stored.offset == offset:
-            self._kept = stored.bias
+            self._kept = stored.bias, offset
         self._log.info(f"the sensor with serial number {serial} has the bias that was kept at {stored.saved}")
         if stored.payload is not None and stored.payload != parameters.payload:
             self._log.warning(

@@ -21,7 +21,7 @@ from bridge.compensating.gravity_sources import (
     SensorSource,
     Source,
 )
-from bridge.compensating.obstacles import SATURATED, Obstacles
+from bridge.compensating.obstacles import Obstacles
 from bridge.compensating.orientation_listener import OrientationListener, check_can_listen
 from bridge.compensating.own_offset import OwnOffset
 from bridge.diagnostics.compensation_state import CompensationState
@@ -137,17 +137,11 @@ class CompensationControl:
         """How things are, for the diagnostics' thread."""
         output, source = self.output, self.source
         payload = self.parameters.payload
-        if not output.has_subscribers:
-            why = output.hold or self._obstacles.foreseen(self.parameters, source, self._listener)
-        elif output.is_stopped:
-            why = output.hold or (SATURATED if output.is_saturated else source.why_none(output.time_s))
-        else:
-            why = None
         return CompensationState(
             has_subscribers=output.has_subscribers,
             published=output.published,
             withheld=output.withheld,
-            why_stopped=why,
+            why_stopped=self._obstacles.stopping(self.parameters, output, source, self._listener),
             source=source.describe,
             age_s=source.age_s(output.time_s),
             payload=payload,
@@ -167,6 +161,7 @@ class CompensationControl:
 
     def set_bias(self, bias: Wrench, origin: str) -> None:
         """Put a bias in force, and keep it if that is asked for."""
+        self._own_offset.begin()
         with self._origin(origin):
             self._live.put(bias=[*bias.values])
 
@@ -214,6 +209,7 @@ class CompensationControl:
         # A parameter that the shift of the bias has not reached yet is no wish.
         if wanted.bias not in (was.bias, self.bias):
             self._ramp.go(wanted.bias, self.output.time_s)
+            self._own_offset.begin()
             self.origin = self._next_origin
         self._make_plan()
         self.output.stops_on_saturation = wanted.on_saturation == "stop"

@@ -6,10 +6,11 @@ from typing import Final
 
 from bridge.compensating.gravity_sources import AccelerometerSource, Listening, NoSource, SensorSource, Source
 from bridge.parameters.compensation import CompensationParameters
+from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.stream.link import Link
 from bridge.stream.watch import Watch
 
-SATURATED: Final = "force or torque is saturated, and on_saturation is stop"
+_SATURATED: Final = "force or torque is saturated, and on_saturation is stop"
 _OF_THE_IMU: Final = ("accelerometer", "sensor")
 
 
@@ -45,10 +46,24 @@ class Obstacles:
             "that frame from the robot (orientation_source)"
         )
 
-    def foreseen(
+    def stopping(
+        self,
+        parameters: CompensationParameters,
+        output: CompensatedOutput,
+        source: Source,
+        listener: Listening | None,
+    ) -> str | None:
+        """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
+        if not output.has_subscribers:
+            return output.hold or self._foreseen(parameters, source, listener)
+        if not output.is_stopped:
+            return None
+        return output.hold or (_SATURATED if output.is_saturated else source.why_none(output.time_s))
+
+    def _foreseen(
         self, parameters: CompensationParameters, source: Source, listener: Listening | None
     ) -> str | None:
-        """Why the newest sample could not be compensated, as far as can be told while none is."""
+        """The latter, as far as can be told while no sample is compensated."""
         sample, time_s = self._watch.sample, self._watch.stamp_ns * 1e-9
         if not parameters.payload.mass:
             return None

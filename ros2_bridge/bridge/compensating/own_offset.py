@@ -13,6 +13,8 @@ class OwnOffset:
         self._link = link
         self.of_bias: Wrench | None = None
         """The one that the bias is for, as far as it was ever known."""
+        self._appeared = False
+        """Whether the bias is from before it was known."""
 
     @property
     def now(self) -> Wrench | None:
@@ -22,7 +24,7 @@ class OwnOffset:
 
     def begin(self) -> Wrench | None:
         """The bias is for the offset of now, which is returned."""
-        self.of_bias = self.now
+        self.of_bias, self._appeared = self.now, False
         return self.of_bias
 
     def follow(self, bias: Wrench) -> Wrench | None:
@@ -31,14 +33,20 @@ class OwnOffset:
         if now is None or now == before:
             return None
         self.of_bias = now
-        return None if before is None or bias == NO_WRENCH else now.plus(before, -1.0)
+        if bias == NO_WRENCH:
+            return None
+        self._appeared = self._appeared or before is None
+        return None if before is None else now.plus(before, -1.0)
 
     def doubt(self, bias: Wrench) -> str:
         """That `bias` may not fit the sensor any more, a sentence; empty if it does."""
-        lost = self.of_bias is not None and self._link.offset is None and self._link.connection is not None
-        if bias == NO_WRENCH or not lost:
+        if bias == NO_WRENCH or self._link.connection is None:
             return ""
-        return "the sensor's own offset is not known any more, so its bias may be wrong: tare"
+        if self._appeared:
+            return "the sensor's own offset was not known when the bias was taken, which may be wrong: tare"
+        if self.of_bias is not None and self._link.offset is None:
+            return "the sensor's own offset is not known any more, so the bias may be wrong: tare"
+        return ""
 
     def after_tare(self, bias: Wrench) -> str:
         """What a tare of the sensor means for `bias`, a sentence; empty if nothing."""
