@@ -138,9 +138,9 @@ def test_a_stall_costs_no_more_than_itself(same_clock: bool, age_ns: int) -> Non
     """Whatever is usual on this connection: what is queued after 60 ms gives one sample, the next passes."""
     select, counts = selector(same_clock=same_clock)
     offset_ns = age_ns if same_clock else age_ns - 10**15
-    for i in range(800):
+    for i in range(8):
         assert numbers(select.select([frame(i)], offset_ns + i * PERIOD_NS)) == [i]
-    for begin in (800, 1800):  # and again: nothing has changed for the rest of the connection
+    for begin in (8, 1008):  # and again: nothing has changed for the rest of the connection
         now = begin + 48
         assert numbers(select.select(frames(range(begin, now)), offset_ns + now * PERIOD_NS)) == [now - 1]
         for i in range(now, begin + 1000):

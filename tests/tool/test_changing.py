@@ -202,7 +202,7 @@ def test_a_tare_of_a_moving_sensor_is_refused(motion: str) -> None:
     """Whether it is seen before or after the offset was written: the former one is in force."""
     refused = 0
     with simulated_bus("--signal", motion) as bus:
-        for _ in range(4):
+        for _ in range(2):
             done = tool_here("tare", bus.near, "--samples", 400, "--json", code=None)
             if done.code == 0:  # it rested for a moment
                 assert max(map(abs, done.json["residual"][:3])) < 0.4

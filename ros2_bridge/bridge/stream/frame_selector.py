@@ -49,9 +49,8 @@ class FrameSelector:
         self._limit: RateLimit | None
         self.limit(limit_hz)
         self.accounting = StreamAccounting(counts)
-        self._least_ns = 0 if same_clock else None
-        """No frame is younger; None: the clocks differ."""
-        self._usual_ns = self._least_ns
+        self._may_be_negative = not same_clock
+        self._usual_ns: int | None = None
         """The usual age; None before the first frame."""
         self._skipping: tuple[int, int] | None = None
         """While all is stale: when its age was looked at last, and what it was."""
@@ -73,9 +72,24 @@ class FrameSelector:
         if not fresh:
             return fresh
         newest = fresh[-1]
-        fresh = self._without_old(fresh, now_ns)
-        if not fresh:
-            return fresh
+        age_ns = now_ns - newest.monotonic_ns
+        usual_ns = self._usual_ns
+        if usual_ns is None:  # an old one is no rule, where it is known to be old
+            is_usual = self._may_be_negative or 0 < age_ns <= BACKLOG_NS
+            usual_ns = self._usual_ns = age_ns if is_usual else 0
+        late_ns = age_ns - usual_ns
+        alone = len(fresh) == 1
+        oldest_late_ns = late_ns if alone else now_ns - fresh[0].monotonic_ns - usual_ns
+        if self._skipping is None and oldest_late_ns <= BACKLOG_NS:
+            if late_ns < 0:
+                usual_ns += late_ns // _FALL
+                self._usual_ns = usual_ns if self._may_be_negative or usual_ns > 0 else 0
+            elif alone:  # it was waited for, so its delay is not this node's
+                self._usual_ns = usual_ns + late_ns // _RISE
+        else:
+            fresh = self._after_stall(fresh, age_ns, now_ns)
+            if not fresh:
+                return fresh
         limit = self._limit
         if limit is not None:
             allowed = limit.allows(newest.monotonic_ns)
@@ -85,26 +99,14 @@ class FrameSelector:
             return selected
         return fresh
 
-    def _without_old(self, fresh: list[DataMessage], now_ns: int) -> list[DataMessage]:
-        """`fresh`; after a stall its newest alone, and nothing while more is on the way."""
-        newest = fresh[-1]
-        age_ns = now_ns - newest.monotonic_ns
-        usual_ns = age_ns if self._usual_ns is None else self._usual_ns
-        late_ns = age_ns - usual_ns
+    def _after_stall(self, fresh: list[DataMessage], age_ns: int, now_ns: int) -> list[DataMessage]:
+        """The newest of `fresh`, or nothing while more is on the way; `age_ns` is its age."""
         if self._skipping is None:
-            if late_ns + newest.monotonic_ns - fresh[0].monotonic_ns <= BACKLOG_NS:
-                if late_ns < 0:
-                    usual_ns += late_ns // _FALL
-                elif len(fresh) == 1:  # it was waited for, so its delay is not this node's
-                    usual_ns += late_ns // _RISE
-                self._usual_ns = usual_ns if self._least_ns is None else max(usual_ns, self._least_ns)
-                return fresh
             self._skipping = now_ns, age_ns
-        if late_ns > FRESH_NS:
+        if age_ns - (self._usual_ns or 0) > FRESH_NS:
             since_ns, was_ns = self._skipping
             passed_ns = now_ns - since_ns
-            catches_up = was_ns - age_ns >= passed_ns // 2
-            if passed_ns < _CATCH_UP_NS or catches_up:
+            if passed_ns < _CATCH_UP_NS or was_ns - age_ns >= passed_ns // 2:
                 if passed_ns >= _CATCH_UP_NS:
                     self._skipping = now_ns, age_ns
                 self._counts.stale += len(fresh)
@@ -112,7 +114,7 @@ class FrameSelector:
             self._usual_ns = age_ns
         self._skipping = None
         self._counts.stale += len(fresh) - 1
-        return [newest]
+        return [fresh[-1]]
 
 
 class RateLimit:
