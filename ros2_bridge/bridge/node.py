@@ -41,6 +41,8 @@ from bridge.stream.requests import RefusedError, RequestFailedError, Requests
 
 SUPERVISOR_TOPIC = "/supervisor_status_data"
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
+SERVER_GOES_ON: Final = 3
+"""Exit code: the supervisor stopped the node, but the server refused to shut down."""
 _ENDS_WITHIN_S: Final = 5.0
 
 
@@ -142,7 +144,8 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         try:
             self.get_logger().info(self.requests.shut_server_down())
         except RefusedError as error:
-            self.fail(str(error))
+            self.get_logger().error(str(error))
+            self.finish(SERVER_GOES_ON)
         except RequestFailedError as error:
             self.get_logger().warning(str(error))
         self.finish(0)

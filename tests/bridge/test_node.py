@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 from diagnostic_msgs.msg import KeyValue
 from std_srvs.srv import Trigger
 
-from bridge.node import SUPERVISOR_TOPIC, run
+from bridge.node import SERVER_GOES_ON, SUPERVISOR_TOPIC, run
 from tests.bridge.conftest import Listener, NodeProcess, Start, StartProcess, establish, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
@@ -127,7 +127,7 @@ def test_a_refused_shutdown_is_an_error() -> None:
     server = SimulatedServer()
     error = {"code": "denied", "message": "only root"}
     server.answers["shutdown"] = lambda _: {"ok": False, "error": error}
-    assert "refused to shut down: only root (denied)" in supervised(server, 1).log
+    assert "refused to shut down: only root (denied)" in supervised(server, SERVER_GOES_ON).log
 
 
 def test_a_shutdown_that_is_never_answered_ends_the_node_too() -> None:
