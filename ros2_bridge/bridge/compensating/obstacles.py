@@ -37,13 +37,13 @@ class Obstacles:
 
     def blind(self, parameters: CompensationParameters, *, needs_gravity: bool) -> str | None:
         """Why it cannot be known where gravity points in the frame of the wrench, if that is needed."""
-        is_imu = parameters.orientation.source in _OF_THE_IMU
+        is_imu = parameters.orientation.source in _OF_THE_IMU or parameters.compensate_inertia
         if not needs_gravity or not is_imu or self._link.settings.get("coordinate_system") is not True:
             return None
         return (
             "settings.coordinate_system is on, so the wrench is in a frame that was configured in the "
             "sensor, and how the IMU is turned to it is not known: switch it off, or take the orientation of "
-            "that frame from the robot (orientation_source)"
+            "that frame from the robot (orientation_source) and set compensate_inertia to false"
         )
 
     def stopping(
