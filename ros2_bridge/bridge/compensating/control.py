@@ -74,7 +74,7 @@ class CompensationControl:
         self._check(self.parameters)
         self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
         self.source: Source = NoSource()
-        self._obstacles, self._live = Obstacles(link, watch), live
+        self.obstacles, self._live = Obstacles(link, watch), live
         live.checks.append(lambda wanted: self._check(wanted.compensation))
         live.listeners.append(lambda wanted: self._apply(wanted.compensation))
         self._guard = node.create_guard_condition(self._follow_sensor)
@@ -107,7 +107,7 @@ class CompensationControl:
         else:
             self._follow_offset()
             if self.output.hold is not _LOOKING_UP:
-                self._hold()
+                self.obstacles.hold(self.parameters, self.output)
 
     @property
     def keeping(self) -> str:
@@ -123,16 +123,6 @@ class CompensationControl:
         """What a new offset in the sensor itself means here, a sentence; "" if nothing."""
         return self._own_offset.after_tare(self.bias)
 
-    def conflict(self, *, needs_gravity: bool = False) -> str | None:
-        """What the sensor is set to that does not go with compensation, a sentence."""
-        obstacles, parameters = self._obstacles, self.parameters
-        return obstacles.conflict(parameters) or obstacles.blind(parameters, needs_gravity=needs_gravity)
-
-    def _hold(self) -> None:
-        """Hold everything back while gravity cannot be had in the wrench's frame."""
-        has_weight = self.parameters.payload.mass > 0.0
-        self.output.hold = self._obstacles.blind(self.parameters, needs_gravity=has_weight)
-
     def state(self) -> CompensationState:
         """How things are, for the diagnostics' thread."""
         output, source = self.output, self.source
@@ -141,7 +131,7 @@ class CompensationControl:
             has_subscribers=output.has_subscribers,
             published=output.published,
             withheld=output.withheld,
-            why_stopped=self._obstacles.stopping(self.parameters, output, source, self._listener),
+            why_stopped=self.obstacles.stopping(self.parameters, output, source, self._listener),
             source=source.describe,
             age_s=source.age_s(output.time_s),
             payload=payload,
@@ -151,7 +141,9 @@ class CompensationControl:
             is_ramping=self.is_ramping,
             keep=self.parameters.bias_keep,
             stops_on_saturation=output.stops_on_saturation,
-            problem=self.conflict() or self._own_offset.doubt(self.bias) or self.keeping,
+            problem=self.obstacles.conflict(self.parameters)
+            or self._own_offset.doubt(self.bias)
+            or self.keeping,
         )
 
     @property
@@ -214,7 +206,7 @@ class CompensationControl:
         self._make_plan()
         self.output.stops_on_saturation = wanted.on_saturation == "stop"
         if self.output.hold is not _LOOKING_UP:
-            self._hold()
+            self.obstacles.hold(self.parameters, self.output)
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
             self._keeper.forget()
         self._keeper.keep(self.bias, wanted, self._own_offset.of_bias)
@@ -265,7 +257,7 @@ class CompensationControl:
         self._follow_offset()
         if self.bias != self.parameters.bias:
             self._live.put(bias=[*self.bias.values])  # shifted
-        self._hold()
+        self.obstacles.hold(self.parameters, self.output)
         if not self._is_same_sensor():
             self.link_changed()
 

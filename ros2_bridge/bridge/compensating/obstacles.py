@@ -20,8 +20,9 @@ class Obstacles:
     def __init__(self, link: Link, watch: Watch) -> None:
         self._link, self._watch = link, watch
 
-    def conflict(self, parameters: CompensationParameters) -> str | None:
-        """What the sensor is set to that does not go with compensation."""
+    def conflict(self, parameters: CompensationParameters, *, needs_gravity: bool = False) -> str | None:
+        """What the sensor is set to that does not go with compensation, or with knowing where gravity points
+        in the frame of the wrench if that is needed."""
         settings = self._link.settings
         if settings.get("calibration_matrix") is False:
             return (
@@ -33,12 +34,15 @@ class Obstacles:
                 "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
                 "or set tool_mass to 0"
             )
-        return None
+        return self._blind(parameters) if needs_gravity else None
 
-    def blind(self, parameters: CompensationParameters, *, needs_gravity: bool) -> str | None:
-        """Why it cannot be known where gravity points in the frame of the wrench, if that is needed."""
+    def hold(self, parameters: CompensationParameters, output: CompensatedOutput) -> None:
+        """Have `output` publish nothing while it cannot be known where gravity points, and must be."""
+        output.hold = self._blind(parameters) if parameters.payload.mass else None
+
+    def _blind(self, parameters: CompensationParameters) -> str | None:
         is_imu = parameters.orientation.source in _OF_THE_IMU or parameters.compensate_inertia
-        if not needs_gravity or not is_imu or self._link.settings.get("coordinate_system") is not True:
+        if not is_imu or self._link.settings.get("coordinate_system") is not True:
             return None
         return (
             "settings.coordinate_system is on, so the wrench is in a frame that was configured in the "

@@ -24,7 +24,7 @@ def take_window(control: CompensationControl, requests: Requests, *, needs_gravi
 
     CompensationError if they do not come or mean nothing.
     """
-    if (conflict := control.conflict(needs_gravity=needs_gravity)) is not None:
+    if (conflict := control.obstacles.conflict(control.parameters, needs_gravity=needs_gravity)) is not None:
         raise CompensationError(conflict)
     link = control.link
     if link.connection is None:
