@@ -188,8 +188,10 @@ class Cycle:
         for stream in self._streams:
             if now >= stream.idle_at_ns and (made := stream.idle(now)):
                 self._hub.publish(made[0], stream.number, made[1], now)
-        if frame is None and (wait := min(self._due_ns(), until_ns) - monotonic_ns()) > 0:
-            return self._receive(wait)
+        if frame is None:
+            most = int(timing.patience_ns) if self._schedule.one_by_one else self._due_ns() - monotonic_ns()
+            if (wait := min(most, until_ns - now)) > 0:
+                return self._receive(wait)
         return frame
 
     def _receive(self, wait: int) -> bytes | None:
