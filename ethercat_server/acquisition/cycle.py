@@ -228,7 +228,8 @@ class Cycle:
             elif made := stream.take(data, wkc, sent, back):
                 self._hub.publish(made[0], number, made[1], back)
         for stream in self._streams_of[which]:
-            stream.learn()
+            if stream.learns:
+                stream.learn()
 
     def _roll(self) -> None:
         """Once a second."""
