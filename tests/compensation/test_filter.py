@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import cmath
 import math
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -84,9 +86,18 @@ def test_a_ramp_comes_out_later_by_the_delay_that_is_said(settings: dict[str, fl
     assert 1599 / RATE_HZ - found[-1] / 2.0 == pytest.approx(made.delay_s, abs=1e-9)
 
 
-@pytest.mark.parametrize(("cutoff", "ms"), [(5.0, 45.0), (10.0, 22.5), (20.0, 11.2), (50.0, 4.4)])
-def test_delays(cutoff: float, ms: float) -> None:
-    assert designed(cutoff=cutoff).delay_s * 1e3 == pytest.approx(ms, abs=0.051)
+def test_delays_are_as_the_documentation_says() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "ros2.md").read_text()
+    rows = re.search(r"\| Cut-off \|(.*)\n.*\n\| Delay at 800 Hz \|(.*)", page)
+    assert rows is not None
+    cutoffs, delays = (
+        re.findall(rf"([\d.]+) {unit}", row) for row, unit in zip(rows.groups(), ("Hz", "ms"), strict=True)
+    )
+    assert len(cutoffs) == len(delays) == 4
+    for cutoff, ms in zip(cutoffs, delays, strict=True):
+        assert designed(cutoff=float(cutoff)).delay_s * 1e3 == pytest.approx(float(ms), abs=0.051)
+    assert "+ 0.16 width / center²" in rows[2]
+    assert notch(50.0, 5.0, RATE_HZ).delay / RATE_HZ == pytest.approx(0.16 * 5.0 / 50.0**2, rel=0.05)
 
 
 def test_the_first_sample_is_no_step() -> None:
