@@ -98,7 +98,7 @@ class WrenchFilter:
         self.delay_s = 0.0
         """Group delay at DC, without the sensor's own filters."""
         self._sections: tuple[_Section, ...] = ()
-        self._running = self._sections
+        self._running: tuple[_Section, ...] = ()
         """Those that have a state."""
         self._dead_band_force = self._dead_band_torque = 0.0
         self._longest_pause_ns = 0.0
