@@ -13,6 +13,8 @@ from typing import Final, NamedTuple
 from ft_compensation.quantities import CompensationError, Wrench
 from protocol.pdo import Vector3
 
+LEAST_CUTOFF_HZ: Final = 0.05
+LEAST_NOTCH_HZ: Final = 1.0
 Six = tuple[float, ...]
 """Fx Fy Fz (N) Mx My Mz (Nm)"""
 _SHORTEST_PAUSE: Final = 3.5

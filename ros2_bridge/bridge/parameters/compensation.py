@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from bridge.parameters.row import ParameterError, Row
-from ft_compensation.filter import FilterSettings
+from ft_compensation.filter import LEAST_CUTOFF_HZ, LEAST_NOTCH_HZ, FilterSettings
 from ft_compensation.quantities import DEFAULT_GRAVITY, ZERO, Payload, Wrench, length
 from ft_compensation.stationary import StationaryLimits
 from protocol.pdo import Vector3
@@ -21,8 +21,6 @@ AUTO: Final = "auto"
 TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
 SOURCES: Final = ("none", "accelerometer", "sensor", *TOPIC_SOURCES, "tf")
 _LEAST_GRAVITY: Final = 0.1
-_LEAST_CUTOFF_HZ: Final = 0.05
-_LEAST_NOTCH_HZ: Final = 1.0
 _REST: Final = StationaryLimits()
 
 _TABLE: Final = (
@@ -132,17 +130,16 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
             f"this one's is {norm:g}"
         )
 
-    for name, least in (("filter.cutoff", _LEAST_CUTOFF_HZ), ("filter.notch", _LEAST_NOTCH_HZ)):
-        if 0.0 < values[name] < least:
-            raise ParameterError(
-                f"parameter {name} is {values[name]:g}: it must be 0, for none, or at least {least:g} Hz"
-            )
-
     def group(prefix: str) -> dict[str, Any]:
         return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
 
     rest = group("rest.")
     duration = rest.pop("duration")
+    for name, least in (("filter.cutoff", LEAST_CUTOFF_HZ), ("filter.notch", LEAST_NOTCH_HZ)):
+        if 0.0 < values[name] < least:
+            raise ParameterError(
+                f"parameter {name} is {values[name]:g}: it must be 0, for none, or at least {least:g} Hz"
+            )
     orientation = group("orientation.") | {"mounting": tuple(part / norm for part in mounting)}
     return CompensationParameters(
         payload=Payload(values["tool_mass"], values["tool_center_of_gravity"]),
