@@ -470,6 +470,9 @@ def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node
         def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
             made.append((buffer, node, spin_thread))
 
+        def unregister(self) -> None:
+            made.append("unregistered")
+
     names = {"Buffer": Buffer, "TransformListener": TransformListener, "TransformException": FakeTfError}
     module = types.ModuleType("tf2_ros")
     vars(module).update(names)
@@ -481,7 +484,8 @@ def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node
     assert isinstance(tf.buffer, Buffer)
     assert tf.errors is FakeTfError
     assert tf.latest.nanoseconds == 0
-    assert made == [tf.buffer, (tf.buffer, ros_node, False)]
+    tf.close()
+    assert made == [tf.buffer, (tf.buffer, ros_node, False), "unregistered"]
 
 
 def test_without_tf2_ros(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,6 +125,7 @@ class CompensationControl:
             published=output.published,
             withheld=output.withheld,
             why_stopped=why,
+            why_partly="" if why else output.problem,
             source=source.describe,
             age_s=source.age_s(output.time_s),
             payload=payload,
@@ -186,6 +187,7 @@ class CompensationControl:
             except ParameterError as error:  # too late to refuse the parameter
                 self._log.error(str(error))
                 self.source = NoSource(str(error))
+        self.output.tune(wanted)
         self._ramp.seconds = wanted.bias_ramp_time
         if wanted.bias != self.bias:
             self._ramp.go(wanted.bias, self.output.time_s)

@@ -18,6 +18,8 @@ class CompensationState(NamedTuple):
     """Samples since the node started that were compensated, and that could not be."""
     why_stopped: str | None = None
     """Why the latest sample could not be, a sentence; None if it could."""
+    why_partly: str = ""
+    """Why some topics alone have stopped, a sentence; empty if none has."""
     source: str = "none"
     age_s: float = math.inf
     """Of the orientation."""

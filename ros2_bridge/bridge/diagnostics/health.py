@@ -247,6 +247,8 @@ def _compensation(s: Snapshot, t: Thresholds) -> Status:
         verdict.add(Level.STALE, "there are no new samples, see stream")
     elif c.why_stopped is not None:
         verdict.add(Level.ERROR, f"wrench_compensated has stopped: {c.why_stopped}")
+    elif c.why_partly:
+        verdict.add(Level.ERROR, c.why_partly)
     elif s.new_withheld:
         verdict.add(
             Level.WARN,
