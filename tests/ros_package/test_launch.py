@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from tests.ros_package.package_files import PACKAGE, ROOT
+from tests.ros_package.page_commands import console, in_text
 from tests.ros_package.test_launch_files import ARGUMENTS
 from tests.server.running import free_port, needs_bus
 
@@ -34,6 +35,7 @@ class Launched:
     """`ros2 launch` with one of our files, in a session of its own."""
 
     def __init__(self, environment: dict[str, str], file: str, *arguments: str) -> None:
+        self.environment = environment
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115
         self.process = subprocess.Popen(
             ["ros2", "launch", str(PACKAGE / "launch" / file), *arguments],
@@ -177,6 +179,26 @@ def test_the_demo_runs_and_ends_cleanly(launch: Launch) -> None:
     assert launched.stop() == 0
     assert launched.log.count("process has finished cleanly") == 2, launched.log
     assert "has died" not in launched.log
+
+
+@pytest.mark.ros
+@pytest.mark.bus
+@needs_bus
+def test_the_commands_on_the_page_about_the_node(launch: Launch) -> None:
+    launched = launch("demo.launch.py", f"server_port:={free_port()}", SERVER)
+    launched.says("connected to localhost")
+    commands = [*console("ros2.md"), *in_text("ros2.md")]
+    try:
+        for command in commands:
+            if command.text != "ros2 run bridge client":  # It runs already.
+                done = subprocess.run(
+                    ["bash", "-c", command.text.replace("NAME", "sensor")],
+                    env=launched.environment, check=False, capture_output=True, text=True,
+                )  # fmt: skip
+                assert done.returncode == 0, done.stderr
+                assert command.output.strip() in done.stdout
+    finally:
+        subprocess.run(["ros2", "daemon", "stop"], env=launched.environment, check=False, capture_output=True)
 
 
 @pytest.mark.ros
