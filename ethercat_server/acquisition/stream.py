@@ -65,7 +65,8 @@ class SensorStream:
     def take(self, data: bytes, wkc: int, sent_ns: int, back_ns: int) -> tuple[bytes, int] | None:
         """The frame that a valid exchange gives, and its flags; None if it gives none.
 
-        `learn` must follow if `learns`. `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the exchange.
+        `learn` must follow if `learns`. `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the
+        exchange.
         """
         clock = self.clock
         if sent_ns < self._seen[0]:  # overtaken
