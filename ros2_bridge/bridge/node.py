@@ -28,8 +28,7 @@ from bridge.parameters.live import LiveParameters
 from bridge.parameters.row import ParameterError
 from bridge.parameters.sensor_settings import SettingsParameters
 from bridge.parameters.table import Parameters
-from bridge.publishing.compensated_wrench import CompensatedOutput
-from bridge.publishing.messages import make, make_stages
+from bridge.publishing.topics import make, make_compensated
 from bridge.services.bias import BiasServices
 from bridge.services.identify import IdentifyServices
 from bridge.services.sensor import Services
@@ -66,7 +65,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
         parameters = declare(self)
-        compensated = CompensatedOutput(make_stages(self, parameters.frame_id))
+        compensated = make_compensated(self, parameters, lambda: self.reader.link.rate_hz)
         outputs = make(self, parameters, compensated)
         self.reader = Reader(
             parameters, outputs, self.get_logger(), self.fail, connect=self.connect, clock=self.clock

@@ -132,6 +132,7 @@ class CompensationControl:
             published=output.published,
             withheld=output.withheld,
             why_stopped=self.obstacles.stopping(self.parameters, output, source, self._listener),
+            why_partly=output.problem,
             source=source.describe,
             age_s=source.age_s(output.time_s),
             payload=payload,
@@ -197,6 +198,7 @@ class CompensationControl:
             except ParameterError as error:  # too late to refuse the parameter
                 self._log.error(str(error))
                 self.source = NoSource(str(error))
+        self.output.tune(wanted)
         self._ramp.seconds = wanted.bias_ramp_time
         # A parameter that the shift of the bias has not reached yet is no wish.
         if wanted.bias not in (was.bias, self.bias):

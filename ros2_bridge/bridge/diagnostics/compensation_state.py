@@ -17,6 +17,8 @@ class CompensationState(NamedTuple):
     """Samples since the node started that were compensated, and that could not be."""
     why_stopped: str | None = None
     """Why the latest sample was not, or would not be if anybody had subscribed, a sentence; None: fine."""
+    why_partly: str = ""
+    """Why some topics alone have stopped, a sentence; empty if none has."""
     source: str = "none"
     age_s: float = math.inf
     """Of the orientation."""

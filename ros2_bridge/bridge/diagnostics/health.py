@@ -265,6 +265,8 @@ def _compensation(s: Snapshot, t: Thresholds) -> Status:
     elif c.why_stopped is not None:
         state = "has stopped" if c.has_subscribers else "could not be published if somebody subscribed"
         verdict.add(Level.ERROR, f"wrench_compensated {state}: {c.why_stopped}")
+    elif c.why_partly:
+        verdict.add(Level.ERROR, c.why_partly)
     elif s.new_withheld:
         why = f"for want of a fresh orientation ({c.source})"
         if c.stops_on_saturation and s.new_saturated:

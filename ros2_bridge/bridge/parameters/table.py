@@ -11,7 +11,8 @@ from typing import Any, Final, NamedTuple
 
 from bridge.parameters.compensation import ROWS as COMPENSATION_ROWS
 from bridge.parameters.compensation import CompensationParameters, gather
-from bridge.parameters.row import Numbers, ParameterError, Row
+from bridge.parameters.row import NO_TEXTS, Numbers, ParameterError, Row
+from bridge.parameters.wrench_frames import WrenchFrame, parse
 from protocol.pdo import ImuUnits
 
 _UNKNOWN: Final = (0.0, 0.0, 0.0)
@@ -28,6 +29,11 @@ _TABLE: Final = (
     Row("publishing_frequency", 0.0, "Most messages a second, always the newest; 0 = every sample", 0, 1e6),
     Row("array_topic", "sensone_sensor_data", "Topic of the Float64MultiArray"),
     Row("frame_id", "ft_sensor", "Frame of the wrench (its origin is the sensor's) and of the temperature"),
+    Row(
+        "wrench_frames",
+        NO_TEXTS,
+        "Frames of wrench_compensated/NAME: NAME (by TF), or 'NAME x y z [qx qy qz qw]' in frame_id, m",
+    ),
     Row("imu_frame_id", "ft_sensor_imu", "Frame of the IMU's messages"),
     Row(
         "imu_raw_units",
@@ -81,6 +87,7 @@ class Parameters(NamedTuple):
     angular_velocity_covariance: Numbers = _UNKNOWN
     linear_acceleration_covariance: Numbers = _UNKNOWN
     temperature_variance: float = 0.0
+    wrench_frames: tuple[WrenchFrame, ...] = ()
     thresholds: Thresholds = Thresholds()
     compensation: CompensationParameters = CompensationParameters()
     """As they are at start."""
@@ -104,5 +111,7 @@ def gather_all(values: dict[str, Any]) -> Parameters:
             )
     compensation = gather({row.name: values.pop(row.name) for row in COMPENSATION_ROWS})
     thresholds = Thresholds(**{name: values.pop(f"diagnostics.{name}") for name in Thresholds._fields})
-    units = ImuUnits(values.pop("imu_raw_units"))
-    return Parameters(**values, imu_units=units, thresholds=thresholds, compensation=compensation)
+    units, frames = ImuUnits(values.pop("imu_raw_units")), parse(values.pop("wrench_frames"))
+    return Parameters(
+        **values, imu_units=units, wrench_frames=frames, thresholds=thresholds, compensation=compensation
+    )
