@@ -35,6 +35,10 @@ class Wrench(NamedTuple):
         """Fx Fy Fz (N) Mx My Mz (Nm)."""
         return *self.force, *self.torque
 
+    def plus(self, other: Wrench, times: float = 1.0) -> Wrench:
+        """The sum of this and `times` the other."""
+        return Wrench.of([a + times * b for a, b in zip(self.values, other.values, strict=True)])
+
 
 NO_WRENCH: Final = Wrench(ZERO, ZERO)
 
@@ -55,6 +59,15 @@ class Payload(NamedTuple):
             raise ValueError(f"a mass cannot be negative: {kilograms:g} kg")
         x, y, z = _finite(center, 3, "a center of gravity")
         return cls(kilograms, (x, y, z))
+
+
+AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+
+
+def wrench_text(wrench: Wrench) -> str:
+    """A wrench for people."""
+    numbers = " ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, wrench.values, strict=True))
+    return f"{numbers} (N, Nm)"
 
 
 NO_PAYLOAD: Final = Payload()

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from bridge.parameters.row import ParameterError, Row
+from ft_compensation.filter import LEAST_CUTOFF_HZ, LEAST_NOTCH_HZ, FilterSettings
 from ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
@@ -45,6 +46,9 @@ _TABLE: Final = (
     Row("compensate_inertia", False, "Whether the inertial force of the tool is subtracted too"),
     Row("imu_position", ZERO,
         "Position of the IMU in frame_id, m, for compensate_inertia", 0, 1, lengths=(3,)),
+    Row("on_saturation", "publish",
+        "What wrench_compensated does on samples whose force or torque is saturated",
+        choices=("publish", "stop")),
     Row("orientation_source", "accelerometer",
         "Source of the sensor's orientation; used only with a tool_mass", choices=SOURCES),
     Row("orientation.topic", "orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}"),
@@ -75,6 +79,12 @@ _TABLE: Final = (
         "Largest standard deviation when stationary, m/s²", 0, 100),
     Row("rest.acceleration_wander", _REST.acceleration_wander,
         "Largest drift of the mean when stationary, m/s²", 0, 100),
+    Row("filter.cutoff", 0.0,
+        "Low-pass of wrench_filtered, -3 dB, Hz; 0 = no such topic", 0, 1000),
+    Row("filter.notch", 0.0, "Center of its notch, Hz; 0 = none", 0, 1000),
+    Row("filter.notch_width", 5.0, "Of the notch, between -3 dB points, Hz", 0.1, 1000),
+    Row("filter.dead_band_force", 0.0, "Taken off the magnitude of its force, N; 0 = none", 0, 1e6),
+    Row("filter.dead_band_torque", 0.0, "Taken off the magnitude of its torque, Nm; 0 = none", 0, 1e6),
     Row("identify.file", AUTO,
         "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bias_directory"),
 )  # fmt: skip
@@ -119,11 +129,13 @@ class CompensationParameters(NamedTuple):
     bias_directory: str = AUTO
     compensate_inertia: bool = False
     imu_position: Vector3 = ZERO
+    on_saturation: str = "publish"
     orientation: OrientationParameters = OrientationParameters()
     accelerometer: AccelerometerParameters = AccelerometerParameters()
     rest_duration: float = 1.0
     rest: StationaryLimits = _REST
     identify_file: str = AUTO
+    filter: FilterSettings = FilterSettings()
 
 
 def gather(values: Mapping[str, Any]) -> CompensationParameters:
@@ -152,6 +164,11 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
 
     rest = group("rest.")
     duration = rest.pop("duration")
+    for name, least in (("filter.cutoff", LEAST_CUTOFF_HZ), ("filter.notch", LEAST_NOTCH_HZ)):
+        if 0.0 < values[name] < least:
+            raise ParameterError(
+                f"parameter {name} is {values[name]:g}: it must be 0, for none, or at least {least:g} Hz"
+            )
     orientation = group("orientation.") | {"mounting": tuple(part / norm for part in mounting)}
     return CompensationParameters(
         payload=Payload(values["tool_mass"], values["tool_center_of_gravity"]),
@@ -162,9 +179,11 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
         bias_directory=values["bias_directory"],
         compensate_inertia=values["compensate_inertia"],
         imu_position=values["imu_position"],
+        on_saturation=values["on_saturation"],
         orientation=OrientationParameters(values["orientation_source"], **orientation),
         accelerometer=AccelerometerParameters(**group("accelerometer.")),
         rest_duration=duration,
         rest=StationaryLimits(**rest),
         identify_file=values["identify.file"],
+        filter=FilterSettings(**group("filter.")),
     )
