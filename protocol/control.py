@@ -45,6 +45,7 @@ class Event(StrEnum):
     SENSOR_LOST = "sensor_lost"
     SENSOR_BACK = "sensor_back"
     RECONFIGURED = "reconfigured"
+    OFFSET_CHANGED = "offset_changed"
     EMERGENCY = "emergency"
     SHUTTING_DOWN = "shutting_down"
 
@@ -235,9 +236,8 @@ def parse_request(message: JsonObject) -> Request:
     for key in message:
         if key not in action.parameters and key not in {"action", "id"}:
             known = ", ".join(("id", *action.parameters))
-            raise RequestError(
-                ErrorCode.BAD_REQUEST, f"{name} takes no key {_short(key)}: it takes {known}"
-            )  # fmt: skip
+            text = f"{name} takes no key {_short(key)}: it takes {known}"
+            raise RequestError(ErrorCode.BAD_REQUEST, text)
     values: dict[str, Any] = {}
     for key, parameter in action.parameters.items():
         if key not in message:

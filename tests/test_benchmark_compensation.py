@@ -30,7 +30,7 @@ def test_every_case_costs_something() -> None:
     shown = io.StringIO()
     found = compensation.measure_compensation(SETUP, Console(file=shown, width=100))
     assert next(iter(found)) == "decoding"
-    assert len(found) == 4
+    assert len(found) == 7
     for name, cost in found.items():
         assert 0.0 < cost["50"] <= cost["99"]
         assert name in shown.getvalue()

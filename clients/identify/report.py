@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from clients.identify.stationary_periods import StationaryPeriod, StationaryPeriods
-from ft_compensation.identification.payload import Identified
+from ft_compensation.identification.judgement import Fit
+from ft_compensation.identification.payload import Identified, OffsetFit
 from ft_compensation.identification.poses import Pose
 from ft_compensation.quantities import Wrench
 
@@ -34,7 +35,7 @@ def show_poses(
 
 
 def show_result(console: Console, result: Identified) -> None:
-    """The ten parameters with their intervals, and notes."""
+    """The parameters with their intervals, and notes."""
     table = Table(title="payload and bias", title_justify="left")
     table.add_column("")
     table.add_column("value", justify="right")
@@ -44,9 +45,14 @@ def show_result(console: Console, result: Identified) -> None:
     for axis, value, interval in zip("xyz", result.payload.center, result.centre_interval, strict=True):
         table.add_row(f"center of gravity {axis}", f"{1000 * value:.2f}", f"{1000 * interval:.2f}", "mm")
     _add_bias(table, result.bias, result.bias_interval)
+    if (fit := result.accelerometer) is not None:
+        for axis, value, half in zip("xyz", fit.calibration.offset, fit.offset_interval, strict=True):
+            table.add_row(f"accelerometer offset {axis}", f"{value:.3f}", f"{half:.3f}", "m/s²")
+        for axis, value, half in zip("xyz", fit.calibration.scale, fit.scale_interval, strict=True):
+            table.add_row(f"accelerometer scale {axis}", f"{value:.4f}", f"{half:.4f}", "")
     console.print(table)
     console.print(
-        f"residual: {result.force_rms:.3g} N, {result.torque_rms:.3g} Nm; condition number "
+        f"residual: {_fit(result.force_fit, 'N')}, {_fit(result.torque_fit, 'Nm')}; condition number "
         f"{result.condition:.2f} (1.2 is ideal)"
     )
     for note in result.notes:
@@ -87,11 +93,30 @@ def as_json(
         "confidence": result.confidence,
         "force_rms": result.force_rms,
         "torque_rms": result.torque_rms,
+        "force_fit": result.force_fit._asdict(),
+        "torque_fit": result.torque_fit._asdict(),
+        "accelerometer": _accelerometer(result.accelerometer),
         "condition": result.condition,
         "gravity": result.gravity,
         "notes": list(result.notes),
         "poses": rows,
         "rejected": list(found.rejected),
+    }
+
+
+def _fit(fit: Fit, unit: str) -> str:
+    times = "" if fit.chi_square is None else f", {fit.chi_square**0.5:.1f} times the noise"
+    return f"{fit.rms:.3g} {unit} ({fit.verdict}{times})"
+
+
+def _accelerometer(fit: OffsetFit | None) -> dict[str, Any] | None:
+    if fit is None:
+        return None
+    return {
+        **fit.calibration._asdict(),
+        "offset_interval": fit.offset_interval,
+        "scale_interval": fit.scale_interval,
+        "undetermined": fit.undetermined,
     }
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 from protocol.framing import DataFlag, DataMessage
@@ -66,11 +66,11 @@ class Topic(NamedTuple):
     name: str
     schema: str
     pack: Callable[[int, Sample], bytes | None]
-    """The message of a stamp (ns since 1970) and a sample; None if a value is not finite."""
+    """The message of a stamp (ns since 1970) and a sample; None if a value is not finite, or not there."""
 
 
 class RosTopics:
-    """The topics of one sensor: `wrench`, `imu/data_raw` and `temperature` in a namespace."""
+    """The topics of one sensor: `wrench`, `imu/data_raw`, `imu/data` and `temperature` in a namespace."""
 
     def __init__(self, namespace: str = "", imu_units: ImuUnits = ImuUnits.G_DPS) -> None:
         """Without a namespace names and frames are the node's own; with one the frames begin with it too."""
@@ -81,7 +81,8 @@ class RosTopics:
         self._temperature = _Packer(frame, 2)
         self.topics = (
             Topic(f"{head}/wrench", WRENCH, self._pack_wrench),
-            Topic(f"{head}/imu/data_raw", IMU, self._pack_imu),
+            Topic(f"{head}/imu/data_raw", IMU, self._pack_raw_imu),
+            Topic(f"{head}/imu/data", IMU, self._pack_imu),
             Topic(f"{head}/temperature", TEMPERATURE, self._pack_temperature),
         )
 
@@ -98,8 +99,15 @@ class RosTopics:
     def _pack_wrench(self, stamp_ns: int, sample: Sample) -> bytes | None:
         return self._wrench.pack(stamp_ns, *sample.force, *sample.torque)
 
+    def _pack_raw_imu(self, stamp_ns: int, sample: Sample) -> bytes | None:
+        return self._pack_oriented(stamp_ns, sample, _NO_ORIENTATION)
+
     def _pack_imu(self, stamp_ns: int, sample: Sample) -> bytes | None:
-        orientation = _NO_ORIENTATION if sample.orientation is None else (*sample.orientation, *_UNKNOWN)
+        if sample.orientation is None:
+            return None
+        return self._pack_oriented(stamp_ns, sample, (*sample.orientation, *_UNKNOWN))
+
+    def _pack_oriented(self, stamp_ns: int, sample: Sample, orientation: Sequence[float]) -> bytes | None:
         return self._imu.pack(
             stamp_ns, *orientation, *sample.angular_rate, *_UNKNOWN, *sample.acceleration, *_UNKNOWN
         )

@@ -21,8 +21,6 @@ from ethercat_server.acquisition.timing.schedule import Schedule
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
-_SERVE_MARGIN_NS: Final = 80_000
-"""Sockets are not served this shortly before a deadline: select may wake late."""
 _SERVE_EVERY_NS: Final = 10_000_000
 """Sockets are served this often even if every deadline has passed."""
 _SERVE_IN_FLIGHT_NS: Final = 2_000_000
@@ -123,14 +121,15 @@ class Cycle:
             now = monotonic_ns()
             if not timing.in_flight:
                 if due > now or now > serve_by:
-                    hub.serve(due - _SERVE_MARGIN_NS)
+                    hub.serve(due)
                     serve_by = now + _SERVE_EVERY_NS
+                    if (left := due - monotonic_ns()) > 0:  # the outlet had nothing to wait for
+                        sleep(left * 1e-9)
+                    if due > now:
+                        self._woke(monotonic_ns() - due)
             elif now > serve_by:
                 hub.serve(now)
                 serve_by = now + _SERVE_IN_FLIGHT_NS
-            if not self._bus.process_data.in_flight and (left := due - monotonic_ns()) > 0:
-                sleep(left * 1e-9)
-                self._woke(monotonic_ns() - due)
             self._answered = False
             self._step(due, (now if timing.in_flight else due) + _SERVE_EVERY_NS)
             now = monotonic_ns()
@@ -189,8 +188,10 @@ class Cycle:
         for stream in self._streams:
             if now >= stream.idle_at_ns and (made := stream.idle(now)):
                 self._hub.publish(made[0], stream.number, made[1], now)
-        if frame is None and (wait := min(self._due_ns(), until_ns) - monotonic_ns()) > 0:
-            return self._receive(wait)
+        if frame is None:
+            most = int(timing.patience_ns) if self._schedule.one_by_one else self._due_ns() - monotonic_ns()
+            if (wait := min(most, until_ns - now)) > 0:
+                return self._receive(wait)
         return frame
 
     def _receive(self, wait: int) -> bytes | None:
@@ -227,7 +228,8 @@ class Cycle:
             elif made := stream.take(data, wkc, sent, back):
                 self._hub.publish(made[0], number, made[1], back)
         for stream in self._streams_of[which]:
-            stream.learn()
+            if stream.learns:
+                stream.learn()
 
     def _roll(self) -> None:
         """Once a second."""

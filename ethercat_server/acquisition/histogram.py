@@ -42,7 +42,8 @@ class Distribution:
             self._counts[duration_ns] += 1
         else:
             # The leading bit is implied: what is left of the top six bits numbers the step.
-            self._counts[min((shift << _STEPS_BITS) + (duration_ns >> shift), _LAST_BUCKET)] += 1
+            bucket = (shift << _STEPS_BITS) + (duration_ns >> shift)
+            self._counts[bucket if bucket < _LAST_BUCKET else _LAST_BUCKET] += 1
 
     def add(self, other: Distribution) -> None:
         """Count everything that `other` has counted."""

@@ -167,10 +167,10 @@ def _tell_offset(sdo: Sdo, sensor: Sensor) -> None:
         offset = finish(read_offset(sdo), clock=sdo.clock)
     except SdoAbortError:
         return
+    sensor.offset = offset
     rows = [dictionary.BY_ADDRESS[dictionary.FORCE_TORQUE_OFFSET, sub] for sub in range(1, 7)]
     texts = [f"{row.name} {value:g} {row.unit}" for row, value in zip(rows, offset, strict=True) if value]
     if texts:
-        sensor.offset = offset
         log.info("sensor %d has a tare in force (saved or not): %s", sensor.number, ", ".join(texts))
 
 

@@ -49,7 +49,7 @@ class SensorStream:
         self.health = SampleHealth(number)
         self._discard = DISCARDED_AT_START
         self._gap = False
-        self._learns = False
+        self.learns = False
         """Whether `learn` has something to do."""
         self._seen = (0, 0, False)
         """The last exchange, as `learn` needs it: sent, back, fresh."""
@@ -63,9 +63,10 @@ class SensorStream:
         """`idle` is to be called from then on."""
 
     def take(self, data: bytes, wkc: int, sent_ns: int, back_ns: int) -> tuple[bytes, int] | None:
-        """The frame that a valid exchange gives, and its flags; None if it gives none. `learn` must follow.
+        """The frame that a valid exchange gives, and its flags; None if it gives none.
 
-        `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the exchange.
+        `learn` must follow if `learns`. `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the
+        exchange.
         """
         clock = self.clock
         if sent_ns < self._seen[0]:  # overtaken
@@ -73,7 +74,7 @@ class SensorStream:
         fresh = data != self.process_data
         self._seen = sent_ns, back_ns, fresh
         self._wkc, self._valid_ns = wkc, back_ns
-        self._learns = True
+        self.learns = True
         if not fresh:
             return None
         self.process_data = data
@@ -93,9 +94,7 @@ class SensorStream:
 
     def learn(self) -> None:
         """What the last exchange teaches, which can wait until its frame is on its way."""
-        if not self._learns:
-            return
-        self._learns = False
+        self.learns = False
         sent_ns, back_ns, fresh = self._seen
         locked = self.clock.locked
         self.clock.observe(sent_ns, back_ns, fresh)

@@ -76,16 +76,25 @@ class Bus(Datagrams):
         """Read from the FMMUs which logical addresses are whose process data."""
         areas: list[list[Area]] = []
         self.fmmus = []
+        lrw = not any(self._features(number) & reg.NO_LRW for number in range(len(self.stations)))
         for number in range(len(self.stations)):
             count = min(self.read_surely(number, reg.FMMU_AND_SM_COUNT, 2)[0], reg.MOST_FMMUS)
             self.fmmus.append(self.read_surely(number, reg.FMMU, count * reg.FMMU_SIZE))
             rows = (reg.FMMU_LAYOUT.unpack_from(self.fmmus[-1], at * reg.FMMU_SIZE) for at in range(count))
             areas.append([Area(row[0], row[0] + row[1], row[6]) for row in rows if row[7] & 1])
             kinds = {area.kind for area in areas[-1]}
-            if kinds != self._kinds(number) or reg.FMMU_READ not in kinds or not fit_a_frame(areas[-1]):
+            if (
+                kinds != self._kinds(number)
+                or reg.FMMU_READ not in kinds
+                or not fit_a_frame(areas[-1], lrw=lrw)
+            ):
                 # SOEM writes them once, and does not look whether that worked.
                 raise SetUpError(f"sensor {number} did not answer when it was mapped: check cable and power")
-        self.process_data = ProcessData(areas, self.backend)
+        self.process_data = ProcessData(areas, self.backend, lrw=lrw)
+
+    def _features(self, number: int) -> int:
+        """What the slave controller of a sensor can do."""
+        return int(_U16.unpack(self.read_surely(number, reg.FEATURES, 2))[0])
 
     def _kinds(self, number: int) -> set[int]:
         """What a sensor has according to its sync managers: inputs, outputs, or both."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -95,7 +96,7 @@ class Sensor:
     meaning: dict[str, str] = field(default_factory=dict)
     """What each of them means. Kept, so that telling it takes no time from the samples."""
     offset: tuple[float, ...] | None = None
-    """The force/torque offset that was set while streaming; written again when the sensor has lost it."""
+    """The force/torque offset in force; written again when the sensor has lost it. None: it has none."""
     sinc_guessed: bool = False
     """The SINC length is a guess from a rate that CHOP may have divided: not to be written for no reason."""
     settled_at: Deadline | None = None
@@ -137,9 +138,15 @@ class Sensor:
             name: value_meaning(name, value, self.rate_hz, chop) for name, value in settings.items()
         }
 
+    @property
+    def told_offset(self) -> list[float] | None:
+        """The force/torque offset as messages carry it; None if it is not known, or no numbers."""
+        offset = self.offset
+        return list(offset) if offset is not None and all(map(math.isfinite, offset)) else None
+
     def in_force(self) -> dict[str, Any]:
         """What replies and events say of a change."""
-        return {"settings": dict(self.settings), "rate_hz": self.rate_hz}
+        return {"settings": dict(self.settings), "rate_hz": self.rate_hz, "offset": self.told_offset}
 
     def describe(self) -> dict[str, Any]:
         """The sensor's part of the `describe` reply."""
@@ -156,6 +163,7 @@ class Sensor:
             "settling": self.settling,
             "settings": self.settings,
             "meaning": self.meaning,
+            "offset": self.told_offset,
         }
 
 

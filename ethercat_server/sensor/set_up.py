@@ -68,8 +68,7 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
             "sensor %d held %s: what is wanted was written and verified", sensor.number, ", ".join(texts)
         )
     yield from read_settings(sdo, sensor)
-    if sensor.offset is not None:
-        yield from write_offset(sdo, sensor.offset)
+    yield from _restore_offset(sdo, sensor)
     sensor.unsettled = False
 
 
@@ -81,8 +80,7 @@ def put_right(sdo: Sdo, sensor: Sensor) -> Steps[None]:
         entry = dictionary.BY_SETTING[name]
         if (yield from _read(sdo, entry.address)) != entry.encode_setting(sensor.wanted[name]):
             yield from write_setting(sdo, sensor, name)
-    if sensor.offset is not None:
-        yield from write_offset(sdo, sensor.offset)
+    yield from _restore_offset(sdo, sensor)
     yield from read_settings(sdo, sensor)
     sensor.unsettled = False
 
@@ -135,6 +133,11 @@ def read_offset(sdo: Sdo) -> Steps[tuple[float, ...]]:
     return tuple(found)
 
 
+def _restore_offset(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+    if sensor.offset is not None and (yield from read_offset(sdo)) != sensor.offset:
+        yield from write_offset(sdo, sensor.offset)
+
+
 def pack_offset(offset: Sequence[float]) -> list[bytes]:
     """The six offsets as REAL32; ValueError if one is too large."""
     try:
@@ -145,12 +148,16 @@ def pack_offset(offset: Sequence[float]) -> list[bytes]:
         raise ValueError(f"{max(offset, key=abs):g} is larger than a REAL32 can be") from None
 
 
-def write_offset(sdo: Sdo, offset: Sequence[float]) -> Steps[None]:
-    """Write the six offsets and verify them; BusError if one does not take."""
+def write_offset(sdo: Sdo, offset: Sequence[float]) -> Steps[tuple[float, ...]]:
+    """Write the six offsets and verify them; returns them as REAL32. BusError if one does not take."""
+    held = []
     for address, value, data in zip(_OFFSETS, offset, pack_offset(offset), strict=True):
+        entry = dictionary.BY_ADDRESS[address]
         yield from sdo.write(*address, data)
         if (yield from sdo.read(*address)) != data:
-            raise BusError(f"the offset {dictionary.BY_ADDRESS[address].name} = {value:g} did not take")
+            raise BusError(f"the offset {entry.name} = {value:g} did not take")
+        held.append(float(entry.type.unpack(data)))
+    return tuple(held)
 
 
 def _divisor(sdo: Sdo, sensor: Sensor) -> Steps[int | None]:

@@ -2,17 +2,18 @@
 
 The sensor adds its offset to what it measures, so new = target - mean + current.
 
-An offset that makes an axis worse is taken back: one that is afterwards further from its target than
-before, by more than five standard errors of the difference of the two means. The standard error of a mean
-is the larger of two estimates: from single samples, and from the means of eight parts of its window, which
-covers noise that the sensor's filters have correlated.
+An offset is taken back if an axis is then off target by more than STEADY and what noise explains: the load
+moved. So is one that makes an axis worse: further from its target than before, by more than five standard
+errors of the difference of the two means. The standard error of a mean is the larger of two estimates: from
+single samples, and from the means of eight parts of its window, which covers noise that the sensor's filters
+have correlated.
 """
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
 from ethercat_server.errors import BusError, CutOffError, extended
@@ -37,6 +38,8 @@ _REST_TORQUE_NM: Final = 0.05
 _REST_RATE_DPS: Final = 3.0
 """Limits of the standard deviation for a stationary sensor, above Bota's own limits for a healthy one."""
 _LIMITS: Final = (_REST_FORCE_N,) * 3 + (_REST_TORQUE_NM,) * 3 + (_REST_RATE_DPS,) * 3
+_STEADY: Final = (0.3,) * 3 + (0.01,) * 3
+"""N and Nm: what a mean may move within a window, and be off target after a tare, beyond noise."""
 _UNITS: Final = ("N",) * 3 + ("Nm",) * 3 + ("deg/s",) * 3
 _REST_TURN_DPS: Final = math.degrees(0.5)
 """Length of the mean angular rate: beyond it a robot is plainly moving. The residual tells what a slower turn
@@ -64,12 +67,17 @@ class Samples(Protocol):
 
 
 def tare(
-    sdo: Sdo, sensor: Sensor, stream: Samples, samples: int, target: Sequence[float]
+    sdo: Sdo,
+    sensor: Sensor,
+    stream: Samples,
+    samples: int,
+    target: Sequence[float],
+    on_offset: Callable[[Sensor], object] = lambda _: None,
 ) -> Steps[dict[str, Any]]:
     """Steps of the action `tare`; returns what its reply carries. RequestError if the sensor is not at rest,
-    or cannot hold the offset, or if that makes an axis worse.
+    or cannot hold the offset, or if an axis is off target afterwards or worse than before.
 
-    If it fails half-way the old offset is put back.
+    If it fails half-way the old offset is put back. `on_offset` hears of either at once.
     """
     _check_fits(target, "the key 'target'")
     samples = max(samples, LEAST_SAMPLES)
@@ -81,13 +89,15 @@ def tare(
     new = tuple(t - m + o for t, m, o in zip(target, before.mean[:6], old, strict=True))
     _check_fits(new, "the offset that the key 'target' asks for")
     try:
-        yield from write_offset(sdo, new)
+        new = sensor.offset = yield from write_offset(sdo, new)
+        on_offset(sensor)
         yield from _wait(sdo.clock, sensor, stream, SETTLING_SAMPLES)
         after = yield from _average(sdo.clock, sensor, stream, samples)
-        _check_better(sensor, before, after, target)
+        _check_better(sensor, before, after, samples, target)
     except (BusError, RequestError) as error:
-        raise (yield from _take_back(sdo, sensor, old, error)) from None
-    sensor.offset = new
+        failed = yield from _take_back(sdo, sensor, old, error)
+        on_offset(sensor)
+        raise failed from None
     return {
         "old_offset": list(old),
         "new_offset": list(new),
@@ -113,7 +123,7 @@ def _take_back(
         addition = LATER
     else:
         try:
-            yield from write_offset(sdo, old)
+            sensor.offset = yield from write_offset(sdo, old)
         except BusError as worse:
             sensor.offset, sensor.unsettled = old, True
             addition = f"; restoring the former offset failed too: {worse}; tare it again"
@@ -226,32 +236,39 @@ def _check_rest(sensor: Sensor, found: _Window) -> None:
             raise _not_at_rest(
                 sensor, f"{name} varies by {deviation:.3g} {unit} (standard deviation; at most {limit:g})"
             )
-    # The means of the two halves may lie as far apart as single samples, and what noise explains.
-    changes = zip(_NAMES[:6], found.change[:6], found.by_chance[:6], _LIMITS[:6], _UNITS[:6], strict=True)
+    changes = zip(_NAMES[:6], found.change[:6], found.by_chance[:6], _STEADY, _UNITS[:6], strict=True)
     for name, change, by_chance, limit, unit in changes:
         if change > limit + by_chance:
             text = f"{name} changes by {change:.3g} {unit} (mean; at most {limit + by_chance:.3g})"
             raise _not_at_rest(sensor, text)
 
 
-def _check_better(sensor: Sensor, before: _Window, after: _Window, target: Sequence[float]) -> None:
-    """RequestError if an axis is further from its target than before, and noise does not explain it."""
+def _check_better(
+    sensor: Sensor, before: _Window, after: _Window, samples: int, target: Sequence[float]
+) -> None:
+    """RequestError if an axis is off target or further from it than before, and noise does not explain it."""
     worst, text = 0.0, ""
-    for n, (name, wanted, limit) in enumerate(zip(_NAMES[:6], target, _LIMITS[:6], strict=True)):
+    for n, (name, wanted, limit) in enumerate(zip(_NAMES[:6], target, _STEADY, strict=True)):
         was, now = before.mean[n] - wanted, after.mean[n] - wanted
         allowed = _BY_CHANCE * math.hypot(before.error[n], after.error[n])
         allowed += _ROUNDING * max(1.0, abs(wanted), abs(before.mean[n]))
-        worse = (abs(now) - abs(was) - allowed) / limit  # so that N and Nm compare
-        if worse > worst:
+        worse = abs(now) - abs(was) - allowed
+        # Of single samples: a load that moves correlates the means of the parts.
+        alone = math.hypot(before.deviation[n], after.deviation[n]) / math.sqrt(samples)
+        off = abs(now) - limit - _BY_CHANCE * alone
+        excess = max(worse, off) / limit  # so that N and Nm compare
+        if excess > worst:
+            did = (
+                f"the tare made sensor {sensor.number} worse"
+                if worse > 0
+                else f"the load of sensor {sensor.number} moved during the tare"
+            )
             worst, text = (
-                worse,
-                f"{name} is {now:.3g} {_UNITS[n]} off target after it and was {was:.3g} before",
+                excess,
+                f"{did}: {name} is {now:.3g} {_UNITS[n]} off target after it and was {was:.3g} before",
             )
     if text:
-        raise RequestError(
-            ErrorCode.NOT_READY,
-            f"the tare made sensor {sensor.number} worse: {text}: keep its load still and tare again",
-        )
+        raise RequestError(ErrorCode.NOT_READY, f"{text}: keep its load still and tare again")
 
 
 def _not_at_rest(sensor: Sensor, why: str) -> RequestError:

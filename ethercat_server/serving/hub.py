@@ -27,7 +27,7 @@ _PAUSE_RATIO: Final = 9
 """Clients get at most a tenth of this thread's time, however much they ask."""
 _LONGEST_PAUSE_NS: Final = 20_000_000
 """A pass that took long because this thread was not running must not silence all clients."""
-_REQUEST_NS: Final = 200_000
+_REQUEST_NS: Final = 280_000
 """No request is begun this shortly before a deadline; a usual one takes less."""
 _MAX_ACCEPTS: Final = 2
 """Clients accepted in one pass."""

@@ -142,10 +142,12 @@ class SensorActions:
         data = bytes_to_write(values)
 
         def steps() -> Steps[Mapping[str, Any]]:
-            before = sensor.settings
+            before, offset = sensor.settings, sensor.offset
             written = yield from write(sdo, sensor, values["index"], values["subindex"], data)
             if sensor.settings != before:
                 self._announce_change(sensor)
+            if sensor.offset != offset:
+                self._announce_offset(sensor)
             return written
 
         self._start(connection, request, steps())
@@ -154,7 +156,8 @@ class SensorActions:
         values = request.values
         sensor = self.sensors[values["sensor"]]
         stream, sdo = self._streams[sensor.number], self._recovery.sdo(sensor.number)
-        steps = tare(sdo, sensor, stream, values["samples"], values["target"])
+        samples, target = values["samples"], values["target"]
+        steps = tare(sdo, sensor, stream, samples, target, self._announce_offset)
         self._start_change(sensor.number, steps, self._answering(connection, request))
 
     def _configure(self, connection: Connection, request: Request) -> None:
@@ -199,6 +202,9 @@ class SensorActions:
 
     def _announce_change(self, sensor: Sensor) -> None:
         self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.number, **sensor.in_force()))
+
+    def _announce_offset(self, sensor: Sensor) -> None:
+        self._hub.broadcast(event(Event.OFFSET_CHANGED, sensor=sensor.number, offset=sensor.told_offset))
 
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
         if save_too:

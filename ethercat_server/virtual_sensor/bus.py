@@ -154,9 +154,10 @@ class Bus:
             self.frames_lost += 1
             return False
         position = self._damaged_at()
-        for life in self._alive[:position]:
-            for datagram in datagrams:
-                execute(life.esc, frame, datagram)
+        for datagram in datagrams:
+            if datagram.command:  # a NOP passes unchanged
+                for life in self._alive[:position]:
+                    execute(life.esc, frame, datagram)
         if position is not None:  # the network card of the master throws it away
             self.frames_lost += 1
             return False

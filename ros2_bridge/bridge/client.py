@@ -1,7 +1,7 @@
 """The program `ros2 run bridge client`, on PATH as `bridge-client`: arguments, signals, exit codes.
 
 Exit codes: 0 ended as asked (SIGINT, SIGTERM, supervisor), 1 could not start or failed, 2 wrong arguments or
-parameters.
+parameters, 3 ended as the supervisor asked, but the server refused to shut down.
 Everything of ROS is imported only after the signals are in hand, so that Ctrl-C is never a traceback.
 """
 

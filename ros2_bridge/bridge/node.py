@@ -7,13 +7,14 @@ several nodes in one process.
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable, Sequence
-from typing import Self
+from typing import Final, Self
 
 import rclpy
 from diagnostic_msgs.msg import KeyValue
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.exceptions import InvalidTopicNameException, ParameterException
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
@@ -22,22 +23,26 @@ from rclpy.utilities import remove_ros_args
 from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics.monitor import Monitor
-from bridge.parameters.declare import declare
+from bridge.parameters.declare import declare, warn_of_others
+from bridge.parameters.live import LiveParameters
 from bridge.parameters.row import ParameterError
 from bridge.parameters.sensor_settings import SettingsParameters
-from bridge.publishing.compensated_wrench import CompensatedOutput
-from bridge.publishing.messages import make, make_stages
+from bridge.parameters.table import Parameters
+from bridge.publishing.topics import make, make_compensated
 from bridge.services.bias import BiasServices
 from bridge.services.identify import IdentifyServices
 from bridge.services.sensor import Services
 from bridge.signals import call_on_stop_signal
-from bridge.spinning import Spinner
+from bridge.spinning import OrdinaryExecutor, PromptExecutor, Spinner
 from bridge.stream.connection import Connection
 from bridge.stream.reader import Reader
-from bridge.stream.requests import Requests
+from bridge.stream.requests import RefusedError, RequestFailedError, Requests
 
 SUPERVISOR_TOPIC = "/supervisor_status_data"
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
+SERVER_GOES_ON: Final = 3
+"""Exit code: the supervisor stopped the node, but the server refused to shut down."""
+_ENDS_WITHIN_S: Final = 5.0
 
 
 class StartError(Exception):
@@ -60,32 +65,37 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
         parameters = declare(self)
-        compensated = CompensatedOutput(make_stages(self, parameters.frame_id))
+        compensated = make_compensated(self, parameters, lambda: self.reader.link.rate_hz)
         outputs = make(self, parameters, compensated)
         self.reader = Reader(
-            parameters, outputs, self.get_logger(), self._fail, connect=self.connect, clock=self.clock
+            parameters, outputs, self.get_logger(), self.fail, connect=self.connect, clock=self.clock
         )
         link = self.reader.link
         # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
         self.requests = Requests(parameters, link)
         self.sensor_settings = SettingsParameters(self, link, self.requests)
+        live = LiveParameters(self)
         self.compensation = CompensationControl(
-            self, parameters, compensated, link, lambda: self.reader.not_finite, self._fail
+            self, parameters, compensated, link, self.reader.watch, live, lambda: self.reader.not_finite
         )
         self.monitor = Monitor(
-            self, parameters.thresholds, self.reader, self.compensation.state, outputs, self._fail
+            self, parameters.thresholds, self.reader, self.compensation.state, outputs, self.fail
         )
         self.triggers = (
             Services(self, link, self.requests, self.sensor_settings, self.compensation.after_sensor_tare),
             BiasServices(self, self.compensation, self.requests),
             IdentifyServices(self, self.compensation, self.requests),
         )
+        live.listeners.append(self._apply)
+        self._outputs = outputs
+        warn_of_others(self)
         link.on_change = self._on_link_change
         self.create_subscription(
             KeyValue,
             SUPERVISOR_TOPIC,
             self._on_supervisor,
             10,
+            callback_group=MutuallyExclusiveCallbackGroup(),  # it is heard while a service waits
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
@@ -104,6 +114,11 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
             ) from None
         return node
 
+    def _apply(self, parameters: Parameters) -> None:
+        self.monitor.thresholds = parameters.thresholds
+        self.reader.limit_rate(parameters.publishing_frequency)
+        self._outputs.configure(parameters)
+
     def _on_link_change(self) -> None:
         self.compensation.link_changed()
         self.sensor_settings.changed()
@@ -116,7 +131,8 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.requests.cancel()
         self.compensation.cancel()
 
-    def _fail(self, reason: str) -> None:
+    def fail(self, reason: str) -> None:
+        """End the node with exit code 1, from any thread."""
         self.get_logger().error(reason)
         self.finish(1)
 
@@ -124,7 +140,13 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         if message.key != SUPERVISOR_KEY or message.value != SUPERVISOR_STOP or self.exit_code is not None:
             return
         self.get_logger().info("the supervisor stops the force/torque sensors")
-        self.get_logger().info(self.requests.shut_server_down())
+        try:
+            self.get_logger().info(self.requests.shut_server_down())
+        except RefusedError as error:
+            self.get_logger().error(str(error))
+            self.finish(SERVER_GOES_ON)
+        except RequestFailedError as error:
+            self.get_logger().warning(str(error))
         self.finish(0)
 
 
@@ -138,7 +160,7 @@ def run(arguments: Sequence[str]) -> int:
     except Exception as error:  # noqa: BLE001 - rclpy raises several unrelated ones, most about arguments
         # rclpy has no public names for these.
         wrong_arguments = type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
-        return _refuse(f"ROS cannot start: {' '.join(str(error).split())}", 2 if wrong_arguments else 1)
+        return _refuse(f"ROS cannot start: {why_not_started(error)}", 2 if wrong_arguments else 1)
     try:
         node = BridgeNode.create()
         call_on_stop_signal(lambda _signal: node.finish(0))
@@ -151,10 +173,19 @@ def run(arguments: Sequence[str]) -> int:
 
 def spin(node: BridgeNode) -> int:
     """Run the node until it is told to finish, and destroy it; returns its exit code."""
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    spinner = Spinner(executor)
+    prompt = PromptExecutor(node)
+    executor = OrdinaryExecutor(node, prompt)
+    spinner, prompt_spinner = Spinner(executor), Spinner(prompt)
     node.on_finish = spinner.stop
+
+    def run_prompt() -> None:
+        try:
+            prompt_spinner.run()
+        except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a deaf node
+            node.fail(f"the node no longer listens: {type(error).__name__}: {error}")
+
+    listening = threading.Thread(target=run_prompt, name="listening", daemon=True)
+    listening.start()
     node.reader.start()
     node.monitor.start()
     try:
@@ -163,11 +194,23 @@ def spin(node: BridgeNode) -> int:
         spinner.run()
         return node.exit_code or 0
     finally:
-        stopped = node.monitor.stop() & node.reader.stop() & node.compensation.close()
-        if not stopped:
+        prompt_spinner.stop()
+        listening.join(_ENDS_WITHIN_S)
+        if not (node.monitor.stop() & node.reader.stop()) or listening.is_alive():
             node.get_logger().error("a thread did not end in time")
+        else:
+            prompt.shutdown()
+        node.compensation.close()
         executor.shutdown()
         node.destroy_node()
+
+
+def why_not_started(error: Exception) -> str:
+    """What rclpy says of it, and what to do where it does not say that."""
+    text = " ".join(str(error).split())
+    if "logging directory" in text:
+        text += "; set HOME, or ROS_LOG_DIR to a directory for its log"
+    return text
 
 
 def _refuse(text: str, exit_code: int) -> int:

@@ -6,6 +6,7 @@ gravity compensation and the bias holds in every pose.
 
 from __future__ import annotations
 
+import threading
 from typing import Final, NamedTuple
 
 from ft_compensation.compensator import Compensator
@@ -25,14 +26,16 @@ GRAVITY_TOLERANCE: Final = 0.5
 """m/s²: how much a stationary accelerometer may differ from g."""
 
 
-def gravity_of(acceleration: Vector3, magnitude: float = STANDARD_GRAVITY) -> Vector3:
+def gravity_of(
+    acceleration: Vector3, magnitude: float = STANDARD_GRAVITY, tolerance: float = GRAVITY_TOLERANCE
+) -> Vector3:
     """Gravity in the sensor's frame, m/s², from what the stationary accelerometer reads.
 
     Only the direction is taken from it; `magnitude` is the length. CompensationError if it reads nothing
-    like g.
+    like g: by more than `tolerance`, m/s².
     """
     measured = length(acceleration)
-    if abs(measured - magnitude) > GRAVITY_TOLERANCE:
+    if abs(measured - magnitude) > tolerance:
         raise CompensationError(
             f"the stationary accelerometer reads {measured:.2f} m/s² where {magnitude:.2f} should be: check "
             "imu_raw_units, the IMU's settings and its offset"
@@ -84,7 +87,7 @@ class _Course(NamedTuple):
 class BiasRamp:
     """The applied bias: moves linearly from the old to the new one; the last change can be undone.
 
-    Times are of the samples, s on any one clock. `at` may run in one thread while another calls `go`.
+    Times are of the samples, s on any one clock. `at` may run in one thread while others change it.
     """
 
     def __init__(self, bias: Wrench = NO_WRENCH, seconds: float = 0.0) -> None:
@@ -92,6 +95,7 @@ class BiasRamp:
         self.seconds = seconds
         self._course = _Course(bias, bias, 0.0, 0.0)
         self._before: Wrench | None = None
+        self._lock = threading.RLock()
 
     @property
     def target(self) -> Wrench:
@@ -100,17 +104,27 @@ class BiasRamp:
 
     def go(self, target: Wrench, now_s: float) -> None:
         """From the bias of `now_s` (the newest sample's time) to `target`."""
-        self._before = self.target
-        self._course = _Course(self.at(now_s), target, now_s, self.seconds)
+        with self._lock:
+            self._before = self.target
+            self._course = _Course(self.at(now_s), target, now_s, self.seconds)
+
+    def shift(self, change: Wrench) -> None:
+        """At once, whatever it is and was: the sensor itself adds so much more from here on."""
+        with self._lock:
+            start, target, begin_s, seconds = self._course
+            self._course = _Course(start.plus(change), target.plus(change), begin_s, seconds)
+            if self._before is not None:
+                self._before = self._before.plus(change)
 
     def undo(self, now_s: float) -> Wrench:
         """Go back to the target before the last `go` and return it. CompensationError if there is none."""
-        before = self._before
-        if before is None:
-            raise CompensationError("there is no change of the bias to undo")
-        self.go(before, now_s)
-        self._before = None
-        return before
+        with self._lock:
+            before = self._before
+            if before is None:
+                raise CompensationError("there is no change of the bias to undo")
+            self.go(before, now_s)
+            self._before = None
+            return before
 
     def arrived(self, now_s: float) -> bool:
         """Whether the bias of `now_s` is the target."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ft_compensation.quantities import NO_PAYLOAD, NO_WRENCH, ZERO, Payload, Wrench
+from ft_compensation.quantities import EXACT, NO_PAYLOAD, NO_WRENCH, ZERO, Accelerometer, Payload, Wrench
 from protocol.pdo import Vector3
 
 
@@ -40,10 +40,14 @@ class Compensator:
         *,
         inertia: bool = False,
         imu_position: Vector3 = ZERO,
+        accelerometer: Accelerometer = EXACT,
     ) -> None:
-        """`inertia` switches the inertial term on; `imu_position` is the IMU's, m from the wrench origin."""
+        """`inertia` switches the inertial term on, which uses the last two.
+
+        `imu_position` is the IMU's, m from the wrench origin, `accelerometer` corrects what it reads.
+        """
         self.payload, self.bias = payload, bias
-        self.inertia, self.imu_position = inertia, imu_position
+        self.inertia, self.imu_position, self.accelerometer = inertia, imu_position, accelerometer
 
     def set_bias(self, bias: Wrench) -> None:
         """From the next sample on this is subtracted."""
@@ -79,6 +83,7 @@ class Compensator:
         left = Wrench((fx - gfx, fy - gfy, fz - gfz), (mx - gmx, my - gmy, mz - gmz))
         if not self.inertia:
             return Stages(bias, corrected, weight, NO_WRENCH, left)
+        acceleration = self.accelerometer.correct(acceleration)
         wx, wy, wz = angular_rate
         ix, iy, iz = self.imu_position
         dx, dy, dz = cx - ix, cy - iy, cz - iz

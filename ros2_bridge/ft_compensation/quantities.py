@@ -35,6 +35,10 @@ class Wrench(NamedTuple):
         """Fx Fy Fz (N) Mx My Mz (Nm)."""
         return *self.force, *self.torque
 
+    def plus(self, other: Wrench, times: float = 1.0) -> Wrench:
+        """The sum of this and `times` the other."""
+        return Wrench.of([a + times * b for a, b in zip(self.values, other.values, strict=True)])
+
 
 NO_WRENCH: Final = Wrench(ZERO, ZERO)
 
@@ -57,7 +61,32 @@ class Payload(NamedTuple):
         return cls(kilograms, (x, y, z))
 
 
+AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+
+
+def wrench_text(wrench: Wrench) -> str:
+    """A wrench for people."""
+    numbers = " ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, wrench.values, strict=True))
+    return f"{numbers} (N, Nm)"
+
+
 NO_PAYLOAD: Final = Payload()
+
+
+class Accelerometer(NamedTuple):
+    """What an accelerometer reads: `scale` times the truth, axis by axis, plus `offset`."""
+
+    offset: Vector3 = ZERO
+    """m/s²"""
+    scale: Vector3 = (1.0, 1.0, 1.0)
+
+    def correct(self, acceleration: Vector3) -> Vector3:
+        """The truth, m/s², of what was read."""
+        (x, y, z), (ox, oy, oz), (sx, sy, sz) = acceleration, self.offset, self.scale
+        return (x - ox) / sx, (y - oy) / sy, (z - oz) / sz
+
+
+EXACT: Final = Accelerometer()
 
 
 def length(a: Vector3) -> float:

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ft_compensation.quantities import CompensationError, Wrench
+from ft_compensation.quantities import ZERO, CompensationError, Wrench
 from protocol.framing import DataFlag
 from protocol.pdo import Sample, Vector3
 from protocol.sensor.warnings_register import WarningFlag
@@ -75,6 +75,8 @@ class StationaryMeans(NamedTuple):
     """Nm"""
     samples: int
     seconds: float
+    acceleration_spread: Vector3 = ZERO
+    """m/s²"""
 
 
 class StationaryWindow:
@@ -170,6 +172,7 @@ def stationary_means(rows: NDArray[np.float64], seconds: float, limits: Stationa
         _triple(spread[3:6]),
         len(rows),
         seconds,
+        _triple(spread[6:9]),
     )
 
 

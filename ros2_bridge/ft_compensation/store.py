@@ -33,6 +33,8 @@ class Stored(NamedTuple):
     payload: Payload | None
     saved: str
     """When, ISO 8601 in UTC."""
+    offset: Wrench | None = None
+    """The sensor's own offset, which the bias was taken with; None if it was not known."""
 
 
 def default_directory() -> Path:
@@ -58,7 +60,9 @@ class CompensationStore:
         """The file of the sensor with this serial number."""
         return self.directory / f"sensor-{int(serial)}.json"
 
-    def save(self, serial: int, bias: Wrench, payload: Payload | None = None) -> Path:
+    def save(
+        self, serial: int, bias: Wrench, payload: Payload | None = None, offset: Wrench | None = None
+    ) -> Path:
         """Keep them, in place of what was kept before; returns the file. StoreError if that fails."""
         path = self.path(serial)
         content = {
@@ -71,6 +75,8 @@ class CompensationStore:
         if payload is not None:
             content["tool_mass"] = payload.mass
             content["tool_center_of_gravity"] = list(payload.center)
+        if offset is not None:
+            content["sensor_offset"] = list(offset.values)
         try:
             self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
             _replace(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
@@ -113,12 +119,14 @@ def _parse(data: bytes, serial: int) -> Stored:
         raise _ContentError(f"it belongs to sensor {content.get('serial')!r:.20}, not {serial}")
     try:
         bias = Wrench.of(content.get("bias"))
-        payload = None
+        payload = offset = None
+        if "sensor_offset" in content:
+            offset = Wrench.of(content["sensor_offset"])
         if "tool_mass" in content:
             payload = Payload.of(content["tool_mass"], content.get("tool_center_of_gravity"))
     except ValueError as error:
         raise _ContentError(str(error)) from None
-    return Stored(bias, payload, str(content.get("saved", ""))[:40])
+    return Stored(bias, payload, str(content.get("saved", ""))[:40], offset)
 
 
 def _replace(path: Path, text: str) -> None:

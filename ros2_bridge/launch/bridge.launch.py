@@ -3,6 +3,8 @@
 `ros2 launch bridge bridge.launch.py --show-args` lists the arguments.
 """
 
+from pathlib import Path
+
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -29,6 +31,10 @@ def start_node(context):
     def value(name):
         return LaunchConfiguration(name).perform(context)
 
+    file = Path(value("params_file")).expanduser()
+    if not file.is_file():
+        # launch_ros would warn and start the node with its defaults.
+        raise FileNotFoundError(f"params_file: there is no file {file.absolute()}")
     given = {
         name: ParameterValue(LaunchConfiguration(name), value_type=value_type)
         for name, (value_type, _) in PARAMETERS.items()
@@ -40,7 +46,7 @@ def start_node(context):
             executable="client",
             name="bridge",
             namespace=value("namespace"),
-            parameters=[value("params_file"), *([given] if given else [])],
+            parameters=[file, *([given] if given else [])],
             ros_arguments=["--log-level", value("log_level")] if value("log_level") else [],
             respawn=LaunchConfiguration("respawn"),
             respawn_delay=2.0,

@@ -5,18 +5,14 @@ Whichever of the two ends first, and Ctrl-C, ends both.
 
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, RegisterEventHandler, Shutdown
+from launch.actions import DeclareLaunchArgument, RegisterEventHandler, Shutdown
 from launch.event_handlers import OnProcessExit
-from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.launch_description_sources import load_python_launch_file_as_module
 from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
 
-
-def include(file, **arguments):
-    # A plain path, so that --show-args can look into the file.
-    source = PythonLaunchDescriptionSource(str(Path(__file__).with_name(file)))
-    return IncludeLaunchDescription(source, launch_arguments=arguments.items())
+include = load_python_launch_file_as_module(str(Path(__file__).with_name("include.py")))
 
 
 def generate_launch_description():
@@ -27,7 +23,7 @@ def generate_launch_description():
             DeclareLaunchArgument("server_port", default_value="12001", description="TCP port of the server"),
             RegisterEventHandler(OnProcessExit(on_exit=[Shutdown(reason="one of the two has ended")])),
             # The node first: if launch cannot make sense of its arguments, no server is left behind.
-            include("bridge.launch.py", server_host="localhost", server_port=port),
-            include("virtual_server.launch.py", server_port=port),
+            include.File("bridge.launch.py", server_host="localhost", server_port=port),
+            include.File("virtual_server.launch.py", server_port=port),
         ]
     )

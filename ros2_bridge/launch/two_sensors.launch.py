@@ -5,21 +5,17 @@
 
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.launch_description_sources import load_python_launch_file_as_module
 from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
 
+include = load_python_launch_file_as_module(str(Path(__file__).with_name("include.py")))
+
 # Namespace, in the order of the bus, and the model that stands there if the bus is virtual.
 SENSORS = {"sensone": "BFT-SENS-ECAT-M8", "rokubi": "BFT-ROKS-ECAT-M8"}
-
-
-def include(file, condition=None, **arguments):
-    # A plain path, so that --show-args can look into the file.
-    source = PythonLaunchDescriptionSource(str(Path(__file__).with_name(file)))
-    return IncludeLaunchDescription(source, condition=condition, launch_arguments=arguments.items())
 
 
 def generate_launch_description():
@@ -33,7 +29,7 @@ def generate_launch_description():
             ),
             # The nodes first: if launch cannot make sense of their arguments, no server is left behind.
             *(
-                include(
+                include.File(
                     "bridge.launch.py",
                     server_port=port,
                     namespace=namespace,
@@ -45,7 +41,7 @@ def generate_launch_description():
                 )
                 for position, namespace in enumerate(SENSORS)
             ),
-            include(
+            include.File(
                 "virtual_server.launch.py",
                 condition=IfCondition(LaunchConfiguration("virtual")),
                 server_port=port,

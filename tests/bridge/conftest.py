@@ -52,6 +52,33 @@ def retire(node: Any) -> None:
     _ENDED.append(node)
 
 
+@contextlib.contextmanager
+def listening(node: Any) -> Iterator[list[BaseException]]:
+    """Has those of a node's callbacks run that wait for no others; gives what they raise."""
+    from bridge.spinning import OrdinaryExecutor, PromptExecutor, Spinner
+
+    executor, raised = PromptExecutor(node), list[BaseException]()
+    ordinary = OrdinaryExecutor(node, executor)  # not run, but it passes on that the node has changed
+    spinner = Spinner(executor)
+
+    def run() -> None:
+        try:
+            spinner.run()
+        except Exception as error:  # noqa: BLE001 - for the test to see
+            raised.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield raised
+    finally:
+        spinner.stop()
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive()
+        executor.shutdown()
+        ordinary.shutdown()
+
+
 class Listener:
     """A subscriber of the node's array topic, and a publisher of the supervisor's."""
 
@@ -128,13 +155,18 @@ class Listener:
         response = self.call(GetParameters, "get_parameters", GetParameters.Request(names=names))
         return [parameter_value_to_python(value) for value in response.values]
 
-    def set_parameter(self, name: str, value: Any) -> tuple[bool, str]:
-        """Whether the node took the value, and why not."""
+    def set_parameter(
+        self, name: str, value: Any, until: Callable[[], object] = lambda: False
+    ) -> tuple[bool, str]:
+        """Whether the node took the value, and why not; until `until`, as `call` has it."""
         from rcl_interfaces.srv import SetParameters
         from rclpy.parameter import Parameter
 
         message = Parameter(name, value=value).to_parameter_msg()
-        response = self.call(SetParameters, "set_parameters", SetParameters.Request(parameters=[message]))
+        request = SetParameters.Request(parameters=[message])
+        response = self.call(SetParameters, "set_parameters", request, until)
+        if response is None:
+            return False, "no answer"
         return response.results[0].successful, response.results[0].reason
 
     def next_number(self) -> float:
@@ -207,6 +239,10 @@ class NodeThread:
         except BaseException as error:
             self._lines.append(f"Traceback: {error!r}")
             raise
+
+    @property
+    def node(self) -> Any:
+        return self._node
 
     @property
     def is_running(self) -> bool:

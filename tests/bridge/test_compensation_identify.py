@@ -9,6 +9,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
+from bridge.diagnostics.health import Level
+from ft_compensation.quantities import NO_PAYLOAD
+from protocol.pdo import STANDARD_GRAVITY
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, sensed
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.compensation.making import AXES, BIAS, TOOL, written_parameters
@@ -91,6 +94,41 @@ def test_from_six_poses_to_a_compensated_wrench(
     hold(server, (1, -2, 1.5), bias=BIAS, force_z=-5.0)
     Stages(started).settle([0.0, 0.0, -5.0, 0.0, 0.0, 0.0], within=2e-3)
     assert started.set_parameter("tool_mass", 0.0)[0]
+    assert started.trigger("clear_tare")[0]
+
+
+def test_the_offset_of_the_accelerometer_is_found_and_subtracted_from_then_on(
+    started: SimulatedNode, server: SimulatedServer, folder: Path
+) -> None:
+    """Gravity, tare and the inertial term go by the corrected acceleration: 0.2 m/s² are 0.16 N here."""
+    off = {"acceleration_x": 0.02, "acceleration_y": -0.015}  # g
+    for up in AXES:
+        hold(server, up, bias=BIAS, **off)
+        assert started.trigger("identify/add_pose")[0]
+    done, text = started.trigger("identify/solve")
+    assert done, text
+    assert "Accelerometer: offset x 0.196 ± " in text
+    offset = [0.02 * STANDARD_GRAVITY, -0.015 * STANDARD_GRAVITY, 0.0]
+    written = written_parameters(folder / "deeper" / "sensor-1-payload.yaml")
+    assert written["accelerometer.offset"] == pytest.approx(offset, abs=2e-3)
+    assert started.trigger("identify/apply")[0]
+    found, scale = started.parameters("accelerometer.offset", "accelerometer.scale")
+    assert list(found) == pytest.approx(offset, abs=2e-3)
+    assert list(scale) == pytest.approx([1.0] * 3, abs=1e-3)
+    stages = Stages(started)
+    hold(server, (1, -2, 1.5), bias=BIAS, force_z=-5.0, **off)
+    stages.settle([0.0, 0.0, -5.0, 0.0, 0.0, 0.0], within=5e-3)
+    hold(server, (1, -2, 1.5), bias=BIAS, **off)
+    assert started.trigger("tare")[0]
+    hold(server, (-2, 1, 1), bias=BIAS, **off)
+    stages.settle(ZERO6, within=1e-2)
+    assert started.set_parameter("compensate_inertia", True)[0]
+    stages.settle(ZERO6, within=1e-2)
+    for name, value in (
+        ("compensate_inertia", False), ("tool_mass", 0.0), ("accelerometer.offset", [0.0] * 3),
+        ("accelerometer.scale", [1.0] * 3),
+    ):  # fmt: skip
+        assert started.set_parameter(name, value)[0]
     assert started.trigger("clear_tare")[0]
 
 
@@ -191,3 +229,20 @@ def test_a_file_that_cannot_be_written(started: SimulatedNode, take: Take) -> No
     assert "Not written: " in text
     assert "/proc/no" in text
     assert started.set_parameter("identify.file", "auto") == (True, "")
+
+
+def test_a_tool_that_was_lost_is_a_warning_and_nothing_is_changed(
+    node: SimulatedNode, server: SimulatedServer
+) -> None:
+    assert node.set_parameter("tool_mass", TOOL.mass)[0]
+    Stages(node)
+    server.forget_once()
+    for up in AXES:
+        hold(server, up, payload=NO_PAYLOAD)
+        node.run(2.5)
+    words = "a tool of 0.00 kg would explain the measurements in"
+    node.until(f"{words} 6 orientations, but tool_mass is 0.80 kg", compensation=Level.WARN)
+    assert node.log.count(words) == 1
+    assert node.parameters("tool_mass") == [TOOL.mass]
+    assert node.set_parameter("tool_mass", 0.0)[0]
+    node.until("nothing is subtracted", compensation=Level.OK)

@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 from bridge.node import StartError
 from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.store import CompensationStore
-from tests.bridge.compensating import QUICK, UP, ZERO6, Stages, hold
+from tests.bridge.compensating import QUICK, UP, ZERO6, Stages, hold, six
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.compensation.making import BIAS
 
@@ -168,6 +168,99 @@ def test_a_sensor_without_a_number(bench: Bench, serial: str) -> None:
         done, text = node.trigger("tare")
         assert done
         assert "not kept: the sensor's serial number is" in text
+
+
+def offset_changed(bench: Bench, offset: list[float] | None) -> None:
+    """As another client's tare does it: the sensor adds that from now on."""
+    changed = ZERO6 if offset is None else offset
+    reads = [b + o for b, o in zip(BIAS.values, changed, strict=True)]
+    hold(bench.server, UP, payload=NOTHING, bias=Wrench.of(reads))
+    bench.server.description["sensors"][0]["offset"] = offset
+
+
+def test_a_change_of_the_sensors_own_offset_shifts_the_bias(bench: Bench) -> None:
+    offset_changed(bench, [0.0] * 6)
+    new = [-1.5, 2.25, 9.75, 0.5, 0.25, -0.125]
+    with bench.start() as (node, stages):
+        assert node.trigger("tare")[0]
+        stages.settle(ZERO6)
+        stages.forget()
+        bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": new})
+        offset_changed(bench, new)
+        node.run(0.2)
+        worst = max(abs(value) for message in stages.final for value in six(message))
+        assert len(stages.final) == 20
+        assert worst < 1e-3, "in no sample"
+        shifted = [b + o for b, o in zip(BIAS.values, new, strict=True)]
+        assert list(node.parameters("bias")[0]) == pytest.approx(shifted, abs=1e-4)
+        assert "the sensor's own offset was changed by Fx -1.5000 Fy 2.2500" in node.log
+        node.until(compensation=OK)
+        assert bench.kept() == pytest.approx(shifted, abs=1e-4)
+        offset_changed(bench, [1.0] * 6)  # while the node is away, too
+        bench.server.drop()
+        stages.settle(ZERO6)
+        # What a client that does not ask the server has done is not known.
+        bench.server.send_json({"event": "sensor_back", "sensor": 0, "offset": None})
+        node.until("the sensor's own offset is not known any more", compensation=WARN)
+        bench.server.send_json({"event": "sensor_back", "sensor": 0, "offset": [1.0] * 6})
+        node.until(compensation=OK)
+
+
+def test_an_offset_that_was_not_known_puts_the_bias_in_doubt(bench: Bench) -> None:
+    """As of a server that was too old to tell it."""
+    with bench.start() as (node, _):
+        assert node.trigger("tare")[0]
+        node.until(compensation=OK)
+        offset_changed(bench, [0.0] * 6)
+        bench.server.drop()
+        node.until("was not known when the bias was taken", compensation=WARN)
+        assert node.trigger("tare")[0]
+        node.until(compensation=OK)
+
+
+def test_no_bias_is_not_shifted(bench: Bench) -> None:
+    offset_changed(bench, [0.0] * 6)
+    with bench.start() as (node, stages):
+        bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": [1.0] * 6})
+        offset_changed(bench, [1.0] * 6)
+        stages.settle([b + 1.0 for b in BIAS.values])
+        assert list(node.parameters("bias")[0]) == ZERO6
+
+
+def test_a_tare_during_which_the_offset_changes_is_refused(bench: Bench) -> None:
+    offset_changed(bench, [0.0] * 6)
+    with bench.start() as (node, _):
+        changed = {"event": "offset_changed", "sensor": 0, "offset": [1e-3] * 6}
+        assert node.trigger("identify/start")[0]
+        node.at(0.1, lambda: bench.server.send_json(changed))
+        assert node.trigger("tare") == (False, "the sensor's own offset was changed meanwhile: call again")
+        assert "the sensor's own offset was changed, so the poses" in node.trigger("identify/add_pose")[1]
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "words"),
+    [
+        ([0.5] * 6, [0.5] * 6, "has the bias that was kept at"),
+        ([0.5] * 6, [-1.0, 2.0, 3.0, 0.1, 0.2, 0.3], "has changed by Fx -1.5000 Fy 1.5000"),
+        (None, [0.5] * 6, "it is not known whether the sensor's own offset is the one of then: tare"),
+        ([0.5] * 6, None, "it is not known whether the sensor's own offset is the one of then: tare"),
+    ],
+)
+def test_a_kept_bias_is_for_the_offset_of_then(
+    bench: Bench, then: list[float] | None, now: list[float] | None, words: str
+) -> None:
+    offset_changed(bench, then)
+    with bench.start() as (node, _):
+        assert node.trigger("tare")[0]
+    offset_changed(bench, now)
+    with bench.start() as (node, stages):
+        assert words in node.log
+        if then is not None and now is not None:
+            assert stages.first() == pytest.approx(ZERO6, abs=1e-3)
+            node.until(compensation=OK)
+        else:
+            assert list(node.parameters("bias")[0]) == ZERO6
+            node.until("it is not known whether", compensation=WARN)
 
 
 def test_a_folder_that_cannot_be_written(bench: Bench, tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Orientation from a topic and from TF: taken, refused, stale, back again. The node is in simulated time.
 
-The topics are real, and so is the thread that listens to them.
+The topics are real, and so is the executor that listens to them.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 import rclpy
 from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped, TransformStamped
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
 
@@ -38,7 +39,7 @@ from bridge.parameters.row import ParameterError
 from ft_compensation.quantities import length
 from protocol.text.json_text import JsonObject
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, is_near, weight
-from tests.bridge.conftest import retire, wait_until
+from tests.bridge.conftest import listening, retire, wait_until
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.bridge.streaming import values
 from tests.compensation.making import BIAS, TOOL, sample
@@ -125,8 +126,9 @@ def node(_robot: Robot) -> Iterator[SimulatedNode]:
         "orientation.topic": "arm/pose",
         "orientation.stale_after": 0.5,
     }
-    with SimulatedNode(_robot, **QUICK, **given) as started:
+    with SimulatedNode(_robot, **QUICK, **given) as started, listening(started.node) as raised:
         yield started
+        assert not raised
 
 
 @pytest.fixture(scope="module")
@@ -308,14 +310,12 @@ def test_a_source_that_cannot_be_had(
 
 
 def test_nothing_listens_where_no_source_is_chosen(robot: Robot, stages: Stages, node: SimulatedNode) -> None:
-    hidden = ("_bridge_orientation", node.node.get_namespace())
+    def topics() -> list[str]:
+        return [subscription.topic_name for subscription in node.node.subscriptions]
 
-    def is_there() -> bool:
-        return hidden in node.node.get_node_names_and_namespaces()
-
-    wait_until(is_there, "the hidden node")
+    assert node.name.replace("bridge", "arm/pose") in topics()
     assert node.set_parameter("orientation_source", "accelerometer") == (True, "")
-    wait_until(lambda: not is_there(), "the hidden node's end")
+    assert node.name.replace("bridge", "arm/pose") not in topics()
     robot.sending = False
     hold(robot, UP)
     stages.settle(ZERO6)
@@ -359,7 +359,7 @@ class FakeBuffer:
 
 def test_tf_is_asked_for_the_sensor_in_the_base() -> None:
     buffer = FakeBuffer()
-    tf = Tf(buffer, FakeTfError, "latest")
+    tf = Tf(buffer, FakeTfError, "latest", lambda: None)
     with pytest.raises(UnusableError, match="TF has none of ft_sensor in base_link: frame does not exist"):
         look_up(tf, "base_link", "ft_sensor")
     buffer.error, buffer.quaternion, buffer.stamp_ns = None, TILTED, 12_000_000_345
@@ -376,18 +376,18 @@ def ros_node(_ros: None) -> Iterator[Node]:
     made.destroy_node()
 
 
+def tf_of(buffer: Any, closed: Callable[[], object] = lambda: None) -> Callable[[Node], Tf]:
+    """What opens a buffer that is there already."""
+    return lambda _node: Tf(buffer, FakeTfError, "latest", closed)
+
+
 def test_the_source_tf(ros_node: Node) -> None:
     buffer = FakeBuffer()
-    failures: list[str] = []
+    closed = threading.Event()
     chosen = OrientationParameters("tf", base_frame="world", mounting=ROLLED, stale_after=0.5)
-    opened = OrientationListener(
-        ros_node,
-        chosen,
-        "ft",
-        failures.append,
-        open_buffer=lambda _node: Tf(buffer, FakeTfError, "latest"),
-    )
-    try:
+    group = MutuallyExclusiveCallbackGroup()
+    opened = OrientationListener(ros_node, chosen, "ft", group, tf_of(buffer, closed.set))
+    with listening(ros_node) as raised:
         source = ListenerSource(CompensationParameters(orientation=chosen), opened)
 
         def gravity(time_s: float) -> Any:
@@ -409,52 +409,33 @@ def test_the_source_tf(ros_node: Node) -> None:
         buffer.stamp_ns = 1001 * 10**9
         buffer.error = None
         wait_until(lambda: gravity(1001.0) is not None, "gravity again")
-    finally:
-        assert opened.close()
-    assert not failures
+        opened.close()
+    assert closed.is_set()
+    assert not raised
+    assert not list(ros_node.timers)
 
 
 @pytest.mark.usefixtures("_ros")
 def test_topics_are_remapped_as_those_of_the_node_are() -> None:
-    """`-r /tf:=...` is meant for what listens to TF, whichever node it is; `-r __node:=...` is not."""
-    remaps = ["--ros-args", "-r", "__node:=left", "-r", "/tf:=/left/tf", "-r", "pose:=/left/pose"]
+    remaps = ["--ros-args", "-r", "pose:=/left/pose"]
     node = rclpy.create_node("bridge", namespace="/test_remap", cli_args=remaps)
-    hidden: list[Node] = []
-
-    def opened(listening: Node) -> Tf:
-        hidden.append(listening)
-        return Tf(FakeBuffer(), FakeTfError, None)
-
-    failures: list[str] = []
-    by_tf = OrientationListener(node, OrientationParameters("tf"), "ft", failures.append, opened)
-    by_topic = OrientationListener(node, OrientationParameters("topic_pose", "pose"), "ft", failures.append)
-    try:
-        assert hidden[0].get_name() == "_left_orientation"
-        assert hidden[0].resolve_topic_name("/tf") == "/left/tf"
-        assert hidden[0].resolve_topic_name("/tf_static") == "/tf_static"
-        assert by_topic.describe == "topic /left/pose"
-    finally:
-        assert by_tf.close()
-        assert by_topic.close()
-        node.destroy_node()
-    assert not failures
+    group = MutuallyExclusiveCallbackGroup()
+    by_topic = OrientationListener(node, OrientationParameters("topic_pose", "pose"), "ft", group)
+    assert by_topic.describe == "topic /left/pose"
+    by_topic.close()
+    node.destroy_node()
 
 
-def test_a_listener_that_fails_is_told(ros_node: Node) -> None:
+def test_a_source_that_fails_ends_the_executor(ros_node: Node) -> None:
     class Broken:
         def lookup_transform(self, target_frame: str, source_frame: str, time: Any) -> Any:
-            raise RuntimeError("unforeseen")
+            raise LookupError("unforeseen")
 
-    failures: list[str] = []
-    opened = OrientationListener(
-        ros_node,
-        OrientationParameters("tf"),
-        "ft",
-        failures.append,
-        open_buffer=lambda _node: Tf(Broken(), FakeTfError, None),
-    )
-    wait_until(lambda: failures, "the failure")
-    assert failures == ["the orientation's source failed: RuntimeError: unforeseen"]
+    group = MutuallyExclusiveCallbackGroup()
+    opened = OrientationListener(ros_node, OrientationParameters("tf"), "ft", group, tf_of(Broken()))
+    with listening(ros_node) as raised:
+        wait_until(lambda: raised, "the failure")
+    assert str(raised[0]) == "unforeseen"
     opened.close()
 
 
@@ -470,6 +451,9 @@ def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node
         def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
             made.append((buffer, node, spin_thread))
 
+        def unregister(self) -> None:
+            made.append("unregistered")
+
     names = {"Buffer": Buffer, "TransformListener": TransformListener, "TransformException": FakeTfError}
     module = types.ModuleType("tf2_ros")
     vars(module).update(names)
@@ -481,7 +465,8 @@ def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node
     assert isinstance(tf.buffer, Buffer)
     assert tf.errors is FakeTfError
     assert tf.latest.nanoseconds == 0
-    assert made == [tf.buffer, (tf.buffer, ros_node, False)]
+    tf.close()
+    assert made == [tf.buffer, (tf.buffer, ros_node, False), "unregistered"]
 
 
 def test_without_tf2_ros(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -85,8 +85,10 @@ def test_warning_bits_of_one_frame_each_are_told_once(node: SimulatedNode, serve
 
 
 def test_saturation_and_heat(node: SimulatedNode, server: SimulatedServer) -> None:
-    server.once(process_data=encode(61, {"force_torque_saturated": 0b101}))
-    node.until("force torque saturated: axes 0x5", sensor=WARN)
+    for _ in range(3):
+        server.once(process_data=encode(61, {"force_torque_saturated": 0b101}))
+    array = node.until("force torque saturated: axes 0x5 (3 samples)", sensor=WARN)
+    assert values(array["sensor"])["saturated_samples"] == "3"
     node.until(sensor=OK)
     server.changes = {"process_data": encode(61, {"temperature": 85.0})}
     node.until("85.0 °C", sensor=ERROR)
@@ -187,9 +189,8 @@ def test_a_server_that_has_no_such_sensor_any_more(node: SimulatedNode, server: 
 
 
 def test_old_samples_are_skipped(node: SimulatedNode, server: SimulatedServer) -> None:
-    """As after the node was stopped."""
-    for _ in range(20):
-        server.once(monotonic_ns=server.monotonic_ns() - 10**9)
-    array = node.until("old samples skipped", stream=WARN)
-    assert int(values(array["stream"])["skipped"]) > 0
-    node.run_until(lambda: int(values(node.statuses()["stream"])["skipped"]) >= 20, "all of them counted")
+    """As after the node was stopped: a burst, then the newest."""
+    for number in range(20):
+        server.send_sample(0.0, monotonic_ns=server.monotonic_ns() - 10**9 + number)
+    array = node.until("20 old samples skipped", stream=WARN)
+    assert int(values(array["stream"])["skipped"]) == 20

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 
 import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 from diagnostic_msgs.msg import KeyValue
+from std_srvs.srv import Trigger
 
-from bridge.node import SUPERVISOR_TOPIC, run
+from bridge.node import SERVER_GOES_ON, SUPERVISOR_TOPIC, run
 from tests.bridge.conftest import Listener, NodeProcess, Start, StartProcess, establish, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
@@ -57,7 +59,57 @@ def test_the_supervisor_shuts_the_server_down_and_ends_the_node(
     assert "is shutting down" in node.log
 
 
-def supervised(server: SimulatedServer) -> SimulatedNode:
+@pytest.mark.parametrize(
+    ("service", "action", "words"),
+    [
+        ("sensor_tare", "tare", "did not answer tare: the node ends"),
+        ("tare", "describe", "tare failed: the node ends"),
+        ("identify/add_pose", "describe", "add_pose failed: the node ends"),
+        ("get_settings", "describe", "did not answer describe: the node ends"),
+        ("a parameter", "configure", "is shutting down"),
+    ],
+)
+def test_the_supervisor_is_heard_during_each_service(
+    server: ScriptedServer, listener: Listener, start: Start, service: str, action: str, words: str
+) -> None:
+    """In real time, with rclpy's own executors: which callback waits for which is what is tested."""
+    node = start(server.port, **{"rest.duration": 60.0, "orientation_source": "accelerometer"})
+    node.says("connected to")
+    if service == "identify/add_pose":
+        assert listener.trigger("identify/start")[0]
+    if action != "describe" or service == "get_settings":
+        server.answers[action] = lambda _: None
+
+    def is_asked() -> bool:
+        if service in {"tare", "identify/add_pose"}:
+            return node.node.compensation.output.window is not None
+        # The diagnostics ask too, but no second time before they are answered.
+        asked = [request["action"] for request in server.requests]
+        return asked.count(action) == (2 if action == "describe" else 1)
+
+    def has_stopped() -> bool:
+        return "shutdown" in [request["action"] for request in server.requests]
+
+    def call() -> None:
+        if service == "a parameter":
+            listener.set_parameter("settings.fir", True, until=has_stopped)
+        else:
+            listener.call(Trigger, service, until=has_stopped)
+
+    del server.requests[2:]
+    calling = threading.Thread(target=call)
+    calling.start()
+    wait_until(is_asked, "the service to wait")
+    listener.supervise("ft_sensors", "1")
+    assert node.ends() == 0
+    calling.join()
+    assert has_stopped()
+    node.says(words)
+    assert "no reply within" not in node.log
+    assert "Traceback" not in node.log
+
+
+def supervised(server: SimulatedServer, exit_code: int = 0) -> SimulatedNode:
     """A node that has been told to stop, and what it has said."""
     with SimulatedNode(server) as node:
         node.run(0.1)
@@ -66,15 +118,16 @@ def supervised(server: SimulatedServer) -> SimulatedNode:
         for key, value in (("ft_sensors", "0"), ("camera", "1"), ("ft_sensors", "11"), ("ft_sensors", "1")):
             subscription.callback(KeyValue(key=key, value=value))
             codes.append(node.node.exit_code)
-        assert codes == [None, None, None, 0]
+        assert codes == [None, None, None, exit_code]
+        node.node.exit_code = 0
     return node
 
 
-def test_a_refused_shutdown_is_said_and_ends_the_node_too() -> None:
+def test_a_refused_shutdown_is_an_error() -> None:
     server = SimulatedServer()
     error = {"code": "denied", "message": "only root"}
     server.answers["shutdown"] = lambda _: {"ok": False, "error": error}
-    assert "refused to shut down: only root (denied)" in supervised(server).log
+    assert "refused to shut down: only root (denied)" in supervised(server, SERVER_GOES_ON).log
 
 
 def test_a_shutdown_that_is_never_answered_ends_the_node_too() -> None:
@@ -96,7 +149,7 @@ def test_the_supervisor_ends_a_node_that_has_no_server(listener: Listener, start
 def test_a_limit_and_the_notes_parameter_names() -> None:
     server = SimulatedServer()
     with SimulatedNode(server, SERVER_PORT=12345, publishing_frequency=100) as node:
-        samples = node.hear("/sensone_sensor_data")
+        samples = node.hear("sensone_sensor_data")
         node.run(0.2)
         samples.clear()
         server.paused = True
@@ -155,6 +208,17 @@ def test_arguments_that_are_not_understood(capsys: pytest.CaptureFixture[str]) -
         said = capsys.readouterr().err
         assert said.startswith("bridge-client: ")
         assert said.count("\n") == 1
+
+
+def test_without_a_home_it_says_what_to_set(
+    start_process: StartProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a process: rclpy is loaded once in one."""
+    for name in ("HOME", "ROS_HOME", "ROS_LOG_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    node = start_process(12001)
+    assert node.ends() == 1
+    assert "set HOME, or ROS_LOG_DIR to a directory for its log" in node.log.splitlines()[-1]
 
 
 def test_help() -> None:

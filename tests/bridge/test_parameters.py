@@ -26,23 +26,28 @@ def test_defaults_are_the_contracts() -> None:
     defaults = {name: row.default for name, row in ROWS.items()}
     assert defaults == {
         "server_host": "localhost", "server_port": 12001, "SERVER_PORT": 0, "sensor": 0,
-        "publishing_frequency": 0.0, "array_topic": "/sensone_sensor_data", "frame_id": "ft_sensor",
+        "publishing_frequency": 0.0, "array_topic": "sensone_sensor_data", "frame_id": "ft_sensor",
         "imu_frame_id": "ft_sensor_imu", "imu_raw_units": "g_dps", "temperature_variance": 0.0,
         "orientation_covariance": (0.0, 0.0, 0.0), "angular_velocity_covariance": (0.0, 0.0, 0.0),
-        "linear_acceleration_covariance": (0.0, 0.0, 0.0), "diagnostics.stale_after": 0.5,
+        "linear_acceleration_covariance": (0.0, 0.0, 0.0), "wrench_frames": ("",),
+        "diagnostics.stale_after": 0.5,
         "diagnostics.rate_tolerance": 0.05, "diagnostics.age_warn": 0.01, "diagnostics.age_error": 0.1,
         "diagnostics.lost_warn": 1, "diagnostics.temperature_warn": 60.0,
         "diagnostics.temperature_error": 80.0,
         "tool_mass": 0.0, "tool_center_of_gravity": (0.0, 0.0, 0.0), "gravity": (0.0, 0.0, -9.80665),
         "bias": (0.0,) * 6, "bias_ramp_time": 0.5, "bias_keep": False, "bias_directory": "auto",
-        "compensate_inertia": False, "imu_position": (0.0, 0.0, 0.0), "orientation_source": "accelerometer",
+        "compensate_inertia": False, "imu_position": (0.0, 0.0, 0.0),
+        "on_saturation": "publish", "orientation_source": "accelerometer",
         "orientation.topic": "orientation", "orientation.base_frame": "base_link",
         "orientation.mounting": (0.0, 0.0, 0.0, 1.0), "orientation.stale_after": 0.1,
         "accelerometer.stale_after": 0.5, "accelerometer.time_constant": 0.5, "accelerometer.gate": 0.5,
-        "accelerometer.tilt_limit": 0.2, "rest.duration": 1.0, "rest.force_spread": 0.8,
+        "accelerometer.tilt_limit": 0.2, "accelerometer.offset": (0.0, 0.0, 0.0),
+        "accelerometer.scale": (1.0, 1.0, 1.0), "rest.duration": 1.0, "rest.force_spread": 0.8,
         "rest.torque_spread": 0.02, "rest.force_wander": 0.3, "rest.torque_wander": 0.01,
         "rest.angular_rate": 0.05, "rest.angular_rate_spread": 0.02, "rest.acceleration_spread": 0.3,
         "rest.acceleration_wander": 0.05, "identify.file": "auto",
+        "filter.cutoff": 0.0, "filter.notch": 0.0, "filter.notch_width": 5.0,
+        "filter.dead_band_force": 0.0, "filter.dead_band_torque": 0.0,
     }  # fmt: skip
     assert all(row.check(row.default) == row.default for row in PARAMETERS)
 
@@ -74,6 +79,8 @@ def _yaml(value: Any) -> str:
         ("tool_mass", -0.1), ("tool_mass", "1"), ("tool_mass", True), ("bias", [0.0] * 5), ("bias", 0.0),
         ("tool_center_of_gravity", [0.0] * 9), ("tool_center_of_gravity", [0.0, 0.0, math.nan]),
         ("tool_center_of_gravity", [0.0, 0.0, -11.0]), ("bias_keep", 1), ("bias_keep", "yes"),
+        ("wrench_frames", [1.0, 2.0, 3.0]), ("wrench_frames", 5), ("wrench_frames", ["tool0", 5]),
+        ("filter.cutoff", -1.0), ("filter.cutoff", "10"), ("filter.notch_width", 0.0),
         ("orientation_source", "imu"), ("orientation.mounting", [0.0] * 3), ("rest.duration", 0.0),
     ],
 )  # fmt: skip
@@ -101,6 +108,8 @@ def test_numbers_of_the_compensation_say_how_many() -> None:
         ({"gravity": (0.0, 0.05, 0.0)}, "set tool_mass to 0"),
         ({"orientation.mounting": (0.5, 0.5, 0.5, 0.6)}, "a quaternion of length 1"),
         ({"orientation.mounting": (0.0, 0.0, 0.0, 0.0)}, "a quaternion of length 1"),
+        ({"filter.cutoff": 0.01}, "parameter filter.cutoff is 0.01: it must be 0, for none, or at least"),
+        ({"filter.notch": 0.5}, "parameter filter.notch is 0.5: it must be 0, for none, or at least 1 Hz"),
     ],
 )
 def test_values_that_do_not_go_together(changes: dict[str, Any], words: str) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from bridge.parameters.table import Parameters
 from bridge.stream.connection import Connection
+from bridge.stream.events import sentence
 from bridge.stream.reader import Reader
 from protocol.errors import ConnectionFailedError, UnreachableError
 from protocol.framing import DataFlag, DataMessage, encode_data, encode_json
@@ -271,8 +272,37 @@ def test_events_reach_the_log_and_the_link() -> None:
     bench.run()
     assert seen == [None, "no power", None]
     text = lines(bench)
-    assert text.count("has lost the sensor") == 1
-    assert "the server says some?[2Jthing" in text
+    assert text.count("no power") == 1
+    assert "the server sent the event some?[2Jthing, which this version does not know" in text
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        ({"event": "sensor_lost", "reason": "wkc"}, "the server has lost the sensor"),
+        (
+            {"event": "sensor_back", "lost_s": 1.25, "settings": {"fir": True}},
+            "the sensor is back after 1.25 s",
+        ),
+        ({"event": "sensor_back", "lost_s": "long"}, "the sensor is back"),
+        (
+            {"event": "reconfigured", "settings": {"fir": True, "sinc_length": 128, "chop": False}},
+            "the sensor was reconfigured: fir true, sinc_length 128",
+        ),
+        ({"event": "reconfigured", "settings": {"chop": False}}, "the sensor was reconfigured"),
+        (
+            {"event": "offset_changed", "offset": [1, 2, 3, 0.1, 0.2, 0.3]},
+            "the sensor's own offset is Fx 1.0000 Fy 2.0000 Fz 3.0000 Mx 0.1000 My 0.2000 Mz 0.3000 (N, Nm) "
+            "now",
+        ),
+        ({"event": "offset_changed", "offset": [1]}, "the sensor's own offset is not known any more"),
+        ({"event": "emergency", "code": 4096}, "the sensor reports an emergency"),
+        ({"event": "emergency", "message": "too hot"}, "the sensor reports an emergency: too hot"),
+        ({"event": "shutting_down"}, "the server is shutting down"),
+    ],
+)
+def test_an_event_is_a_sentence(message: JsonObject, said: str) -> None:
+    assert sentence(message, {"sinc_length": 64, "chop": False}) == said
 
 
 def test_a_server_without_the_sensor_is_tried_again() -> None:

@@ -180,7 +180,7 @@ def test_an_unanswered_request_holds_up_neither_stream_nor_diagnostics(
     node: SimulatedNode, scripted: SimulatedServer
 ) -> None:
     scripted.answers["describe"] = lambda _: None
-    samples, arrays = node.hear("/sensone_sensor_data"), node.hear("/diagnostics")
+    samples, arrays = node.hear("sensone_sensor_data"), node.hear("/diagnostics")
     node.run(0.2)
     samples.clear()
     arrays.clear()

@@ -113,7 +113,7 @@ def test_events_are_said(server: ScriptedServer, listener: Listener, node: NodeT
         "the sensor is back",
         "emergency",
         "too hot",
-        "the server says some?[2Jthing",
+        "the server sent the event some?[2Jthing, which this version does not know",
     ):
         node.says(words)
 

@@ -1,4 +1,7 @@
-"""The typed topics: values, units, frames, stamps, covariances; nothing that is not finite."""
+"""The typed topics: values, units, frames, stamps, covariances; nothing that is not finite.
+
+By DDS: frames and the filter themselves are tested in `test_outputs`.
+"""
 
 from __future__ import annotations
 
@@ -35,10 +38,8 @@ class Topics:
         self._listener = listener
         self.wrench = listener.subscribe(WrenchStamped, "wrench")
         self.imu = listener.subscribe(Imu, "imu/data_raw")
+        self.oriented = listener.subscribe(Imu, "imu/data")
         self.temperature = listener.subscribe(Temperature, "temperature")
-
-    def all(self) -> tuple[queue.Queue[Any], ...]:
-        return self.wrench, self.imu, self.temperature
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,8 @@ def node(server: ScriptedServer, listener: Listener) -> Iterator[NodeThread]:
             orientation_covariance="[0.1, 0.2, 0.3]",
             linear_acceleration_covariance="[1, 2, 3, 4, 5, 6, 7, 8, 9]",
             temperature_variance=0.25,
+            wrench_frames="[tcp 0 0 0.5]",
+            **{"filter.cutoff": 10.0},
             **{f"qos_overrides./{listener.tag}/wrench.publisher.reliability": "best_effort"},
         )
 
@@ -60,12 +63,17 @@ def topics(server: ScriptedServer, listener: Listener, node: NodeThread) -> Topi
     subscribed = Topics(listener)
     establish(server, listener)
     wait_until(
-        lambda: _sent(server) and not any(m.empty() for m in subscribed.all()[1:]), "a message on every topic"
+        lambda: (
+            _sent(server)
+            and not any(m.empty() for m in (subscribed.imu, subscribed.oriented, subscribed.temperature))
+        ),
+        "a message on every topic",
     )
     return subscribed
 
 
 def _sent(server: ScriptedServer) -> bool:
+    server.send_sample(0, process_data=encode(77, QUATERNION))
     server.send_sample(-1.0)
     return True
 
@@ -139,16 +147,34 @@ def test_imu_in_si_units_and_without_orientation(server: ScriptedServer, topics:
 
 
 def test_orientation_where_the_sensor_estimates_one(server: ScriptedServer, topics: Topics) -> None:
-    server.send_sample(0, process_data=encode(77, QUATERNION))
+    while not topics.oriented.empty():
+        topics.oriented.get()
+    acceleration = {"acceleration.z": 0.5}
+    server.send_sample(0, process_data=encode(77, QUATERNION | acceleration), stamp_ns=7)
     server.send_sample(0, process_data=process_data(1.0, 77))  # all zero: no estimate
-    server.send_sample(0, process_data=encode(77, QUATERNION))
-    first, second, third = (get(topics.imu) for _ in range(3))
-    for message in (first, third):
+    server.send_sample(0, process_data=process_data(1.0, 61))
+    server.send_sample(0, process_data=encode(77, QUATERNION), stamp_ns=9)
+    messages = [get(topics.oriented) for _ in range(2)]
+    assert [stamp_ns(message) for message in messages] == [7, 9]
+    for message in messages:
         q = message.orientation
         assert (q.x, q.y, q.z, q.w) == (0.5, -0.5, 0.5, 0.5)
         assert list(message.orientation_covariance) == [0.1, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0, 0.3]
-    assert second.orientation_covariance[0] == -1.0
-    assert second.orientation.w == 1.0
+        assert message.header.frame_id == "left_imu"
+    assert messages[0].linear_acceleration.z == pytest.approx(0.5 * 9.80665)
+    for raw in (get(topics.imu) for _ in range(4)):
+        assert raw.orientation_covariance[0] == -1.0
+        assert raw.orientation.w == 1.0
+
+
+def test_outputs_that_are_configured(server: ScriptedServer, topics: Topics, listener: Listener) -> None:
+    by_name = {
+        name: listener.subscribe(WrenchStamped, name)
+        for name in ("wrench_compensated/tcp", "wrench_filtered")
+    }
+    wait_until(lambda: _sent(server) and not any(m.empty() for m in by_name.values()), "messages")
+    frames = {name: get(messages).header.frame_id for name, messages in by_name.items()}
+    assert frames == {"wrench_compensated/tcp": "tcp", "wrench_filtered": "left_ft"}
 
 
 def test_temperature(server: ScriptedServer, topics: Topics) -> None:
@@ -167,8 +193,8 @@ def test_what_is_not_finite_stays_away_from_its_topic(
     server.send_sample(0, process_data=encode(61, {"force.x": value, "temperature": 3.0}))
     server.send_sample(0, process_data=encode(61, {"acceleration.z": 4.0, "temperature": 4.0}))
     assert [get(topics.temperature).temperature for _ in range(3)] == [2.0, 3.0, 4.0]
-    got = [get(topics.imu).linear_acceleration.z for _ in range(3)]
-    assert got == pytest.approx([0.0, 0.0, 4.0 * 9.80665])
+    got = [get(topics.imu).linear_acceleration.z for _ in range(4)]
+    assert got == pytest.approx([0.0, 0.0, 0.0, 4.0 * 9.80665])
 
 
 def test_a_late_subscriber_gets_only_what_is_new(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -48,14 +49,15 @@ def node(server: WholeServer) -> Iterator[SimulatedNode]:
 
 
 def test_gravity_and_orientation(node: SimulatedNode, server: WholeServer) -> None:
-    messages = node.hear("imu/data_raw")
+    messages, oriented = node.hear("imu/data_raw"), node.hear("imu/data")
     node.run(0.3)
     a = messages[-1].linear_acceleration
     assert math.hypot(a.x, a.y, a.z) == pytest.approx(9.8, abs=0.5)
-    assert messages[-1].orientation_covariance[0] == -1.0  # mapped, but not estimated
+    assert not oriented  # mapped, but not estimated
     assert node.set_parameter("settings.orientation_estimation", True) == (True, "")
     node.run(0.3)
-    assert messages[-1].orientation_covariance[0] == 0.0
+    assert messages[-1].orientation_covariance[0] == -1.0
+    assert oriented[-1].orientation_covariance[0] == 0.0
     assert server.time_ns() - stamp_ns(messages[-1]) < 20e6
 
 
@@ -88,6 +90,38 @@ def test_tare(node: SimulatedNode) -> None:
         refused += [] if done else [text]
     assert all("is not at rest" in text for text in refused)
     assert "residual Fx" in text
+
+
+def test_a_tare_of_a_moving_sensor_is_refused() -> None:
+    with SimulatedNode(WholeServer(SensorOptions(signal="scene"))) as node:
+        node.run(1.0)
+        answers = [node.trigger("sensor_tare") for _ in range(3)]
+    assert not all(done for done, _ in answers)
+    for done, text in answers:
+        if done:  # it rested for a moment
+            residuals = [float(value) for value in re.findall(r"-?\d+\.\d+", text.partition("residual")[2])]
+            assert max(map(abs, residuals[:3])) < 0.4
+        else:
+            assert "is not at rest" in text or "moved during the tare" in text
+            assert f"sensor_tare failed: {text}" in node.log
+
+
+def test_another_clients_tare_shifts_the_bias() -> None:
+    server = WholeServer(SensorOptions(signal="rest"))
+    with SimulatedNode(server, bias_ramp_time=0.0) as node:
+        wrenches = node.hear("wrench_compensated")
+        node.run(1.5)
+        assert node.trigger("tare")[0]
+        other = server.simulation.connect()
+        other.send("tare", samples=20)
+        wrenches.clear()
+        node.run_until(lambda: other.replies, "the reply to the other")
+        assert min(map(abs, other.replies[0]["new_offset"][:3])) > 1.0
+        node.run(0.2)
+        worst = [max(map(abs, six(message)[:3])) for message in wrenches]
+        assert worst[-1] < 0.5, "the sensor's noise"
+        assert sum(one > 0.5 for one in worst) <= 13, "while six numbers are written and read, a sample each"
+        node.until(compensation=OK)
 
 
 def test_a_server_that_stood_still(node: SimulatedNode, server: WholeServer) -> None:

@@ -73,7 +73,8 @@ def simulate(
         if valid:
             timing.took(sent, now)
         made = stream.take(data, 3, sent, now) if valid else None
-        stream.learn()
+        if stream.learns:
+            stream.learn()
         if made is None and now >= stream.idle_at_ns:
             made = stream.idle(now)
         if made is not None:

@@ -85,6 +85,8 @@ def test_it_finds_the_tool_and_the_bias(recording: Path, capsys: pytest.CaptureF
     assert answer["bias"] == pytest.approx(OFFSET, abs=0.05)
     assert abs(answer["tool_mass"] - scene.TOOL_MASS) < 3 * answer["tool_mass_interval"]
     assert [len(pose["residual_force"]) for pose in answer["poses"]] == [3] * 6
+    assert {answer["force_fit"]["verdict"], answer["torque_fit"]["verdict"]} <= {"noise", "small"}
+    assert answer["accelerometer"]["offset"] == pytest.approx([0.0] * 3, abs=0.02)
 
 
 def test_a_person_sees_tables(
@@ -101,6 +103,7 @@ def test_a_person_sees_tables(
         "mm",
         "± (95 %)",
         "bias torque x",
+        "accelerometer offset z",
     ):
         assert words in shown
     assert max(map(len, shown.splitlines())) <= 100
@@ -116,6 +119,8 @@ def test_the_yaml_is_what_the_node_takes(
     parameters = written_parameters(out)
     assert parameters["tool_mass"] == pytest.approx(answer["tool_mass"], abs=1e-8)
     assert parameters["bias"] == pytest.approx(answer["bias"], abs=1e-8)
+    assert parameters["accelerometer.offset"] == pytest.approx(answer["accelerometer"]["offset"], abs=1e-8)
+    assert parameters["accelerometer.scale"] == pytest.approx(answer["accelerometer"]["scale"], abs=1e-8)
     assert "gravity" not in parameters
     asked(capsys, recording, "--yaml", out, "--gravity", "9.81")
     assert written_parameters(out)["gravity"] == [0.0, 0.0, -9.81]

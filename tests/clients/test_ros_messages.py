@@ -65,14 +65,14 @@ def check_wrench(message: Any, item: DataMessage, namespace: str) -> None:
     assert (torque.x, torque.y, torque.z) == sample.torque
 
 
-def check_imu(message: Any, item: DataMessage, namespace: str) -> None:
+def check_imu(message: Any, item: DataMessage, namespace: str, *, oriented: bool = False) -> None:
     sample = SampleDecoder(len(item.process_data)).decode(item.process_data)
     assert message.header.frame_id == (f"{namespace}_ft_sensor_imu" if namespace else "ft_sensor_imu")
     a, r, q = message.linear_acceleration, message.angular_velocity, message.orientation
     assert (a.x, a.y, a.z) == sample.acceleration
     assert (r.x, r.y, r.z) == sample.angular_rate
-    assert (q.x, q.y, q.z, q.w) == (sample.orientation or (0.0, 0.0, 0.0, 1.0))
-    assert list(message.orientation_covariance) == [0.0 if sample.orientation else -1.0, *[0.0] * 8]
+    assert (q.x, q.y, q.z, q.w) == (sample.orientation if oriented else (0.0, 0.0, 0.0, 1.0))
+    assert list(message.orientation_covariance) == [0.0 if oriented else -1.0, *[0.0] * 8]
     assert list(message.linear_acceleration_covariance) == [0.0] * 9
 
 
@@ -87,6 +87,8 @@ def test_mcap_decodes_it_with_its_crcs_on(bag: Path, namespace: str) -> None:
         check_wrench(wrench, item, namespace)
     for imu, item in zip(found[topic(namespace, "imu/data_raw")], NEW, strict=True):
         check_imu(imu, item, namespace)
+    (imu,) = found[topic(namespace, "imu/data")]
+    check_imu(imu, FRAMES[3], namespace, oriented=True)
     assert [t.temperature for t in found[topic(namespace, "temperature")]] == [35.5] * 3
     raw = found[frame_topic(0)]
     assert [(r.sequence, r.stamp_ns, r.monotonic_ns, r.sensor, r.flags, r.wkc) for r in raw] == [
@@ -119,6 +121,8 @@ def test_rosbags_opens_it_and_finds_the_same(bag: Path, namespace: str) -> None:
         check_wrench(wrench, item, namespace)
     for imu, item in zip(found[topic(namespace, "imu/data_raw")], NEW, strict=True):
         check_imu(imu, item, namespace)
+    (imu,) = found[topic(namespace, "imu/data")]
+    check_imu(imu, FRAMES[3], namespace, oriented=True)
     assert [bytes(message.process_data) for message in found[frame_topic(0)]] == [
         item.process_data for item in FRAMES
     ]

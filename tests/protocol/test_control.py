@@ -110,7 +110,7 @@ def test_refusals_answer_anything() -> None:
 
 
 def test_events_have_the_contracts_names() -> None:
-    names = ["sensor_lost", "sensor_back", "reconfigured", "emergency", "shutting_down"]
+    names = ["sensor_lost", "sensor_back", "reconfigured", "offset_changed", "emergency", "shutting_down"]
     assert [str(e) for e in Event] == names
     assert event(Event.SENSOR_LOST, sensor=1) == {"event": "sensor_lost", "sensor": 1}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import runpy
 import shutil
 import subprocess
@@ -16,6 +17,7 @@ import pytest
 import setuptools
 
 from tests.ros_package.package_files import PACKAGE, ROOT, SHARED_FOLDERS, shared_files
+from tests.ros_package.page_commands import in_text
 
 MARKER = "share/ament_index/resource_index/packages"
 
@@ -65,7 +67,7 @@ def test_no_other_folder_has_files() -> None:
 
 
 @pytest.mark.long
-def test_the_wheel_has_them(tmp_path: Path) -> None:
+def test_the_wheel_has_them_where_ros_looks(tmp_path: Path) -> None:
     # Of a copy: pip leaves what it builds in the folder that it builds from.
     copy = tmp_path / "copy"
     shutil.copytree(
@@ -78,3 +80,15 @@ def test_the_wheel_has_them(tmp_path: Path) -> None:
         names = {name.partition(".data/data/")[2] for name in archive.namelist()}
     assert {f"share/bridge/{file}" for file in shared_files()} <= names
     assert {f"{MARKER}/bridge", "share/bridge/package.xml", "lib/bridge/client"} <= names
+
+    bota = tmp_path / "bota"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", bota], check=True)
+    pip = [sys.executable, "-m", "pip", f"--python={bota}/bin/python", "install", "--quiet"]
+    subprocess.run([*pip, "--no-deps", "--no-index", wheel], check=True)
+    (export,) = [
+        command.text for command in in_text("ros2-workspace.md") if command.text.startswith("export")
+    ]
+    shell = f'{export}; cd "${{AMENT_PREFIX_PATH%%:*}}" && ls {MARKER}/bridge && lib/bridge/client --help'
+    environment = os.environ | {"HOME": str(tmp_path)}
+    used = subprocess.run(["bash", "-c", shell], env=environment, check=True, capture_output=True, text=True)
+    assert "usage: ros2 run bridge client" in used.stdout

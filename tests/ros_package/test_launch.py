@@ -1,8 +1,7 @@
-"""The launch files, run by `ros2 launch` where it is installed; what the page about them says, anywhere."""
+"""The launch files, run by `ros2 launch` where it is installed; test_launch_files.py does without it."""
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import os
 import re
@@ -18,6 +17,8 @@ from pathlib import Path
 import pytest
 
 from tests.ros_package.package_files import PACKAGE, ROOT
+from tests.ros_package.page_commands import console, in_text
+from tests.ros_package.test_launch_files import ARGUMENTS
 from tests.server.running import free_port, needs_bus
 
 PATIENCE_S = 30.0
@@ -34,6 +35,7 @@ class Launched:
     """`ros2 launch` with one of our files, in a session of its own."""
 
     def __init__(self, environment: dict[str, str], file: str, *arguments: str) -> None:
+        self.environment = environment
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115
         self.process = subprocess.Popen(
             ["ros2", "launch", str(PACKAGE / "launch" / file), *arguments],
@@ -134,6 +136,23 @@ def test_namespace_log_level_and_text_that_looks_like_a_number(launch: Launch) -
 
 
 @pytest.mark.ros
+@pytest.mark.parametrize("file", ["bridge.launch.py", "demo.launch.py", "two_sensors.launch.py"])
+def test_a_parameter_file_that_is_not_there_is_refused(launch: Launch, file: str) -> None:
+    launched = launch(file, "params_file:=nofile.yaml", SERVER)
+    assert launched.process.wait(PATIENCE_S) == 1
+    assert f"params_file: there is no file {ROOT / 'nofile.yaml'}" in launched.log
+    assert "process started" not in launched.log
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_the_arguments_that_are_listed(launch: Launch, name: str) -> None:
+    launched = launch(f"{name}.launch.py", "--show-args")
+    assert launched.process.wait(PATIENCE_S) == 0
+    assert set(re.findall(r"^ +'(\w+)':", launched.log, re.MULTILINE)) == ARGUMENTS[name]
+
+
+@pytest.mark.ros
 def test_respawn_starts_the_node_again(launch: Launch) -> None:
     launched = launch("bridge.launch.py", "sensor:=300", "respawn:=true")
     launched.says("parameter sensor is 300")
@@ -165,6 +184,26 @@ def test_the_demo_runs_and_ends_cleanly(launch: Launch) -> None:
 @pytest.mark.ros
 @pytest.mark.bus
 @needs_bus
+def test_the_commands_on_the_page_about_the_node(launch: Launch) -> None:
+    launched = launch("demo.launch.py", f"server_port:={free_port()}", SERVER)
+    launched.says("connected to localhost")
+    commands = [*console("ros2.md"), *in_text("ros2.md")]
+    try:
+        for command in commands:
+            if command.text != "ros2 run bridge client":  # It runs already.
+                done = subprocess.run(
+                    ["bash", "-c", command.text.replace("NAME", "sensor")],
+                    env=launched.environment, check=False, capture_output=True, text=True,
+                )  # fmt: skip
+                assert done.returncode == 0, done.stderr
+                assert command.output.strip() in done.stdout
+    finally:
+        subprocess.run(["ros2", "daemon", "stop"], env=launched.environment, check=False, capture_output=True)
+
+
+@pytest.mark.ros
+@pytest.mark.bus
+@needs_bus
 def test_the_end_of_the_server_ends_the_demo(launch: Launch) -> None:
     launched = launch("demo.launch.py", f"server_port:={free_port()}", SERVER)
     launched.says("connected to localhost")
@@ -188,36 +227,3 @@ def test_two_sensors_have_a_node_and_a_namespace_each(launch: Launch) -> None:
             time.sleep(0.05)
     assert launched.stop() == 0
     assert launched.log.count("process has finished cleanly") == 3, launched.log
-
-
-def arguments_of(file: Path) -> set[str]:
-    """The arguments that a launch file declares, read from its source."""
-    tree = ast.parse(file.read_text())
-    names = {
-        str(call.args[0].value)
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call)
-        and isinstance(call.func, ast.Name)
-        and call.func.id == "DeclareLaunchArgument"
-        and isinstance(call.args[0], ast.Constant)
-    }
-    for assignment in ast.walk(tree):
-        if isinstance(assignment, ast.Assign) and ast.unparse(assignment.targets[0]) == "PARAMETERS":
-            assert isinstance(assignment.value, ast.Dict)
-            names |= {str(key.value) for key in assignment.value.keys if isinstance(key, ast.Constant)}
-    return names
-
-
-def test_bridge_launch_file_takes_what_it_is_to_take() -> None:
-    assert arguments_of(PACKAGE / "launch/bridge.launch.py") >= {
-        "server_host", "server_port", "sensor", "namespace", "frame_id", "imu_frame_id", "params_file",
-        "respawn", "log_level",
-    }  # fmt: skip
-
-
-def test_the_page_names_every_file_and_argument() -> None:
-    page = (ROOT / "docs/ros2-workspace.md").read_text()
-    for file in (PACKAGE / "launch").glob("*.py"):
-        assert f"`{file.name}`" in page
-        for name in arguments_of(file):
-            assert f"`{name}`" in page, f"{file.name}: {name}"

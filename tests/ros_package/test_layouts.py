@@ -125,6 +125,8 @@ def test_rviz_shows_the_wrenches() -> None:
     ]
     topics = {display["Topic"]["Value"] for display in wrenches}
     assert topics == {"/wrench", "/wrench_compensated"}
+    (model,) = [display for display in manager["Displays"] if display["Class"].endswith("/RobotModel")]
+    assert model["Description Topic"]["Value"] == "/robot_description"  # of robot_state_publisher
     named = {display["Topic"]["Value"] for display in manager["Displays"] if "Topic" in display}
     assert named == topics
     assert all("Topic" not in tool for tool in manager["Tools"])

@@ -40,12 +40,17 @@ def test_it_has_what_format_3_requires() -> None:
 
 
 def test_everything_that_is_imported_is_a_dependency() -> None:
-    ours = {"bridge", "protocol", "__future__", *sys.stdlib_module_names}
-    for folder in ("bridge", "launch"):
-        for path in (PACKAGE / folder).glob("*.py"):
-            # The module tf2_ros is in the package tf2_ros_py; the package tf2_ros is C++.
-            needed = {"tf2_ros_py" if name == "tf2_ros" else name for name in imports(path) - ours}
-            assert needed <= set(texts("exec_depend")), path
+    ours = {"bridge", "ft_compensation", "protocol", "__future__", *sys.stdlib_module_names}
+    # Packages that are not named as their modules; the package tf2_ros is C++.
+    packages = {"tf2_ros": "tf2_ros_py", "numpy": "python3-numpy"}
+    needed = {
+        packages.get(name, name)
+        for folder in ("bridge", "ft_compensation", "launch")
+        for path in (PACKAGE / folder).rglob("*.py")
+        for name in imports(path) - ours
+    }
+    # xacro is for the files in urdf/.
+    assert needed | {"xacro"} == set(texts("exec_depend"))
 
 
 def test_no_dependency_is_named_twice() -> None:

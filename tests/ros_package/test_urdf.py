@@ -1,4 +1,4 @@
-"""The URDF macro: the published frames of every model, and a tree that URDF readers take."""
+"""The URDF macro: the published frames and body of every model, and a tree that URDF readers take."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import pytest
 import xacro
+import yaml
 
 from ethercat_server.sensor.objects.dictionary import MODELS
 from tests.ros_package.package_files import PACKAGE
@@ -21,11 +22,18 @@ FIGURES = {
     "LAXS": (44.5, 11.95),
     "MEGS": (59.0, 13.4),
 }
+# Mass in kg, diameter in mm.
+BODIES = {"SENS": (0.239, 70.0), "ROKS": (0.098, 48.0), "ROKA": (0.098, 48.0), "MEDS": (0.11, 48.0)}
+
+
+def example_text(**arguments: str) -> str:
+    return str(
+        xacro.process_file(str(URDF / "example.urdf.xacro"), mappings=arguments).toprettyxml(indent="  ")
+    )
 
 
 def example(**arguments: str) -> ElementTree.Element:
-    document = xacro.process_file(str(URDF / "example.urdf.xacro"), mappings=arguments)
-    return ElementTree.fromstring(document.toxml())
+    return ElementTree.fromstring(example_text(**arguments))
 
 
 def offset_mm(robot: ElementTree.Element, parent: str, child: str) -> float:
@@ -54,6 +62,38 @@ def test_frames_are_where_the_figures_say(model: str) -> None:
     assert offset_mm(robot, "ft_sensor_mounting", "ft_sensor_imu") == pytest.approx(imu)
 
 
+def numbers(element: ElementTree.Element | None, *names: str) -> list[float]:
+    assert element is not None
+    return [float(number) for name in names for number in str(element.get(name)).split()]
+
+
+@pytest.mark.parametrize("model", BODIES)
+def test_the_body_is_a_solid_cylinder_between_mounting_face_and_wrench_origin(model: str) -> None:
+    mass, diameter = BODIES[model]
+    r, h = diameter / 2000, FIGURES[model][0] / 1000
+    (link,) = example(model=model).findall("link[inertial]")
+    assert link.get("name") == "ft_sensor_mounting"
+    assert numbers(link.find("inertial/mass"), "value") == [mass]
+    across, along = mass * (3 * r * r + h * h) / 12, mass * r * r / 2
+    inertia = numbers(link.find("inertial/inertia"), "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    assert inertia == pytest.approx([across, across, along, 0, 0, 0])
+    for shape in ("visual", "collision"):
+        assert numbers(link.find(f"{shape}/geometry/cylinder"), "radius", "length") == [r, h]
+    for part in ("inertial", "visual", "collision"):
+        assert numbers(link.find(f"{part}/origin"), "xyz", "rpy") == [0, 0, h / 2, 0, 0, 0]
+
+
+def test_a_model_without_known_body_has_the_frames_only() -> None:
+    assert not example(model="MEGS").findall("link/*")
+
+
+def test_a_parameter_of_ros_which_is_yaml_takes_it_as_text() -> None:
+    """`-p robot_description:="$(xacro FILE)"`: a comment with a colon would be a mapping, and an error."""
+    text = example_text()
+    assert "<!--" in text
+    assert ElementTree.fromstring(yaml.safe_load(text)).tag == "robot"
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_every_model_that_the_server_knows_is_taken_by_its_whole_name(name: str) -> None:
     robot = example(model=name)
@@ -78,7 +118,9 @@ def test_two_sensors_fit_on_one_robot() -> None:
       <xacro:include filename="{URDF / "bota_sensor.xacro"}"/>
       <link name="base"/>
       <xacro:bota_sensor model="SENS" parent="base" prefix="a_"><origin xyz="0 0 1"/></xacro:bota_sensor>
-      <xacro:bota_sensor model="MEGS" parent="a_ft_sensor" prefix="b_"><origin/></xacro:bota_sensor>
+      <xacro:bota_sensor model="MEGS" parent="a_ft_sensor" prefix="b_" mass="1.5" diameter="0.12">
+        <origin/>
+      </xacro:bota_sensor>
     </robot>"""
     document = xacro.parse(text)
     xacro.process_doc(document)
@@ -86,6 +128,9 @@ def test_two_sensors_fit_on_one_robot() -> None:
     assert len(robot.findall("link")) == 7
     assert offset_mm(robot, "a_ft_sensor_mounting", "a_ft_sensor") == pytest.approx(35)
     assert offset_mm(robot, "b_ft_sensor_mounting", "b_ft_sensor") == pytest.approx(59)
+    assert [numbers(mass, "value") for mass in robot.findall("link/inertial/mass")] == [[0.239], [1.5]]
+    radii = [numbers(cylinder, "radius") for cylinder in robot.findall("link/collision/geometry/cylinder")]
+    assert radii == [[0.035], [0.06]]
 
 
 def test_an_unknown_model_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:

@@ -115,18 +115,25 @@ def test_indices_are_none_of_soems() -> None:
     assert {frame[17] for frame in wire.sent} == set(range(0x80, 0x90))
 
 
-def operational(*sensors: SensorOptions, machine: Machine | None = None) -> tuple[Bus, MemoryBackend]:
+def operational(
+    *sensors: SensorOptions, machine: Machine | None = None, lrw: bool = True
+) -> tuple[Bus, MemoryBackend]:
     backend = MemoryBackend(*sensors, machine=machine)
+    if not lrw:
+        life = backend.sensors.sensors[-1].life
+        assert life is not None
+        life.esc.take_lrw_away()
     bus = Bus(backend)
     bring_up(bus, Asked(), lambda: None)
     return bus, backend
 
 
-def test_an_exchange_brings_every_sensors_process_data() -> None:
+@pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
+def test_an_exchange_brings_every_sensors_process_data(lrw: bool) -> None:
     sensors = [
         SensorOptions(serial=n, pdo_size=size, signal="constant") for n, size in enumerate((61, 77, 61))
     ]
-    bus, backend = operational(*sensors)
+    bus, backend = operational(*sensors, lrw=lrw)
     exchange = Exchange(bus)
     assert exchange() == 9
     assert bus.process_data.counters == [(3,)] * 3
@@ -137,8 +144,10 @@ def test_an_exchange_brings_every_sensors_process_data() -> None:
         assert len(exchange.inputs[position]) == options.pdo_size
 
 
-def test_process_data_that_does_not_fit_one_frame_goes_in_several() -> None:
-    bus, backend = operational(*(SensorOptions(serial=n, pdo_size=77, signal="constant") for n in range(20)))
+@pytest.mark.parametrize(("lrw", "frames"), [(True, 2), (False, 3)], ids=["LRW", "LRD and LWR"])
+def test_process_data_that_does_not_fit_one_frame_goes_in_several(lrw: bool, frames: int) -> None:
+    sensors = (SensorOptions(serial=n, pdo_size=77, signal="constant") for n in range(20))
+    bus, backend = operational(*sensors, lrw=lrw)
     sent: list[int] = []
     send = backend.send
 
@@ -149,7 +158,7 @@ def test_process_data_that_does_not_fit_one_frame_goes_in_several() -> None:
     cast(Any, bus.process_data)._send = noted
     exchange = Exchange(bus)
     assert exchange() == 60
-    assert len(sent) == 2
+    assert len(sent) == frames
     assert max(sent) <= 1514
     for position in range(20):
         life = backend.sensors.sensors[position].life

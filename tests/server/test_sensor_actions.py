@@ -293,6 +293,25 @@ def test_a_tare_that_made_it_worse_is_taken_back(bench: tuple[Bench, Client]) ->
     assert held == offset, "it outlives a power cut too"
 
 
+def test_a_change_of_the_offset_is_told_at_once(bench: tuple[Bench, Client]) -> None:
+    sensor, asking = bench
+
+    def described() -> Any:
+        return asking.ask("describe")["sensors"][0]["offset"]
+
+    assert described() == [0.0] * 6
+    new = tare_at_rest(asking)["new_offset"]
+    assert sensor.wait_event("offset_changed") == {"event": "offset_changed", "sensor": 0, "offset": new}
+    assert described() == new
+    assert asking.ask("sdo_write", index=OFFSET, subindex=3, type="f32", value=1.5)["ok"]
+    changed = [*new[:2], 1.5, *new[3:]]
+    assert sensor.wait_event("offset_changed")["offset"] == described() == changed
+    sensor.command("on-write 0x8000 1 limit force.z 9")  # the tare is taken back
+    assert not asking.ask("tare", samples=50)["ok"]
+    assert sensor.wait_event("offset_changed")["offset"] != changed
+    assert sensor.wait_event("offset_changed")["offset"] == described() == changed
+
+
 def test_noise_does_not_make_a_tare_worse(bench: tuple[Bench, Client]) -> None:
     """It is on target already, so that each of these may be somewhat worse by chance."""
     sensor, asking = bench

@@ -29,7 +29,8 @@ class Feeder:
         self.timing.sends(self.now - took_ns)
         self.timing.took(self.now - took_ns, self.now)
         made = self.stream.take(data, 3, self.now - took_ns, self.now) if valid else None
-        self.stream.learn()
+        if self.stream.learns:
+            self.stream.learn()
         if made is None and self.now >= self.stream.idle_at_ns:
             made = self.stream.idle(self.now)
         if made is None:

@@ -28,9 +28,9 @@ class ExchangeTiming:
     """Round trips, and lateness of wake-ups, of one bus. All in ns; variances in ns²."""
 
     __slots__ = (
-        "_excess_square", "_late_variance", "_least_now_ns", "_most_excess_ns", "_roll_at_ns", "_turn",
-        "excess_ns", "in_flight", "late_ns", "least_ns", "look_ns", "look_variance", "patience_ns",
-        "sent_ns", "unanswered", "unanswered_since_ns", "usual_ns", "variance",
+        "_excess_square", "_late_variance", "_least_now_ns", "_most_excess_ns", "_most_late_ns",
+        "_roll_at_ns", "_turn", "excess_ns", "in_flight", "late_ns", "least_ns", "look_ns", "look_variance",
+        "patience_ns", "sent_ns", "unanswered", "unanswered_since_ns", "usual_ns", "variance",
     )  # fmt: skip
 
     def __init__(self, now_ns: int = 0) -> None:
@@ -64,6 +64,7 @@ class ExchangeTiming:
         least_ns = self.least_ns if self.least_ns < math.inf else _FIRST_GUESS_NS
         self.usual_ns = least_ns + self.excess_ns
         self._most_excess_ns = _OUTLIER * math.sqrt(self._excess_square) + _ROOM_NS
+        self._most_late_ns = _OUTLIER * math.sqrt(self._late_variance) + _ROOM_NS
         self.patience_ns = self.usual_ns + 3 * self.excess_ns + _PATIENCE_NS
         """After this time an answer is overdue."""
 
@@ -89,7 +90,8 @@ class ExchangeTiming:
         if took_ns < self._least_now_ns:
             self._least_now_ns = took_ns
             self.least_ns = min(self.least_ns, took_ns)
-        excess_ns = min(took_ns - self.least_ns, self._most_excess_ns)
+        excess_ns = took_ns - self.least_ns
+        excess_ns = min(excess_ns, self._most_excess_ns)
         self.excess_ns += _GAIN * (excess_ns - self.excess_ns)
         self._excess_square += _GAIN * (excess_ns * excess_ns - self._excess_square)
         self._turn -= 1
@@ -99,8 +101,9 @@ class ExchangeTiming:
 
     def woke(self, late_ns: float) -> None:
         """The loop woke so long after it had wanted to."""
-        most = _OUTLIER * math.sqrt(self._late_variance) + _ROOM_NS
-        error = min(max(late_ns - self.late_ns, -most), most)
+        error, most = late_ns - self.late_ns, self._most_late_ns
+        if not -most < error < most:
+            error = math.copysign(most, error)
         self.late_ns += _GAIN * error
         self._late_variance += _GAIN * (error * error - self._late_variance)
 
@@ -109,7 +112,9 @@ class ExchangeTiming:
 
         Returns the instant and its variance.
         """
-        excess_ns = max(0.0, back_ns - sent_ns - self.least_ns)
+        excess_ns = back_ns - sent_ns - self.least_ns
+        if excess_ns <= 0:
+            return sent_ns, 0.0
         return sent_ns + excess_ns / 2, excess_ns * excess_ns / 12
 
     def describe(self) -> dict[str, Any]:

@@ -32,9 +32,12 @@ _LOSS_PERIODS: Final = 10.0
 _NO_TIME: Final = 0.5
 """There is none if a round trip takes more than this part of a period."""
 _LARGEST_MARGIN: Final = 0.4
-_EARLY_POLLS: Final = 0.08
+_EARLY_POLLS: Final = 0.11
 """Part of the samples whose first poll is to be early."""
 _CAUTION_GAIN: Final = 0.05
+_TURNS: Final = 7
+_CHANGED: Final = 1.25
+"""The margin is derived anew every so many exchanges, and when the variance has changed by this factor."""
 _PROBE_BELOW: Final = 5_000.0**2
 """A phase known so well needs no probes, however well polls could tell it."""
 _UNPROBED: Final = 500
@@ -55,9 +58,10 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_absent", "_aim_ns", "_begun", "_caution", "_doubtful", "_estimate", "_hits", "_looked_ns",
-        "_margin_ns", "_newest", "_nominal_ns", "_overdue", "_probing", "_single", "_timing", "instant_ns",
-        "locked", "quiet_until_ns", "steps", "uncertain",
+        "_absent", "_aim_ns", "_begun", "_caution", "_doubtful", "_estimate", "_hits", "_least_variance",
+        "_looked_ns", "_margin_ns", "_most_variance", "_newest", "_nominal_ns", "_overdue", "_probed_above",
+        "_probing", "_single", "_timing", "_turn", "_usual_margin_ns", "instant_ns", "locked",
+        "quiet_until_ns", "steps", "uncertain",
     )  # fmt: skip
 
     def __init__(self, period_ns: float, timing: ExchangeTiming) -> None:
@@ -96,7 +100,10 @@ class SampleClock:
         """Samples since a look was early."""
         self._caution = 1.0
         """Part of the margin that is needed: looks are spread less evenly than a margin assumes."""
-        self._margin_ns = 0.0
+        self._turn = 0
+        self._least_variance = self._most_variance = 0.0
+        """Between these the margin is as it was derived last."""
+        self._usual_margin_ns = self._margin_ns = self._probed_above = 0.0
         self._aim_ns = 0.0
         """When the next poll should be sent."""
         self._settle()
@@ -110,6 +117,11 @@ class SampleClock:
     def uncertainty_ns(self) -> float:
         """How far `instant_ns` may be off: two standard deviations, and where the slave is on the way."""
         return 2 * math.sqrt(self._estimate.variance) + self._timing.least_ns / 2
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether it is followed, and an exchange is back before the next one is wanted."""
+        return self.locked and not self._single
 
     @property
     def pull(self) -> float:
@@ -151,17 +163,21 @@ class SampleClock:
 
     def _settle(self) -> None:
         """Derive from the estimate what the next poll needs."""
-        timing, variance, period_ns = self._timing, self._estimate.variance, self._estimate.period_ns
-        phase_ns = self._estimate.phase_ns
+        timing, estimate = self._timing, self._estimate
+        variance, period_ns = estimate.variance, estimate.period_ns
         deviation_ns = math.sqrt(variance)
         self.locked = self._begun and deviation_ns < _LOCKED * period_ns
-        self._single = _has_time_for_one(timing, period_ns)
-        self._margin_ns = margin_ns(timing, period_ns, variance)
-        if not self._single:
-            self._margin_ns *= self._caution
-        self._aim_ns = phase_ns + self._margin_ns - timing.look_ns
-        self._probing = self._hits > _UNPROBED or variance > (timing.look_variance + _PROBE_BELOW) / 4
-        self.quiet_until_ns = phase_ns - CERTAIN * deviation_ns if self.locked else 0.0
+        self._turn -= 1
+        if self._turn < 0 or not self._least_variance < variance < self._most_variance:
+            self._turn = _TURNS
+            self._least_variance, self._most_variance = variance / _CHANGED, variance * _CHANGED
+            self._single = _has_time_for_one(timing, period_ns)
+            self._usual_margin_ns = margin_ns(timing, period_ns, variance)
+            self._probed_above = (timing.look_variance + _PROBE_BELOW) / 4
+        self._margin_ns = self._usual_margin_ns if self._single else self._usual_margin_ns * self._caution
+        self._aim_ns = estimate.phase_ns + self._margin_ns - timing.look_ns
+        self._probing = self._hits > _UNPROBED or variance > self._probed_above
+        self.quiet_until_ns = estimate.phase_ns - CERTAIN * deviation_ns if self.locked else 0.0
 
     # -- what an exchange says
 
@@ -180,7 +196,9 @@ class SampleClock:
             self.uncertain = unwatched_ns >= period_ns
             self.instant_ns = min(back_ns, sent_ns + period_ns) - min(unwatched_ns, period_ns) / 2
             return
-        excess_ns = max(0.0, back_ns - sent_ns - least_ns)
+        excess_ns = back_ns - sent_ns - least_ns
+        if excess_ns < 0:
+            excess_ns = 0.0
         # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought is
         # dated from before, never as younger than it may be.
         looked_at_ns = sent_ns + (excess_ns / 2 if excess_ns < _LONGEST_LOOK * period_ns else 0.0)
@@ -204,7 +222,10 @@ class SampleClock:
             self.steps = 1  # a silent sensor is told as such
         elif late > _EARLY:
             self.steps += self._absent  # those that did not come are missing, too
-        self.instant_ns = min(max(phase_ns + (newest - 1) * period_ns, looked_ns) + least_ns / 2, back_ns)
+        instant_ns = phase_ns + (newest - 1) * period_ns
+        instant_ns = max(instant_ns, looked_ns)
+        instant_ns += least_ns / 2
+        self.instant_ns = instant_ns if instant_ns < back_ns else back_ns
 
     def _is_late(self, look_ns: float, variance: float) -> bool:
         """Whether the sample that is expected should have been there at a look."""
@@ -226,7 +247,7 @@ class SampleClock:
                 estimate.advance(self._newest - 1)
             if self.uncertain:
                 pass  # it may be another sample's
-            elif self.locked and not self._is_late(looked_ns, variance):
+            elif self.locked and not (looked_ns > estimate.phase_ns and self._is_late(looked_ns, variance)):
                 estimate.learn_bit(look_ns, variance, 1)
             elif look_ns - looked_ns < estimate.period_ns:
                 estimate.learn_bracket(looked_ns, look_ns, variance)

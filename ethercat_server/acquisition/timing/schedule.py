@@ -16,7 +16,7 @@ _COST_GAIN: Final = 1 / 64
 _FIRST_COST_NS: Final = 50_000.0
 _BUDGET: Final = 1 / 3
 """Part of the time that exchanges may take."""
-_LARGEST_WAIT: Final = 0.25
+_LARGEST_WAIT: Final = 0.2
 """What a poll may wait for another, in shortest sample periods."""
 _LONGEST_LEAD_NS: Final = 200_000.0
 """By how much polls are brought forward at most because this machine wakes late."""
@@ -32,6 +32,8 @@ class Schedule:
         self._spacing_ns = 0.0
         self.shortest_ns = 0.0
         """The shortest sample period; it changes with the rates."""
+        self.one_by_one = True
+        """Whether the answer to an exchange is usually back before the next one is due."""
         self.roll()
 
     def next_ns(self) -> float:
@@ -57,3 +59,4 @@ class Schedule:
         """Once a second."""
         self.shortest_ns = min(stream.clock.period_ns for stream in self._streams)
         self._spacing_ns = min(self._cost_ns / _BUDGET, _LARGEST_WAIT * self.shortest_ns)
+        self.one_by_one = all(stream.clock.one_by_one for stream in self._streams)

@@ -10,6 +10,9 @@ from typing import Final
 
 DL_INFORMATION: Final = 0x0000
 FMMU_AND_SM_COUNT: Final = 0x0004
+FEATURES: Final = 0x0008
+NO_LRW: Final = 1 << 9
+"""In FEATURES: logical memory can be read (LRD) and written (LWR), but not both at once."""
 """Two bytes: the number of FMMUs, the number of sync managers."""
 STATION_ADDRESS: Final = 0x0010
 STATION_ALIAS: Final = 0x0012

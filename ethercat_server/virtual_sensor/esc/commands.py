@@ -73,6 +73,8 @@ def _physical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
 def _logical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
     address = datagram.ado << 16 | datagram.adp
     key = (address, datagram.length)
+    if datagram.command == Command.LRW and not esc.has_lrw:
+        return 0
     plan = esc.plans.get(key)
     if plan is None:
         plan = [

@@ -67,7 +67,14 @@ class Esc:
         self.sync_managers = [SyncManager(self.memory, n) for n in range(reg.SYNC_MANAGER_COUNT)]
         self.fmmus: list[Fmmu] = []
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
+        self.has_lrw = True
         self._events = 0
+
+    def take_lrw_away(self) -> None:
+        """Be a controller that does not know LRW."""
+        self.has_lrw = False
+        features = _U16.unpack_from(self.memory, reg.FEATURES)[0]
+        _U16.pack_into(self.memory, reg.FEATURES, features | reg.NO_LRW)
 
     def count(self, counter: int) -> None:
         """Add one to the error counter at this register; it stays at 255."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from bridge.parameters.compensation import AUTO, CompensationParameters
-from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
+from ft_compensation.quantities import NO_WRENCH, Payload, Wrench, wrench_text
 from ft_compensation.store import CompensationStore, Stored, StoreError, default_directory
 
 FROM_PARAMETER: Final = "parameter"
@@ -34,36 +34,43 @@ class BiasKeeper:
     def __init__(self, log: Any) -> None:
         self.serial: str | None = None
         self.problem = ""
-        self._kept: Wrench | None = None
-        """What the file has."""
+        self._kept: tuple[Wrench, Wrench | None] | None = None
+        """What the file has: a bias, and the sensor's own offset with it."""
         self._log = log
 
     def forget(self) -> None:
         """What the file has is not known any more: keep the bias anew."""
         self._kept = None
 
-    def keep(self, bias: Wrench, parameters: CompensationParameters) -> None:
-        """Keep `bias` for the sensor that is there, if that is asked for and it is not the kept one."""
+    def keep(self, bias: Wrench, parameters: CompensationParameters, offset: Wrench | None) -> None:
+        """Keep `bias`, taken with the sensor's own `offset`, for the sensor that is there, if that is asked
+        for and it is not the kept one."""
         if not parameters.bias_keep:
             self.problem = ""
             return
-        if self.serial is None or bias == self._kept:
+        if self.serial is None or (bias, offset) == self._kept:
             return
         try:
-            path = _store(parameters).save(_number(self.serial), bias, parameters.payload)
+            path = _store(parameters).save(_number(self.serial), bias, parameters.payload, offset)
         except StoreError as error:
             self._say_not_kept(str(error))
             return
-        self._kept, self.problem = bias, ""
+        self._kept, self.problem = (bias, offset), ""
         self._log.info(f"the bias is kept in {path}")
 
     def take(
-        self, serial: str, bias: Wrench, origin: str, parameters: CompensationParameters
+        self,
+        serial: str,
+        bias: Wrench,
+        origin: str,
+        parameters: CompensationParameters,
+        offset: Wrench | None,
     ) -> Beginning | None:
-        """Another sensor is there; `bias` from `origin` is in force. None: it stays."""
+        """Another sensor is there, with this `offset` of its own; `bias` from `origin` is in force. None: it
+        stays."""
         is_first, self.serial = self.serial is None, serial
         self._kept = None
-        stored = self._look_up(serial, parameters)
+        stored = self._look_up(serial, parameters, offset)
         if stored is None:
             if is_first or origin == FROM_PARAMETER:
                 return None
@@ -74,12 +81,13 @@ class BiasKeeper:
             return Beginning(NO_WRENCH, FROM_PARAMETER)
         if is_first and bias not in (NO_WRENCH, stored.bias):
             self._log.warning(
-                f"the bias kept of sensor {serial} is not used, because the parameter bias is given; "
-                "it is replaced by it"
+                f"the bias kept of the sensor with serial number {serial} is not used, because the parameter "
+                "bias is given; it is replaced by it"
             )
             return None
-        self._kept = stored.bias
-        self._log.info(f"sensor {serial} has the bias that was kept at {stored.saved}")
+        if stored.offset == offset:
+            self._kept = stored.bias, offset
+        self._log.info(f"the sensor with serial number {serial} has the bias that was kept at {stored.saved}")
         if stored.payload is not None and stored.payload != parameters.payload:
             self._log.warning(
                 f"the kept bias was taken with {_payload_text(stored.payload)}, and now there is "
@@ -87,15 +95,32 @@ class BiasKeeper:
             )
         return Beginning(stored.bias, f"kept since {stored.saved}")
 
-    def _look_up(self, serial: str, parameters: CompensationParameters) -> Stored | None:
+    def _look_up(
+        self, serial: str, parameters: CompensationParameters, offset: Wrench | None
+    ) -> Stored | None:
+        """What was kept, the bias as it is with the sensor's `offset` of now."""
         self.problem = ""
         if not parameters.bias_keep:
             return None
         try:
-            return _store(parameters).load(_number(serial))
+            stored = _store(parameters).load(_number(serial))
         except StoreError as error:
             self._say_not_kept(str(error))
             return None
+        if stored is None or stored.offset == offset:
+            return stored
+        if stored.offset is None or offset is None:
+            self._say_not_kept(
+                f"the bias kept of the sensor with serial number {serial} is not used, because it is not "
+                "known whether the sensor's own offset is the one of then: tare"
+            )
+            return None
+        change = offset.plus(stored.offset, -1.0)
+        self._log.info(
+            f"the own offset of the sensor with serial number {serial} has changed by "
+            f"{wrench_text(change)} since its bias was kept, which is shifted by that"
+        )
+        return stored._replace(bias=stored.bias.plus(change))
 
     def _say_not_kept(self, problem: str) -> None:
         self.problem = problem

@@ -13,25 +13,22 @@ from typing import Final
 from rclpy.node import Node
 
 from bridge.compensating.bias_keeper import FROM_PARAMETER, BiasKeeper
-from bridge.compensating.gravity_sources import (
-    AccelerometerSource,
-    ListenerSource,
-    NoSource,
-    SensorSource,
-    Source,
-)
-from bridge.compensating.orientation_listener import OrientationListener, check_can_listen
-from bridge.diagnostics.compensation_state import CompensationState, conflict
+from bridge.compensating.gravity_sources import NoSource, Source
+from bridge.compensating.obstacles import Obstacles
+from bridge.compensating.own_offset import OwnOffset
+from bridge.compensating.source_choice import SourceChoice, is_same_source
+from bridge.diagnostics.compensation_state import CompensationState
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.live import LiveParameters
 from bridge.parameters.row import ParameterError
 from bridge.parameters.table import Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
 from bridge.stream.link import Link
-from ft_compensation.attitude.tilt import GyroscopeOffset
+from bridge.stream.watch import Watch
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import NO_WRENCH, Payload, Wrench, length
+from ft_compensation.payload_watch import PayloadWatch
+from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, length, wrench_text
 
 _LOOKING_UP: Final = "the bias of this sensor is being looked up"
 
@@ -45,8 +42,9 @@ class CompensationControl:
         parameters: Parameters,
         output: CompensatedOutput,
         link: Link,
+        watch: Watch,
+        live: LiveParameters,
         count_not_finite: Callable[[], int],
-        on_failure: Callable[[str], object],
     ) -> None:
         """ParameterError if the parameters cannot be had here."""
         self.parameters = parameters.compensation
@@ -56,31 +54,34 @@ class CompensationControl:
         self.sensors = 1
         """How many have been there: what was measured on one is of no use with another."""
         self.ending = False
-        self._node, self._log = node, node.get_logger()
-        self._frame, self._on_failure = parameters.frame_id, on_failure
-        self._listener: OrientationListener | None = None
-        self._gyroscope = GyroscopeOffset()
+        self._log = node.get_logger()
+        self._choice = SourceChoice(node, parameters.frame_id)
         self._keeper = BiasKeeper(self._log)
+        self._own_offset = OwnOffset(link)
         self.count_not_finite = count_not_finite
         """Samples so far that were not finite somewhere."""
         self._next_origin = FROM_PARAMETER
-        self._check(self.parameters)
+        self._choice.check(self.parameters)
         self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
-        self.source: Source = NoSource()
-        self._live = LiveParameters(node, self._check, self._apply)
+        self._watch: PayloadWatch | None = None
+        self._watched: object = None
+        self.obstacles, self._live = Obstacles(link, watch), live
+        live.checks.append(lambda wanted: self._choice.check(wanted.compensation))
+        live.listeners.append(lambda wanted: self._apply(wanted.compensation))
         self._guard = node.create_guard_condition(self._follow_sensor)
 
     def start(self) -> None:
-        """Open the orientation's source, which may take a thread; before any sample comes.
+        """Open the orientation's source; before any sample comes.
 
         ParameterError if it cannot be had.
         """
-        self.source = self._open_source(self.parameters)
+        self._choice.open(self.parameters)
+        self.output.stops_on_saturation = self.parameters.on_saturation == "stop"
         self._make_plan()
 
-    def close(self) -> bool:
-        """Stop listening for orientations; False if that does not end in time."""
-        return self._listener is None or self._listener.close()
+    def close(self) -> None:
+        """Stop listening for orientations."""
+        self._choice.close()
 
     def cancel(self) -> None:
         """Make whoever waits for samples give up; from any thread: the node ends."""
@@ -92,11 +93,20 @@ class CompensationControl:
             # Not one sample of this sensor with what may be another's bias.
             self.output.hold = _LOOKING_UP
             self._guard.trigger()
+        else:
+            self._follow_offset()
+            if self.output.hold is not _LOOKING_UP:
+                self.obstacles.hold(self.parameters, self.output)
 
     @property
     def keeping(self) -> str:
         """Why the bias could not be kept or read, a sentence; empty if it could, or was not to be."""
         return self._keeper.problem
+
+    @property
+    def source(self) -> Source:
+        """Where gravity is taken from."""
+        return self._choice.source
 
     @property
     def bias(self) -> Wrench:
@@ -105,26 +115,18 @@ class CompensationControl:
 
     def after_sensor_tare(self) -> str:
         """What a new offset in the sensor itself means here, a sentence; "" if nothing."""
-        if self.bias == NO_WRENCH:
-            return ""
-        return "The node's own bias was for the old offset: call ~/tare or ~/clear_tare"
-
-    def conflict(self) -> str | None:
-        """What the sensor is set to that does not go with compensation, a sentence."""
-        return conflict(self.link.settings, self.parameters.payload)
+        return self._own_offset.after_tare(self.bias)
 
     def state(self) -> CompensationState:
         """How things are, for the diagnostics' thread."""
-        output, source = self.output, self.source
+        output, source, watch = self.output, self._choice.source, self._watch
         payload = self.parameters.payload
-        why = None
-        if output.is_stopped:
-            why = output.hold or output.broken or source.why_none(output.time_s)
         return CompensationState(
             has_subscribers=output.has_subscribers,
             published=output.published,
             withheld=output.withheld,
-            why_stopped=why,
+            why_stopped=self.obstacles.stopping(self.parameters, output, source, self._choice.listener),
+            why_partly=output.problem,
             source=source.describe,
             age_s=source.age_s(output.time_s),
             tilt=source.tilt,
@@ -135,7 +137,11 @@ class CompensationControl:
             origin=self.origin,
             is_ramping=self.is_ramping,
             keep=self.parameters.bias_keep,
-            problem=self.conflict() or self.keeping,
+            stops_on_saturation=output.stops_on_saturation,
+            problem=self.obstacles.conflict(self.parameters)
+            or self._own_offset.doubt(self.bias)
+            or self.keeping
+            or (watch.finding if watch is not None else ""),
         )
 
     @property
@@ -145,6 +151,7 @@ class CompensationControl:
 
     def set_bias(self, bias: Wrench, origin: str) -> None:
         """Put a bias in force, and keep it if that is asked for."""
+        self._own_offset.begin()
         with self._origin(origin):
             self._live.put(bias=[*bias.values])
 
@@ -155,12 +162,18 @@ class CompensationControl:
         self.origin = "undone"
         return before
 
-    def set_payload(self, payload: Payload, bias: Wrench) -> None:
-        """Put an identified payload and its bias in force, both at once."""
+    def set_payload(self, payload: Payload, bias: Wrench, accelerometer: Accelerometer | None = None) -> None:
+        """Put an identified payload, its bias and the accelerometer's correction in force, all at once."""
+        values: dict[str, object] = {
+            "tool_mass": payload.mass,
+            "tool_center_of_gravity": [*payload.center],
+            "bias": [*bias.values],
+        }
+        if accelerometer is not None:
+            values["accelerometer.offset"] = [*accelerometer.offset]
+            values["accelerometer.scale"] = [*accelerometer.scale]
         with self._origin("identified"):
-            self._live.put(
-                tool_mass=payload.mass, tool_center_of_gravity=[*payload.center], bias=[*bias.values]
-            )
+            self._live.put(**values)
 
     @contextlib.contextmanager
     def _origin(self, origin: str) -> Iterator[None]:
@@ -170,26 +183,28 @@ class CompensationControl:
         finally:
             self._next_origin = FROM_PARAMETER
 
-    def _check(self, wanted: CompensationParameters) -> None:
-        """ParameterError if that cannot be had on this machine."""
-        check_can_listen(self._node, wanted.orientation)
-
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted
-        if _source_part(wanted) != _source_part(was):
+        if not is_same_source(wanted, was):
             try:
-                self.source = self._open_source(wanted)
+                self._choice.open(wanted)
             except ParameterError as error:  # too late to refuse the parameter
                 self._log.error(str(error))
-                self.source = NoSource(str(error))
+                self._choice.source = NoSource(str(error))
+        self.output.tune(wanted)
         self._ramp.seconds = wanted.bias_ramp_time
-        if wanted.bias != self.bias:
+        # A parameter that the shift of the bias has not reached yet is no wish.
+        if wanted.bias not in (was.bias, self.bias):
             self._ramp.go(wanted.bias, self.output.time_s)
+            self._own_offset.begin()
             self.origin = self._next_origin
         self._make_plan()
+        self.output.stops_on_saturation = wanted.on_saturation == "stop"
+        if self.output.hold is not _LOOKING_UP:
+            self.obstacles.hold(self.parameters, self.output)
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
             self._keeper.forget()
-        self._keeper.keep(self.bias, wanted)
+        self._keeper.keep(self.bias, wanted, self._own_offset.of_bias)
 
     def _make_plan(self) -> None:
         wanted = self.parameters
@@ -198,22 +213,13 @@ class CompensationControl:
             wanted.payload,
             inertia=wanted.compensate_inertia and has_weight,
             imu_position=wanted.imu_position,
+            accelerometer=wanted.accelerometer.reading,
         )
-        self.output.plan = Plan(self.source, compensator, self._ramp, has_weight)
-
-    def _open_source(self, wanted: CompensationParameters) -> Source:
-        listener, self._listener = self._listener, None
-        if listener is not None:
-            listener.close()
-        name = wanted.orientation.source
-        if name == "none":
-            return NoSource()
-        if name == "accelerometer":
-            return AccelerometerSource(wanted, self._gyroscope)
-        if name == "sensor":
-            return SensorSource(wanted)
-        self._listener = OrientationListener(self._node, wanted.orientation, self._frame, self._on_failure)
-        return ListenerSource(wanted, self._listener)
+        watched = wanted.payload, self.bias, self.sensors
+        if watched != self._watched:
+            self._watched = watched
+            self._watch = PayloadWatch(wanted.payload, self._log.warning, wanted.rest) if has_weight else None
+        self.output.plan = Plan(self._choice.source, compensator, self._ramp, has_weight, self._watch)
 
     def _is_same_sensor(self) -> bool:
         info = self.link.info
@@ -226,7 +232,8 @@ class CompensationControl:
             if info is None:
                 break
             is_another = self._keeper.serial is not None
-            begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters)
+            offset = self._own_offset.begin()
+            begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters, offset)
             if begin is not None:
                 self._begin_with(*begin)
             elif is_another:
@@ -234,16 +241,27 @@ class CompensationControl:
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
                 self._make_plan()
             if is_another:
-                self._gyroscope = GyroscopeOffset()
-                if isinstance(self.source, AccelerometerSource):
-                    self.source = AccelerometerSource(self.parameters, self._gyroscope)
-                    self._make_plan()
+                self._choice.another_sensor(self.parameters)
+                self._make_plan()
                 self.sensors += 1
             if not self.keeping and self.bias != NO_WRENCH:
-                self._keeper.keep(self.bias, self.parameters)
-        self.output.hold = None
+                self._keeper.keep(self.bias, self.parameters, self._own_offset.of_bias)
+        self._follow_offset()
+        if self.bias != self.parameters.bias:
+            self._live.put(bias=[*self.bias.values])  # shifted
+        self.obstacles.hold(self.parameters, self.output)
         if not self._is_same_sensor():
             self.link_changed()
+
+    def _follow_offset(self) -> None:
+        """Shift the bias by what the sensor itself adds now, from the next sample on; for the reader too."""
+        change = self._own_offset.follow(self.bias)
+        if change is not None:
+            self._ramp.shift(change)
+            self._log.info(
+                f"the sensor's own offset was changed by {wrench_text(change)}: the bias is shifted by that"
+            )
+            self._guard.trigger()
 
     def _begin_with(self, bias: Wrench, origin: str) -> None:
         """Put a bias in force at once, with nothing before it."""
@@ -253,7 +271,3 @@ class CompensationControl:
             self._live.put(bias=[*bias.values])
         self.origin, self._keeper.problem = origin, problem
         self._make_plan()
-
-
-def _source_part(parameters: CompensationParameters) -> tuple[object, ...]:
-    return parameters.orientation, parameters.accelerometer, parameters.gravity

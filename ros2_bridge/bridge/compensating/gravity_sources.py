@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 from bridge.parameters.compensation import CompensationParameters, Quaternion
 from ft_compensation.attitude.tilt import GyroscopeOffset
 from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
-from ft_compensation.quantities import length
+from ft_compensation.quantities import EXACT, length
 from protocol.pdo import Sample, Vector3
 
 
@@ -87,6 +87,7 @@ class AccelerometerSource:
             tilt_limit=p.tilt_limit,
             offset=gyroscope,
         )
+        self._correct = None if p.reading == EXACT else p.reading.correct
         self._broken = ""
 
     @property
@@ -100,6 +101,8 @@ class AccelerometerSource:
         acceleration = sample.acceleration
         if not sample.angular_rate_saturated:
             usable = None if sample.acceleration_saturated else acceleration
+            if usable is not None and self._correct is not None:
+                usable = self._correct(usable)
             good = self._filter.update(usable, sample.angular_rate, time_s)
             if not good and not math.isfinite(sum(acceleration) + sum(sample.angular_rate)):
                 self._broken = "the IMU's numbers are not finite: see stream"

@@ -1,17 +1,15 @@
-"""Listens to a topic or to TF for the sensor's orientation, in a thread and with a hidden node of its own.
+"""Listens to a topic or to TF for the sensor's orientation.
 
-A node of its own, because the executor of `bridge` stands still while a service waits for the server or for
-samples, and a pose that is not taken in is an old one. It exists only while such a source is chosen.
+In a callback group of its own, so that it waits for no service: a pose that is not taken in is an old one.
 """
 
 from __future__ import annotations
 
-import threading
+import time
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
@@ -28,15 +26,20 @@ from bridge.compensating.orientation_messages import (
 )
 from bridge.parameters.compensation import TOPIC_SOURCES, OrientationParameters
 from bridge.parameters.row import ParameterError
-from bridge.spinning import Spinner
 
 TF_PERIOD_S: Final = 0.005
 """How often TF is asked."""
-TF_TOPICS: Final = ("/tf", "/tf_static")
+_LET_GO_S: Final = 1.0
+"""How long an executor may take to let go of the subscription before: DDS has one type for a topic."""
 
 
-def check_can_listen(node: Node, chosen: OrientationParameters) -> None:
-    """ParameterError if that source cannot be had on this machine, or its topic has no possible name."""
+def check_can_listen(
+    node: Node, chosen: OrientationParameters, listening: OrientationListener | None = None
+) -> None:
+    """ParameterError if that source cannot be had on this machine, or its topic has no possible name.
+
+    `listening` is what will be closed before.
+    """
     if chosen.source == "tf":
         check_tf()
     if chosen.source in TOPIC_SOURCES:
@@ -48,6 +51,8 @@ def check_can_listen(node: Node, chosen: OrientationParameters) -> None:
         wanted = TOPIC_KINDS[chosen.source].type
         for own in (*node.publishers, *node.subscriptions):
             # DDS has one type for a topic in a process.
+            if listening is not None and own is listening.subscription:
+                continue
             if own.topic_name == resolved and own.msg_type is not wanted:
                 raise ParameterError(
                     f"parameter orientation.topic is {chosen.topic!r}: this node itself has that topic, with "
@@ -63,7 +68,7 @@ class OrientationListener:
         node: Node,
         chosen: OrientationParameters,
         frame: str,
-        on_failure: Callable[[str], object],
+        group: CallbackGroup,
         open_buffer: Callable[[Node], Tf] = open_tf,
     ) -> None:
         """`chosen.source` is a key of TOPIC_KINDS, or `tf`: then `frame` is the sensor's.
@@ -73,68 +78,58 @@ class OrientationListener:
         self.latest: Oriented | None = None
         self.problem = "nothing has come yet"
         """What was wrong with what came last; empty if nothing was."""
-        self._on_failure = on_failure
-        self._closing = False
-        self._mounting = None if chosen.source == "tf" else chosen.mounting
-        name = f"_{node.get_name()}_orientation"
-        self._node = rclpy.create_node(
-            name,
-            context=node.context,
-            namespace=node.get_namespace(),
-            # Topics are remapped as `bridge`'s are, but what renames that node must not rename this one.
-            use_global_arguments=False,
-            cli_args=[
-                "--ros-args",
-                *(word for tf in TF_TOPICS for word in ("-r", f"{tf}:={node.resolve_topic_name(tf)}")),
-            ],
-            start_parameter_services=False,
-            enable_rosout=False,
-        )
-        try:
-            self._listen(node, chosen, frame, open_buffer)
-        except RuntimeError as error:
-            self._node.destroy_node()
-            raise ParameterError(
-                f"parameter orientation.topic is {chosen.topic!r}: ROS refuses to listen there ({error}); "
-                "choose another topic"
-            ) from None
-        self._executor = SingleThreadedExecutor(context=node.context)
-        self._executor.add_node(self._node)
-        self._spinner = Spinner(self._executor)
-        self._thread = threading.Thread(target=self._run, name="orientation", daemon=True)
-        self._thread.start()
-
-    def _listen(
-        self,
-        node: Node,
-        chosen: OrientationParameters,
-        frame: str,
-        open_buffer: Callable[[Node], Tf],
-    ) -> None:
+        self.subscription: Any = None
+        """To a topic; None: to TF."""
+        self._node, self._group = node, group
+        self._close: Callable[[], object]
         if chosen.source == "tf":
-            base, tf = chosen.base_frame, open_buffer(self._node)
-            self.describe = f"TF from {base} to {frame}"
-            self._node.create_timer(TF_PERIOD_S, lambda: self._take(lambda: look_up(tf, base, frame)))
+            self._mounting = None
+            self._listen_to_tf(open_buffer(node), chosen.base_frame, frame)
         else:
-            kind = TOPIC_KINDS[chosen.source]
-            resolved = node.resolve_topic_name(chosen.topic)
-            self.describe = f"topic {resolved}"
-            self.problem = "nothing has come on it yet"
-            profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-            self._node.create_subscription(
-                kind.type, resolved, lambda message: self._take(lambda: read_message(kind, message)), profile
-            )
+            self._mounting = chosen.mounting
+            self._listen_to_topic(chosen)
 
-    def close(self, timeout_s: float = 5.0) -> bool:
-        """Stop listening; False if the thread does not end in time."""
-        self._closing = True
-        self._spinner.stop()
-        self._thread.join(timeout_s)
-        if self._thread.is_alive():
-            return False  # what it waits for must not be taken from under it
-        self._executor.shutdown()
-        self._node.destroy_node()
-        return True
+    def _listen_to_tf(self, tf: Tf, base: str, frame: str) -> None:
+        self.describe = f"TF from {base} to {frame}"
+        timer = self._node.create_timer(
+            TF_PERIOD_S, lambda: self._take(lambda: look_up(tf, base, frame)), self._group
+        )
+
+        def close() -> None:
+            self._node.destroy_timer(timer)
+            tf.close()
+
+        self._close = close
+
+    def _listen_to_topic(self, chosen: OrientationParameters) -> None:
+        kind = TOPIC_KINDS[chosen.source]
+        resolved = self._node.resolve_topic_name(chosen.topic)
+        self.describe = f"topic {resolved}"
+        self.problem = "nothing has come on it yet"
+        profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        deadline_s = time.monotonic() + _LET_GO_S
+        while self.subscription is None:
+            try:
+                self.subscription = self._node.create_subscription(
+                    kind.type,
+                    resolved,
+                    lambda message: self._take(lambda: read_message(kind, message)),
+                    profile,
+                    callback_group=self._group,
+                )
+            except RuntimeError as error:
+                if time.monotonic() < deadline_s:
+                    time.sleep(0.01)
+                    continue
+                raise ParameterError(
+                    f"parameter orientation.topic is {chosen.topic!r}: ROS refuses to listen there "
+                    f"({error}); choose another topic"
+                ) from None
+        self._close = lambda: self._node.destroy_subscription(self.subscription)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._close()
 
     def _take(self, read: Callable[[], Oriented]) -> None:
         try:
@@ -146,10 +141,3 @@ class OrientationListener:
             if self._mounting is not None:
                 quaternion = multiply(quaternion, self._mounting)
             self.latest, self.problem = Oriented(quaternion, found.stamp_ns), ""
-
-    def _run(self) -> None:
-        try:
-            self._spinner.run()
-        except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a dead source
-            if not self._closing:
-                self._on_failure(f"the orientation's source failed: {type(error).__name__}: {error}")

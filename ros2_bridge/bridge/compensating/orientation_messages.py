@@ -87,6 +87,8 @@ class Tf(NamedTuple):
     """What a lookup raises."""
     latest: Any
     """The time that stands for the latest there is."""
+    close: Callable[[], object] = lambda: None
+    """Ends listening."""
 
 
 def look_up(tf: Tf, base: str, frame: str) -> Oriented:
@@ -101,22 +103,24 @@ def look_up(tf: Tf, base: str, frame: str) -> Oriented:
     return Oriented(unit(found.transform.rotation), stamp_ns or time.time_ns())
 
 
-def check_tf() -> None:
-    """ParameterError if tf2_ros is not there."""
+def check_tf(
+    wanted: str = "parameter orientation_source is 'tf'", instead: str = "take another source"
+) -> None:
+    """ParameterError if tf2_ros is not there. `wanted`: what needs it, `instead`: what to do without it."""
     try:
         import tf2_ros  # noqa: F401, PLC0415 - only where it is asked for: not everybody has it
     except ImportError as error:
         raise ParameterError(
-            f"parameter orientation_source is 'tf': it needs tf2_ros, which cannot be loaded ({error}): "
-            "sudo apt install ros-$ROS_DISTRO-tf2-ros-py and source ROS 2, or take another source"
+            f"{wanted}: it needs tf2_ros, which cannot be loaded ({error}): "
+            f"sudo apt install ros-$ROS_DISTRO-tf2-ros-py and source ROS 2, or {instead}"
         ) from None
 
 
 def open_tf(node: Any) -> Tf:
-    """A buffer that `node` fills from /tf and /tf_static as it spins."""
+    """A buffer that `node` fills from /tf and /tf_static as it spins, in a callback group of tf2_ros's."""
     from rclpy.time import Time  # noqa: PLC0415
     from tf2_ros import Buffer, TransformException, TransformListener  # noqa: PLC0415 - see check_tf
 
     buffer = Buffer()
-    node.transform_listener = TransformListener(buffer, node, spin_thread=False)
-    return Tf(buffer, TransformException, Time())
+    listener = TransformListener(buffer, node, spin_thread=False)
+    return Tf(buffer, TransformException, Time(), listener.unregister)

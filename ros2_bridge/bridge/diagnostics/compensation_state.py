@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import NamedTuple
 
 from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
@@ -17,7 +16,9 @@ class CompensationState(NamedTuple):
     withheld: int = 0
     """Samples since the node started that were compensated, and that could not be."""
     why_stopped: str | None = None
-    """Why the latest sample could not be, a sentence; None if it could."""
+    """Why the latest sample was not, or would not be if anybody had subscribed, a sentence; None: fine."""
+    why_partly: str = ""
+    """Why some topics alone have stopped, a sentence; empty if none has."""
     source: str = "none"
     age_s: float = math.inf
     """Of the orientation."""
@@ -33,6 +34,7 @@ class CompensationState(NamedTuple):
     is_ramping: bool = False
     keep: bool = False
     """Whether the bias is to survive a restart."""
+    stops_on_saturation: bool = False
     problem: str = ""
     """What is not as it should be, a sentence."""
 
@@ -71,21 +73,6 @@ class CompensationState(NamedTuple):
             "compensated": self.published,
             "withheld": self.withheld,
         }
-
-
-def conflict(settings: Mapping[str, object], payload: Payload) -> str | None:
-    """What the sensor is set to that does not go with compensation, a sentence."""
-    if settings.get("calibration_matrix") is False:
-        return (
-            "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
-            "switch it on"
-        )
-    if settings.get("inertia_compensation") is True and payload.mass:
-        return (
-            "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
-            "or set tool_mass to 0"
-        )
-    return None
 
 
 def _numbers(values: tuple[float, ...]) -> str:

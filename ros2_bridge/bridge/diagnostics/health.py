@@ -5,7 +5,7 @@ Five statuses. A message says what is wrong and what to do; the values are for t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import IntEnum
 from typing import Final, NamedTuple
 
@@ -196,7 +196,9 @@ def _sensor(s: Snapshot, t: Thresholds) -> Status:
             verdict.add(_LEVELS[row.severity], f"{row.meaning}: {row.remedy}")
         for name in _SATURATIONS:
             if bits := getattr(s.flags, name):
-                verdict.add(Level.WARN, f"{name.replace('_', ' ')}: axes {bits:#x}")
+                many = f" ({s.new_saturated} samples)" if name == _SATURATIONS[0] else ""
+                verdict.add(Level.WARN, f"{name.replace('_', ' ')}: axes {bits:#x}{many}")
+        _judge_settings(verdict, s.settings)
         if s.temperature is not None and s.temperature >= t.temperature_warn:
             level = Level.ERROR if s.temperature >= t.temperature_error else Level.WARN
             verdict.add(level, f"{s.temperature:.1f} °C: let the sensor cool down")
@@ -216,11 +218,26 @@ def _sensor(s: Snapshot, t: Thresholds) -> Status:
         "status_byte": f"{s.flags.status:#04x}",
         "warnings_register": f"{s.flags.warnings:#010x}",
         **{name: f"{getattr(s.flags, name):#x}" for name in _SATURATIONS},
+        "saturated_samples": s.saturated,
         "emergencies": s.server_row.get("emergencies", ""),
         "last_emergency": emergency,
         "last_emergency_ago_s": "" if ago_s is None else ago_s,
     }
     return verdict.status("sensor", "as it should be", values)
+
+
+def _judge_settings(verdict: _Verdict, settings: Mapping[str, object]) -> None:
+    if settings.get("calibration_matrix") is False:
+        verdict.add(
+            Level.ERROR,
+            "settings.calibration_matrix is off: force and torque are counts and not N and Nm, switch it on",
+        )
+    if settings.get("coordinate_system") is True:
+        verdict.add(
+            Level.WARN,
+            "settings.coordinate_system is on: force and torque are in a frame that was configured in the "
+            "sensor, which is not frame_id as the URDF has it; switch it off, or correct the URDF",
+        )
 
 
 def _clock(s: Snapshot, t: Thresholds) -> Status:
@@ -246,12 +263,15 @@ def _compensation(s: Snapshot, t: Thresholds) -> Status:
     if not s.connected or s.lost is not None or s.silent_s > t.stale_after:
         verdict.add(Level.STALE, "there are no new samples, see stream")
     elif c.why_stopped is not None:
-        verdict.add(Level.ERROR, f"wrench_compensated has stopped: {c.why_stopped}")
+        state = "has stopped" if c.has_subscribers else "could not be published if somebody subscribed"
+        verdict.add(Level.ERROR, f"wrench_compensated {state}: {c.why_stopped}")
+    elif c.why_partly:
+        verdict.add(Level.ERROR, c.why_partly)
     elif s.new_withheld:
-        verdict.add(
-            Level.WARN,
-            f"{s.new_withheld} samples were not compensated, for want of a fresh orientation ({c.source})",
-        )
+        why = f"for want of a fresh orientation ({c.source})"
+        if c.stops_on_saturation and s.new_saturated:
+            why = "because force or torque was saturated (on_saturation), or " + why
+        verdict.add(Level.WARN, f"{s.new_withheld} samples were not compensated, {why}")
     if c.problem:
         verdict.add(Level.WARN, c.problem)
     return verdict.status("compensation", c.good, c.values)

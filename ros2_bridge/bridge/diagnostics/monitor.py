@@ -39,7 +39,9 @@ class Monitor:
         on_failure: Callable[[str], object],
     ) -> None:
         self._observer, self._clock = Observer(reader, compensation), reader.link.clock
-        self._thresholds, self._outputs, self._on_failure = thresholds, outputs, on_failure
+        self.thresholds = thresholds
+        """May be replaced at any time."""
+        self._outputs, self._on_failure = outputs, on_failure
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
         self._published_s = self._clock.monotonic()
@@ -73,7 +75,7 @@ class Monitor:
         if regular:
             self._observer.measure(now_s)
         snapshot = self._observer.look(now_s)
-        statuses = judge(snapshot, self._thresholds)
+        statuses = judge(snapshot, self.thresholds)
         levels = [int(status.level) for status in statuses]
         if regular or levels != self._levels:
             self._levels, self._published_s = levels, now_s

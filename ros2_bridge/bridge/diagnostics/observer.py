@@ -34,7 +34,7 @@ class Observer:
         self._rate_fresh, self._rate_s = 0, self._fresh_s
         """Where the rate is measured from."""
         self._then, self._then_not_finite = FrameCounts(), 0
-        self._then_connects, self._then_withheld = 0, 0
+        self._then_connects = self._then_withheld = self._then_saturated = 0
         self._then_server: ServerCounts | None = None
 
     def look(self, now_s: float) -> Snapshot:
@@ -79,6 +79,9 @@ class Observer:
             server=status,
             new_server=counted,
             answer_s=self._poll.owed_s(now_s),
+            settings=link.settings,
+            saturated=reader.watch.saturated,
+            new_saturated=reader.watch.saturated - self._then_saturated,
             compensation=compensation,
             new_withheld=compensation.withheld - self._then_withheld,
         )
@@ -101,6 +104,7 @@ class Observer:
         self._flags = Flags()
         self._then, self._then_not_finite = reported.counts, reported.not_finite
         self._then_connects, self._then_withheld = reported.connects, reported.compensation.withheld
+        self._then_saturated = reported.saturated
         if reported.server:
             self._then_server = ServerCounts.of(reported.server, self._link.sensor)
         elif not reported.connected:

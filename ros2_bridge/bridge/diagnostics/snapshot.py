@@ -44,6 +44,11 @@ class Snapshot(NamedTuple):
     new_server: ServerCounts
     answer_s: float
     """How long the server has owed an answer; 0 if it owes none."""
+    settings: Mapping[str, object] = {}
+    """The sensor's settings, as far as they are known."""
+    saturated: int = 0
+    new_saturated: int = 0
+    """Samples whose force or torque was saturated."""
     compensation: CompensationState = CompensationState()
     new_withheld: int = 0
     """Samples that could not be compensated."""

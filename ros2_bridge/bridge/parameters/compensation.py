@@ -10,7 +10,16 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from bridge.parameters.row import ParameterError, Row
-from ft_compensation.quantities import DEFAULT_GRAVITY, ZERO, Payload, Wrench, length
+from ft_compensation.outputs.filter import LEAST_CUTOFF_HZ, LEAST_NOTCH_HZ, FilterSettings
+from ft_compensation.quantities import (
+    DEFAULT_GRAVITY,
+    EXACT,
+    ZERO,
+    Accelerometer,
+    Payload,
+    Wrench,
+    length,
+)
 from ft_compensation.stationary import StationaryLimits
 from protocol.pdo import Vector3
 
@@ -20,6 +29,7 @@ AUTO: Final = "auto"
 TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
 SOURCES: Final = ("none", "accelerometer", "sensor", *TOPIC_SOURCES, "tf")
 _LEAST_GRAVITY: Final = 0.1
+_LEAST_SCALE: Final = 0.5
 _REST: Final = StationaryLimits()
 
 _TABLE: Final = (
@@ -36,6 +46,9 @@ _TABLE: Final = (
     Row("compensate_inertia", False, "Whether the inertial force of the tool is subtracted too"),
     Row("imu_position", ZERO,
         "Position of the IMU in frame_id, m, for compensate_inertia", 0, 1, lengths=(3,)),
+    Row("on_saturation", "publish",
+        "What wrench_compensated does on samples whose force or torque is saturated",
+        choices=("publish", "stop")),
     Row("orientation_source", "accelerometer",
         "Source of the sensor's orientation; used only with a tool_mass", choices=SOURCES),
     Row("orientation.topic", "orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}"),
@@ -52,6 +65,9 @@ _TABLE: Final = (
         "A usable mean of 50 ms differs from gravity in length by no more, m/s²", 0.01, 10),
     Row("accelerometer.tilt_limit", 0.2,
         "Stop when gravity may be tilted by more, rad; start at a third", 0.1, 3),
+    Row("accelerometer.offset", ZERO, "Read too much, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
+    Row("accelerometer.scale", EXACT.scale,
+        "What it reads, without the offset, per m/s²; ~/identify finds it", 0, 2, lengths=(3,)),
     Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
     Row("rest.force_spread", _REST.force_spread, "Largest standard deviation when stationary, N", 0, 1e3),
     Row("rest.torque_spread", _REST.torque_spread, "Largest standard deviation when stationary, Nm", 0, 1e3),
@@ -64,6 +80,12 @@ _TABLE: Final = (
         "Largest standard deviation when stationary, m/s²", 0, 100),
     Row("rest.acceleration_wander", _REST.acceleration_wander,
         "Largest drift of the mean when stationary, m/s²", 0, 100),
+    Row("filter.cutoff", 0.0,
+        "Low-pass of wrench_filtered, -3 dB, Hz; 0 = no such topic", 0, 1000),
+    Row("filter.notch", 0.0, "Center of its notch, Hz; 0 = none", 0, 1000),
+    Row("filter.notch_width", 5.0, "Of the notch, between -3 dB points, Hz", 0.1, 1000),
+    Row("filter.dead_band_force", 0.0, "Taken off the magnitude of its force, N; 0 = none", 0, 1e6),
+    Row("filter.dead_band_torque", 0.0, "Taken off the magnitude of its torque, Nm; 0 = none", 0, 1e6),
     Row("identify.file", AUTO,
         "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bias_directory"),
 )  # fmt: skip
@@ -88,6 +110,13 @@ class AccelerometerParameters(NamedTuple):
     time_constant: float = 0.5
     gate: float = 0.5
     tilt_limit: float = 0.2
+    offset: Vector3 = EXACT.offset
+    scale: Vector3 = EXACT.scale
+
+    @property
+    def reading(self) -> Accelerometer:
+        """What its readings are corrected by."""
+        return Accelerometer(self.offset, self.scale)
 
 
 class CompensationParameters(NamedTuple):
@@ -101,11 +130,13 @@ class CompensationParameters(NamedTuple):
     bias_directory: str = AUTO
     compensate_inertia: bool = False
     imu_position: Vector3 = ZERO
+    on_saturation: str = "publish"
     orientation: OrientationParameters = OrientationParameters()
     accelerometer: AccelerometerParameters = AccelerometerParameters()
     rest_duration: float = 1.0
     rest: StationaryLimits = _REST
     identify_file: str = AUTO
+    filter: FilterSettings = FilterSettings()
 
 
 def gather(values: Mapping[str, Any]) -> CompensationParameters:
@@ -123,11 +154,22 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
             f"this one's is {norm:g}"
         )
 
+    if min(values["accelerometer.scale"]) < _LEAST_SCALE:
+        raise ParameterError(
+            f"parameter accelerometer.scale is {list(values['accelerometer.scale'])}: each must be at least "
+            f"{_LEAST_SCALE}; 1 is an exact axis"
+        )
+
     def group(prefix: str) -> dict[str, Any]:
         return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
 
     rest = group("rest.")
     duration = rest.pop("duration")
+    for name, least in (("filter.cutoff", LEAST_CUTOFF_HZ), ("filter.notch", LEAST_NOTCH_HZ)):
+        if 0.0 < values[name] < least:
+            raise ParameterError(
+                f"parameter {name} is {values[name]:g}: it must be 0, for none, or at least {least:g} Hz"
+            )
     orientation = group("orientation.") | {"mounting": tuple(part / norm for part in mounting)}
     return CompensationParameters(
         payload=Payload(values["tool_mass"], values["tool_center_of_gravity"]),
@@ -138,9 +180,11 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
         bias_directory=values["bias_directory"],
         compensate_inertia=values["compensate_inertia"],
         imu_position=values["imu_position"],
+        on_saturation=values["on_saturation"],
         orientation=OrientationParameters(values["orientation_source"], **orientation),
         accelerometer=AccelerometerParameters(**group("accelerometer.")),
         rest_duration=duration,
         rest=StationaryLimits(**rest),
         identify_file=values["identify.file"],
+        filter=FilterSettings(**group("filter.")),
     )

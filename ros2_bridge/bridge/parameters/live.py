@@ -9,23 +9,22 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from bridge.parameters.compensation import ROWS, CompensationParameters, gather
 from bridge.parameters.row import ParameterError
+from bridge.parameters.table import PARAMETERS, Parameters, gather_all
 
-_ROWS: Final = {row.name: row for row in ROWS}
+_LIVE: Final = {row.name: row for row in PARAMETERS if row.live}
 
 
 class LiveParameters:
-    """Lives in the executor's thread. `check` may refuse (ParameterError), `apply` gets what is new."""
+    """Lives in the executor's thread."""
 
-    def __init__(
-        self,
-        node: Node,
-        check: Callable[[CompensationParameters], None],
-        apply: Callable[[CompensationParameters], None],
-    ) -> None:
+    def __init__(self, node: Node) -> None:
         """The parameters must have been declared."""
-        self._node, self._check, self._apply = node, check, apply
+        self._node = node
+        self.checks: list[Callable[[Parameters], object]] = []
+        """Each may refuse what is wanted: ParameterError."""
+        self.listeners: list[Callable[[Parameters], object]] = []
+        """Each gets what is new."""
         node.add_pre_set_parameters_callback(_convert)
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._after_set)
@@ -38,31 +37,38 @@ class LiveParameters:
             raise ParameterError(result.reason)
 
     def _on_set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        changed = {parameter.name: parameter.value for parameter in parameters if parameter.name in _ROWS}
+        changed = {parameter.name: parameter.value for parameter in parameters if parameter.name in _LIVE}
         if changed:
             try:
-                self._check(self._gather(changed))
+                wanted = self._gather(changed)
+                for check in self.checks:
+                    check(wanted)
             except ParameterError as error:
                 return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _after_set(self, parameters: Sequence[Parameter]) -> None:
-        if any(parameter.name in _ROWS for parameter in parameters):
-            self._apply(self._gather({}))
+        if any(parameter.name in _LIVE for parameter in parameters):
+            found = self._gather({})
+            for listener in self.listeners:
+                listener(found)
 
-    def _gather(self, changed: dict[str, Any]) -> CompensationParameters:
-        values = {
-            name: row.check(changed[name] if name in changed else self._node.get_parameter(name).value)
-            for name, row in _ROWS.items()
-        }
-        return gather(values)
+    def _gather(self, changed: dict[str, Any]) -> Parameters:
+        return gather_all(
+            {
+                row.name: row.check(
+                    changed[row.name] if row.name in changed else self._node.get_parameter(row.name).value
+                )
+                for row in PARAMETERS
+            }
+        )
 
 
 def _convert(parameters: Sequence[Parameter]) -> list[Parameter]:
     """Whole numbers as the floats that are meant: `ros2 param set /bridge tool_mass 1`."""
     return [
-        Parameter(parameter.name, value=_ROWS[parameter.name].convert(parameter.value))
-        if parameter.name in _ROWS and parameter.value is not None
+        Parameter(parameter.name, value=_LIVE[parameter.name].convert(parameter.value))
+        if parameter.name in _LIVE and parameter.value is not None
         else parameter
         for parameter in parameters
     ]

@@ -7,7 +7,10 @@ from array import array
 from typing import Final, NamedTuple
 
 Numbers = tuple[float, ...]
-ParameterValue = bool | int | float | str | Numbers
+Texts = tuple[str, ...]
+ParameterValue = bool | int | float | str | Numbers | Texts
+NO_TEXTS: Final = ("",)
+"""A list of texts without any: ROS cannot tell of what type an empty list is."""
 _COVARIANCE_LENGTHS: Final = (3, 9)
 
 
@@ -16,7 +19,7 @@ class ParameterError(Exception):
 
 
 class Row(NamedTuple):
-    """One parameter. The default's type is the parameter's; a tuple is numbers, `lengths` how many.
+    """One parameter. The default's type is the parameter's; a tuple is texts, or numbers, `lengths` how many.
 
     `low` and `high` bound a number, or the magnitude of each of several. `live`: can be set while the node
     runs.
@@ -33,7 +36,10 @@ class Row(NamedTuple):
 
     def check(self, value: object) -> ParameterValue:
         """Return `value`, a whole number as float where one is meant; ParameterError if it cannot be."""
-        checked = self._numbers(value) if isinstance(self.default, tuple) else self._one(value)
+        if self._is_texts:
+            checked: ParameterValue | None = self._texts(value)
+        else:
+            checked = self._numbers(value) if isinstance(self.default, tuple) else self._one(value)
         if checked is None:
             raise ParameterError(f"parameter {self.name} is {value!r}: it must be {self.allowed()}")
         return checked
@@ -69,6 +75,19 @@ class Row(NamedTuple):
             return None
         return tuple(float(item) for item in items)
 
+    @property
+    def _is_texts(self) -> bool:
+        return isinstance(self.default, tuple) and isinstance(self.default[0], str)
+
+    @staticmethod
+    def _texts(value: object) -> Texts | None:
+        if value is None:  # what rclpy makes of []
+            return NO_TEXTS
+        items = [value] if isinstance(value, str) else value
+        if not isinstance(items, list | tuple) or not all(isinstance(item, str) for item in items):
+            return None
+        return tuple(items) or NO_TEXTS
+
     def _in_range(self, value: float) -> bool:
         return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
 
@@ -80,6 +99,8 @@ class Row(NamedTuple):
             return "text that is not empty"
         if isinstance(self.default, bool):
             return "true or false"
+        if self._is_texts:
+            return "a list of texts"
         if isinstance(self.default, tuple):
             if self.lengths == _COVARIANCE_LENGTHS:
                 return "3 numbers, the variances, or 9, the covariance row by row"

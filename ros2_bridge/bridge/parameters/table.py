@@ -1,8 +1,8 @@
 """The node's parameters: one table, from which they are declared, checked, described and documented. No ROS.
 
-Those of the compensation (`compensation`) can be set while the node runs (`live`), others are read-only. A
-wrong value ends the node at start with one sentence. The sensor's settings are parameters too, but the server
-decides about them: `sensor_settings`.
+Those of the compensation (`compensation`), limits and covariances can be set while the node runs (`live`),
+others are read-only. A wrong value ends the node at start with one sentence. The sensor's settings are
+parameters too, but the server decides about them: `sensor_settings`.
 """
 
 from __future__ import annotations
@@ -11,21 +11,29 @@ from typing import Any, Final, NamedTuple
 
 from bridge.parameters.compensation import ROWS as COMPENSATION_ROWS
 from bridge.parameters.compensation import CompensationParameters, gather
-from bridge.parameters.row import Numbers, ParameterError, Row
+from bridge.parameters.row import NO_TEXTS, Numbers, ParameterError, Row
+from bridge.parameters.wrench_frames import WrenchFrame, parse
 from protocol.pdo import ImuUnits
 
 _UNKNOWN: Final = (0.0, 0.0, 0.0)
 _COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"
 
 SERVER_PORT: Final = Row("server_port", 12001, "TCP port of ethercat-server", 1, 65535)
-PARAMETERS: Final = (
+_LIVE: Final = ("publishing_frequency", "temperature_variance", "diagnostics.")
+"""How the names begin of what can be set while the node runs; covariances too."""
+_TABLE: Final = (
     Row("server_host", "localhost", "Host that ethercat-server runs on"),
     SERVER_PORT,
     Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535),
     Row("sensor", 0, "The sensor's position on the bus, from 0", 0, 255),
     Row("publishing_frequency", 0.0, "Most messages a second, always the newest; 0 = every sample", 0, 1e6),
-    Row("array_topic", "/sensone_sensor_data", "Topic of the Float64MultiArray"),
+    Row("array_topic", "sensone_sensor_data", "Topic of the Float64MultiArray"),
     Row("frame_id", "ft_sensor", "Frame of the wrench (its origin is the sensor's) and of the temperature"),
+    Row(
+        "wrench_frames",
+        NO_TEXTS,
+        "Frames of wrench_compensated/NAME: NAME (by TF), or 'NAME x y z [qx qy qz qw]' in frame_id, m",
+    ),
     Row("imu_frame_id", "ft_sensor_imu", "Frame of the IMU's messages"),
     Row(
         "imu_raw_units",
@@ -45,6 +53,10 @@ PARAMETERS: Final = (
     Row("diagnostics.temperature_warn", 60.0, "Temperature, °C, from which it is a warning", -40, 200),
     Row("diagnostics.temperature_error", 80.0, "Temperature, °C, from which it is an error", -40, 200),
     *COMPENSATION_ROWS,
+)
+PARAMETERS: Final = tuple(
+    row._replace(live=row.live or row.name.startswith(_LIVE) or row.name.endswith("_covariance"))
+    for row in _TABLE
 )
 
 
@@ -75,6 +87,7 @@ class Parameters(NamedTuple):
     angular_velocity_covariance: Numbers = _UNKNOWN
     linear_acceleration_covariance: Numbers = _UNKNOWN
     temperature_variance: float = 0.0
+    wrench_frames: tuple[WrenchFrame, ...] = ()
     thresholds: Thresholds = Thresholds()
     compensation: CompensationParameters = CompensationParameters()
     """As they are at start."""
@@ -90,7 +103,15 @@ def gather_all(values: dict[str, Any]) -> Parameters:
             )
         values["server_port"] = alias
     del values["SERVER_PORT"]
+    for name in ("frame_id", "imu_frame_id", "orientation.base_frame"):
+        if values[name].startswith("/"):
+            raise ParameterError(
+                f"parameter {name} is {values[name]!r}: frames have no leading slash, give "
+                f"{values[name].lstrip('/') or 'a name'!r}"
+            )
     compensation = gather({row.name: values.pop(row.name) for row in COMPENSATION_ROWS})
     thresholds = Thresholds(**{name: values.pop(f"diagnostics.{name}") for name in Thresholds._fields})
-    units = ImuUnits(values.pop("imu_raw_units"))
-    return Parameters(**values, imu_units=units, thresholds=thresholds, compensation=compensation)
+    units, frames = ImuUnits(values.pop("imu_raw_units")), parse(values.pop("wrench_frames"))
+    return Parameters(
+        **values, imu_units=units, wrench_frames=frames, thresholds=thresholds, compensation=compensation
+    )

@@ -12,8 +12,10 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple, Protocol
 
 from bridge.compensating.gravity_sources import NoSource, Source
+from bridge.parameters.compensation import CompensationParameters
 from ft_compensation.bias import BiasRamp
-from ft_compensation.compensator import Compensator
+from ft_compensation.compensator import Compensator, Stages
+from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
 from ft_compensation.stationary import StationaryLimits, StationaryMeans, StationaryWindow
 from protocol.pdo import Sample, Vector3
@@ -30,6 +32,8 @@ class Plan(NamedTuple):
     ramp: BiasRamp
     needs_gravity: bool
     """Whether anything has weight."""
+    watch: PayloadWatch | None = None
+    """Who looks now and then whether the payload is the one that is compensated."""
 
 
 class RestWindow:
@@ -82,16 +86,28 @@ class RestWindow:
 
 
 class StageTopic(Protocol):
-    """One stage of the compensation as a topic: `publishing.messages.StageTopic`."""
+    """One stage of the compensation as a topic, as it is or worked on: `publishing.messages.StageTopic`."""
 
     index: int
     """Of the stage in `Stages`."""
+    takes_all: bool
+    """Whether it goes by samples, too, that are not published: `note`."""
+
+    @property
+    def problem(self) -> str:
+        """Why it publishes nothing, a sentence; "" if it does."""
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed."""
 
     def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
         """Publish a force and a torque."""
+
+    def note(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+        """Take note of those that `publishing_frequency` leaves out."""
+
+    def tune(self, parameters: CompensationParameters) -> None:
+        """Take other parameters; for the executor's thread."""
 
 
 class CompensatedOutput:
@@ -102,15 +118,18 @@ class CompensatedOutput:
     def __init__(self, topics: Sequence[StageTopic]) -> None:
         self._all = topics
         self._wanted: tuple[StageTopic, ...] = ()
+        self._noting: tuple[StageTopic, ...] = ()
         self.plan = Plan(NoSource(), Compensator(), BiasRamp(), needs_gravity=False)
         self.window: RestWindow | None = None
         """The one that is open."""
         self.hold: str | None = None
         """Why nothing may be published for now, whatever else is known."""
+        self.stops_on_saturation = self.is_saturated = False
+        """Whether saturated samples are not published, and whether the latest was one of them."""
         self.broken: str | None = None
         """What of the latest sample cannot be used, though where gravity points is known; a sentence."""
         self.published = self.withheld = 0
-        """Samples since the node started that were compensated, and that could not be."""
+        """Samples since the node started that were compensated, and that were not."""
         self.is_stopped = False
         """Whether the latest could not; at the beginning, whether that has taken long."""
         self._begins_s = math.inf
@@ -121,6 +140,7 @@ class CompensatedOutput:
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed to any of the topics, or a window is open."""
         self._wanted = tuple(topic for topic in self._all if topic.is_wanted())
+        self._noting = tuple(topic for topic in self._wanted if topic.takes_all)
         if not self._wanted:
             self.is_stopped, self._begins_s = False, math.inf  # nobody misses anything
         return bool(self._wanted) or self.window is not None
@@ -130,10 +150,25 @@ class CompensatedOutput:
         """Whether anybody has subscribed, as of the last look."""
         return bool(self._wanted)
 
+    @property
+    def problem(self) -> str:
+        """Why some of the topics that somebody has subscribed to are silent alone; "" if none is."""
+        return "; ".join(topic.problem for topic in self._wanted if topic.problem)
+
+    def tune(self, parameters: CompensationParameters) -> None:
+        """Take what parameters say of single topics; for the executor's thread."""
+        for topic in self._all:
+            topic.tune(parameters)
+
     def follow(self, sample: Sample, stamp_ns: int) -> None:
-        """Have the source and the open window take in a sample that is not published."""
+        """Have the source, the open window and some of the topics take in a sample that is not published."""
         self.time_s = time_s = stamp_ns * 1e-9
-        self._gravity(self.plan, sample, time_s)
+        plan = self.plan
+        gravity = self._gravity(plan, sample, time_s)
+        if self._noting and gravity is not None and self.hold is None and not self._unusable(plan, sample):
+            stages = self._stages(plan, sample, gravity, time_s)
+            for topic in self._noting:
+                topic.note(*stages[topic.index], stamp_ns)
 
     def _gravity(self, plan: Plan, sample: Sample, time_s: float) -> Vector3 | None:
         """Gravity as far as it is needed, None if it is not known; the open window takes the sample in."""
@@ -152,20 +187,34 @@ class CompensatedOutput:
         self.time_s = time_s = stamp_ns * 1e-9
         plan = self.plan
         gravity = self._gravity(plan, sample, time_s)
-        compensator = plan.compensator
-        self.broken = None
-        if compensator.inertia and not math.isfinite(sum(sample.acceleration) + sum(sample.angular_rate)):
-            self.broken = "the IMU's numbers are not finite, which compensate_inertia needs: see stream"
-        if gravity is None or self.hold is not None or self.broken is not None:
+        self.is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
+        self.broken = self._unusable(plan, sample)
+        if gravity is None or self.hold is not None or self.is_saturated or self.broken is not None:
             self.withheld += 1
             self._begins_s = min(self._begins_s, time_s)
-            self.is_stopped = not 0.0 <= time_s - self._begins_s <= _BEGINS_S
+            is_new = gravity is None and 0.0 <= time_s - self._begins_s <= _BEGINS_S
+            self.is_stopped = not is_new
             return
         self.is_stopped, self._begins_s = False, -math.inf
-        compensator.set_bias(plan.ramp.at(time_s))
-        stages = compensator.compensate(
-            sample.force, sample.torque, gravity, sample.acceleration, sample.angular_rate
-        )
+        stages = self._stages(plan, sample, gravity, time_s)
+        if (watch := plan.watch) is not None and watch.is_due(time_s):
+            watch.look(stages.final.force, gravity, sample.angular_rate, time_s)
         for topic in self._wanted:
             topic.send(*stages[topic.index], stamp_ns)
         self.published += 1
+
+    @staticmethod
+    def _unusable(plan: Plan, sample: Sample) -> str | None:
+        if plan.compensator.inertia and not math.isfinite(
+            sum(sample.acceleration) + sum(sample.angular_rate)
+        ):
+            return "the IMU's numbers are not finite, which compensate_inertia needs: see stream"
+        return None
+
+    @staticmethod
+    def _stages(plan: Plan, sample: Sample, gravity: Vector3, time_s: float) -> Stages:
+        compensator = plan.compensator
+        compensator.set_bias(plan.ramp.at(time_s))
+        return compensator.compensate(
+            sample.force, sample.torque, gravity, sample.acceleration, sample.angular_rate
+        )

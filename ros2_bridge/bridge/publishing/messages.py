@@ -1,7 +1,7 @@
 """The ROS messages: each made and serialised once, then refilled and published.
 
 An output's `publish` runs in the reader's thread, for every selected sample and only while somebody has
-subscribed, so it must not block and should not allocate. To add a topic, add a class here and to `make`.
+subscribed, so it must not block and should not allocate. `topics` has the list of them.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import Imu, Temperature
+from sensor_msgs.msg import Temperature
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
-from bridge.parameters.row import Numbers
+from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.table import Parameters
 from bridge.publishing.serialized import SerializedMessage, axes
 from ft_compensation.compensator import Stages
@@ -29,7 +29,6 @@ ARRAY_LABEL: Final = "Fx Fy Fz Mx My Mz Ax Ay Az Rx Ry Rz"
 ARRAY_SIZE: Final = len(ARRAY_LABEL.split())
 _DEPTH: Final = 10
 """Short: what a subscriber is too slow for is replaced by newer samples."""
-_NO_ROTATION: Final = (0.0, 0.0, 0.0, 1.0)
 
 
 class Output(Protocol):
@@ -60,24 +59,18 @@ class Outputs:
         """Look who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
         self.wanted = tuple(output for output in self.all if output.is_wanted())
 
+    def configure(self, parameters: Parameters) -> None:
+        """Have those outputs follow that go by parameters, such as covariances."""
+        for output in self.all:
+            configure = getattr(output, "configure", None)
+            if configure is not None:
+                configure(parameters)
+
     def publish_finite(self, sample: Sample, stamp_ns: int) -> None:
         """Publish a sample that is not finite everywhere where it is."""
         for output in self.wanted:
             if all(_is_finite(getattr(sample, field)) for field in output.fields):
                 output.publish(sample, stamp_ns)
-
-
-def make(node: Node, parameters: Parameters, *others: Output) -> Outputs:
-    """The node's outputs, `others` last."""
-    return Outputs(
-        [
-            ArrayOutput(node, parameters.array_topic),
-            WrenchOutput(node, "wrench", parameters.frame_id),
-            ImuOutput(node, "imu/data_raw", parameters),
-            TemperatureOutput(node, "temperature", parameters),
-            *others,
-        ]
-    )
 
 
 def create_publisher(node: Node, message_type: Any, topic: str) -> Any:
@@ -154,9 +147,22 @@ class WrenchOutput(WrenchTopic):
 class StageTopic(WrenchTopic):
     """One stage of the compensation."""
 
+    takes_all = False
+
     def __init__(self, node: Node, topic: str, frame_id: str, stage: str) -> None:
         super().__init__(node, topic, frame_id)
         self.index = Stages._fields.index(stage)
+
+    @property
+    def problem(self) -> str:
+        """Why nothing is published; here it always is."""
+        return ""
+
+    def tune(self, parameters: CompensationParameters) -> None:
+        """Nothing."""
+
+    def note(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+        """Nothing."""
 
 
 def make_stages(node: Node, frame_id: str) -> list[StageTopic]:
@@ -166,46 +172,6 @@ def make_stages(node: Node, frame_id: str) -> list[StageTopic]:
     return [StageTopic(node, name, frame_id, stage) for name, stage in zip(names, stages, strict=True)]
 
 
-class ImuOutput(Topic):
-    """`sensor_msgs/Imu`: m/s², rad/s; the sensor's own orientation, if it estimates one."""
-
-    fields = ("acceleration", "angular_rate", "orientation")
-
-    def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
-        super().__init__(node, Imu, topic)
-        self._message = Imu()
-        self._message.header.frame_id = parameters.imu_frame_id
-        self._message.angular_velocity_covariance = _covariance(parameters.angular_velocity_covariance)
-        self._message.linear_acceleration_covariance = _covariance(parameters.linear_acceleration_covariance)
-        self._known = _covariance(parameters.orientation_covariance)
-        self._unknown = [-1.0, *[0.0] * 8]  # REP 145
-        self._message.orientation_covariance = self._unknown
-        self._has_orientation = False
-        self._serialized = self._serialize()
-
-    def _serialize(self) -> SerializedMessage:
-        message = self._message
-        positions = [
-            axes(message.linear_acceleration),
-            axes(message.angular_velocity),
-            axes(message.orientation, "xyzw"),
-        ]
-        return SerializedMessage(message, positions, message.header.stamp)
-
-    def publish(self, sample: Sample, stamp_ns: int) -> None:
-        """Publish acceleration, angular rate and, where there is one, the orientation."""
-        if (sample.orientation is not None) is not self._has_orientation:
-            self._has_orientation = sample.orientation is not None
-            self._message.orientation_covariance = self._known if self._has_orientation else self._unknown
-            self._serialized = self._serialize()
-        serialized = self._serialized
-        serialized.stamp(stamp_ns)
-        serialized.fill(0, sample.acceleration)
-        serialized.fill(1, sample.angular_rate)
-        serialized.fill(2, sample.orientation or _NO_ROTATION)
-        self._publish(serialized.message())
-
-
 class TemperatureOutput(Topic):
     """`sensor_msgs/Temperature`: °C, inside the sensor."""
 
@@ -213,6 +179,10 @@ class TemperatureOutput(Topic):
 
     def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
         super().__init__(node, Temperature, topic)
+        self.configure(parameters)
+
+    def configure(self, parameters: Parameters) -> None:
+        """Take this variance, from any thread."""
         message = Temperature(variance=parameters.temperature_variance)
         message.header.frame_id = parameters.frame_id
         self._serialized = SerializedMessage(message, [[(message, "temperature")]], message.header.stamp)
@@ -220,13 +190,6 @@ class TemperatureOutput(Topic):
     def publish(self, sample: Sample, stamp_ns: int) -> None:
         """Publish the temperature."""
         self._publish(self._serialized.filled(stamp_ns, (sample.temperature,)))
-
-
-def _covariance(values: Numbers) -> list[float]:
-    """Nine numbers, row by row, from nine or from three variances."""
-    if len(values) == 9:
-        return list(values)
-    return [values[position // 4] if position % 4 == 0 else 0.0 for position in range(9)]
 
 
 def _is_finite(value: float | Sequence[float] | None) -> bool:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from rclpy.node import Node
 
 from bridge.compensating.control import CompensationControl
@@ -11,9 +9,7 @@ from bridge.services.triggers import create_triggers
 from bridge.services.window import take_window
 from bridge.stream.requests import Requests
 from ft_compensation.bias import estimate_bias, gravity_of
-from ft_compensation.quantities import NO_WRENCH, CompensationError, Wrench, length
-
-AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+from ft_compensation.quantities import NO_WRENCH, CompensationError, length, wrench_text
 
 
 class BiasServices:
@@ -26,11 +22,12 @@ class BiasServices:
 
     def _tare(self) -> str:
         control = self._control
-        window = take_window(control, self._requests)
+        window = take_window(control, self._requests, needs_gravity=control.parameters.payload.mass > 0)
         means = window.means()
         payload, gravity = control.parameters.payload, None
         if payload.mass:
-            gravity = window.gravity() or gravity_of(means.acceleration, length(control.parameters.gravity))
+            acceleration = control.parameters.accelerometer.reading.correct(means.acceleration)
+            gravity = window.gravity() or gravity_of(acceleration, length(control.parameters.gravity))
         control.set_bias(estimate_bias(means, payload, gravity), "tare")
         weight = (
             f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
@@ -53,9 +50,3 @@ class BiasServices:
             text += f"; not kept: {control.keeping}" if control.keeping else "; kept for the next start"
         self._log.info(text)
         return text
-
-
-def wrench_text(wrench: Wrench) -> str:
-    """A wrench for people."""
-    numbers = " ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, wrench.values, strict=True))
-    return f"{numbers} (N, Nm)"

@@ -9,14 +9,13 @@ from rclpy.node import Node
 from bridge.compensating.bias_keeper import directory_of, expand
 from bridge.compensating.control import CompensationControl
 from bridge.parameters.compensation import AUTO
-from bridge.services.bias import wrench_text
 from bridge.services.triggers import create_triggers
 from bridge.services.window import take_window
 from bridge.stream.requests import Requests
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified
-from ft_compensation.identification.session import IdentificationSession, summary
-from ft_compensation.quantities import CompensationError, length
+from ft_compensation.identification.session import IdentificationSession, accelerometer_text, summary
+from ft_compensation.quantities import CompensationError, length, wrench_text
 
 
 class IdentifyServices:
@@ -25,7 +24,7 @@ class IdentifyServices:
     def __init__(self, node: Node, control: CompensationControl, requests: Requests) -> None:
         self._control, self._requests, self._log = control, requests, node.get_logger()
         self._session: IdentificationSession | None = None
-        self._sensors = control.sensors
+        self._sensor = self._sensor_now()
         """As of the session's start."""
         self._result: Identified | None = None
         """What was solved last, and fits the poses that there are."""
@@ -47,7 +46,7 @@ class IdentifyServices:
             )
         before = f", the {len(self._session.poses)} poses before are dropped" if self._session else ""
         self._session = IdentificationSession(length(self._control.parameters.gravity))
-        self._sensors = self._control.sensors
+        self._sensor = self._sensor_now()
         self._result = None
         return self._said(
             f"identification started{before}; gravity is known by {self._control.source.describe}; "
@@ -57,7 +56,7 @@ class IdentifyServices:
 
     def _add_pose(self) -> str:
         session = self._started()
-        window = take_window(self._control, self._requests)
+        window = take_window(self._control, self._requests, needs_gravity=True)
         means = window.means()
         text = session.add(means, window.gravity())
         self._result = None
@@ -80,11 +79,13 @@ class IdentifyServices:
         result = self._result
         if result is None:
             raise CompensationError("there is no result to apply: call identify/solve first")
-        self._control.set_payload(result.payload, result.bias)
+        accelerometer = result.accelerometer.calibration if result.accelerometer else None
+        self._control.set_payload(result.payload, result.bias, accelerometer)
         not_kept = self._control.keeping
         return self._said(
-            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias; the "
-            "tool lasts until the node ends, start it with the file to have it again"
+            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias"
+            + (", accelerometer.offset and accelerometer.scale" if accelerometer else "")
+            + "; the tool lasts until the node ends, start it with the file to have it again"
             + (f"; the bias is not kept: {not_kept}" if not_kept else "")
         )
 
@@ -96,14 +97,21 @@ class IdentifyServices:
         )
 
     def _started(self) -> IdentificationSession:
-        if self._session is not None and self._sensors != self._control.sensors:
+        if self._session is not None and self._sensor != (now := self._sensor_now()):
             self._session = self._result = None
-            raise CompensationError(
-                "another sensor is there now, so the poses before were dropped: call identify/start again"
+            what = (
+                "the sensor's own offset was changed"
+                if now[0] == self._sensor[0]
+                else "another sensor is there now"
             )
+            raise CompensationError(f"{what}, so the poses before were dropped: call identify/start again")
         if self._session is None:
             raise CompensationError("no identification was started: call identify/start first")
         return self._session
+
+    def _sensor_now(self) -> tuple[int, object]:
+        """What poses must have in common: the sensor, and the offset that it adds itself."""
+        return self._control.sensors, self._control.link.offset
 
     def _write(self, result: Identified, comment: list[str]) -> str:
         try:
@@ -135,6 +143,7 @@ def details(result: Identified) -> list[str]:
     ]
     return [
         f"Bias {wrench_text(result.bias)}, ± {wrench_text(result.bias_interval)}",
+        *([accelerometer_text(result.accelerometer)] if result.accelerometer else []),
         f"Residuals by pose, {', '.join(left)}",
         f"Condition {result.condition:.2f} (1.2 is ideal, beyond 10 is bad)",
         f"One more pose would help most so: {result.coverage.next_pose}",

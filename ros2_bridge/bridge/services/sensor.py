@@ -9,11 +9,11 @@ from typing import Final
 from rclpy.node import Node
 
 from bridge.parameters.sensor_settings import SettingsParameters
-from bridge.services.bias import AXES
 from bridge.services.triggers import create_triggers
 from bridge.stream.connection import find_sensor
 from bridge.stream.link import Link
 from bridge.stream.requests import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, RequestFailedError, Requests
+from ft_compensation.quantities import AXES
 from protocol.errors import ConnectionFailedError
 
 _TARE_S: Final = 0.5

@@ -18,13 +18,13 @@ _LOOK_S: Final = 0.05
 _SETTLED_WITHIN_S: Final = 10.0
 
 
-def take_window(control: CompensationControl, requests: Requests) -> RestWindow:
+def take_window(control: CompensationControl, requests: Requests, *, needs_gravity: bool) -> RestWindow:
     """The samples of the next `rest.duration`, whole, once the sensor's data has settled; blocks the caller
     and never the stream.
 
     CompensationError if they do not come or mean nothing.
     """
-    if (conflict := control.conflict()) is not None:
+    if (conflict := control.obstacles.conflict(control.parameters, needs_gravity=needs_gravity)) is not None:
         raise CompensationError(conflict)
     link = control.link
     if link.connection is None:
@@ -35,7 +35,7 @@ def take_window(control: CompensationControl, requests: Requests) -> RestWindow:
     patience_s = 1.5 * seconds + _PATIENCE_S
     clock = link.clock
     deadline_s = clock.monotonic() + patience_s
-    info, bad = link.info, control.count_not_finite()
+    info, offset, bad = link.info, link.offset, control.count_not_finite()
     control.output.window = window
     try:
         while not clock.wait(window.done, _LOOK_S):
@@ -50,6 +50,8 @@ def take_window(control: CompensationControl, requests: Requests) -> RestWindow:
     # By what the reader knows: the executor, which would count another sensor, is the one that waits here.
     if info is not None and link.info is not None and info.serial != link.info.serial:
         raise CompensationError("the sensor was replaced by another meanwhile: call again")
+    if offset != link.offset:
+        raise CompensationError("the sensor's own offset was changed meanwhile: call again")
     if bad := control.count_not_finite() - bad:
         raise CompensationError(
             f"the window is spoiled: {bad} of its samples were not finite; see /diagnostics, stream, and "

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from bridge.clock import SYSTEM_CLOCK, Clock
 from protocol.client.connection import CONNECT_TIMEOUT_S, FramedConnection
-from protocol.control import check_version, request
+from protocol.control import check_version, request, six_numbers
 from protocol.errors import ConnectionFailedError, RefusedError, SettingError
 from protocol.framing import DataMessage
 from protocol.settings import SETTINGS, SettingValue
@@ -41,10 +41,16 @@ class SensorInfo(NamedTuple):
     settings: Mapping[str, SettingValue] = {}
     settling: bool = False
     """Whether its data has not settled."""
+    offset: tuple[float, ...] | None = None
+    """Its own force/torque offset, N and Nm; None if the server does not say."""
 
     def __str__(self) -> str:
         """One phrase for the log."""
         return f"sensor {self.sensor} ({self.name}, serial {self.serial}, {self.rate_hz} Hz, {self.state})"
+
+
+class RefusalError(ConnectionFailedError):
+    """The server refused what the connection cannot do without."""
 
 
 class Connection(FramedConnection):
@@ -102,7 +108,7 @@ class Connection(FramedConnection):
                     self.take_reply(message)
         reply = future.result()
         if reply.get("ok") is not True:
-            raise ConnectionFailedError(f"the server refused {action}: {refusal(reply)}")
+            raise RefusalError(f"the server refused {action}: {refusal(reply)}")
         return reply
 
     def subscribe(self, sensor: int) -> SensorInfo:
@@ -143,6 +149,14 @@ def known_rate(rate_hz: object) -> float:
     return float(rate_hz) if isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ else 0.0
 
 
+def known_offset(offset: object) -> tuple[float, ...] | None:
+    """The sensor's own offset that a message gives; None if it is none."""
+    try:
+        return six_numbers(offset)
+    except ValueError:
+        return None
+
+
 def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
     """The row of `sensor` in a `describe` reply; ConnectionFailedError if there is none."""
     found = rows(description.get("sensors"))
@@ -154,8 +168,9 @@ def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
             )
             number = known_rate(row.get("rate_hz"))
             settings, settling = known_settings(row.get("settings")), row.get("settling") is True
+            offset = known_offset(row.get("offset"))
             return SensorInfo(
-                sensor, name, serial, rate, state, hardware, firmware, number, settings, settling
+                sensor, name, serial, rate, state, hardware, firmware, number, settings, settling, offset
             )
     there = ", ".join(printable(row.get("sensor"), 10) for row in found[:16]) or "none"
     raise ConnectionFailedError(

@@ -3,10 +3,12 @@
 The rules it keeps:
 
 - `protocol.accounting` says which frames are new. No other frame is ever selected.
-- When a queued frame is older than BACKLOG_NS (this process was stopped, or is slower than the stream),
-  all of them are left out, and counted as stale, up to the first frame younger than FRESH_NS.
-- Age is CLOCK_MONOTONIC now minus the frame's, if the server's clock is ours. Otherwise it is relative to
-  the least such difference seen, which may rise slowly as clocks drift apart.
+- Age is CLOCK_MONOTONIC now minus the frame's, compared with what is usual on this connection: where the
+  server's clock is another machine's, only differences mean anything.
+- When a queued frame is older than usual by BACKLOG_NS (this process was stopped, or is slower than the
+  stream), the newest is selected and the others are counted as stale. If it is not fresh either, within
+  FRESH_NS of the usual age, more is on the way: everything is stale until it is.
+- A stream that does not catch up is not behind: its age is the usual one from then on.
 - With a limit to the rate, the newest of what is queued is selected, whenever the limit allows one.
 """
 
@@ -21,10 +23,10 @@ from protocol.framing import DataMessage
 
 BACKLOG_NS: Final = 50_000_000
 FRESH_NS: Final = 4_000_000
-_LONGEST_SKIP_NS: Final = 250_000_000
-"""After this long with nothing fresh the clocks cannot be the same: ages are relative from there."""
-_DRIFT_DIVISOR: Final = 5000
-"""Two machines' clocks drift apart by less than 1/5000."""
+_CATCH_UP_NS: Final = 20_000_000
+"""After a stall the age must fall by half of this in each such time: then what waits is being read."""
+_FALL, _RISE = 8, 64
+"""The usual age follows each age by one part in so many: a low expectile, as delays only add."""
 
 
 @dataclass(slots=True)
@@ -44,14 +46,20 @@ class FrameSelector:
         """`same_clock`: the server's CLOCK_MONOTONIC is ours. `limit_hz` 0 is no limit."""
         self._sensor = sensor
         self._counts = counts
-        self._limit = RateLimit(limit_hz) if limit_hz > 0 else None
+        self._limit: RateLimit | None
+        self.limit(limit_hz)
         self.accounting = StreamAccounting(counts)
-        self._same_clock = same_clock
-        self._offset_ns: int | None = 0 if same_clock else None
-        self._now_ns = 0
-        self._skipping_since_ns: int | None = None
+        self._may_be_negative = not same_clock
+        self._usual_ns: int | None = None
+        """The usual age; None before the first frame."""
+        self._skipping: tuple[int, int] | None = None
+        """While all is stale: when its age was looked at last, and what it was."""
         self.passed_over: list[DataMessage] = []
         """New frames that the rate limit left out of the last `select`, older than the one selected."""
+
+    def limit(self, hz: float) -> None:
+        """Select so many a second at most, 0 = all; from any thread."""
+        self._limit = RateLimit(hz) if hz > 0 else None
 
     def select(self, frames: Sequence[DataMessage], now_ns: int) -> list[DataMessage]:
         """The frames of `frames`, all that were queued, that are to be published, oldest first.
@@ -59,46 +67,54 @@ class FrameSelector:
         `now_ns` is CLOCK_MONOTONIC after the last was received.
         """
         fresh = self.accounting.select_new(frames, self._sensor)
-        if self._limit is not None:
+        if self.passed_over:
             self.passed_over = []
         if not fresh:
             return fresh
         newest = fresh[-1]
-        age_ns = self._age_ns(newest, now_ns)
-        if self._skipping_since_ns is None:
-            if age_ns + newest.monotonic_ns - fresh[0].monotonic_ns > BACKLOG_NS:
-                self._skipping_since_ns = now_ns
-        elif now_ns - self._skipping_since_ns > _LONGEST_SKIP_NS:
-            self._same_clock = False
-            self._offset_ns = now_ns - newest.monotonic_ns
-            age_ns = 0
-        if self._skipping_since_ns is not None:
-            if age_ns > FRESH_NS:
-                self._counts.stale += len(fresh)
-                return []
-            self._skipping_since_ns = None
-            self._counts.stale += len(fresh) - 1
-            fresh = [newest]
-        if self._limit is not None:
-            allowed = self._limit.allows(newest.monotonic_ns)
+        age_ns = now_ns - newest.monotonic_ns
+        usual_ns = self._usual_ns
+        if usual_ns is None:  # an old one is no rule, where it is known to be old
+            is_usual = self._may_be_negative or 0 < age_ns <= BACKLOG_NS
+            usual_ns = self._usual_ns = age_ns if is_usual else 0
+        late_ns = age_ns - usual_ns
+        alone = len(fresh) == 1
+        oldest_late_ns = late_ns if alone else now_ns - fresh[0].monotonic_ns - usual_ns
+        if self._skipping is None and oldest_late_ns <= BACKLOG_NS:
+            if late_ns < 0:
+                usual_ns += late_ns // _FALL
+                self._usual_ns = usual_ns if self._may_be_negative or usual_ns > 0 else 0
+            elif alone:  # it was waited for, so its delay is not this node's
+                self._usual_ns = usual_ns + late_ns // _RISE
+        else:
+            fresh = self._after_stall(fresh, age_ns, now_ns)
+            if not fresh:
+                return fresh
+        limit = self._limit
+        if limit is not None:
+            allowed = limit.allows(newest.monotonic_ns)
             self._counts.limited += len(fresh) - allowed
             selected = [newest] if allowed else []
             self.passed_over = fresh[: len(fresh) - len(selected)]
             return selected
         return fresh
 
-    def _age_ns(self, newest: DataMessage, now_ns: int) -> int:
-        difference = now_ns - newest.monotonic_ns
-        if self._same_clock:
-            return difference
-        if self._offset_ns is None:
-            self._offset_ns = difference
-        else:
-            self._offset_ns = min(
-                self._offset_ns + (now_ns - self._now_ns) // _DRIFT_DIVISOR, difference
-            )  # fmt: skip
-        self._now_ns = now_ns
-        return difference - self._offset_ns
+    def _after_stall(self, fresh: list[DataMessage], age_ns: int, now_ns: int) -> list[DataMessage]:
+        """The newest of `fresh`, or nothing while more is on the way; `age_ns` is its age."""
+        if self._skipping is None:
+            self._skipping = now_ns, age_ns
+        if age_ns - (self._usual_ns or 0) > FRESH_NS:
+            since_ns, was_ns = self._skipping
+            passed_ns = now_ns - since_ns
+            if passed_ns < _CATCH_UP_NS or was_ns - age_ns >= passed_ns // 2:
+                if passed_ns >= _CATCH_UP_NS:
+                    self._skipping = now_ns, age_ns
+                self._counts.stale += len(fresh)
+                return []
+            self._usual_ns = age_ns
+        self._skipping = None
+        self._counts.stale += len(fresh) - 1
+        return [fresh[-1]]
 
 
 class RateLimit:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from bridge.clock import Clock
-from bridge.stream.connection import Connection, SensorInfo, known_rate, known_settings
+from bridge.stream.connection import Connection, SensorInfo, known_offset, known_rate, known_settings
 from protocol.control import Event
 from protocol.settings import SettingValue, sampling_rate_hz
 from protocol.text.json_text import JsonObject
@@ -33,6 +33,8 @@ class Link:
         """The sensor as the server described it last; kept when the connection ends."""
         self.settings: Mapping[str, SettingValue] = {}
         """The sensor's settings; empty without a connection."""
+        self.offset: tuple[float, ...] | None = None
+        """The sensor's own force/torque offset, part of every sample, N and Nm; None: not known."""
         self.rate_hz = 0.0
         """Samples a second that are to be expected; 0 if the server does not say."""
         self.problem = NEVER_CONNECTED
@@ -50,6 +52,7 @@ class Link:
     def connected(self, connection: Connection, info: SensorInfo) -> None:
         """The stream begins."""
         self.info, self.settings, self.rate_hz = info, info.settings, info.rate
+        self.offset = info.offset
         self.connects += 1
         self.since_s = self.clock.monotonic()
         self.lost = None
@@ -86,8 +89,10 @@ class Link:
             self.lost = None
             self.epoch += 1
             self.take_settings(message)
-        else:
+        elif event != Event.OFFSET_CHANGED:
             return True
+        if "offset" in message:
+            self.offset = known_offset(message["offset"])
         self.on_change()
         return True
 
@@ -109,7 +114,7 @@ class Link:
         self.settings = found
 
     def described(self, info: SensorInfo) -> None:
-        """Note what a later `describe` says. Settings come with events, which are never behind."""
+        """Note what a later `describe` says. Settings and offset come with events, which are never behind."""
         if info.rate != self.rate_hz:
             self.epoch += 1
         self.info, self.rate_hz = info, info.rate

@@ -7,12 +7,13 @@ and connection can be given: `run` then needs neither sockets nor real time. `st
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, Protocol
 
 from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.parameters.table import Parameters
 from bridge.stream.connection import Connection
+from bridge.stream.events import sentence
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
 from bridge.stream.link import Link
 from bridge.stream.watch import Watch
@@ -86,6 +87,8 @@ class Reader:
         self.link = Link(self._address, parameters.sensor, clock)
         self.watch = Watch(parameters.sensor)
         self._stopping = threading.Event()
+        self._limit_hz = parameters.publishing_frequency
+        self._selector: FrameSelector | None = None
         self._connection: Connection | None = None
         self._problem: str | None = None
         self._was_connected = False
@@ -104,6 +107,22 @@ class Reader:
             connection.shutdown()
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
+
+    def limit_rate(self, hz: float) -> None:
+        """Publish so many samples a second at most, 0 = all; from any thread."""
+        if hz != self._limit_hz:
+            self._limit_hz = hz
+            if self._selector is not None:
+                self._selector.limit(hz)
+            self._warn_of_aliases()
+
+    def _warn_of_aliases(self) -> None:
+        if 0 < self._limit_hz < self.link.rate_hz:
+            self._log.warning(
+                f"publishing_frequency {self._limit_hz:g} takes the newest of {self.link.rate_hz:g} samples "
+                f"a second, without a low-pass: noise and vibration above {self._limit_hz / 2:g} Hz appear "
+                "at lower frequencies (aliasing); take every sample, or a longer sinc_length"
+            )
 
     def _run(self) -> None:
         try:
@@ -142,6 +161,7 @@ class Reader:
             self._was_connected = True
             self._problem = None
             self.link.connected(connection, info)
+            self._warn_of_aliases()
             self.read(connection)
         finally:
             self._connection = None
@@ -149,11 +169,8 @@ class Reader:
 
     def read(self, connection: Connection) -> None:
         """Publish what a subscribed connection brings; ConnectionFailedError is how it ends."""
-        selector = FrameSelector(
-            self._parameters.sensor,
-            self.counts,
-            same_clock=connection.same_machine,
-            limit_hz=self._parameters.publishing_frequency,
+        selector = self._selector = FrameSelector(
+            self._parameters.sensor, self.counts, same_clock=connection.same_machine, limit_hz=self._limit_hz
         )
         decoders, outputs, watch, link = self._decoders, self._outputs, self.watch, self.link
         monotonic_ns = self._clock.monotonic_ns
@@ -182,7 +199,7 @@ class Reader:
                 if sample.is_finite:
                     for output in outputs.wanted:
                         output.publish(sample, frame.stamp_ns)
-                    watch.sample = sample
+                    watch.sample, watch.stamp_ns = sample, frame.stamp_ns
                 else:
                     self._publish_finite(sample, frame.stamp_ns)
                 watch.ages.append(monotonic_ns() - frame.monotonic_ns)
@@ -226,13 +243,12 @@ class Reader:
             )
 
     def _log_event(self, message: JsonObject) -> None:
+        before = self.link.settings
         if "event" not in message or not self.link.take_event(message):
             return
-        event = printable(message["event"], 40)
-        details = {key: value for key, value in message.items() if key != "event"}
-        text = EVENTS.get(event, f"the server says {event}") + (f" {printable(details)}" if details else "")
+        text = sentence(message, before)
         # A line of source has one severity: rclpy insists.
-        if event in {Event.SENSOR_LOST, Event.EMERGENCY}:
+        if message["event"] in (Event.SENSOR_LOST, Event.EMERGENCY):
             self._log.warning(text)
         else:
             self._log.info(text)
@@ -249,13 +265,3 @@ class Reader:
         if not known:
             self._problem = text
             self._log.warning(text)
-
-
-EVENTS: Final[Mapping[str, str]] = {
-    Event.SENSOR_LOST: "the server has lost the sensor",
-    Event.SENSOR_BACK: "the sensor is back",
-    Event.RECONFIGURED: "the sensor was reconfigured",
-    Event.EMERGENCY: "the sensor reports an emergency",
-    Event.SHUTTING_DOWN: "the server is shutting down",
-}
-"""What the server's events are called in the log."""

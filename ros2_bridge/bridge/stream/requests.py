@@ -9,7 +9,7 @@ import threading
 from typing import Final
 
 from bridge.parameters.table import Parameters
-from bridge.stream.connection import Connection, refusal
+from bridge.stream.connection import Connection, RefusalError, refusal
 from bridge.stream.link import Link
 from protocol.errors import ConnectionFailedError
 from protocol.text.json_text import JsonObject
@@ -33,14 +33,15 @@ class Requests:
     def __init__(self, parameters: Parameters, link: Link) -> None:
         self._parameters = parameters
         self._link = link
-        self._over = threading.Event()
-        """Set once the reply is there that is waited for, or none is wanted any more."""
+        self._waiting: set[threading.Event] = set()
+        """One for each that waits: set once its reply is there, or none is wanted any more."""
         self._ending = False
 
     def cancel(self) -> None:
         """Make whoever waits for a reply give up, now and from now on: the node ends."""
         self._ending = True
-        self._over.set()
+        for over in list(self._waiting):
+            over.set()
 
     def ask(self, action: str, timeout_s: float, **values: object) -> JsonObject:
         """The reply that grants the request; RequestFailedError otherwise. Blocks for `timeout_s` at most."""
@@ -55,11 +56,15 @@ class Requests:
     def _exchange(
         self, connection: Connection, action: str, timeout_s: float, values: dict[str, object]
     ) -> JsonObject:
-        over = self._over = threading.Event()
-        waiting = connection.send_request(action, **values)
-        waiting.add_done_callback(lambda _: over.set())
-        if not self._ending:
-            self._link.clock.wait(over, timeout_s)
+        over = threading.Event()
+        self._waiting.add(over)
+        try:
+            waiting = connection.send_request(action, **values)
+            waiting.add_done_callback(lambda _: over.set())
+            if not self._ending:
+                self._link.clock.wait(over, timeout_s)
+        finally:
+            self._waiting.discard(over)
         if not waiting.done():
             connection.forget(waiting)
             why = "the node ends" if self._ending else f"no reply within {timeout_s:g} s"
@@ -73,7 +78,8 @@ class Requests:
         return reply
 
     def shut_server_down(self, timeout_s: float = SHUTDOWN_TIMEOUT_S) -> str:
-        """Ask the server to shut down; a sentence that says what came of it.
+        """Ask the server to shut down; a sentence. RefusedError if it will not, RequestFailedError if nobody
+        knows.
 
         Where there is no connection it makes one attempt of its own.
         """
@@ -85,12 +91,16 @@ class Requests:
                 own.ask("shutdown")
             else:
                 self._exchange(connection, "shutdown", timeout_s, {})
-        except RefusedError as error:
-            return f"the server at {address} refused to shut down: {error}"
+        except (RefusedError, RefusalError) as error:
+            raise RefusedError(f"the server at {address} refused to shut down: {error}") from None
         except RequestFailedError:
-            return f"the server at {address} did not answer the request to shut down"
+            raise RequestFailedError(
+                f"the server at {address} did not answer the request to shut down"
+            ) from None
         except ConnectionFailedError as error:
-            return f"the server at {address} could not be told to shut down: {error}"
+            raise RequestFailedError(
+                f"the server at {address} could not be told to shut down: {error}"
+            ) from None
         finally:
             if own is not None:
                 own.close()

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+from protocol.accounting import NOT_NEW
 from protocol.framing import DataMessage
 from protocol.pdo import LAYOUTS, Sample
 
@@ -38,6 +39,9 @@ _FLAGS: Final = struct.Struct(
 """Of every size of process data, which all begin alike: the flags, and nothing of the rest."""
 
 
+_FORCE_TORQUE: Final = Flags._fields.index("force_torque_saturated")
+
+
 class Watch:
     """`see` is for the reader, `take_flags` and `take_ages` are for the monitor."""
 
@@ -50,6 +54,10 @@ class Watch:
         """Nanoseconds from a sample to the end of its publication, newest last."""
         self.sample: Sample | None = None
         """The newest sample that was published."""
+        self.stamp_ns = 0
+        """Its time, ns since the Unix epoch."""
+        self.saturated = 0
+        """Samples whose force or torque was saturated."""
 
     def see(self, frames: Sequence[DataMessage]) -> None:
         """Note the flags of every frame, whether it is to be published or not."""
@@ -58,6 +66,8 @@ class Watch:
             if flags != self._seen and frame.sensor == self._sensor:
                 self._seen = flags
                 self._changes.append(flags)
+            if flags[_FORCE_TORQUE] and not frame.flags & NOT_NEW and frame.sensor == self._sensor:
+                self.saturated += 1
 
     def take_flags(self) -> Flags:
         """All that were set since the last call, if only for one frame, and those that are set now."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ft_compensation.identification.payload import Identified
-from ft_compensation.quantities import CompensationError, Payload, Wrench
+from ft_compensation.quantities import Accelerometer, CompensationError, Payload, Wrench
 from protocol.pdo import Vector3
 
 
@@ -15,11 +15,17 @@ class ParameterFileError(CompensationError):
 
 
 def to_yaml(
-    payload: Payload, bias: Wrench, gravity: Vector3 | None = None, comment: str = "", node: str = "/**"
+    payload: Payload,
+    bias: Wrench,
+    gravity: Vector3 | None = None,
+    comment: str = "",
+    node: str = "/**",
+    accelerometer: Accelerometer | None = None,
 ) -> str:
     """The text of a parameter file for `node`; `comment` goes on top of it.
 
-    `gravity` is in the base frame, m/s²; without it the file does not say how the base stands.
+    `gravity` is in the base frame, m/s²; without it the file does not say how the base stands. Without
+    `accelerometer` it leaves that one alone.
     """
     rows: list[tuple[str, Sequence[float], str]] = [
         ("tool_center_of_gravity", payload.center, "m, in the sensor's frame"),
@@ -27,6 +33,9 @@ def to_yaml(
     ]
     if gravity is not None:
         rows.append(("gravity", gravity, "m/s², in the base frame"))
+    if accelerometer is not None:
+        rows.append(("accelerometer.offset", accelerometer.offset, "m/s², subtracted"))
+        rows.append(("accelerometer.scale", accelerometer.scale, "divided by, after that"))
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     lines += [f"{node}:", "  ros__parameters:", f"    tool_mass: {_number(payload.mass)}  # kg"]
     lines += [f"    {name}: [{', '.join(map(_number, values))}]  # {unit}" for name, values, unit in rows]
@@ -35,8 +44,10 @@ def to_yaml(
 
 def write_yaml(path: Path, result: Identified, comment: str = "", gravity: Vector3 | None = None) -> None:
     """Write what was identified; `gravity` as for `to_yaml`. ParameterFileError if that fails."""
+    accelerometer = result.accelerometer.calibration if result.accelerometer else None
+    text = to_yaml(result.payload, result.bias, gravity, comment, accelerometer=accelerometer)
     try:
-        path.write_text(to_yaml(result.payload, result.bias, gravity, comment), encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise ParameterFileError(f"{path} cannot be written: {error.strerror or error}") from None
 

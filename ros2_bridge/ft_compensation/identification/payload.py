@@ -1,8 +1,6 @@
-"""Payload identification: mass, center of gravity and bias by least squares from static poses.
+"""Payload identification: mass, center of gravity, bias and the accelerometer's offset from static poses.
 
-In every pose: force = m g + bias force, torque = c x g + bias torque, with c = m times the center of gravity.
-The ten unknowns are linear, and the force and torque equations share none of them, so two least-squares
-problems with units of their own are solved: m and three of the bias from 3 n equations, c and three from 3 n.
+Checks what is given, has `estimation` solve it, and judges the answer.
 """
 
 from __future__ import annotations
@@ -11,11 +9,19 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ft_compensation.identification.estimation import OFFSET_PRIOR, Value, estimate
+from ft_compensation.identification.judgement import (
+    ARM,
+    Fit,
+    fit_notes,
+    interval_notes,
+    judge,
+    offset_notes,
+)
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
-from ft_compensation.identification.student import two_sided
-from ft_compensation.quantities import CompensationError, Payload, Wrench, length
+from ft_compensation.identification.weighted import Array
+from ft_compensation.quantities import Accelerometer, CompensationError, Payload, Wrench, length
 from protocol.pdo import Vector3
 
 LARGEST_MASS: Final = 500.0
@@ -24,14 +30,9 @@ LARGEST_CENTRE: Final = 2.0
 """m"""
 _LARGEST_MISFIT: Final = 0.1
 _FORGIVEN_MISFIT: Final = 1.0
-"""N: residuals are refused beyond this plus a tenth of the weight."""
-_SUSPICIOUS: Final = 3.0
-_NEGLIGIBLE: Final = 0.01
-"""Of the weight: a residual below it is not worth a word."""
-_ARM: Final = 0.05
-"""m: what makes a torque of it."""
-
-Array = NDArray[np.float64]
+"""N: residuals are refused beyond this plus a tenth of the weight; torques at the arm of the weight."""
+_UNKNOWN: Final = 0.5
+"""Of the interval before anything is measured: an offset no better known than so is not determined."""
 
 
 class IdentificationError(CompensationError):
@@ -45,6 +46,17 @@ class Residual(NamedTuple):
     """N"""
     torque: Vector3
     """Nm"""
+
+
+class OffsetFit(NamedTuple):
+    """What the poses say of the accelerometer."""
+
+    calibration: Accelerometer
+    offset_interval: Vector3
+    """m/s²"""
+    scale_interval: Vector3
+    undetermined: str
+    """Axes whose offset the poses do not determine: "", "x", ..."""
 
 
 class Identified(NamedTuple):
@@ -61,7 +73,7 @@ class Identified(NamedTuple):
     bias_interval: Wrench
     """N, Nm"""
     confidence: float
-    """Of the intervals: 0.95 as a rule. Student's t, from what the residuals scatter."""
+    """Of the intervals: 0.95 as a rule. Student's t; each axis has the variance that its residuals show."""
     residuals: tuple[Residual, ...]
     """One a pose, in order."""
     force_rms: float
@@ -73,11 +85,17 @@ class Identified(NamedTuple):
     coverage: Coverage
     notes: tuple[str, ...]
     """What a person should know, sentences: a pose that does not fit, a wide interval."""
+    force_fit: Fit
+    torque_fit: Fit
+    accelerometer: OffsetFit | None
+    """None where gravity is not from it: it is not touched then."""
 
 
 def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool = False) -> Identified:
-    """Mass, center of gravity and bias from `poses`. IdentificationError, a sentence, where they do not
-    suffice.
+    """Mass, center of gravity and bias from `poses`.
+
+    If every pose has its `acceleration`, the accelerometer's offset and sensitivities are found too.
+    IdentificationError, a sentence, where the poses do not suffice.
 
     Args:
         poses: at least four, whose directions of gravity do not lie in one plane; six with each axis of the
@@ -88,88 +106,73 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
     """
     if len(poses) > MOST_POSES:
         raise IdentificationError(f"{len(poses)} poses are more than the {MOST_POSES} that are taken")
-    if not all(np.isfinite([*pose.wrench.values, *pose.gravity]).all() for pose in poses):
+    if not all(
+        np.isfinite([*pose.wrench.values, *pose.gravity, *(pose.acceleration or ())]).all() for pose in poses
+    ):
         raise IdentificationError("a pose has numbers that are not finite")
     seen = coverage(poses, one_axis=one_axis)
     if seen.missing is not None:
         raise IdentificationError(f"the poses do not suffice: {seen.missing}; {seen.next_pose}")
     gravity = np.array([pose.gravity for pose in poses])
     wrench = np.array([pose.wrench.values for pose in poses])
-    force = _solve(_force_design(gravity), wrench[:, :3])
-    torque = _solve(_torque_design(gravity), wrench[:, 3:])
-    mass = float(force.answer[0])
-    t_force, t_torque = (two_sided(confidence, part.degrees) for part in (force, torque))
-    mass_interval = t_force * float(force.deviation[0])
+    read = [pose.acceleration for pose in poses if pose.acceleration is not None]
+    noise = float(np.mean([length(pose.acceleration_spread) ** 2 / 3.0 / pose.samples for pose in poses]))
+    try:
+        found = estimate(
+            wrench, gravity, confidence, np.array(read) if len(read) == len(poses) else None, noise
+        )
+    except np.linalg.LinAlgError:
+        raise IdentificationError("the poses do not suffice: their equations leave an unknown open") from None
+    mass, mass_interval = float(found.mass.value[0]), float(found.mass.half[0])
     _check_mass(mass, mass_interval)
-    center = torque.answer[:3] / mass
-    # c and m come from separate equations, so their errors add as squares.
-    deviation = np.hypot(torque.deviation[:3], center * force.deviation[0]) / mass
-    centre_interval = _triple(max(t_force, t_torque) * deviation)
-    residuals = tuple(
-        Residual(_triple(f), _triple(m)) for f, m in zip(force.residuals, torque.residuals, strict=True)
-    )
-    _check_fit(force, mass * float(np.linalg.norm(gravity, axis=1).mean()))
-    if float(np.linalg.norm(center)) > LARGEST_CENTRE:
+    payload = Payload(mass, _triple(found.center.value))
+    weight = mass * float(np.linalg.norm(gravity, axis=1).mean())
+    moment = weight * max(ARM, length(payload.center))
+    forces, torques = found.residuals[:, :3], found.residuals[:, 3:]
+    force = judge(poses, forces, found.degrees[:3], "force", weight)
+    torque = judge(poses, torques, found.degrees[3:], "torque", moment)
+    _check_fit(force, forces, _FORGIVEN_MISFIT + _LARGEST_MISFIT * weight, "N")
+    if length(payload.center) > LARGEST_CENTRE:
         raise IdentificationError(
-            f"the center of gravity would be {np.linalg.norm(center):.2g} m from the sensor with a mass of "
+            f"the center of gravity would be {length(payload.center):.2g} m from the sensor with a mass of "
             f"{mass:.3g} kg, which cannot be: something held or touched the tool, or there is no tool"
         )
+    _check_fit(torque, torques, _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment, "Nm")
+    residuals = tuple(Residual(_triple(row[:3]), _triple(row[3:])) for row in found.residuals)
+    centre_interval = _triple(found.center.half)
+    accelerometer = _accelerometer(found.offset, found.scale)
     return Identified(
-        Payload(mass, _triple(center)),
-        Wrench(_triple(force.answer[1:]), _triple(torque.answer[3:])),
+        payload,
+        Wrench.of(found.bias.value.tolist()),
         float(np.linalg.norm(gravity, axis=1).mean()),
         mass_interval,
         centre_interval,
-        Wrench(_triple(t_force * force.deviation[1:]), _triple(t_torque * torque.deviation[3:])),
+        Wrench.of(found.bias.half.tolist()),
         confidence,
         residuals,
         force.rms,
         torque.rms,
         _condition(gravity),
         seen,
-        tuple(_notes(poses, residuals, mass, mass_interval, centre_interval)),
+        (
+            *fit_notes(poses, forces, force, "force", "N", weight),
+            *fit_notes(poses, torques, torque, "torque", "Nm", moment),
+            *interval_notes(mass, mass_interval, length(centre_interval)),
+            *offset_notes(accelerometer.undetermined if accelerometer else ""),
+        ),
+        force,
+        torque,
+        accelerometer,
     )
 
 
-class _Solution(NamedTuple):
-    answer: Array
-    deviation: Array
-    """Standard deviation of each unknown."""
-    residuals: Array
-    rms: float
-    degrees: int
-
-
-def _force_design(gravity: Array) -> Array:
-    """(3 n, 4): m, then the bias force."""
-    design = np.zeros((len(gravity), 3, 4))
-    design[:, :, 0] = gravity
-    design[:, :, 1:] = np.eye(3)
-    return design.reshape(-1, 4)
-
-
-def _torque_design(gravity: Array) -> Array:
-    """(3 n, 6): c, as in c x g, then the bias torque."""
-    design = np.zeros((len(gravity), 3, 6))
-    gx, gy, gz = gravity.T
-    design[:, 0, 1], design[:, 0, 2] = gz, -gy
-    design[:, 1, 0], design[:, 1, 2] = -gz, gx
-    design[:, 2, 0], design[:, 2, 1] = gy, -gx
-    design[:, :, 3:] = np.eye(3)
-    return design.reshape(-1, 6)
-
-
-def _solve(design: Array, measured: Array) -> _Solution:
-    found, _, rank, _ = np.linalg.lstsq(design, measured.reshape(-1), rcond=None)
-    answer = found.astype(np.float64)
-    unknowns = design.shape[1]
-    if rank < unknowns:
-        raise IdentificationError("the poses do not suffice: their equations leave an unknown open")
-    residuals = measured.reshape(-1) - design @ answer
-    degrees = len(residuals) - unknowns
-    variance = float(residuals @ residuals) / degrees
-    deviation: Array = np.sqrt(variance * np.diag(np.linalg.inv(design.T @ design)))
-    return _Solution(answer, deviation, residuals.reshape(-1, 3), variance**0.5, degrees)
+def _accelerometer(offset: Value | None, scale: Value | None) -> OffsetFit | None:
+    if offset is None or scale is None:
+        return None
+    limit = _UNKNOWN * 1.96 * OFFSET_PRIOR
+    open_axes = "".join(axis for axis, half in zip("xyz", offset.half, strict=True) if half > limit)
+    calibration = Accelerometer(_triple(offset.value), _triple(scale.value))
+    return OffsetFit(calibration, _triple(offset.half), _triple(scale.half), open_axes)
 
 
 def _condition(gravity: Array) -> float:
@@ -204,49 +207,14 @@ def _check_mass(mass: float, interval: float) -> None:
         )
 
 
-def _check_fit(force: _Solution, weight: float) -> None:
-    limit = _FORGIVEN_MISFIT + _LARGEST_MISFIT * weight
-    if force.rms > limit:
-        worst = int(np.linalg.norm(force.residuals, axis=1).argmax())
+def _check_fit(fit: Fit, residuals: Array, limit: float, unit: str) -> None:
+    if fit.rms > limit:
+        worst = int(np.linalg.norm(residuals, axis=1).argmax())
         raise IdentificationError(
-            f"the poses do not fit one payload: the residual is {force.rms:.2g} N, the limit {limit:.2g} N; "
-            f"pose {worst + 1} fits worst; something touched the tool, or it moved: take that pose "
+            f"the poses do not fit one payload: the residual is {fit.rms:.2g} {unit}, the limit {limit:.2g} "
+            f"{unit}; pose {worst + 1} fits worst; something touched the tool, or it moved: take that pose "
             "again"
         )
-
-
-def _notes(
-    poses: Sequence[Pose],
-    residuals: Sequence[Residual],
-    mass: float,
-    mass_interval: float,
-    centre_interval: Vector3,
-) -> list[str]:
-    notes = []
-    weight = mass * length(poses[0].gravity)
-    for name, unit, negligible, spreads in (
-        ("force", "N", _NEGLIGIBLE * weight, [pose.force_spread for pose in poses]),
-        ("torque", "Nm", _NEGLIGIBLE * weight * _ARM, [pose.torque_spread for pose in poses]),
-    ):
-        sizes = np.array([length(getattr(residual, name)) for residual in residuals])
-        worst = int(sizes.argmax())
-        others = float(np.sqrt(np.mean(np.delete(sizes, worst) ** 2)))
-        by_chance = length(spreads[worst]) / poses[worst].samples ** 0.5
-        if sizes[worst] > max(_SUSPICIOUS * others, _SUSPICIOUS * by_chance, negligible):
-            notes.append(
-                f"pose {worst + 1} fits worse than the others: {sizes[worst]:.2g} {unit} of residual "
-                f"{name}; if something touched the tool, take it again"
-            )
-    if mass_interval > 0.05 * mass:
-        notes.append(
-            f"the mass is known to ± {100 * mass_interval / mass:.0f} % only: take more poses, or longer ones"
-        )
-    if length(centre_interval) > 0.01:
-        notes.append(
-            f"the center of gravity is known to ± {1000 * length(centre_interval):.0f} mm only: take more "
-            "poses, or longer ones"
-        )
-    return notes
 
 
 def _triple(values: Array) -> Vector3:

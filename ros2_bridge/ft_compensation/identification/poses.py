@@ -23,6 +23,8 @@ LEAST_SPREAD: Final = 0.1
 """Of the directions of gravity, in g: less along an axis counts as not seen."""
 _SAME_POSE: Final = 0.97
 """Cosine: directions nearer than 14° are the same pose."""
+_LARGEST_OFFSET: Final = 1.5
+"""m/s²: of an accelerometer whose offset is yet to be found."""
 
 
 class Pose(NamedTuple):
@@ -37,6 +39,10 @@ class Pose(NamedTuple):
     torque_spread: Vector3 = ZERO
     """Likewise, Nm."""
     samples: int = 1
+    acceleration: Vector3 | None = None
+    """What the accelerometer read, m/s², where `gravity` is from it; None where it is from something else."""
+    acceleration_spread: Vector3 = ZERO
+    """Standard deviation of single samples, m/s²."""
 
     @property
     def up(self) -> Vector3:
@@ -54,11 +60,21 @@ def pose_of(
     `gravity` (in the sensor's frame, m/s²) is from the window's own accelerometer, with length `magnitude`,
     unless it is given. CompensationError if the accelerometer reads nothing like g.
     """
+    acceleration = None
     if gravity is None:
-        gravity = gravity_of(means.acceleration, magnitude)
+        acceleration = means.acceleration
+        gravity = gravity_of(acceleration, magnitude, _LARGEST_OFFSET)
     elif not length(gravity) > 0.0:
         raise CompensationError("a pose without gravity says nothing about a payload")
-    return Pose(means.wrench, gravity, means.force_spread, means.torque_spread, means.samples)
+    return Pose(
+        means.wrench,
+        gravity,
+        means.force_spread,
+        means.torque_spread,
+        means.samples,
+        acceleration,
+        means.acceleration_spread,
+    )
 
 
 class Coverage(NamedTuple):

@@ -5,7 +5,7 @@ Used by the node's services. Nothing in it measures or moves: it is given window
 
 from __future__ import annotations
 
-from ft_compensation.identification.payload import Identified, identify
+from ft_compensation.identification.payload import Identified, OffsetFit, identify
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage, pose_of
 from ft_compensation.quantities import CompensationError
 from ft_compensation.stationary import StationaryMeans
@@ -68,6 +68,16 @@ def summary(result: Identified) -> str:
     text = (
         f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, center of gravity ({x:.2f} ± "
         f"{ix:.2f}, {y:.2f} ± {iy:.2f}, {z:.2f} ± {iz:.2f}) mm ({100 * result.confidence:g} % confidence) "
-        f"from {result.coverage.poses} poses; residual {result.force_rms:.2g} N, {result.torque_rms:.2g} Nm"
+        f"from {result.coverage.poses} poses; residual {result.force_rms:.2g} N "
+        f"({result.force_fit.verdict}), {result.torque_rms:.2g} Nm ({result.torque_fit.verdict})"
     )
     return ". ".join([text, *result.notes])
+
+
+def accelerometer_text(fit: OffsetFit) -> str:
+    """Offset and sensitivities of the accelerometer with their confidence intervals, a sentence."""
+    axes = zip("xyz", fit.calibration.offset, fit.offset_interval, strict=True)
+    offset = ", ".join(f"{axis} {value:.3f} ± {half:.3f}" for axis, value, half in axes)
+    axes = zip("xyz", fit.calibration.scale, fit.scale_interval, strict=True)
+    scale = ", ".join(f"{axis} {value:.4f} ± {half:.4f}" for axis, value, half in axes)
+    return f"Accelerometer: offset {offset} m/s², scale {scale}"

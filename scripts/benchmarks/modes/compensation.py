@@ -20,6 +20,8 @@ from bridge.publishing.messages import make_stages
 from ft_compensation.attitude.tilt import GyroscopeOffset
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
+from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
+from ft_compensation.outputs.frames import WrenchTransform
 from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.stationary import StationaryLimits
 from protocol.pdo import Sample, SampleDecoder, encode
@@ -94,6 +96,23 @@ def costs(setup: Setup) -> Costs:
         measure("with inertia, while a tare is taken", inertia=True, window=True)
     finally:
         rclpy.try_shutdown(context=context)
+    found |= outputs(samples, setup.rate_hz)
+    return found
+
+
+def outputs(samples: list[Sample], rate_hz: float) -> Costs:
+    """What outputs that are configured cost besides, each while somebody has subscribed to it."""
+    wrench_filter, step_ns = WrenchFilter(), 1_000_000_000 / rate_hz
+    frame = WrenchTransform.of((0.1, 0.2, 0.3), (0.5, 0.5, 0.5, 0.5))
+
+    def step(number: int) -> object:
+        return wrench_filter.step(samples[number].force, samples[number].torque, round(number * step_ns))
+
+    wrench_filter.design(FilterSettings(cutoff=10.0), rate_hz)
+    found = {"wrench_filtered": took(step)}
+    wrench_filter.design(FilterSettings(10.0, 50.0, 5.0, 1.0, 0.01), rate_hz)
+    found["wrench_filtered, notch and dead band"] = took(step)
+    found["another frame"] = took(lambda number: frame.apply(samples[number].force, samples[number].torque))
     return found
 
 

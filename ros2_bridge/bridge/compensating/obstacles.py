@@ -1,0 +1,89 @@
+"""What keeps the wrench from being compensated, or right, whether anybody has subscribed or not. No ROS."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from bridge.compensating.gravity_sources import AccelerometerSource, Listening, NoSource, SensorSource, Source
+from bridge.parameters.compensation import CompensationParameters
+from bridge.publishing.compensated_wrench import CompensatedOutput
+from bridge.stream.link import Link
+from bridge.stream.watch import Watch
+
+_SATURATED: Final = "force or torque is saturated, and on_saturation is stop"
+_OF_THE_IMU: Final = ("accelerometer", "sensor")
+
+
+class Obstacles:
+    """Each as a sentence that says what to do; None if there is none."""
+
+    def __init__(self, link: Link, watch: Watch) -> None:
+        self._link, self._watch = link, watch
+
+    def conflict(self, parameters: CompensationParameters, *, needs_gravity: bool = False) -> str | None:
+        """What the sensor is set to that does not go with compensation, or with knowing where gravity points
+        in the frame of the wrench if that is needed."""
+        settings = self._link.settings
+        if settings.get("calibration_matrix") is False:
+            return (
+                "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
+                "switch it on"
+            )
+        if settings.get("inertia_compensation") is True and parameters.payload.mass:
+            return (
+                "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
+                "or set tool_mass to 0"
+            )
+        return self._blind(parameters) if needs_gravity else None
+
+    def hold(self, parameters: CompensationParameters, output: CompensatedOutput) -> None:
+        """Have `output` publish nothing while it cannot be known where gravity points, and must be."""
+        output.hold = self._blind(parameters) if parameters.payload.mass else None
+
+    def _blind(self, parameters: CompensationParameters) -> str | None:
+        is_imu = parameters.orientation.source in _OF_THE_IMU or parameters.compensate_inertia
+        if not is_imu or self._link.settings.get("coordinate_system") is not True:
+            return None
+        return (
+            "settings.coordinate_system is on, so the wrench is in a frame that was configured in the "
+            "sensor, and how the IMU is turned to it is not known: switch it off, or take the orientation of "
+            "that frame from the robot (orientation_source) and set compensate_inertia to false"
+        )
+
+    def stopping(
+        self,
+        parameters: CompensationParameters,
+        output: CompensatedOutput,
+        source: Source,
+        listener: Listening | None,
+    ) -> str | None:
+        """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
+        if not output.has_subscribers:
+            return output.hold or self._foreseen(parameters, source, listener)
+        if not output.is_stopped:
+            return None
+        if output.is_saturated:
+            return output.hold or _SATURATED
+        return output.hold or output.broken or source.why_none(output.time_s)
+
+    def _foreseen(
+        self, parameters: CompensationParameters, source: Source, listener: Listening | None
+    ) -> str | None:
+        """The latter, as far as can be told while no sample is compensated."""
+        sample, time_s = self._watch.sample, self._watch.stamp_ns * 1e-9
+        if not parameters.payload.mass:
+            return None
+        if isinstance(source, NoSource):
+            return source.why_none(time_s)
+        if listener is not None:
+            latest, limit_s = listener.latest, parameters.orientation.stale_after
+            fits = latest is not None and abs(time_s - latest.stamp_ns * 1e-9) <= limit_s
+            return None if fits or sample is None else source.why_none(time_s)
+        if isinstance(source, SensorSource) and sample is not None and sample.orientation is None:
+            return source.why_none(time_s)
+        is_off = self._link.settings.get("imu_active") == 0 or (
+            sample is not None and not any(sample.acceleration)
+        )
+        if isinstance(source, AccelerometerSource) and is_off:
+            return "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
+        return None

@@ -1,0 +1,57 @@
+"""The offset (object 0x8000) that the sensor itself adds to every sample, and that a bias is for."""
+
+from __future__ import annotations
+
+from bridge.stream.link import Link
+from ft_compensation.quantities import NO_WRENCH, Wrench
+
+
+class OwnOffset:
+    """Follows what the server says of it, from the executor's thread and the reader's."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self.of_bias: Wrench | None = None
+        """The one that the bias is for, as far as it was ever known."""
+        self._appeared = False
+        """Whether the bias is from before it was known."""
+
+    @property
+    def now(self) -> Wrench | None:
+        """The sensor's; None if it is not known."""
+        offset = self._link.offset
+        return None if offset is None else Wrench.of(offset)
+
+    def begin(self) -> Wrench | None:
+        """The bias is for the offset of now, which is returned."""
+        self.of_bias, self._appeared = self.now, False
+        return self.of_bias
+
+    def follow(self, bias: Wrench) -> Wrench | None:
+        """By how much `bias` must be shifted for the offset of now, once; None: not at all."""
+        now, before = self.now, self.of_bias
+        if now is None or now == before:
+            return None
+        self.of_bias = now
+        if bias == NO_WRENCH:
+            return None
+        self._appeared = self._appeared or before is None
+        return None if before is None else now.plus(before, -1.0)
+
+    def doubt(self, bias: Wrench) -> str:
+        """That `bias` may not fit the sensor any more, a sentence; empty if it does."""
+        if bias == NO_WRENCH or self._link.connection is None:
+            return ""
+        if self._appeared:
+            return "the sensor's own offset was not known when the bias was taken, which may be wrong: tare"
+        if self.of_bias is not None and self._link.offset is None:
+            return "the sensor's own offset is not known any more, so the bias may be wrong: tare"
+        return ""
+
+    def after_tare(self, bias: Wrench) -> str:
+        """What a tare of the sensor means for `bias`, a sentence; empty if nothing."""
+        if bias == NO_WRENCH:
+            return ""
+        if self._link.offset is None:
+            return "The node's own bias was for the old offset: call ~/tare or ~/clear_tare"
+        return "The node's own bias was shifted by the change, so wrench_compensated is as it was"

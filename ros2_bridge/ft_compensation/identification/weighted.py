@@ -1,0 +1,120 @@
+"""Least squares with a variance of its own for every group of equations, estimated from the residuals.
+
+The variances are those of the restricted maximum likelihood (REML), since a few poses leave few degrees of
+freedom. The covariance takes into account that the weights are estimates too, and every unknown has its own
+degrees of freedom for Student's t (Kenward and Roger 1997). Leading axes of the arrays, shown as `...`, are
+independent problems.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+_ROUNDS: Final = 60
+_CONVERGED: Final = 1e-4
+_MOST_DEGREES: Final = 1e6
+_LEAST_DEGREES: Final = 0.5
+_LEAST_RATIO: Final = 1e-9
+"""Of two variances: beyond it the arithmetic fails."""
+_SECOND_ORDER: Final = 5.0
+"""Six poses need more than Kenward and Roger's correction of the covariance, which is of first order. With
+its square taken so often, 95 % intervals cover 93 to 97 % for 6 to 24 poses and axes whose noise differs
+tenfold (`tests/compensation/test_coverage.py`)."""
+
+
+class Known(NamedTuple):
+    """What is known before anything is measured."""
+
+    information: Array
+    """(p, p): inverse of the covariance of the unknowns, about zero; zeros where nothing is known."""
+    floor: Array
+    """(..., k): the variances are at least this, so that perfect data divide by no zero."""
+    degrees: Array | float = 0.0
+    """(k,): how many residuals the assumed variances are worth; 0 = not assumed."""
+    variance: Array | float = 0.0
+    """(..., k): the assumed variances."""
+
+
+class Solution(NamedTuple):
+    """p unknowns from k groups of n equations."""
+
+    answer: Array
+    """(..., p)"""
+    covariance: Array
+    """(..., p, p)"""
+    variances: Array
+    """(..., k): of a single equation of each group."""
+    residuals: Array
+    """(..., k, n)"""
+    degrees: Array
+    """(..., k): residual degrees of freedom of each group."""
+    plain: Array
+    """(..., p, p): the covariance if the weights were exact."""
+    parts: Array
+    """(..., k, p, p): the contribution of each group to it."""
+    uncertainty: Array
+    """(..., k, k): covariance of the logarithms of the variances."""
+
+    def student(self, directions: Array) -> tuple[Array, Array]:
+        """Standard deviation and degrees of freedom of linear combinations `directions` (..., q, p)."""
+
+        def along(matrix: Array) -> Array:
+            found: Array = np.einsum("...qi,...ij,...qj->...q", directions, matrix, directions)
+            return found
+
+        plain = along(self.plain)
+        slope = np.stack([along(self.parts[..., k, :, :]) for k in range(self.parts.shape[-3])], axis=-1)
+        spread = np.einsum("...qi,...ij,...qj->...q", slope, self.uncertainty, slope)
+        degrees = 2.0 * plain**2 / np.maximum(spread, 2.0 * plain**2 / _MOST_DEGREES)
+        return np.sqrt(along(self.covariance)), np.maximum(degrees, 1.0)
+
+
+def solve(design: Array, measured: Array, known: Known, variances: Array | None = None) -> Solution:
+    """The unknowns of `design` (..., k, n, p) times unknowns = `measured` (..., k, n).
+
+    `variances` (..., k) are where to start. LinAlgError if the equations leave an unknown open.
+    """
+    count = design.shape[-2]
+    turned = np.swapaxes(design, -1, -2)
+    square = turned @ design
+    right = (turned @ measured[..., np.newaxis])[..., 0]
+    if variances is None:
+        variances = np.ones(measured.shape[:-1])
+    for _ in range(_ROUNDS):
+        before = variances
+        plain = np.linalg.inv((square / before[..., np.newaxis, np.newaxis]).sum(-3) + known.information)
+        answer = (plain @ (right / before[..., np.newaxis]).sum(-2)[..., np.newaxis])[..., 0]
+        residuals = measured - (design @ answer[..., np.newaxis, :, np.newaxis])[..., 0]
+        degrees = count - np.einsum("...ij,...kji->...k", plain, square) / before
+        variances = np.maximum(
+            ((residuals**2).sum(-1) + known.degrees * known.variance)
+            / np.maximum(degrees + known.degrees, _LEAST_DEGREES),
+            known.floor,
+        )
+        variances = np.maximum(variances, _LEAST_RATIO * variances.max(axis=-1, keepdims=True))
+        if (np.abs(variances - before) <= _CONVERGED * before).all():
+            break
+    information = square / before[..., np.newaxis, np.newaxis]
+    shares = plain[..., np.newaxis, :, :] @ information
+    crossed = np.einsum("...iab,...jba->...ij", shares, shares)
+    own = np.einsum("...kaa->...k", shares)
+    fisher = crossed + np.eye(design.shape[-3]) * (count - 2.0 * own + known.degrees)[..., np.newaxis, :]
+    uncertainty = 2.0 * np.linalg.inv(fisher)
+    inner = np.einsum("...kk,...kab->...ab", uncertainty, information) - np.einsum(
+        "...ij,...iab,...jbc->...ac", uncertainty, information, shares
+    )
+    growth = 2.0 * inner @ plain
+    return Solution(
+        answer,
+        plain @ (np.eye(plain.shape[-1]) + growth + _SECOND_ORDER * growth @ growth),
+        before,
+        residuals,
+        degrees,
+        plain,
+        shares @ plain[..., np.newaxis, :, :],
+        uncertainty,
+    )

@@ -1,0 +1,1 @@
+"""What is made of a compensated wrench: another frame, a filter."""
