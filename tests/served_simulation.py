@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 
+from ethercat_server.acquisition.cycle import Made
 from ethercat_server.serving.transport.base import Transport
 from ethercat_server.serving.transport.sockets import SocketTransport
 from ethercat_server.simulation.backend import MemoryBackend
@@ -68,8 +69,8 @@ class ServedSimulation(Simulation):
     def listen(self) -> Transport:
         return _Transport(self.clock, self.port)
 
-    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
-        self.hub.publish(frame, position, flags, now_ns)
+    def publish(self, made: Sequence[Made], now_ns: int) -> None:
+        self.hub.publish(made, now_ns)
 
     def serve(self, until_ns: int) -> None:
         self._goes_on.wait()

@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import pytest
 
-from ethercat_server.acquisition.cycle import Cycle
+from ethercat_server.acquisition.cycle import Cycle, Made
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
@@ -170,9 +170,9 @@ class SimulatedServer:
         self.hub.start(Actions(self.hub, self.cycle, actions).handle)
         self._stop_if: Callable[[], object] = lambda: False
 
-    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
+    def publish(self, made: Sequence[Made], now_ns: int) -> None:
         """See `Outlet`."""
-        self.hub.publish(frame, position, flags, now_ns)
+        self.hub.publish(made, now_ns)
 
     def serve(self, until_ns: int) -> None:
         """See `Outlet`."""

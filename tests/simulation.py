@@ -15,12 +15,12 @@ failure is repeated by the same arguments, step by step in a debugger.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import pytest
 
-from ethercat_server.acquisition.cycle import Cycle
+from ethercat_server.acquisition.cycle import Cycle, Made
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
@@ -119,11 +119,12 @@ class Simulation:
 
     # -- what the loop hands its samples to
 
-    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
-        self._decoder.feed(frame)
-        self._decoder.take_data(self.frames)
-        self.published_ns.append(self.clock.now_ns)
-        self.hub.publish(frame, position, flags, now_ns)
+    def publish(self, made: Sequence[Made], now_ns: int) -> None:
+        for frame, _, _ in made:
+            self._decoder.feed(frame)
+            self._decoder.take_data(self.frames)
+            self.published_ns.append(self.clock.now_ns)
+        self.hub.publish(made, now_ns)
 
     def serve(self, until_ns: int) -> None:
         self.on_serve(until_ns)

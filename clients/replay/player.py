@@ -124,7 +124,7 @@ class Player:
         if self.stopping:
             return
         now = time.monotonic_ns()
-        self._hub.publish(encode_data(*frame), frame.sensor, frame.flags, now)
+        self._hub.publish(((encode_data(*frame), frame.sensor, frame.flags),), now)
         self.meter.count(frame, due_ns, now)
 
     def _wait(self, due_ns: int) -> None:

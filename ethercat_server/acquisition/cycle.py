@@ -31,11 +31,15 @@ _SUMMARY_NS: Final = 200_000_000
 """Interval between summaries of the distributions, which take some 100 µs each."""
 
 
+Made = tuple[bytes, int, int]
+"""A DATA frame, the number of its sensor, its flags."""
+
+
 class Outlet(Protocol):
     """Where the samples go: the server's `Hub`, or a tool that wants them in its own process."""
 
-    def publish(self, frame: bytes, number: int, flags: int, now_ns: int) -> None:
-        """Take a DATA frame of the sensor `number`; `now_ns` is when its exchange was back."""
+    def publish(self, made: Sequence[Made], now_ns: int) -> None:
+        """Take the DATA frames that an exchange made, one for a sensor; `now_ns` is when it was back."""
         ...
 
     def serve(self, until_ns: int) -> None:
@@ -187,7 +191,7 @@ class Cycle:
         self._cycles += 1
         for stream in self._streams:
             if now >= stream.idle_at_ns and (made := stream.idle(now)):
-                self._hub.publish(made[0], stream.number, made[1], now)
+                self._hub.publish(((made[0], stream.number, made[1]),), now)
         if frame is None:
             most = int(timing.patience_ns) if self._schedule.one_by_one else self._due_ns() - monotonic_ns()
             if (wait := min(most, until_ns - now)) > 0:
@@ -218,6 +222,7 @@ class Cycle:
         frame, wkc, which = process_data.frame, process_data.wkc, process_data.which
         self._answered = True
         self._complete = complete = wkc >= self._recovery.alive_wkc[which]
+        new: list[Made] = []
         for number, start, end, untouched, sensor, stream in self._carried[which]:
             if back < stream.clock.quiet_until_ns:
                 continue  # the poll was for another sensor
@@ -226,7 +231,9 @@ class Cycle:
             if not complete or sensor.state is not SensorState.STREAMING or data == untouched:
                 stream.invalid(wkc)
             elif made := stream.take(data, wkc, sent, back):
-                self._hub.publish(made[0], number, made[1], back)
+                new.append((made[0], number, made[1]))
+        if new:
+            self._hub.publish(new, back)
         for stream in self._streams_of[which]:
             if stream.learns:
                 stream.learn()

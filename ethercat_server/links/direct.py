@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, TypeVar
 
-from ethercat_server.acquisition.cycle import Cycle
+from ethercat_server.acquisition.cycle import Cycle, Made
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import AsFound, enter_op, find_sensors
@@ -161,9 +161,10 @@ class _Running:
         self._decoder = FrameDecoder()
         self._stopped = False
 
-    def publish(self, frame: bytes, number: int, flags: int, now_ns: int) -> None:  # noqa: ARG002
+    def publish(self, made: Sequence[Made], now_ns: int) -> None:  # noqa: ARG002
         """See `Outlet`."""
-        self._decoder.feed(frame)
+        for frame, _, _ in made:
+            self._decoder.feed(frame)
         for message in self._decoder:
             if isinstance(message, DataMessage) and not self._on_frame(message):
                 self._cycle.stop()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 from ethercat_server.serving.outbox import Outbox, with_gap
@@ -222,30 +222,40 @@ class Connection:
             return
         self.outbox.send(encode_bare_json(message) if self.bare is not None else encode_json(message))
 
-    def offer(self, frame: bytes, number: int, flags: int, now_ns: int) -> None:
-        """Send a DATA frame if the subscription wants it."""
+    def offer(self, made: Sequence[tuple[bytes, int, int]], now_ns: int) -> None:
+        """Send those DATA frames that the subscription wants, at once: one for a sensor."""
         wants = self.subscription
-        if wants is None or not wants.wanted[number]:
+        if wants is None:
             return
-        if not flags and wants.every == 1 and not wants.gap[number]:
-            withheld = self.outbox.send(frame, number)
+        chosen = []
+        for frame, number, flags in made:
+            if not wants.wanted[number]:
+                continue
+            if flags or wants.every != 1 or wants.gap[number]:
+                choice = _choose(wants, frame, number, flags, now_ns)
+                if choice is None:
+                    continue
+                chosen.append((choice, number))
+            else:
+                chosen.append((frame, number))
             wants.last_ns[number] = now_ns
-            if withheld >= 0:
-                wants.gap[withheld] = True
-            return
-        if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[number] < _IDLE_FRAME_NS:
-            return
-        if flags & _GAP:
-            wants.gap[number] = True
-        if wants.skipped[number] < wants.every - 1:
-            wants.skipped[number] += 1
-            return
-        wants.skipped[number] = 0
-        wants.last_ns[number] = now_ns
-        if wants.gap[number]:
-            wants.gap[number] = False
-            if not flags & _GAP:
-                frame = with_gap(frame)
-        withheld = self.outbox.send(frame, number)
-        if withheld >= 0:
-            wants.gap[withheld] = True
+        if chosen:
+            for number in self.outbox.send_data(chosen):
+                wants.gap[number] = True
+
+
+def _choose(wants: Subscription, frame: bytes, number: int, flags: int, now_ns: int) -> bytes | None:
+    """What a subscription gets of a DATA frame that is not like most."""
+    if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[number] < _IDLE_FRAME_NS:
+        return None
+    if flags & _GAP:
+        wants.gap[number] = True
+    if wants.skipped[number] < wants.every - 1:
+        wants.skipped[number] += 1
+        return None
+    wants.skipped[number] = 0
+    if wants.gap[number]:
+        wants.gap[number] = False
+        if not flags & _GAP:
+            frame = with_gap(frame)
+    return frame

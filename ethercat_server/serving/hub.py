@@ -63,10 +63,10 @@ class Hub:
         """Begin to accept; until now clients waited in the kernel's queue."""
         self._handler = handler
 
-    def publish(self, frame: bytes, number: int, flags: int, now_ns: int) -> None:
-        """Send a DATA frame of the sensor `number` to every subscriber that wants it."""
+    def publish(self, made: Sequence[tuple[bytes, int, int]], now_ns: int) -> None:
+        """Send DATA frames, with their sensors' numbers and flags, to every subscriber that wants them."""
         for connection in self._subscribers:
-            connection.offer(frame, number, flags, now_ns)
+            connection.offer(made, now_ns)
 
     def broadcast(self, message: JsonObject) -> None:
         """Send an event to every framed connection."""

@@ -7,7 +7,7 @@ part of a frame and never a reply.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from ethercat_server.serving.transport.base import Stream
@@ -49,34 +49,58 @@ class Outbox:
         replies = len(self._queue) - self._queued_data
         return replies >= MAX_QUEUED_JSON or self._queued_json_bytes > MAX_QUEUED_JSON_BYTES
 
-    def send(self, message: bytes, number: int = NO_SENSOR) -> int:
-        """Send a message or queue it; `number` is the sensor's number if it is a DATA frame.
+    def send(self, message: bytes) -> None:
+        """Send a reply or an event, or queue it."""
+        if not self._queue:
+            sent = self._try(message)
+            if sent == len(message) or self.broken:
+                return
+            self._head_sent = sent
+        self._queue.append((message, NO_SENSOR))
+        self._queued_json_bytes += len(message)
 
-        Returns the number of the sensor whose next frame must carry GAP because one was dropped, if any.
+    def send_data(self, frames: Sequence[tuple[bytes, int]]) -> Sequence[int]:
+        """Send DATA frames with their sensors' numbers, one for each, or queue them.
+
+        Returns the sensors whose next frame must carry GAP because one was dropped.
         """
         if not self._queue:
-            try:
-                sent = self._send(message)
-            except BlockingIOError:
-                sent = 0
-            except OSError:
-                self._break()
-                return NO_SENSOR
+            message = frames[0][0] if len(frames) == 1 else b"".join([frame for frame, _ in frames])
+            sent = self._try(message)
             if sent == len(message):
-                if number >= 0:
-                    self.sent += 1
-                return NO_SENSOR
+                self.sent += len(frames)
+                return ()
+            if self.broken:
+                return ()
+            whole = 0
+            while sent >= (size := len(frames[whole][0])):
+                sent -= size
+                whole += 1
+            self.sent += whole
+            frames = frames[whole:]
             self._head_sent = sent
-            self.waiting = True
-            self.progress_ns = self._monotonic_ns()
-        self._queue.append((message, number))
-        if number < 0:
-            self._queued_json_bytes += len(message)
-        else:
+        dropped: set[int] = set()
+        for frame, number in frames:
+            self._queue.append((with_gap(frame) if number in dropped else frame, number))
+            dropped.discard(number)
             self._queued_data += 1
             if self._queued_data > MAX_QUEUED_DATA:
-                return self._drop_oldest_data()
-        return NO_SENSOR
+                dropped.add(self._drop_oldest_data())
+        return tuple(dropped - {NO_SENSOR})
+
+    def _try(self, message: bytes) -> int:
+        """How many bytes of it the socket accepts."""
+        try:
+            sent = self._send(message)
+        except BlockingIOError:
+            sent = 0
+        except OSError:
+            self._break()
+            return 0
+        if sent < len(message):
+            self.waiting = True
+            self.progress_ns = self._monotonic_ns()
+        return sent
 
     def flush(self) -> None:
         """Send what is queued, as far as the socket accepts it."""

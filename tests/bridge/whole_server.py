@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+from ethercat_server.acquisition.cycle import Made
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.errors import UnreachableError
 from tests.bridge.simulated_node import STEP_S, Wire
@@ -16,8 +17,8 @@ SLOW = {"sinc_length": 512}
 class Serving(Simulation):
     """Stops after each sample, so that the node gets it at once."""
 
-    def publish(self, frame: bytes, position: int, flags: int, now_ns: int) -> None:
-        super().publish(frame, position, flags, now_ns)
+    def publish(self, made: Sequence[Made], now_ns: int) -> None:
+        super().publish(made, now_ns)
         self.cycle.stop()
 
 

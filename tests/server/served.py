@@ -55,7 +55,7 @@ class Served:
 
     def publish(self, position: int = 0, flags: int = 0, now_ns: int | None = None) -> None:
         frame = encode_data(self.sequence, 1, 2, position, flags, 3, bytes(61))
-        self.hub.publish(frame, position, flags, self.clock.now_ns if now_ns is None else now_ns)
+        self.hub.publish([(frame, position, flags)], self.clock.now_ns if now_ns is None else now_ns)
         self.sequence += 1
 
     def read(self, client: InMemoryStream) -> list[DataMessage | JsonObject]:

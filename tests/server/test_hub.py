@@ -15,7 +15,7 @@ from ethercat_server.serving.connection import MAX_REQUEST_LENGTH, Connection, L
 from ethercat_server.serving.outbox import MAX_QUEUED_DATA
 from ethercat_server.serving.state import State
 from ethercat_server.serving.transport.in_memory import InMemoryStream
-from protocol.framing import DataFlag, DataMessage, encode_data, encode_json
+from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
 from protocol.text.json_text import JsonObject
 from tests.server.served import TURN_NS, Served
 
@@ -294,6 +294,42 @@ def test_a_client_that_does_not_read_loses_the_oldest_whole_frames_and_is_told(s
     assert sum(step - 1 for _, step in jumps) == slow_connection.outbox.withheld
     assert received_quick == list(range(total))
     assert quick_connection.outbox.withheld == 0
+
+
+@pytest.mark.parametrize("every", [1, 2, *range(253, 259)])
+def test_frames_of_several_sensors_go_at_once_and_a_gap_is_told_for_each(served: Served, every: int) -> None:
+    """Sensor 1 has something new in each `every`th exchange."""
+    slow, quick = served.subscribe(buffer_size=10_007), served.subscribe()
+    slow_connection, quick_connection = served.hub.connections.values()
+    made: list[list[int]] = [[], []]
+    for number in range(2000):
+        each = [0, 1] if number % every == 0 else [0]
+        for sensor in each:
+            made[sensor].append(number)
+        frames = [(encode_data(number, 1, 2, sensor, 0, 3, bytes(61)), sensor, 0) for sensor in each]
+        served.hub.publish(frames, served.clock.now_ns)
+        if number % 50 == 0:
+            served.read(quick)
+    received = bytearray()
+    while data := slow.recv_all():
+        received += data
+        served.serve()
+    served.hub.publish(
+        [(encode_data(2000, 1, 2, sensor, 0, 3, bytes(61)), sensor, 0) for sensor in (0, 1)], 0
+    )
+    received += slow.recv_all()
+    decoder = FrameDecoder()
+    decoder.feed(received)
+    got = [message for message in decoder if isinstance(message, DataMessage)]
+    outbox = slow_connection.outbox
+    assert outbox.withheld > 1000
+    assert len(got) == len(made[0]) + len(made[1]) + 2 - outbox.withheld == outbox.sent
+    assert quick_connection.outbox.withheld == 0
+    for sensor in (0, 1):
+        numbers = [*made[sensor], 2000]
+        for before, after in pairwise([frame for frame in got if frame.sensor == sensor]):
+            skipped = numbers.index(after.sequence) - numbers.index(before.sequence) - 1
+            assert bool(after.flags & DataFlag.GAP) == (skipped > 0)
 
 
 def test_queue_is_bounded(served: Served) -> None:

@@ -278,7 +278,7 @@ def test_a_slow_subscriber_over_tcp_gets_whole_frames_and_the_newest(over_tcp: S
         (connection,) = over_tcp.hub.connections.values()
         total = 0
         while connection.outbox.withheld < 500:
-            over_tcp.hub.publish(encode_data(total, 1, 2, 0, 0, 3, bytes(61)), 0, 0, time.monotonic_ns())
+            over_tcp.hub.publish([(encode_data(total, 1, 2, 0, 0, 3, bytes(61)), 0, 0)], time.monotonic_ns())
             total += 1
         received = bytearray()
         over_tcp.serve_until(lambda: receive(sock, received) or not connection.outbox.waiting)
