@@ -16,7 +16,7 @@ _COST_GAIN: Final = 1 / 64
 _FIRST_COST_NS: Final = 50_000.0
 _BUDGET: Final = 1 / 3
 """Part of the time that exchanges may take."""
-_LARGEST_WAIT: Final = 0.2
+_LARGEST_WAIT: Final = 0.25
 """What a poll may wait for another, in shortest sample periods."""
 _LONGEST_LEAD_NS: Final = 200_000.0
 """By how much polls are brought forward at most because this machine wakes late."""
