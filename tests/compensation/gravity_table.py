@@ -39,8 +39,8 @@ def table() -> Sequence[Row]:
 
 def lines(rows: Sequence[Row]) -> list[str]:
     """As Markdown."""
-    head = ["| Tilt, rms (worst) | " + " | ".join(ESTIMATORS) + " |", "|---|" + "---|" * len(ESTIMATORS)]
+    head = ["| Tilt, rms/worst, ° | " + " | ".join(ESTIMATORS) + " |", "|---|" + "---|" * len(ESTIMATORS)]
     return head + [
-        f"| {kind} | " + " | ".join(f"{rms:.2f}° ({worst:.1f}°)" for rms, worst in cells) + " |"
+        f"| {kind} | " + " | ".join(f"{rms:.2f}/{worst:.1f}" for rms, worst in cells) + " |"
         for kind, cells in rows
     ]
