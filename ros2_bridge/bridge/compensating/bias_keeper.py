@@ -39,7 +39,7 @@ class BiasKeeper:
         self._log = log
 
     def forget(self) -> None:
-        """What the file has is not known any more: keep the bias anew."""
+        """Store the bias again, whatever the file has."""
         self._kept = None
 
     def keep(self, bias: Wrench, parameters: CompensationParameters, offset: Wrench | None) -> None:
@@ -81,8 +81,8 @@ class BiasKeeper:
             return Beginning(NO_WRENCH, FROM_PARAMETER)
         if is_first and bias not in (NO_WRENCH, stored.bias):
             self._log.warning(
-                f"the bias kept of the sensor with serial number {serial} is not used, because the parameter "
-                "bias is given; it is replaced by it"
+                f"the stored bias of the sensor with serial number {serial} is not used, because the "
+                "parameter bias is given, and is overwritten"
             )
             return None
         if stored.offset == offset:
@@ -111,14 +111,14 @@ class BiasKeeper:
             return stored
         if stored.offset is None or offset is None:
             self._say_not_kept(
-                f"the bias kept of the sensor with serial number {serial} is not used, because it is not "
-                "known whether the sensor's own offset is the one of then: tare"
+                f"the stored bias of the sensor with serial number {serial} is not used, because it is "
+                "unknown whether the sensor's own offset has changed since: tare"
             )
             return None
         change = offset.plus(stored.offset, -1.0)
         self._log.info(
             f"the own offset of the sensor with serial number {serial} has changed by "
-            f"{wrench_text(change)} since its bias was kept, which is shifted by that"
+            f"{wrench_text(change)} since its bias was stored: the bias is shifted by the change"
         )
         return stored._replace(bias=stored.bias.plus(change))
 

@@ -105,7 +105,7 @@ class AccelerometerSource:
                 usable = self._correct(usable)
             good = self._filter.update(usable, sample.angular_rate, time_s)
             if not good and not math.isfinite(sum(acceleration) + sum(sample.angular_rate)):
-                self._broken = "the IMU's numbers are not finite: see stream"
+                self._broken = "the IMU sends NaN or infinity: see the status stream"
                 return None
         found = self._filter.gravity(time_s)
         if found is None:
@@ -123,8 +123,8 @@ class AccelerometerSource:
         since = "not yet" if math.isinf(age_s) else f"not for {age_s:.2f} s"
         if self.tilt is not None and age_s <= f.stale_after_s:
             return (
-                f"gravity by the accelerometer may be tilted by {math.degrees(f.tilt_95):.1f}°, too much for "
-                "a start: hold the sensor still for a second"
+                f"gravity from the accelerometer may be tilted by {math.degrees(f.tilt_95):.1f}°, too much "
+                "to start with: keep the sensor stationary for a second"
             )
         return (
             f"the accelerometer has {since} agreed with {f.magnitude:.2f} ± {f.gate:g} m/s² and the "

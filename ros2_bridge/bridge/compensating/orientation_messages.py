@@ -96,7 +96,7 @@ def look_up(tf: Tf, base: str, frame: str) -> Oriented:
     try:
         found = tf.buffer.lookup_transform(base, frame, tf.latest)
     except tf.errors as error:
-        raise UnusableError(f"TF has none of {frame} in {base}: {' '.join(str(error).split())}") from None
+        raise UnusableError(f"TF has no pose of {frame} in {base}: {' '.join(str(error).split())}") from None
     stamp = found.header.stamp
     stamp_ns = stamp.sec * _NS_PER_S + stamp.nanosec
     # A chain of static transforms only has no time: it holds at any, so now.

@@ -33,14 +33,12 @@ def warn_of_others(node: Node) -> None:
         if node.has_parameter(given) or given.startswith(_OF_OTHERS):
             continue
         near = difflib.get_close_matches(given, names, 1)
-        meant = f"did you mean {near[0]}?" if near else "ros2 param list shows those there are"
-        node.get_logger().warning(
-            f"there is no parameter {given}, so what was given for it is not used: {meant}"
-        )
+        meant = f"did you mean {near[0]}?" if near else "ros2 param list shows the valid names"
+        node.get_logger().warning(f"unknown parameter {given} is ignored: {meant}")
     if node.get_parameter("use_sim_time").value is True:
         node.get_logger().warning(
-            "use_sim_time is true, but a real sensor knows no simulation time: stamps are the wall clock's, "
-            "and those of orientations must be too"
+            "use_sim_time is true, but a real sensor has no simulation time: stamps are wall-clock time, and "
+            "those of orientations must be too"
         )
 
 

@@ -208,7 +208,7 @@ class CompensatedOutput:
         if plan.compensator.inertia and not math.isfinite(
             sum(sample.acceleration) + sum(sample.angular_rate)
         ):
-            return "the IMU's numbers are not finite, which compensate_inertia needs: see stream"
+            return "the IMU, which compensate_inertia needs, sends NaN or infinity: see the status stream"
         return None
 
     @staticmethod
