@@ -35,7 +35,7 @@ class BiasKeeper:
         self.serial: str | None = None
         self.problem = ""
         self._kept: tuple[Wrench, Wrench | None] | None = None
-        """What the file has: a bias, and the sensor's own offset with it."""
+        """The content of the file: a bias, and the sensor's own offset at that time."""
         self._log = log
 
     def forget(self) -> None:
@@ -43,8 +43,8 @@ class BiasKeeper:
         self._kept = None
 
     def keep(self, bias: Wrench, parameters: CompensationParameters, offset: Wrench | None) -> None:
-        """Keep `bias`, taken with the sensor's own `offset`, for the sensor that is there, if that is asked
-        for and it is not the kept one."""
+        """Store `bias`, taken with the sensor's own `offset`, for the connected sensor, if enabled and
+        changed."""
         if not parameters.bias_keep:
             self.problem = ""
             return
@@ -66,8 +66,8 @@ class BiasKeeper:
         parameters: CompensationParameters,
         offset: Wrench | None,
     ) -> Beginning | None:
-        """Another sensor is there, with this `offset` of its own; `bias` from `origin` is in force. None: it
-        stays."""
+        """Another sensor was connected, with its own `offset`; `bias` from `origin` is in force. None: keep
+        it."""
         is_first, self.serial = self.serial is None, serial
         self._kept = None
         stored = self._look_up(serial, parameters, offset)
@@ -98,7 +98,7 @@ class BiasKeeper:
     def _look_up(
         self, serial: str, parameters: CompensationParameters, offset: Wrench | None
     ) -> Stored | None:
-        """What was kept, the bias as it is with the sensor's `offset` of now."""
+        """What was stored, with the bias shifted to the sensor's current `offset`."""
         self.problem = ""
         if not parameters.bias_keep:
             return None

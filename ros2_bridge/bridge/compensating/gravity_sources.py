@@ -32,7 +32,7 @@ class Source(Protocol):
 
     @property
     def tilt(self) -> float | None:
-        """The largest error of the direction in 95 % of cases, rad; None if that is not known."""
+        """The error of the direction that is not exceeded in 95 % of cases, rad; None if unknown."""
 
     def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
         """m/s², for this sample; None if what is known is too old, or nothing is."""
@@ -77,7 +77,7 @@ class AccelerometerSource:
     is_accelerometer = True
 
     def __init__(self, parameters: CompensationParameters, gyroscope: GyroscopeOffset) -> None:
-        """`gyroscope`: what is known of it, and is improved."""
+        """`gyroscope`: the estimate of its offset, which is improved in place."""
         p = parameters.accelerometer
         self._filter = AccelerometerGravity(
             length(parameters.gravity),
@@ -92,7 +92,7 @@ class AccelerometerSource:
 
     @property
     def tilt(self) -> float | None:
-        """The largest that the estimate may have, in 95 % of cases, rad."""
+        """The bound of the estimate's tilt that holds in 95 % of cases, rad."""
         found = self._filter.tilt_95
         return found if math.isfinite(found) else None
 
@@ -133,7 +133,7 @@ class AccelerometerSource:
         )
 
     def age_s(self, time_s: float) -> float:
-        """Since the accelerometer last counted."""
+        """Time since the accelerometer was last used."""
         return self._filter.age_s(time_s)
 
 
@@ -189,7 +189,7 @@ class ListenerSource:
         self.describe = listener.describe
 
     def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
-        """From the latest orientation, if it is of nearly the sample's time."""
+        """From the latest orientation, if its time is close to the sample's."""
         self._turn.follow(sample.angular_rate, time_s)
         latest = self._listener.latest
         if latest is not self._taken and latest is not None:

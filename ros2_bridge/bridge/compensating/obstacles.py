@@ -69,7 +69,7 @@ class Obstacles:
     def _foreseen(
         self, parameters: CompensationParameters, source: Source, listener: Listening | None
     ) -> str | None:
-        """The latter, as far as can be told while no sample is compensated."""
+        """The same without subscribers, as far as it can be known while no sample is compensated."""
         sample, time_s = self._watch.sample, self._watch.stamp_ns * 1e-9
         if not parameters.payload.mass:
             return None

@@ -106,7 +106,7 @@ def look_up(tf: Tf, base: str, frame: str) -> Oriented:
 def check_tf(
     wanted: str = "parameter orientation_source is 'tf'", instead: str = "take another source"
 ) -> None:
-    """ParameterError if tf2_ros is not there. `wanted`: what needs it, `instead`: what to do without it."""
+    """ParameterError if tf2_ros is missing. `wanted`: what needs it, `instead`: what to do without it."""
     try:
         import tf2_ros  # noqa: F401, PLC0415 - only where it is asked for: not everybody has it
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""The offset (object 0x8000) that the sensor itself adds to every sample, and that a bias is for."""
+"""The offset (object 0x8000) that the sensor itself adds to every sample, and how it affects the bias."""
 
 from __future__ import annotations
 

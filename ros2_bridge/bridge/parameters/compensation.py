@@ -115,7 +115,7 @@ class AccelerometerParameters(NamedTuple):
 
     @property
     def reading(self) -> Accelerometer:
-        """What its readings are corrected by."""
+        """The correction of its readings."""
         return Accelerometer(self.offset, self.scale)
 
 

@@ -20,7 +20,7 @@ from ft_compensation.outputs.frames import WrenchTransform
 from protocol.pdo import Vector3
 
 TF_PERIOD_S: Final = 0.005
-"""How often TF is asked."""
+"""Period of the TF lookups."""
 _PATIENCE: Final = 200
 """Failed lookups after the first subscription before it is a problem: TF has to arrive first."""
 _NS_PER_S: Final = 1_000_000_000
@@ -78,7 +78,7 @@ class TfFrameTopic(StageTopic):
         self.tune(parameters.compensation)
 
     def tune(self, parameters: CompensationParameters) -> None:
-        """Take the limit to the age."""
+        """Take the limit of the age."""
         self._limit_ns = parameters.orientation.stale_after * _NS_PER_S
 
     def is_wanted(self) -> bool:

@@ -1,4 +1,4 @@
-"""The server's events as sentences for the log. What they say is not trusted to have a form."""
+"""The server's events as sentences for the log. Their content is not trusted."""
 
 from __future__ import annotations
 
