@@ -78,9 +78,9 @@ class ProcessData:
         for number, each in enumerate(areas):
             self._lay_out(number, each, spans)
         self._ends = [FIRST_DATA + end - start for start, end in spans]
-        """Where the process data ends in each, the inputs' at least."""
+        """Where the process data (at least the inputs) ends in each."""
         self._written = [0 if lrw else end + _BEFORE_TAG + end - FIRST_DATA for end in self._ends]
-        """Where the outputs end in each, if they are apart."""
+        """Where the outputs end in each, if separate."""
         self._tags = [
             (each or end) + _BEFORE_TAG for each, end in zip(self._written, self._ends, strict=True)
         ]
@@ -89,7 +89,7 @@ class ProcessData:
         self._sent = [_NOTHING] * _INDICES
         """By index less the first: when a frame was sent that is not back, else 0; which it was; its tag."""
         self.in_flight = 0
-        """Frames that are not back, and are not known to be lost."""
+        """Frames in flight: not back, and not known to be lost."""
         self._lost = 0
         self.blocked_until_ns = 0
         """Nothing can be sent before, as long as nothing comes back."""

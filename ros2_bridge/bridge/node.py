@@ -206,7 +206,7 @@ def spin(node: BridgeNode) -> int:
 
 
 def why_not_started(error: Exception) -> str:
-    """What rclpy says of it, and what to do where it does not say that."""
+    """rclpy's own message, with a remedy where it has none."""
     text = " ".join(str(error).split())
     if "logging directory" in text:
         text += "; set HOME, or ROS_LOG_DIR to a directory for its log"

@@ -21,7 +21,7 @@ _HAIR_S: Final = 1e-6
 _FASTEST: Final = 100.0
 """rad/s: three times the largest range. A rate beyond it is none."""
 _AT_FIRST: Final = 0.35
-"""Of the limit to the tilt: to lose what is known takes more than to begin."""
+"""Fraction of the tilt limit that applies at the start (hysteresis)."""
 _MOST_RATES: Final = 4096
 """Remembered for orientations that come late: 2.5 s at 1600 Hz."""
 
@@ -117,7 +117,7 @@ class AccelerometerGravity:
         self._sum.begin(time_s, self._attitude)
 
     def _begin_anew(self) -> None:
-        """From the steady mean of late."""
+        """From the recent steady mean."""
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._attitude.matrix
         x, y, z = self._filter.steady
         # The matrix's transpose: back into the sensor's frame.
@@ -126,7 +126,7 @@ class AccelerometerGravity:
         self._is_known = False
 
     def age_s(self, now_s: float) -> float:
-        """How long since the accelerometer last counted, s; infinite if it never did."""
+        """Time since the accelerometer was last used, s; infinite if it never was."""
         if not self._is_begun:
             return math.inf
         return abs(now_s - self._time_s) + self._filter.rejected_s

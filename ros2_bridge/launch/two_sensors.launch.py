@@ -34,7 +34,7 @@ def generate_launch_description():
                     server_port=port,
                     namespace=namespace,
                     sensor=str(position),
-                    # Relative: the default is one absolute name, which both would publish on.
+                    # Without the model, which is in the namespace.
                     array_topic="sensor_data",
                     frame_id=f"{namespace}_ft_sensor",
                     imu_frame_id=f"{namespace}_ft_sensor_imu",

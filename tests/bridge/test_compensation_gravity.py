@@ -130,7 +130,7 @@ def test_numbers_that_are_not_finite_stop_only_what_needs_them(arm: Arm, node: S
     hold(arm, UP, acceleration_y=math.nan)
     node.run(0.1)
     assert stages.are_silent()
-    node.until("wrench_compensated has stopped: the IMU's numbers are not finite", compensation=ERROR)
+    node.until("wrench_compensated has stopped: the IMU sends NaN or infinity", compensation=ERROR)
     assert node.set_parameter("tool_mass", 0.0) == (True, "")
     stages.settle(weight(UP))
     node.until(compensation=OK)
@@ -143,7 +143,7 @@ def test_the_inertial_term_needs_the_accelerometer(arm: Arm, node: SimulatedNode
         assert node.set_parameter(name, value) == (True, "")
     stages = Stages(node)
     arm.changes = {"process_data": sensed(UP, size=77, orientation_w=1.0, acceleration_x=math.nan)}
-    node.until("not finite, which compensate_inertia needs", compensation=ERROR)
+    node.until("the IMU, which compensate_inertia needs, sends NaN", compensation=ERROR)
     assert stages.are_silent()
     assert node.set_parameter("compensate_inertia", False) == (True, "")
     stages.forget()
@@ -158,7 +158,7 @@ def test_it_says_why_it_does_not_start(arm: Arm, node: SimulatedNode) -> None:
     own = np.zeros_like(felt.up)
     own[:, 0] = 2.0 * np.sin(2 * math.pi * 1.0 * felt.times)
     arm.play(felt._replace(acceleration=felt.acceleration + own, own=own))
-    node.until("too much for a start: hold the sensor still for a second", compensation=ERROR)
+    node.until("too much to start with: keep the sensor stationary for a second", compensation=ERROR)
     assert stages.are_silent()
     hold(arm, UP)
     arm.felt = None

@@ -132,7 +132,7 @@ def test_nothing_of_one_sensor_is_used_for_another(bench: Bench) -> None:
         assert node.trigger("undo_tare") == (False, "there is no change of the bias to undo")
         done, text = node.trigger("identify/add_pose")
         assert not done
-        assert "another sensor is there now, so the poses before were dropped" in text
+        assert "another sensor is there now, so the previous poses were dropped" in text
         assert "no identification was started" in node.trigger("identify/add_pose")[1]
 
 
@@ -201,7 +201,7 @@ def test_a_change_of_the_sensors_own_offset_shifts_the_bias(bench: Bench) -> Non
         stages.settle(ZERO6)
         # What a client that does not ask the server has done is not known.
         bench.server.send_json({"event": "sensor_back", "sensor": 0, "offset": None})
-        node.until("the sensor's own offset is not known any more", compensation=WARN)
+        node.until("the sensor's own offset is no longer known", compensation=WARN)
         bench.server.send_json({"event": "sensor_back", "sensor": 0, "offset": [1.0] * 6})
         node.until(compensation=OK)
 
@@ -213,7 +213,7 @@ def test_an_offset_that_was_not_known_puts_the_bias_in_doubt(bench: Bench) -> No
         node.until(compensation=OK)
         offset_changed(bench, [0.0] * 6)
         bench.server.drop()
-        node.until("was not known when the bias was taken", compensation=WARN)
+        node.until("was unknown when the bias was taken", compensation=WARN)
         assert node.trigger("tare")[0]
         node.until(compensation=OK)
 
@@ -234,7 +234,10 @@ def test_a_tare_during_which_the_offset_changes_is_refused(bench: Bench) -> None
         assert node.trigger("identify/start")[0]
         node.at(0.1, lambda: bench.server.send_json(changed))
         assert node.trigger("tare") == (False, "the sensor's own offset was changed meanwhile: call again")
-        assert "the sensor's own offset was changed, so the poses" in node.trigger("identify/add_pose")[1]
+        assert (
+            "the sensor's own offset was changed, so the previous poses"
+            in node.trigger("identify/add_pose")[1]
+        )
 
 
 @pytest.mark.parametrize(
@@ -242,8 +245,8 @@ def test_a_tare_during_which_the_offset_changes_is_refused(bench: Bench) -> None
     [
         ([0.5] * 6, [0.5] * 6, "has the bias that was kept at"),
         ([0.5] * 6, [-1.0, 2.0, 3.0, 0.1, 0.2, 0.3], "has changed by Fx -1.5000 Fy 1.5000"),
-        (None, [0.5] * 6, "it is not known whether the sensor's own offset is the one of then: tare"),
-        ([0.5] * 6, None, "it is not known whether the sensor's own offset is the one of then: tare"),
+        (None, [0.5] * 6, "it is unknown whether the sensor's own offset has changed since: tare"),
+        ([0.5] * 6, None, "it is unknown whether the sensor's own offset has changed since: tare"),
     ],
 )
 def test_a_kept_bias_is_for_the_offset_of_then(
@@ -260,7 +263,7 @@ def test_a_kept_bias_is_for_the_offset_of_then(
             node.until(compensation=OK)
         else:
             assert list(node.parameters("bias")[0]) == ZERO6
-            node.until("it is not known whether", compensation=WARN)
+            node.until("it is unknown whether", compensation=WARN)
 
 
 def test_a_folder_that_cannot_be_written(bench: Bench, tmp_path: Path) -> None:

@@ -360,7 +360,7 @@ class FakeBuffer:
 def test_tf_is_asked_for_the_sensor_in_the_base() -> None:
     buffer = FakeBuffer()
     tf = Tf(buffer, FakeTfError, "latest", lambda: None)
-    with pytest.raises(UnusableError, match="TF has none of ft_sensor in base_link: frame does not exist"):
+    with pytest.raises(UnusableError, match="TF has no pose of ft_sensor in base_link: frame does not exist"):
         look_up(tf, "base_link", "ft_sensor")
     buffer.error, buffer.quaternion, buffer.stamp_ns = None, TILTED, 12_000_000_345
     assert look_up(tf, "base_link", "ft_sensor") == Oriented(pytest.approx(TILTED), 12_000_000_345)  # type: ignore[arg-type]
@@ -395,7 +395,7 @@ def test_the_source_tf(ros_node: Node) -> None:
 
         wait_until(lambda: buffer.asked, "a lookup")
         assert gravity(1000.0) is None
-        words = "no orientation from TF from world to ft: TF has none of ft in world: frame does not exist"
+        words = "no orientation from TF from world to ft: TF has no pose of ft in world: frame does not exist"
         wait_until(lambda: source.why_none(1000.0) == words, words)
         buffer.quaternion, buffer.stamp_ns = TILTED, 1000 * 10**9
         buffer.error = None

@@ -56,11 +56,11 @@ def test_a_wrench_in_a_configured_frame(node: SimulatedNode, server: SimulatedSe
     stages = Stages(node)
     stages.settle(ZERO6)
     configure(server, coordinate_system=True)
-    node.until("not frame_id as the URDF has it", "has stopped", sensor=WARN, compensation=ERROR)
+    node.until("not in frame_id as in the URDF", "has stopped", sensor=WARN, compensation=ERROR)
     assert stages.are_silent()
-    assert "how the IMU is turned to it is not known" in node.trigger("tare")[1]
+    assert "the rotation from the IMU to it is unknown" in node.trigger("tare")[1]
     assert node.trigger("identify/start")[0]
-    assert "how the IMU is turned to it is not known" in node.trigger("identify/add_pose")[1]
+    assert "the rotation from the IMU to it is unknown" in node.trigger("identify/add_pose")[1]
     assert node.set_parameter("tool_mass", 0.0) == (True, "")  # a bias is in any frame what it is
     stages.first()
     assert node.trigger("tare")[0]
@@ -175,14 +175,14 @@ def test_a_limit_at_start_warns_of_aliasing(server: SimulatedServer) -> None:
 def test_parameters_that_are_none_are_named(server: SimulatedServer) -> None:
     given = {"publish_frequency": 100.0, "settings.sinc_lenght": 64, "zzz": 1, "use_sim_time": True}
     with SimulatedNode(server, **given) as node:
-        assert "there is no parameter publish_frequency" in node.log
+        assert "unknown parameter publish_frequency" in node.log
         assert "did you mean publishing_frequency?" in node.log
         assert "did you mean settings.sinc_length?" in node.log
-        assert "there is no parameter zzz" in node.log
-        assert "use_sim_time is true, but a real sensor knows no simulation time" in node.log
-        assert node.log.count("there is no parameter") == 3
+        assert "unknown parameter zzz" in node.log
+        assert "use_sim_time is true, but a real sensor has no simulation time" in node.log
+        assert node.log.count("unknown parameter") == 3
     with SimulatedNode(server, sensor=0, **{"qos_overrides./wrench.publisher.depth": 3}) as node:
-        assert "there is no parameter" not in node.log
+        assert "unknown parameter" not in node.log
         assert "use_sim_time" not in node.log
 
 

@@ -85,7 +85,7 @@ def test_nothing_more_unless_it_is_configured() -> None:
 def test_the_filter_and_its_delay() -> None:
     with SimulatedNode(Sensor(), bias=[1.0, 0.0, 0.0, 0.0, 0.0, 0.5], **TEN_HZ) as node:
         node.run(0.3)  # nobody listens, but the delay is said
-        assert "wrench_filtered is delayed by 21.8 ms: cut-off 10 Hz, 100 samples a second" in node.log
+        assert "wrench_filtered is delayed by 21.8 ms: cut-off 10 Hz, sampling rate 100 Hz" in node.log
         raw, got = node.hear("wrench_compensated"), node.hear("wrench_filtered")
         node.run(1.0)
         check_filtered(got, raw, 85, cutoff=10.0)
@@ -137,7 +137,7 @@ def test_it_follows_the_sensors_rate() -> None:
         got = node.hear("wrench_filtered")
         node.run(0.3)
         server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS, rate_hz=50))
-        words = "filter.cutoff is 40 Hz, and 50 samples a second allow less than 25 Hz"
+        words = "filter.cutoff is 40 Hz, but must be below half of the sampling rate, 25 Hz"
         node.until(f"wrench_filtered has stopped: {words}", compensation=ERROR)
         got.clear()
         node.run(0.2)
@@ -145,7 +145,7 @@ def test_it_follows_the_sensors_rate() -> None:
         server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS, rate_hz=200))
         node.until(compensation=OK)
         assert got
-        assert "cut-off 40 Hz, 200 samples a second" in node.log
+        assert "cut-off 40 Hz, sampling rate 200 Hz" in node.log
 
 
 def test_a_server_that_does_not_tell_the_rate() -> None:
@@ -153,7 +153,7 @@ def test_a_server_that_does_not_tell_the_rate() -> None:
     server.description["sensors"][0]["rate_hz"] = 0
     with SimulatedNode(server, **TEN_HZ) as node:
         got = node.hear("wrench_filtered")
-        node.until("wrench_filtered has stopped: the server does not say", compensation=ERROR)
+        node.until("wrench_filtered has stopped: the server does not report", compensation=ERROR)
         assert not got
 
 
@@ -263,7 +263,7 @@ def test_a_frame_that_tf_does_not_know(node: SimulatedNode, tf: FakeTf) -> None:
     got, others = node.hear("wrench_compensated/base"), node.hear("wrench_compensated")
     node.run(0.5)
     node.until(compensation=OK)  # it may be on its way
-    words = "wrench_compensated/base has stopped: TF has none of ft_sensor in base: frame does not exist"
+    words = "wrench_compensated/base has stopped: TF has no pose of ft_sensor in base: frame does not exist"
     node.until(words, compensation=ERROR)
     assert not got
     assert others
@@ -284,7 +284,7 @@ def test_a_transform_that_is_too_old(node: SimulatedNode, server: Sensor, tf: Fa
     node.run(0.04)
     assert got, "within orientation.stale_after"
     node.until(
-        "wrench_compensated/base has stopped: TF's latest of ft_sensor in base is 0.", compensation=ERROR
+        "wrench_compensated/base has stopped: TF's latest pose of ft_sensor in base is 0.", compensation=ERROR
     )
     node.until("older than the sample (limit 0.1 s, orientation.stale_after)", compensation=ERROR)
     got.clear()

@@ -295,7 +295,7 @@ def test_events_reach_the_log_and_the_link() -> None:
             "the sensor's own offset is Fx 1.0000 Fy 2.0000 Fz 3.0000 Mx 0.1000 My 0.2000 Mz 0.3000 (N, Nm) "
             "now",
         ),
-        ({"event": "offset_changed", "offset": [1]}, "the sensor's own offset is not known any more"),
+        ({"event": "offset_changed", "offset": [1]}, "the sensor's own offset is no longer known"),
         ({"event": "emergency", "code": 4096}, "the sensor reports an emergency"),
         ({"event": "emergency", "message": "too hot"}, "the sensor reports an emergency: too hot"),
         ({"event": "shutting_down"}, "the server is shutting down"),

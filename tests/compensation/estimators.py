@@ -1,4 +1,4 @@
-"""What finds gravity in the samples of `moves`: the node's filter, the one before it, and two libraries."""
+"""What finds gravity in the samples of `moves`: the node's filter, its previous one, and two libraries."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def node(felt: Felt, source: AccelerometerGravity | None = None) -> Found:
 
 
 def before(felt: Felt) -> Found:
-    """The complementary filter that the node had: gate by the length alone, time constant 0.5 s."""
+    """The node's previous, complementary filter: gated by the length alone, time constant 0.5 s."""
     x, y, z = (-felt.acceleration[0]).tolist()
     rows = zip(felt.times.tolist(), felt.acceleration.tolist(), felt.rate.tolist(), strict=True)
     then, found = 0.0, np.empty_like(felt.up)
@@ -120,7 +120,7 @@ def _settled(felt: Felt, up: Array) -> Found:
 
 ESTIMATORS: Final[Mapping[str, Callable[[Felt], Found]]] = {
     "this filter": node,
-    "the one before": before,
+    "previous filter": before,
     "VQF": by_vqf,
     "imufusion": by_imufusion,
 }

@@ -1,11 +1,10 @@
-"""Draws docs/compensation.svg: what each stage of compensation leaves, and what mistakes look like.
+"""Draws docs/compensation.svg: the residual after each stage of compensation, and what mistakes look like.
 
-usage: python -m tests.compensation.figure [OUT.svg]. The virtual sensor runs at simulated time.
+The virtual sensor runs in simulated time.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -26,10 +25,19 @@ FIGURE: Final = Path(__file__).parents[2] / "docs" / "compensation.svg"
 BIAS: Final = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)
 """What this sensor reads without load, N and Nm."""
 _RATE: Final = 100
-_SETTLES: Final = 2
-"""Seconds of the turn's end, in which the source of gravity settles."""
-_EVERY: Final = 30
-"""So many samples apart are the points that are drawn."""
+_SETTLING_S: Final = 2
+"""The end of the previous turn, for the source of gravity to settle."""
+_EVERY: Final = 40
+"""One sample in this many is drawn."""
+_COLUMNS: Final = 3
+_PANEL: Final = (270, 180)
+_PLOT: Final = (236, 136)
+"""Width and height of a panel, and of the plot in it, px."""
+_LARGEST: Final = 22.0
+"""N"""
+_MARKS: Final = (-20, -10, 0, 10, 20)
+"""N"""
+_COLORS: Final = {"x": "#d62728", "y": "#2ca02c", "z": "#1f77b4"}
 _TOUCH: Final = (20.0, 24.0)
 _PUSH: Final = (0.0, 0.0, -12.0)
 
@@ -54,7 +62,7 @@ def samples(noise: bool = True) -> Samples:
     signal = scene.Scene(1, noise, Turning())
     source = AccelerometerGravity()
     rows: list[tuple[float, ...]] = []
-    for number in range(-_SETTLES * _RATE, int(TURN_LENGTH * _RATE)):
+    for number in range(-_SETTLING_S * _RATE, int(TURN_LENGTH * _RATE)):
         time_s = number / _RATE
         reading = signal.reading(number, 0, time_s)
         ax, ay, az = (part * STANDARD_GRAVITY for part in reading.acceleration)
@@ -120,39 +128,45 @@ def panels(data: Samples) -> Iterator[tuple[str, Array]]:
 
 
 def draw(path: Path, data: Samples, shown: Mapping[str, Array]) -> None:
-    """Write the figure."""
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
-    mpl.rcParams["svg.fonttype"] = "none"
-    mpl.rcParams["svg.hashsalt"] = "compensation"  # the same file every time
-    figure = Figure(figsize=(12, 8))
-    axes = figure.subplots(3, 3, sharex=True)
+    """Write the figure as SVG: three panels in a row, with the force along x, y and z in each."""
+    title = "A tool of 0.8 kg on the virtual sensor; gray: a push of 12 N along -z. Force in N over time in s"
+    legend = "".join(f' <tspan fill="{color}">{axis}</tspan>' for axis, color in _COLORS.items())
+    rows = -(-len(shown) // _COLUMNS)
+    width, height = _COLUMNS * _PANEL[0] + 8, rows * _PANEL[1] + 24
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
+        'font-family="sans-serif" font-size="9">',
+        f'<rect width="{width}" height="{height}" fill="white"/>',
+        f'<text x="{width / 2:g}" y="14" font-size="11" text-anchor="middle">{title}:{legend}</text>',
+    ]
     three_sigma = 3 * scene.Scene(1, noise=True).deviations[0]
     for number, (name, left) in enumerate(shown.items()):
-        panel = axes[number // 3][number % 3]
-        for axis, colour in enumerate(("tab:red", "tab:green", "tab:blue")):
-            panel.plot(
-                data.times[::_EVERY], left[::_EVERY, axis], color=colour, linewidth=0.7, label="xyz"[axis]
-            )
-        panel.axvspan(*_TOUCH, color="0.9", zorder=0)
-        if number == 2:
-            for limit in (-three_sigma, three_sigma):
-                panel.axhline(limit, color="0.5", linestyle=":", linewidth=0.8)
-        panel.set_title(name, fontsize=9)
-        panel.set_ylim(-22, 22)
-        panel.grid(visible=True, color="0.93")
-    axes[0][0].legend(loc="upper right", fontsize=7, ncols=3)
-    for panel in axes[:, 0]:
-        panel.set_ylabel("force, N")
-    for panel in axes[2]:
-        panel.set_xlabel("s of a slow full turn")
-    title = "A tool of 0.8 kg on the virtual sensor; grey: something pushes with 12 N along -z"
-    figure.suptitle(title, fontsize=10)
-    figure.tight_layout()
-    figure.savefig(path, metadata={"Date": None})
+        down, across = divmod(number, _COLUMNS)
+        lines.append(f'<g transform="translate({across * _PANEL[0] + 26} {down * _PANEL[1] + 38})">')
+        lines += _panel(name, data.times, left, three_sigma if name.endswith("(IV.5)") else None)
+        lines.append("</g>")
+    path.write_text("\n".join([*lines, "</svg>", ""]), encoding="utf-8")
 
 
-if __name__ == "__main__":
-    turn = samples()
-    draw(Path(sys.argv[1]) if len(sys.argv) > 1 else FIGURE, turn, dict(panels(turn)))
+def _panel(name: str, times: Array, left: Array, limit: float | None) -> Iterator[str]:
+    """One panel, its upper left corner at the origin, with dotted lines at ± `limit` N."""
+    width, height = _PLOT
+    x_scale, y_scale = width / TURN_LENGTH, 0.5 * height / _LARGEST
+    middle = 0.5 * height
+    begin, end = (time_s * x_scale for time_s in _TOUCH)
+    yield f'<text x="{width / 2:g}" y="-4" text-anchor="middle">{name}</text>'
+    yield f'<path fill="#e6e6e6" d="M{begin:.1f} 0V{height}H{end:.1f}V0z"/>'
+    for force in _MARKS:
+        y = middle - force * y_scale
+        yield f'<path stroke="#ddd" d="M0 {y:.1f}H{width}"/>'
+        yield f'<text x="-3" y="{y + 3:.1f}" text-anchor="end">{force}</text>'
+    for time_s in range(0, int(TURN_LENGTH) + 1, 20):
+        yield f'<text x="{time_s * x_scale:.1f}" y="{height + 10}" text-anchor="middle">{time_s}</text>'
+    for sign in (-1, 1) if limit is not None else ():
+        y = middle - sign * (limit or 0.0) * y_scale
+        yield f'<path stroke="gray" stroke-dasharray="1 2" d="M0 {y:.1f}H{width}"/>'
+    for axis, color in enumerate(_COLORS.values()):
+        drawn = zip(times[::_EVERY] * x_scale, middle - left[::_EVERY, axis] * y_scale, strict=True)
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in drawn)
+        yield f'<polyline fill="none" stroke="{color}" stroke-width="0.7" points="{points}"/>'
+    yield f'<rect width="{width}" height="{height}" fill="none" stroke="black" stroke-width="0.8"/>'

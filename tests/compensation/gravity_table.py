@@ -1,7 +1,4 @@
-"""Prints the table of docs/compensation.md: how far each estimator of gravity is off, by kind of move.
-
-usage: python -m tests.compensation.gravity_table. Everything is simulated; it takes half a minute.
-"""
+"""The table in docs/compensation.md: the error of each estimator of gravity, by kind of move, simulated."""
 
 from __future__ import annotations
 
@@ -42,12 +39,8 @@ def table() -> Sequence[Row]:
 
 def lines(rows: Sequence[Row]) -> list[str]:
     """As Markdown."""
-    head = ["| Tilt, rms (worst) | " + " | ".join(ESTIMATORS) + " |", "|---|" + "---|" * len(ESTIMATORS)]
+    head = ["| Tilt, rms/worst, ° | " + " | ".join(ESTIMATORS) + " |", "|---|" + "---|" * len(ESTIMATORS)]
     return head + [
-        f"| {kind} | " + " | ".join(f"{rms:.2f}° ({worst:.1f}°)" for rms, worst in cells) + " |"
+        f"| {kind} | " + " | ".join(f"{rms:.2f}/{worst:.1f}" for rms, worst in cells) + " |"
         for kind, cells in rows
     ]
-
-
-if __name__ == "__main__":
-    print("\n".join(lines(table())))

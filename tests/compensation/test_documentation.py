@@ -46,7 +46,7 @@ def left_over(mistake: str) -> equations.ArrayStages:
 
 
 def table_of_mistakes() -> dict[str, list[float]]:
-    rows = re.findall(r"^\| ([^|]+) \|((?: [\d.]+ N \|){3})", PAGE, re.MULTILINE)
+    rows = re.findall(r"^\| ([^|]+) \|((?: [\d.]+ \|){3})", PAGE, re.MULTILINE)
     return {name: [float(number) for number in re.findall(r"[\d.]+", cells)] for name, cells in rows}
 
 

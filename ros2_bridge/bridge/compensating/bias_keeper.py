@@ -35,16 +35,16 @@ class BiasKeeper:
         self.serial: str | None = None
         self.problem = ""
         self._kept: tuple[Wrench, Wrench | None] | None = None
-        """What the file has: a bias, and the sensor's own offset with it."""
+        """The content of the file: a bias, and the sensor's own offset at that time."""
         self._log = log
 
     def forget(self) -> None:
-        """What the file has is not known any more: keep the bias anew."""
+        """Store the bias again, whatever the file has."""
         self._kept = None
 
     def keep(self, bias: Wrench, parameters: CompensationParameters, offset: Wrench | None) -> None:
-        """Keep `bias`, taken with the sensor's own `offset`, for the sensor that is there, if that is asked
-        for and it is not the kept one."""
+        """Store `bias`, taken with the sensor's own `offset`, for the connected sensor, if enabled and
+        changed."""
         if not parameters.bias_keep:
             self.problem = ""
             return
@@ -66,8 +66,8 @@ class BiasKeeper:
         parameters: CompensationParameters,
         offset: Wrench | None,
     ) -> Beginning | None:
-        """Another sensor is there, with this `offset` of its own; `bias` from `origin` is in force. None: it
-        stays."""
+        """Another sensor was connected, with its own `offset`; `bias` from `origin` is in force. None: keep
+        it."""
         is_first, self.serial = self.serial is None, serial
         self._kept = None
         stored = self._look_up(serial, parameters, offset)
@@ -81,8 +81,8 @@ class BiasKeeper:
             return Beginning(NO_WRENCH, FROM_PARAMETER)
         if is_first and bias not in (NO_WRENCH, stored.bias):
             self._log.warning(
-                f"the bias kept of the sensor with serial number {serial} is not used, because the parameter "
-                "bias is given; it is replaced by it"
+                f"the stored bias of the sensor with serial number {serial} is not used, because the "
+                "parameter bias is given, and is overwritten"
             )
             return None
         if stored.offset == offset:
@@ -98,7 +98,7 @@ class BiasKeeper:
     def _look_up(
         self, serial: str, parameters: CompensationParameters, offset: Wrench | None
     ) -> Stored | None:
-        """What was kept, the bias as it is with the sensor's `offset` of now."""
+        """What was stored, with the bias shifted to the sensor's current `offset`."""
         self.problem = ""
         if not parameters.bias_keep:
             return None
@@ -111,14 +111,14 @@ class BiasKeeper:
             return stored
         if stored.offset is None or offset is None:
             self._say_not_kept(
-                f"the bias kept of the sensor with serial number {serial} is not used, because it is not "
-                "known whether the sensor's own offset is the one of then: tare"
+                f"the stored bias of the sensor with serial number {serial} is not used, because it is "
+                "unknown whether the sensor's own offset has changed since: tare"
             )
             return None
         change = offset.plus(stored.offset, -1.0)
         self._log.info(
             f"the own offset of the sensor with serial number {serial} has changed by "
-            f"{wrench_text(change)} since its bias was kept, which is shifted by that"
+            f"{wrench_text(change)} since its bias was stored: the bias is shifted by the change"
         )
         return stored._replace(bias=stored.bias.plus(change))
 

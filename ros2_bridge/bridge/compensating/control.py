@@ -254,7 +254,7 @@ class CompensationControl:
             self.link_changed()
 
     def _follow_offset(self) -> None:
-        """Shift the bias by what the sensor itself adds now, from the next sample on; for the reader too."""
+        """Shift the bias by the change of the sensor's own offset, from the next sample on; any thread."""
         change = self._own_offset.follow(self.bias)
         if change is not None:
             self._ramp.shift(change)

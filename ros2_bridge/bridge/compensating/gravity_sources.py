@@ -32,7 +32,7 @@ class Source(Protocol):
 
     @property
     def tilt(self) -> float | None:
-        """The largest error of the direction in 95 % of cases, rad; None if that is not known."""
+        """The error of the direction that is not exceeded in 95 % of cases, rad; None if unknown."""
 
     def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
         """m/s², for this sample; None if what is known is too old, or nothing is."""
@@ -77,7 +77,7 @@ class AccelerometerSource:
     is_accelerometer = True
 
     def __init__(self, parameters: CompensationParameters, gyroscope: GyroscopeOffset) -> None:
-        """`gyroscope`: what is known of it, and is improved."""
+        """`gyroscope`: the estimate of its offset, which is improved in place."""
         p = parameters.accelerometer
         self._filter = AccelerometerGravity(
             length(parameters.gravity),
@@ -92,7 +92,7 @@ class AccelerometerSource:
 
     @property
     def tilt(self) -> float | None:
-        """The largest that the estimate may have, in 95 % of cases, rad."""
+        """The bound of the estimate's tilt that holds in 95 % of cases, rad."""
         found = self._filter.tilt_95
         return found if math.isfinite(found) else None
 
@@ -105,7 +105,7 @@ class AccelerometerSource:
                 usable = self._correct(usable)
             good = self._filter.update(usable, sample.angular_rate, time_s)
             if not good and not math.isfinite(sum(acceleration) + sum(sample.angular_rate)):
-                self._broken = "the IMU's numbers are not finite: see stream"
+                self._broken = "the IMU sends NaN or infinity: see the status stream"
                 return None
         found = self._filter.gravity(time_s)
         if found is None:
@@ -123,8 +123,8 @@ class AccelerometerSource:
         since = "not yet" if math.isinf(age_s) else f"not for {age_s:.2f} s"
         if self.tilt is not None and age_s <= f.stale_after_s:
             return (
-                f"gravity by the accelerometer may be tilted by {math.degrees(f.tilt_95):.1f}°, too much for "
-                "a start: hold the sensor still for a second"
+                f"gravity from the accelerometer may be tilted by {math.degrees(f.tilt_95):.1f}°, too much "
+                "to start with: keep the sensor stationary for a second"
             )
         return (
             f"the accelerometer has {since} agreed with {f.magnitude:.2f} ± {f.gate:g} m/s² and the "
@@ -133,7 +133,7 @@ class AccelerometerSource:
         )
 
     def age_s(self, time_s: float) -> float:
-        """Since the accelerometer last counted."""
+        """Time since the accelerometer was last used."""
         return self._filter.age_s(time_s)
 
 
@@ -189,7 +189,7 @@ class ListenerSource:
         self.describe = listener.describe
 
     def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
-        """From the latest orientation, if it is of nearly the sample's time."""
+        """From the latest orientation, if its time is close to the sample's."""
         self._turn.follow(sample.angular_rate, time_s)
         latest = self._listener.latest
         if latest is not self._taken and latest is not None:

@@ -1,4 +1,4 @@
-"""What keeps the wrench from being compensated, or right, whether anybody has subscribed or not. No ROS."""
+"""What prevents a correct compensation, with or without subscribers. No ROS."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Obstacles:
         self._link, self._watch = link, watch
 
     def conflict(self, parameters: CompensationParameters, *, needs_gravity: bool = False) -> str | None:
-        """What the sensor is set to that does not go with compensation, or with knowing where gravity points
-        in the frame of the wrench if that is needed."""
+        """A setting of the sensor that conflicts with compensation or, if `needs_gravity`, with knowing
+        gravity in the frame of the wrench."""
         settings = self._link.settings
         if settings.get("calibration_matrix") is False:
             return (
@@ -37,7 +37,7 @@ class Obstacles:
         return self._blind(parameters) if needs_gravity else None
 
     def hold(self, parameters: CompensationParameters, output: CompensatedOutput) -> None:
-        """Have `output` publish nothing while it cannot be known where gravity points, and must be."""
+        """Stop `output` while gravity is needed and cannot be known."""
         output.hold = self._blind(parameters) if parameters.payload.mass else None
 
     def _blind(self, parameters: CompensationParameters) -> str | None:
@@ -45,9 +45,9 @@ class Obstacles:
         if not is_imu or self._link.settings.get("coordinate_system") is not True:
             return None
         return (
-            "settings.coordinate_system is on, so the wrench is in a frame that was configured in the "
-            "sensor, and how the IMU is turned to it is not known: switch it off, or take the orientation of "
-            "that frame from the robot (orientation_source) and set compensate_inertia to false"
+            "settings.coordinate_system is on, so the wrench is in a frame configured in the sensor, and the "
+            "rotation from the IMU to it is unknown: switch it off, or take the orientation of that frame "
+            "from the robot (orientation_source) and set compensate_inertia to false"
         )
 
     def stopping(
@@ -69,7 +69,7 @@ class Obstacles:
     def _foreseen(
         self, parameters: CompensationParameters, source: Source, listener: Listening | None
     ) -> str | None:
-        """The latter, as far as can be told while no sample is compensated."""
+        """The same without subscribers, as far as it can be known while no sample is compensated."""
         sample, time_s = self._watch.sample, self._watch.stamp_ns * 1e-9
         if not parameters.payload.mass:
             return None

@@ -28,15 +28,15 @@ from bridge.parameters.compensation import TOPIC_SOURCES, OrientationParameters
 from bridge.parameters.row import ParameterError
 
 TF_PERIOD_S: Final = 0.005
-"""How often TF is asked."""
+"""Period of the TF lookups."""
 _LET_GO_S: Final = 1.0
-"""How long an executor may take to let go of the subscription before: DDS has one type for a topic."""
+"""How long an executor may take to release the previous subscription: DDS has one type per topic."""
 
 
 def check_can_listen(
     node: Node, chosen: OrientationParameters, listening: OrientationListener | None = None
 ) -> None:
-    """ParameterError if that source cannot be had on this machine, or its topic has no possible name.
+    """ParameterError if that source is not available on this machine, or its topic's name is invalid.
 
     `listening` is what will be closed before.
     """

@@ -96,7 +96,7 @@ def look_up(tf: Tf, base: str, frame: str) -> Oriented:
     try:
         found = tf.buffer.lookup_transform(base, frame, tf.latest)
     except tf.errors as error:
-        raise UnusableError(f"TF has none of {frame} in {base}: {' '.join(str(error).split())}") from None
+        raise UnusableError(f"TF has no pose of {frame} in {base}: {' '.join(str(error).split())}") from None
     stamp = found.header.stamp
     stamp_ns = stamp.sec * _NS_PER_S + stamp.nanosec
     # A chain of static transforms only has no time: it holds at any, so now.
@@ -106,7 +106,7 @@ def look_up(tf: Tf, base: str, frame: str) -> Oriented:
 def check_tf(
     wanted: str = "parameter orientation_source is 'tf'", instead: str = "take another source"
 ) -> None:
-    """ParameterError if tf2_ros is not there. `wanted`: what needs it, `instead`: what to do without it."""
+    """ParameterError if tf2_ros is missing. `wanted`: what needs it, `instead`: what to do without it."""
     try:
         import tf2_ros  # noqa: F401, PLC0415 - only where it is asked for: not everybody has it
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""The offset (object 0x8000) that the sensor itself adds to every sample, and that a bias is for."""
+"""The offset (object 0x8000) that the sensor itself adds to every sample, and how it affects the bias."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ from ft_compensation.quantities import NO_WRENCH, Wrench
 
 
 class OwnOffset:
-    """Follows what the server says of it, from the executor's thread and the reader's."""
+    """Follows what the server reports; used by the executor's thread and the reader's."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
         self.of_bias: Wrench | None = None
-        """The one that the bias is for, as far as it was ever known."""
+        """The offset that the bias was taken with; None if it was never known."""
         self._appeared = False
-        """Whether the bias is from before it was known."""
+        """Whether the offset became known only after the bias was taken."""
 
     @property
     def now(self) -> Wrench | None:
-        """The sensor's; None if it is not known."""
+        """The sensor's current offset; None if unknown."""
         offset = self._link.offset
         return None if offset is None else Wrench.of(offset)
 
     def begin(self) -> Wrench | None:
-        """The bias is for the offset of now, which is returned."""
+        """The bias goes with the current offset, which is returned."""
         self.of_bias, self._appeared = self.now, False
         return self.of_bias
 
     def follow(self, bias: Wrench) -> Wrench | None:
-        """By how much `bias` must be shifted for the offset of now, once; None: not at all."""
+        """The shift of `bias` that the current offset requires, once; None: no shift."""
         now, before = self.now, self.of_bias
         if now is None or now == before:
             return None
@@ -39,13 +39,13 @@ class OwnOffset:
         return None if before is None else now.plus(before, -1.0)
 
     def doubt(self, bias: Wrench) -> str:
-        """That `bias` may not fit the sensor any more, a sentence; empty if it does."""
+        """Why `bias` may no longer fit the sensor, a sentence; empty if it does."""
         if bias == NO_WRENCH or self._link.connection is None:
             return ""
         if self._appeared:
-            return "the sensor's own offset was not known when the bias was taken, which may be wrong: tare"
+            return "the sensor's own offset was unknown when the bias was taken: the bias may be wrong, tare"
         if self.of_bias is not None and self._link.offset is None:
-            return "the sensor's own offset is not known any more, so the bias may be wrong: tare"
+            return "the sensor's own offset is no longer known: the bias may be wrong, tare"
         return ""
 
     def after_tare(self, bias: Wrench) -> str:
@@ -54,4 +54,4 @@ class OwnOffset:
             return ""
         if self._link.offset is None:
             return "The node's own bias was for the old offset: call ~/tare or ~/clear_tare"
-        return "The node's own bias was shifted by the change, so wrench_compensated is as it was"
+        return "The node's own bias was shifted by the change, so wrench_compensated is unchanged"

@@ -1,4 +1,4 @@
-"""Opens the source of gravity that the parameters name, and closes the one before."""
+"""Opens the source of gravity that the parameters name, and closes the previous one."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ class SourceChoice:
         """`frame` is the sensor's, for TF."""
         self.source: Source = NoSource()
         self.listener: OrientationListener | None = None
-        """Of a source that listens to a topic or TF."""
+        """The listener of a source that uses a topic or TF."""
         self._node, self._frame = node, frame
         self._listening = MutuallyExclusiveCallbackGroup()
         self._gyroscope = GyroscopeOffset()
 
     def check(self, wanted: CompensationParameters) -> None:
-        """ParameterError if that cannot be had on this machine."""
+        """ParameterError if it is not available on this machine."""
         check_can_listen(self._node, wanted.orientation, self.listener)
 
     def open(self, wanted: CompensationParameters) -> None:
-        """Put the source in force that is wanted; ParameterError if it cannot be had."""
+        """Open the source that is wanted; ParameterError if it is not available."""
         self.close()
         self.source = self._opened(wanted)
 
@@ -50,7 +50,7 @@ class SourceChoice:
         return ListenerSource(wanted, self.listener)
 
     def another_sensor(self, wanted: CompensationParameters) -> None:
-        """Forget the IMU of the one before."""
+        """Forget the previous sensor's IMU."""
         self._gyroscope = GyroscopeOffset()
         if isinstance(self.source, AccelerometerSource):
             self.source = AccelerometerSource(wanted, self._gyroscope)

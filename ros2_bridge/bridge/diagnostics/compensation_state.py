@@ -16,14 +16,14 @@ class CompensationState(NamedTuple):
     withheld: int = 0
     """Samples since the node started that were compensated, and that could not be."""
     why_stopped: str | None = None
-    """Why the latest sample was not, or would not be if anybody had subscribed, a sentence; None: fine."""
+    """Why the latest sample was not compensated, or would not be with a subscriber; None: it was."""
     why_partly: str = ""
-    """Why some topics alone have stopped, a sentence; empty if none has."""
+    """Why single topics have stopped, a sentence; empty if none has."""
     source: str = "none"
     age_s: float = math.inf
     """Of the orientation."""
     tilt: float | None = None
-    """The largest that gravity's direction may have in 95 % of cases, rad; None if that is not known."""
+    """The tilt of gravity that is not exceeded in 95 % of cases, rad; None if unknown."""
     weight: float = 0.0
     """Of the payload, N."""
     payload: Payload = Payload()

@@ -235,8 +235,8 @@ def _judge_settings(verdict: _Verdict, settings: Mapping[str, object]) -> None:
     if settings.get("coordinate_system") is True:
         verdict.add(
             Level.WARN,
-            "settings.coordinate_system is on: force and torque are in a frame that was configured in the "
-            "sensor, which is not frame_id as the URDF has it; switch it off, or correct the URDF",
+            "settings.coordinate_system is on: force and torque are in a frame configured in the sensor, "
+            "not in frame_id as in the URDF; switch it off, or correct the URDF",
         )
 
 
@@ -268,7 +268,7 @@ def _compensation(s: Snapshot, t: Thresholds) -> Status:
     elif c.why_partly:
         verdict.add(Level.ERROR, c.why_partly)
     elif s.new_withheld:
-        why = f"for want of a fresh orientation ({c.source})"
+        why = f"for lack of a current orientation ({c.source})"
         if c.stops_on_saturation and s.new_saturated:
             why = "because force or torque was saturated (on_saturation), or " + why
         verdict.add(Level.WARN, f"{s.new_withheld} samples were not compensated, {why}")

@@ -58,16 +58,16 @@ _TABLE: Final = (
     Row("orientation.stale_after", 0.1,
         "Largest difference of the stamps of orientation and sample, s", 0.001, 10),
     Row("accelerometer.stale_after", 0.5,
-        "Longest gap between samples that the gyroscope's rate bridges, s", 0.001, 10),
+        "Longest gap between samples that the gyroscope bridges, s", 0.001, 10),
     Row("accelerometer.time_constant", 0.5,
-        "With which trust in a steady accelerometer grows, s", 0.001, 60),
+        "Time constant of the trust in a steady accelerometer, s", 0.001, 60),
     Row("accelerometer.gate", 0.5,
-        "A usable mean of 50 ms differs from gravity in length by no more, m/s²", 0.01, 10),
+        "Largest deviation of a usable 50 ms mean from the magnitude of gravity, m/s²", 0.01, 10),
     Row("accelerometer.tilt_limit", 0.2,
-        "Stop when gravity may be tilted by more, rad; start at a third", 0.1, 3),
-    Row("accelerometer.offset", ZERO, "Read too much, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
+        "Stop while gravity may be tilted by more, rad; at the start by a third", 0.1, 3),
+    Row("accelerometer.offset", ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
     Row("accelerometer.scale", EXACT.scale,
-        "What it reads, without the offset, per m/s²; ~/identify finds it", 0, 2, lengths=(3,)),
+        "Its scale factors; ~/identify finds them", 0, 2, lengths=(3,)),
     Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
     Row("rest.force_spread", _REST.force_spread, "Largest standard deviation when stationary, N", 0, 1e3),
     Row("rest.torque_spread", _REST.torque_spread, "Largest standard deviation when stationary, Nm", 0, 1e3),
@@ -83,9 +83,9 @@ _TABLE: Final = (
     Row("filter.cutoff", 0.0,
         "Low-pass of wrench_filtered, -3 dB, Hz; 0 = no such topic", 0, 1000),
     Row("filter.notch", 0.0, "Center of its notch, Hz; 0 = none", 0, 1000),
-    Row("filter.notch_width", 5.0, "Of the notch, between -3 dB points, Hz", 0.1, 1000),
-    Row("filter.dead_band_force", 0.0, "Taken off the magnitude of its force, N; 0 = none", 0, 1e6),
-    Row("filter.dead_band_torque", 0.0, "Taken off the magnitude of its torque, Nm; 0 = none", 0, 1e6),
+    Row("filter.notch_width", 5.0, "Width of the notch between -3 dB points, Hz", 0.1, 1000),
+    Row("filter.dead_band_force", 0.0, "Subtracted from the magnitude of its force, N; 0 = none", 0, 1e6),
+    Row("filter.dead_band_torque", 0.0, "Subtracted from the magnitude of its torque, Nm; 0 = none", 0, 1e6),
     Row("identify.file", AUTO,
         "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bias_directory"),
 )  # fmt: skip
@@ -115,7 +115,7 @@ class AccelerometerParameters(NamedTuple):
 
     @property
     def reading(self) -> Accelerometer:
-        """What its readings are corrected by."""
+        """The correction of its readings."""
         return Accelerometer(self.offset, self.scale)
 
 

@@ -12,7 +12,7 @@ from bridge.parameters.row import ParameterValue, Row
 from bridge.parameters.table import PARAMETERS, Parameters, gather_all
 
 _OF_OTHERS: Final = ("qos_overrides.", "use_sim_time", "start_type_description_service")
-"""How the names of parameters begin that rclpy declares, not always."""
+"""Prefixes of parameters that rclpy itself may declare."""
 
 
 def declare(node: Node) -> Parameters:
@@ -27,20 +27,18 @@ def declare(node: Node) -> Parameters:
 
 
 def warn_of_others(node: Node) -> None:
-    """Warn of parameters that were given and are none of the node's, once all of its are declared."""
+    """Warn of given parameters that the node does not have; call it once all are declared."""
     names = list(node.get_parameters_by_prefix(""))
     for given in node._parameter_overrides:  # rclpy has no public name
         if node.has_parameter(given) or given.startswith(_OF_OTHERS):
             continue
         near = difflib.get_close_matches(given, names, 1)
-        meant = f"did you mean {near[0]}?" if near else "ros2 param list shows those there are"
-        node.get_logger().warning(
-            f"there is no parameter {given}, so what was given for it is not used: {meant}"
-        )
+        meant = f"did you mean {near[0]}?" if near else "ros2 param list shows the valid names"
+        node.get_logger().warning(f"unknown parameter {given} is ignored: {meant}")
     if node.get_parameter("use_sim_time").value is True:
         node.get_logger().warning(
-            "use_sim_time is true, but a real sensor knows no simulation time: stamps are the wall clock's, "
-            "and those of orientations must be too"
+            "use_sim_time is true, but a real sensor has no simulation time: stamps are wall-clock time, and "
+            "those of orientations must be too"
         )
 
 

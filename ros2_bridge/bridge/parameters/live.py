@@ -22,9 +22,9 @@ class LiveParameters:
         """The parameters must have been declared."""
         self._node = node
         self.checks: list[Callable[[Parameters], object]] = []
-        """Each may refuse what is wanted: ParameterError."""
+        """Each may refuse new values: ParameterError."""
         self.listeners: list[Callable[[Parameters], object]] = []
-        """Each gets what is new."""
+        """Each gets the new values."""
         node.add_pre_set_parameters_callback(_convert)
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._after_set)

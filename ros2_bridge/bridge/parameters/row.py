@@ -10,7 +10,7 @@ Numbers = tuple[float, ...]
 Texts = tuple[str, ...]
 ParameterValue = bool | int | float | str | Numbers | Texts
 NO_TEXTS: Final = ("",)
-"""A list of texts without any: ROS cannot tell of what type an empty list is."""
+"""An empty list of strings: ROS cannot infer the type of []."""
 _COVARIANCE_LENGTHS: Final = (3, 9)
 
 

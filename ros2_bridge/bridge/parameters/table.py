@@ -20,7 +20,7 @@ _COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"
 
 SERVER_PORT: Final = Row("server_port", 12001, "TCP port of ethercat-server", 1, 65535)
 _LIVE: Final = ("publishing_frequency", "temperature_variance", "diagnostics.")
-"""How the names begin of what can be set while the node runs; covariances too."""
+"""Prefixes of what can be set while the node runs; covariances can, too."""
 _TABLE: Final = (
     Row("server_host", "localhost", "Host that ethercat-server runs on"),
     SERVER_PORT,

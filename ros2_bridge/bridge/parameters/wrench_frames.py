@@ -22,11 +22,11 @@ class WrenchFrame(NamedTuple):
 
     name: str
     fixed: WrenchTransform | None = None
-    """From `frame_id` to it; None: TF tells."""
+    """From `frame_id` to it; None: from TF."""
 
 
 def parse(texts: Sequence[str]) -> tuple[WrenchFrame, ...]:
-    """The frames of the texts that are not empty; ParameterError."""
+    """The frames of all strings that are not empty; ParameterError."""
     frames = tuple(_frame(text) for text in texts if text.strip())
     names = [frame.name for frame in frames]
     for name in names:

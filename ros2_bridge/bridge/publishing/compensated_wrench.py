@@ -21,7 +21,7 @@ from ft_compensation.stationary import StationaryLimits, StationaryMeans, Statio
 from protocol.pdo import Sample, Vector3
 
 _BEGINS_S: Final = 1.0
-"""How long it may take until gravity is known, before that is worth an error."""
+"""How long gravity may be unknown after a start before it is an error."""
 
 
 class Plan(NamedTuple):
@@ -33,7 +33,7 @@ class Plan(NamedTuple):
     needs_gravity: bool
     """Whether anything has weight."""
     watch: PayloadWatch | None = None
-    """Who looks now and then whether the payload is the one that is compensated."""
+    """Checks now and then whether the payload is still the one that is compensated."""
 
 
 class RestWindow:
@@ -91,7 +91,7 @@ class StageTopic(Protocol):
     index: int
     """Of the stage in `Stages`."""
     takes_all: bool
-    """Whether it goes by samples, too, that are not published: `note`."""
+    """Whether it also needs samples that are not published: `note`."""
 
     @property
     def problem(self) -> str:
@@ -104,7 +104,7 @@ class StageTopic(Protocol):
         """Publish a force and a torque."""
 
     def note(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
-        """Take note of those that `publishing_frequency` leaves out."""
+        """Take a sample that `publishing_frequency` leaves out."""
 
     def tune(self, parameters: CompensationParameters) -> None:
         """Take other parameters; for the executor's thread."""
@@ -127,13 +127,13 @@ class CompensatedOutput:
         self.stops_on_saturation = self.is_saturated = False
         """Whether saturated samples are not published, and whether the latest was one of them."""
         self.broken: str | None = None
-        """What of the latest sample cannot be used, though where gravity points is known; a sentence."""
+        """What of the latest sample cannot be used although gravity is known; a sentence."""
         self.published = self.withheld = 0
         """Samples since the node started that were compensated, and that were not."""
         self.is_stopped = False
-        """Whether the latest could not; at the beginning, whether that has taken long."""
+        """Whether the latest could not be compensated; at the start, whether for long."""
         self._begins_s = math.inf
-        """When somebody subscribed and nothing has been published since, s; infinite: not known yet."""
+        """Time of a subscription after which nothing was published yet, s; infinite: unknown."""
         self.time_s = 0.0
         """The latest sample's, seconds since the Unix epoch."""
 
@@ -152,7 +152,7 @@ class CompensatedOutput:
 
     @property
     def problem(self) -> str:
-        """Why some of the topics that somebody has subscribed to are silent alone; "" if none is."""
+        """Why single subscribed topics are silent; "" if none is."""
         return "; ".join(topic.problem for topic in self._wanted if topic.problem)
 
     def tune(self, parameters: CompensationParameters) -> None:
@@ -161,7 +161,7 @@ class CompensatedOutput:
             topic.tune(parameters)
 
     def follow(self, sample: Sample, stamp_ns: int) -> None:
-        """Have the source, the open window and some of the topics take in a sample that is not published."""
+        """Give source, open window and filters a sample that is not published."""
         self.time_s = time_s = stamp_ns * 1e-9
         plan = self.plan
         gravity = self._gravity(plan, sample, time_s)
@@ -208,7 +208,7 @@ class CompensatedOutput:
         if plan.compensator.inertia and not math.isfinite(
             sum(sample.acceleration) + sum(sample.angular_rate)
         ):
-            return "the IMU's numbers are not finite, which compensate_inertia needs: see stream"
+            return "the IMU, which compensate_inertia needs, sends NaN or infinity: see the status stream"
         return None
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""`wrench_filtered`: the compensated wrench, filtered; there once that is configured."""
+"""`wrench_filtered`: the compensated wrench, filtered, if configured."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class FilteredTopic:
         return wanted
 
     def _is_ready(self) -> bool:
-        """Whether there is a filter, made for the settings and the sensor's rate as they are now."""
+        """Whether there is a filter for the current settings and sampling rate."""
         wanted = self._settings, self._rate_hz()
         if wanted != self._designed:
             self.problem = self._design(*wanted)
@@ -59,7 +59,7 @@ class FilteredTopic:
         if not settings.cutoff:
             return "wrench_filtered has stopped: filter.cutoff is 0"
         if not rate_hz:
-            return "wrench_filtered has stopped: the server does not say how many samples a second there are"
+            return "wrench_filtered has stopped: the server does not report the sampling rate"
         try:
             self._filter.design(settings, rate_hz)
         except CompensationError as error:
@@ -67,7 +67,7 @@ class FilteredTopic:
         notch = f", notch {settings.notch:g} Hz" if settings.notch else ""
         self._node.get_logger().info(
             f"wrench_filtered is delayed by {self._filter.delay_s * 1e3:.1f} ms: cut-off "
-            f"{settings.cutoff:g} Hz{notch}, {rate_hz:g} samples a second"
+            f"{settings.cutoff:g} Hz{notch}, sampling rate {rate_hz:g} Hz"
         )
         return ""
 

@@ -14,7 +14,7 @@ from bridge.publishing.serialized import SerializedMessage, axes
 from protocol.pdo import Sample
 
 _UNKNOWN: Final = [-1.0, *[0.0] * 8]
-"""REP 145: the covariance of an orientation that there is not."""
+"""REP 145: the covariance of a missing orientation."""
 
 
 class RawImuOutput(Topic):

@@ -60,7 +60,7 @@ class Outputs:
         self.wanted = tuple(output for output in self.all if output.is_wanted())
 
     def configure(self, parameters: Parameters) -> None:
-        """Have those outputs follow that go by parameters, such as covariances."""
+        """Pass new parameters, such as covariances, to the outputs that use them."""
         for output in self.all:
             configure = getattr(output, "configure", None)
             if configure is not None:
@@ -155,7 +155,7 @@ class StageTopic(WrenchTopic):
 
     @property
     def problem(self) -> str:
-        """Why nothing is published; here it always is."""
+        """Why nothing is published; empty, as here it always is."""
         return ""
 
     def tune(self, parameters: CompensationParameters) -> None:

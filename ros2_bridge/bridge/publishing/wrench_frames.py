@@ -20,9 +20,9 @@ from ft_compensation.outputs.frames import WrenchTransform
 from protocol.pdo import Vector3
 
 TF_PERIOD_S: Final = 0.005
-"""How often TF is asked."""
+"""Period of the TF lookups."""
 _PATIENCE: Final = 200
-"""Lookups in vain, from the first subscriber on, before it is a problem: TF has to come in first."""
+"""Failed lookups after the first subscription before it is a problem: TF has to arrive first."""
 _NS_PER_S: Final = 1_000_000_000
 
 
@@ -45,7 +45,7 @@ def make_frames(
 
 
 class FixedFrameTopic(StageTopic):
-    """In a frame that does not move against the sensor's."""
+    """In a frame fixed to the sensor's."""
 
     def __init__(self, node: Node, name: str, transform: WrenchTransform) -> None:
         super().__init__(node, f"wrench_compensated/{name}", name, "final")
@@ -63,7 +63,7 @@ class _Found(NamedTuple):
 
 
 class TfFrameTopic(StageTopic):
-    """In a frame that TF knows. `look_up` is for one thread, `send` for the reader's."""
+    """In a frame known to TF. `look_up` is for one thread, `send` for the reader's."""
 
     def __init__(self, node: Node, name: str, parameters: Parameters) -> None:
         super().__init__(node, f"wrench_compensated/{name}", name, "final")
@@ -78,7 +78,7 @@ class TfFrameTopic(StageTopic):
         self.tune(parameters.compensation)
 
     def tune(self, parameters: CompensationParameters) -> None:
-        """Take the limit to the age."""
+        """Take the limit of the age."""
         self._limit_ns = parameters.orientation.stale_after * _NS_PER_S
 
     def is_wanted(self) -> bool:
@@ -101,11 +101,11 @@ class TfFrameTopic(StageTopic):
             self._found = _Found(transform, stamp.sec * _NS_PER_S + stamp.nanosec)
 
     def forget(self) -> None:
-        """Nothing is known any more."""
+        """Forget the pose."""
         self._found, self._misses = None, 0
 
     def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
-        """Publish them in this frame, if where it is is known."""
+        """Publish them in this frame, if its pose is known."""
         self._asked_ns = stamp_ns
         found = self._found
         if found is not None and (not found.stamp_ns or abs(stamp_ns - found.stamp_ns) <= self._limit_ns):
@@ -119,13 +119,13 @@ class TfFrameTopic(StageTopic):
         if found is None:
             if self._misses < _PATIENCE:
                 return ""
-            return f"{what}TF has none of {self._source} in {self._name}: {self._error}"
+            return f"{what}TF has no pose of {self._source} in {self._name}: {self._error}"
         behind_ns = self._asked_ns - found.stamp_ns
         if not found.stamp_ns or not self._asked_ns or abs(behind_ns) <= self._limit_ns:
             return ""
         differs_s, order = abs(behind_ns) / _NS_PER_S, "older" if behind_ns > 0 else "newer"
         return (
-            f"{what}TF's latest of {self._source} in {self._name} is {differs_s:.3g} s {order} than the "
+            f"{what}TF's latest pose of {self._source} in {self._name} is {differs_s:.3g} s {order} than the "
             f"sample (limit {self._limit_ns / _NS_PER_S:g} s, orientation.stale_after)"
         )
 

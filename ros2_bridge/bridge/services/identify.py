@@ -27,7 +27,7 @@ class IdentifyServices:
         self._sensor = self._sensor_now()
         """As of the session's start."""
         self._result: Identified | None = None
-        """What was solved last, and fits the poses that there are."""
+        """The latest solution, of the current poses."""
         acts = {
             "identify/start": self._start,
             "identify/add_pose": self._add_pose,
@@ -85,7 +85,7 @@ class IdentifyServices:
         return self._said(
             f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias"
             + (", accelerometer.offset and accelerometer.scale" if accelerometer else "")
-            + "; the tool lasts until the node ends, start it with the file to have it again"
+            + "; to keep the tool, start the node with the file"
             + (f"; the bias is not kept: {not_kept}" if not_kept else "")
         )
 
@@ -104,13 +104,13 @@ class IdentifyServices:
                 if now[0] == self._sensor[0]
                 else "another sensor is there now"
             )
-            raise CompensationError(f"{what}, so the poses before were dropped: call identify/start again")
+            raise CompensationError(f"{what}, so the previous poses were dropped: call identify/start again")
         if self._session is None:
             raise CompensationError("no identification was started: call identify/start first")
         return self._session
 
     def _sensor_now(self) -> tuple[int, object]:
-        """What poses must have in common: the sensor, and the offset that it adds itself."""
+        """What all poses must share: the sensor and its own offset."""
         return self._control.sensors, self._control.link.offset
 
     def _write(self, result: Identified, comment: list[str]) -> str:

@@ -150,7 +150,7 @@ def known_rate(rate_hz: object) -> float:
 
 
 def known_offset(offset: object) -> tuple[float, ...] | None:
-    """The sensor's own offset that a message gives; None if it is none."""
+    """The sensor's own offset from a message; None if missing or invalid."""
     try:
         return six_numbers(offset)
     except ValueError:

@@ -1,4 +1,4 @@
-"""The server's events as sentences for the log. What they say is not trusted to have a form."""
+"""The server's events as sentences for the log. Their content is not trusted."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def sentence(message: JsonObject, before: Mapping[str, SettingValue]) -> str:
         return f"the sensor was reconfigured{_changes(message, before)}"
     if event == Event.OFFSET_CHANGED:
         offset = known_offset(message.get("offset"))
-        now = "not known any more" if offset is None else f"{wrench_text(Wrench.of(offset))} now"
+        now = "no longer known" if offset is None else f"{wrench_text(Wrench.of(offset))} now"
         return f"the sensor's own offset is {now}"
     if event == Event.EMERGENCY:
         return "the sensor reports an emergency" + (f": {printable(told)}" if isinstance(told, str) else "")

@@ -24,9 +24,9 @@ from protocol.framing import DataMessage
 BACKLOG_NS: Final = 50_000_000
 FRESH_NS: Final = 4_000_000
 _CATCH_UP_NS: Final = 20_000_000
-"""After a stall the age must fall by half of this in each such time: then what waits is being read."""
+"""After a stall the age must fall by half of this per such time: then the backlog is being read."""
 _FALL, _RISE = 8, 64
-"""The usual age follows each age by one part in so many: a low expectile, as delays only add."""
+"""The usual age follows each age with these weights (1/n): a low expectile, as delays only add."""
 
 
 @dataclass(slots=True)
@@ -53,12 +53,12 @@ class FrameSelector:
         self._usual_ns: int | None = None
         """The usual age; None before the first frame."""
         self._skipping: tuple[int, int] | None = None
-        """While all is stale: when its age was looked at last, and what it was."""
+        """While everything is stale: the time of the last check of the age, and the age."""
         self.passed_over: list[DataMessage] = []
         """New frames that the rate limit left out of the last `select`, older than the one selected."""
 
     def limit(self, hz: float) -> None:
-        """Select so many a second at most, 0 = all; from any thread."""
+        """Select at most this many a second, 0 = all; from any thread."""
         self._limit = RateLimit(hz) if hz > 0 else None
 
     def select(self, frames: Sequence[DataMessage], now_ns: int) -> list[DataMessage]:

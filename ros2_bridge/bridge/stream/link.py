@@ -114,7 +114,7 @@ class Link:
         self.settings = found
 
     def described(self, info: SensorInfo) -> None:
-        """Note what a later `describe` says. Settings and offset come with events, which are never behind."""
+        """Take a later reply to `describe`. Settings and offset come with events, which are never stale."""
         if info.rate != self.rate_hz:
             self.epoch += 1
         self.info, self.rate_hz = info, info.rate

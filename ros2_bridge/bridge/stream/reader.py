@@ -109,7 +109,7 @@ class Reader:
         return not self._thread.is_alive()
 
     def limit_rate(self, hz: float) -> None:
-        """Publish so many samples a second at most, 0 = all; from any thread."""
+        """Publish at most this many samples a second, 0 = all; from any thread."""
         if hz != self._limit_hz:
             self._limit_hz = hz
             if self._selector is not None:

@@ -34,7 +34,7 @@ class Requests:
         self._parameters = parameters
         self._link = link
         self._waiting: set[threading.Event] = set()
-        """One for each that waits: set once its reply is there, or none is wanted any more."""
+        """One for each waiting request: set once its reply has arrived, or is no longer wanted."""
         self._ending = False
 
     def cancel(self) -> None:

@@ -55,7 +55,7 @@ class BlockSum:
         turn: Vector3,
         passed_s: float,
     ) -> bool:
-        """Take a sample, and the turn since the one before, rad. False: it spoils the block."""
+        """Take a sample, and the turn since the previous one, rad. False: it spoils the block."""
         tx, ty, tz = turn
         sx, sy, sz = self._turned
         self._turned = sx + tx, sy + ty, sz + tz
@@ -83,7 +83,7 @@ class BlockSum:
         return False
 
     def end(self, time_s: float, attitude: CarriedAttitude) -> Block:
-        """What they were."""
+        """Their means."""
         passed_s, count = time_s - self.began_s, self._count
         x, y, z = self._turned
         rate = x / passed_s, y / passed_s, z / passed_s

@@ -15,10 +15,10 @@ _NOISES: Final = 4.0
 
 
 class Steadiness:
-    """Watches one vector. `mean` is its mean of late."""
+    """Watches one vector. `mean` is its recent mean."""
 
     def __init__(self, limit: float) -> None:
-        """One that is further than `limit` from the mean is another vector."""
+        """A vector further than `limit` from the mean is another one."""
         self.mean: Vector3 = ZERO
         self.lasted_s = -1.0
         """Seconds; 0 of the first one, negative before it."""

@@ -17,7 +17,7 @@ direction is trusted after some time constants. While f is not steady, a block i
 
 A block does not count at all if |f| - g is beyond the gate, or if its angle contradicts the estimate. Then
 only the gyroscope remains, and the uncertainty grows. A contradiction that is steady for longer than an arm
-can accelerate shows that the estimate is wrong: all begins anew.
+can accelerate shows that the estimate is wrong: the filter restarts.
 
 The offset is learned at rest only: with f steady in the sensor's frame and the rate steady and small. Turning
 about the vertical cannot be seen by the accelerometer, and a slow turn passes for rest. The filter
@@ -47,7 +47,7 @@ COVERS_95: Final = 2.45
 
 # The gyroscope.
 _OFFSET: Final = 0.02**2
-"""(rad/s)²: of one that nothing is known about; 0.03 rad/s is usual."""
+"""(rad/s)²: variance of an unknown offset; 0.03 rad/s is usual."""
 _OFFSET_DRIFT: Final = 1e-4**2
 """(rad/s)² per s: 0.05 °/s in a minute, by temperature."""
 _RATE_NOISE: Final = 1e-3**2
@@ -56,7 +56,7 @@ _RATE_SCALE: Final = 0.01**2
 """Square of the error of the scale, over turns of about a second."""
 _LOST_TURN: Final = 1.25**2
 """(rad/s²)², times s⁴: an eighth of the angular acceleration, 10 rad/s², that a gap between samples may hide
-from the mean of the rates before and after it."""
+from the mean of the rates at its ends."""
 
 # The accelerometer, as angles: m/s² over g.
 _REST: Final = 0.005**2
@@ -76,7 +76,7 @@ _UNEVEN: Final = 3 * 2.0
 """rad² per relative error of |f|: an acceleration across gravity, a, makes f longer by a²/2g. Three times
 that, because it may also point down a little."""
 _OWN_OFFSET: Final = 0.01**2
-"""rad²: what an accelerometer's own offset of 0.1 m/s² tilts. Nothing here can find it."""
+"""rad²: tilt by an accelerometer offset of 0.1 m/s², which is not observable here."""
 _START: Final = math.radians(20.0) ** 2
 """rad²: of a first guess by a sensor that may be accelerated by 3.5 m/s²."""
 
@@ -100,13 +100,13 @@ _AGREES_MOVED: Final = 0.05**2
 """rad²: the same while it is not: 0.5 m/s² of vibration or motion."""
 _OTHER_POSE: Final = 0.03**2
 """The same, rad² per rad² of a turn, up to 1 rad: an offset of the accelerometer (0.2 m/s²) tilts to another
-side then, until the accelerometer has had its say in the new pose: `arm` is known to `_KNOWN_ARM` (rad²)."""
+side then, until the filter has adapted to the new pose: `arm` is known to `_KNOWN_ARM` (rad²)."""
 _KNOWN_ARM: Final = 0.03**2
 _RECOVERS: Final = 3.0
 """Time constants of steady contradiction after which the estimate, and not the accelerometer, is wrong."""
 _HELD_S: Final = 30.0
-"""Time constant, s, with which is forgotten for how long the arm held an acceleration: for as long, nothing
-steady is believed. Without that, a filter of an arm that never rests agrees with one half of its moves."""
+"""Time constant, s, of the memory of how long the arm held an acceleration: nothing steady is trusted before
+it has lasted longer. Otherwise, on an arm that never rests, the filter would believe half of its moves."""
 _CONTRADICTED_S: Final = 10.0
 """Seconds without a block that counts from which the estimate is doubted. Arms reverse much earlier."""
 _DOUBT: Final = 0.02**2
@@ -117,7 +117,7 @@ _ARM_ONLY: Final = np.eye(2, 7, 5)
 
 
 class GyroscopeOffset:
-    """What is known of what a gyroscope reads at rest. Outlives the filters that learn it."""
+    """The estimate of a gyroscope's offset. Outlives the filters that learn it."""
 
     def __init__(self) -> None:
         self.value: Vector3 = ZERO
@@ -170,16 +170,16 @@ class TiltFilter:
 
     @property
     def steady(self) -> Vector3:
-        """The mean acceleration of late, m/s² in the still frame."""
+        """The recent mean acceleration, m/s² in the still frame."""
         return self._steady.mean
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the accelerometer has contradicted steadily, so that all must begin anew."""
+        """Whether the accelerometer has contradicted steadily, so that the filter must restart."""
         return min(self.rejected_s, self._steady.lasted_s) > _RECOVERS * self.time_constant_s
 
     def predict(self, block: Block) -> None:
-        """Let a block's time go by."""
+        """Propagate over the time of a block."""
         passed_s, turned = block.passed_s, math.hypot(*block.rate) * block.passed_s
         self._turned += turned
         self._held_s *= math.exp(-passed_s / _HELD_S)

@@ -115,7 +115,7 @@ class WrenchFilter:
         for name, value in frequencies.items():
             if not value < half:
                 raise CompensationError(
-                    f"filter.{name} is {value:g} Hz, and {rate_hz:g} samples a second allow less than "
+                    f"filter.{name} is {value:g} Hz, but must be below half of the sampling rate, "
                     f"{half:g} Hz: lower it"
                 )
         designs = [low_pass(settings.cutoff, rate_hz)]
