@@ -15,6 +15,8 @@ class OwnOffset:
         """The one that the bias is for, as far as it was ever known."""
         self._appeared = False
         """Whether the bias is from before it was known."""
+        self.has_bias = False
+        """Whether there is a bias. Zero may be one: what a tare finds where the sensor reads nothing."""
 
     @property
     def now(self) -> Wrench | None:
@@ -22,25 +24,31 @@ class OwnOffset:
         offset = self._link.offset
         return None if offset is None else Wrench.of(offset)
 
-    def begin(self) -> Wrench | None:
-        """The bias is for the offset of now, which is returned."""
+    @property
+    def to_keep(self) -> Wrench | None:
+        """`of_bias`; None where there is no bias, which goes with any offset."""
+        return self.of_bias if self.has_bias else None
+
+    def begin(self, bias: Wrench, *, is_measured: bool = False) -> Wrench | None:
+        """`bias` is for the offset of now, which is returned. Zero is none, unless it was measured."""
+        self.has_bias = is_measured or bias != NO_WRENCH
         self.of_bias, self._appeared = self.now, False
         return self.of_bias
 
-    def follow(self, bias: Wrench) -> Wrench | None:
-        """By how much `bias` must be shifted for the offset of now, once; None: not at all."""
+    def follow(self) -> Wrench | None:
+        """By how much the bias must be shifted for the offset of now, once; None: not at all."""
         now, before = self.now, self.of_bias
         if now is None or now == before:
             return None
         self.of_bias = now
-        if bias == NO_WRENCH:
+        if not self.has_bias:
             return None
         self._appeared = self._appeared or before is None
         return None if before is None else now.plus(before, -1.0)
 
-    def doubt(self, bias: Wrench) -> str:
-        """That `bias` may not fit the sensor any more, a sentence; empty if it does."""
-        if bias == NO_WRENCH or self._link.connection is None:
+    def doubt(self) -> str:
+        """That the bias may not fit the sensor any more, a sentence; empty if it does."""
+        if not self.has_bias or self._link.connection is None:
             return ""
         if self._appeared:
             return "the sensor's own offset was not known when the bias was taken, which may be wrong: tare"
@@ -48,9 +56,9 @@ class OwnOffset:
             return "the sensor's own offset is not known any more, so the bias may be wrong: tare"
         return ""
 
-    def after_tare(self, bias: Wrench) -> str:
-        """What a tare of the sensor means for `bias`, a sentence; empty if nothing."""
-        if bias == NO_WRENCH:
+    def after_tare(self) -> str:
+        """What a tare of the sensor means for the bias, a sentence; empty if nothing."""
+        if not self.has_bias:
             return ""
         if self._link.offset is None:
             return "The node's own bias was for the old offset: call ~/tare or ~/clear_tare"
