@@ -17,6 +17,7 @@ looks like a tilt. So `TiltFilter` takes it only where it is at a loss itself.
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -33,6 +34,9 @@ _LOOKS_S: Final = 0.25
 _FORCE: Final = 0.03
 """m/s²: what else is wrong with the mean acceleration of a block."""
 _CONTRADICTS: Final = 4.0**2
+_VERTICAL_S: Final = 3.0
+_VERTICAL: Final = 5.0
+"""m/s: an arm's vertical accelerations, added up and forgotten with that time constant, are below it."""
 _LONGEST_S: Final = 0.1
 """A gap between samples beyond it may hide any velocity."""
 _VELOCITY: Final = np.eye(2, 7, 5)
@@ -44,7 +48,7 @@ class MotionTilt:
     def __init__(self, magnitude: float) -> None:
         """`magnitude` of gravity, m/s²."""
         self._magnitude = magnitude
-        self._since_s = 0.0
+        self._since_s = self._vertical = 0.0
         self.forget(1.0, np.eye(3))
 
     def forget(self, start: float, offset: Array) -> None:
@@ -62,7 +66,7 @@ class MotionTilt:
         p[5:] = p[:, 5:] = 0.0
         p[5, 5] = p[6, 6] = (_FAST / self._magnitude) ** 2
         self._error[5:] = 0.0
-        self._since_s = 0.0
+        self._since_s = self._vertical = 0.0
 
     def follow(self, block: Block, grows: float, drift: float) -> None:
         """Take a block; tilt and offset have become less certain by so much variance."""
@@ -77,6 +81,11 @@ class MotionTilt:
         self._error, self.covariance = error, p
         if mean is None or block.longest_s > _LONGEST_S:
             self._lose_velocity()
+            return
+        self._vertical *= math.exp(-passed_s / _VERTICAL_S)
+        self._vertical += passed_s * (mean[2] - self._magnitude)
+        if abs(self._vertical) > _VERTICAL:  # wrong units, or no arm
+            self.forget(*self._start)
             return
         error[5] += passed_s * mean[1] / self._magnitude
         error[6] -= passed_s * mean[0] / self._magnitude
