@@ -113,7 +113,7 @@ class BiasRamp:
         with self._lock:
             start, target, begin_s, seconds = self._course
             self._course = _Course(start.plus(change), target.plus(change), begin_s, seconds)
-            if self._before is not None:
+            if self._before not in {None, NO_WRENCH}:  # none stays none
                 self._before = self._before.plus(change)
 
     def undo(self, now_s: float) -> Wrench:

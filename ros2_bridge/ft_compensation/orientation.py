@@ -106,7 +106,7 @@ class AccelerometerGravity:
         attitude, tilt = self._attitude, self._filter
         block = self._sum.end(time_s, attitude)
         tilt.predict(block)
-        correction = tilt.correct(block)
+        correction = tilt.correct(block, in_use=self._is_known)
         if correction is not None:
             attitude.rotate((*correction, 0.0))
             attitude.offset = self.offset.value

@@ -34,7 +34,7 @@ class Stored(NamedTuple):
     saved: str
     """When, ISO 8601 in UTC."""
     offset: Wrench | None = None
-    """The sensor's own offset, which the bias was taken with; None if it was not known."""
+    """The sensor's own offset, which the bias was taken with; None if not known or not needed."""
 
 
 def default_directory() -> Path:

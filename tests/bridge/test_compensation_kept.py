@@ -227,6 +227,39 @@ def test_no_bias_is_not_shifted(bench: Bench) -> None:
         assert list(node.parameters("bias")[0]) == ZERO6
 
 
+def test_no_bias_is_kept_as_none(bench: Bench) -> None:
+    """What ~/clear_tare leaves goes with every offset, after a restart too; ~/undo_tare goes back to none."""
+    offset_changed(bench, [0.0] * 6)
+    with bench.start() as (node, _):
+        assert node.trigger("tare")[0]
+        assert node.trigger("clear_tare")[0]
+    offset_changed(bench, [1.0] * 6)
+    raw = [b + 1.0 for b in BIAS.values]
+    with bench.start() as (node, stages):
+        assert stages.first() == pytest.approx(raw, abs=1e-4)
+        node.until(compensation=OK)
+        assert node.trigger("tare")[0]
+        bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": [2.0] * 6})
+        offset_changed(bench, [2.0] * 6)
+        stages.settle(ZERO6)
+        assert node.trigger("undo_tare")[0]
+        stages.settle([b + 2.0 for b in BIAS.values])
+
+
+def test_a_zero_that_was_measured_is_a_bias(bench: Bench) -> None:
+    """The sensor's tare and then the node's, or a shift, may leave a bias of exactly 0."""
+    offset_changed(bench, [-b for b in BIAS.values])
+    with bench.start() as (node, stages):
+        assert node.trigger("tare")[0]
+        assert list(node.parameters("bias")[0]) == pytest.approx(ZERO6, abs=1e-9)
+        bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": [1.0] * 6})
+        offset_changed(bench, [1.0] * 6)
+        stages.settle(ZERO6)
+    offset_changed(bench, [2.0] * 6)
+    with bench.start() as (_, stages):
+        assert stages.first() == pytest.approx(ZERO6, abs=1e-3)
+
+
 def test_a_tare_during_which_the_offset_changes_is_refused(bench: Bench) -> None:
     offset_changed(bench, [0.0] * 6)
     with bench.start() as (node, _):

@@ -96,6 +96,18 @@ def test_the_imu_is_off_by_the_settings(node: SimulatedNode, server: SimulatedSe
     node.until("switch the IMU on (settings.imu_active)", compensation=ERROR)
 
 
+def test_gravity_does_not_stand_still_with_the_imu_off(node: SimulatedNode, server: SimulatedServer) -> None:
+    """The gyroscope reads zero too, which is no rest: the arm may be turning."""
+    stages = Stages(node)
+    stages.settle(ZERO6)
+    hold(server, UP, acceleration_z=-1.0)
+    node.run(0.02)
+    assert stages.are_silent()
+    node.until("switch the IMU on", compensation=ERROR)
+    hold(server, UP)
+    stages.settle(ZERO6)
+
+
 def saturated() -> bytes:
     data = bytearray(sensed(UP))
     data[layout_for(len(data)).offsets["force_torque_saturated"]] = 0b100

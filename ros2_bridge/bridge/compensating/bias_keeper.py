@@ -21,6 +21,8 @@ class Beginning(NamedTuple):
     bias: Wrench
     origin: str
     """Where it comes from."""
+    is_one: bool
+    """Whether there is a bias: a zero that was not measured is none."""
 
 
 class BiasKeeper:
@@ -44,7 +46,7 @@ class BiasKeeper:
 
     def keep(self, bias: Wrench, parameters: CompensationParameters, offset: Wrench | None) -> None:
         """Store `bias`, taken with the sensor's own `offset`, for the connected sensor, if enabled and
-        changed."""
+        changed. `offset` is None if it is unknown, or if there is no bias."""
         if not parameters.bias_keep:
             self.problem = ""
             return
@@ -78,7 +80,7 @@ class BiasKeeper:
                 f"another sensor is there now, serial number {serial}: the bias was the other's and is "
                 "zero now; tare"
             )
-            return Beginning(NO_WRENCH, FROM_PARAMETER)
+            return Beginning(NO_WRENCH, FROM_PARAMETER, is_one=False)
         if is_first and bias not in (NO_WRENCH, stored.bias):
             self._log.warning(
                 f"the stored bias of the sensor with serial number {serial} is not used, because the "
@@ -93,7 +95,8 @@ class BiasKeeper:
                 f"the kept bias was taken with {_payload_text(stored.payload)}, and now there is "
                 f"{_payload_text(parameters.payload)}: tare again"
             )
-        return Beginning(stored.bias, f"kept since {stored.saved}")
+        is_one = stored.bias != NO_WRENCH or stored.offset is not None
+        return Beginning(stored.bias, f"kept since {stored.saved}", is_one)
 
     def _look_up(
         self, serial: str, parameters: CompensationParameters, offset: Wrench | None
@@ -107,7 +110,8 @@ class BiasKeeper:
         except StoreError as error:
             self._say_not_kept(str(error))
             return None
-        if stored is None or stored.offset == offset:
+        is_none = stored is not None and stored.offset is None and stored.bias == NO_WRENCH
+        if stored is None or is_none or stored.offset == offset:
             return stored
         if stored.offset is None or offset is None:
             self._say_not_kept(

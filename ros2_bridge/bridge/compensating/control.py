@@ -30,6 +30,8 @@ from ft_compensation.compensator import Compensator
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, length, wrench_text
 
+_MEASURED: Final = ("tare", "identified")
+"""Where a bias comes from that is one even if it is zero."""
 _LOOKING_UP: Final = "the bias of this sensor is being looked up"
 
 
@@ -115,7 +117,7 @@ class CompensationControl:
 
     def after_sensor_tare(self) -> str:
         """What a new offset in the sensor itself means here, a sentence; "" if nothing."""
-        return self._own_offset.after_tare(self.bias)
+        return self._own_offset.after_tare()
 
     def state(self) -> CompensationState:
         """How things are, for the diagnostics' thread."""
@@ -139,7 +141,7 @@ class CompensationControl:
             keep=self.parameters.bias_keep,
             stops_on_saturation=output.stops_on_saturation,
             problem=self.obstacles.conflict(self.parameters)
-            or self._own_offset.doubt(self.bias)
+            or self._own_offset.doubt()
             or self.keeping
             or (watch.finding if watch is not None else ""),
         )
@@ -151,7 +153,7 @@ class CompensationControl:
 
     def set_bias(self, bias: Wrench, origin: str) -> None:
         """Put a bias in force, and keep it if that is asked for."""
-        self._own_offset.begin()
+        self._own_offset.begin(bias, is_measured=origin in _MEASURED)
         with self._origin(origin):
             self._live.put(bias=[*bias.values])
 
@@ -196,7 +198,7 @@ class CompensationControl:
         # A parameter that the shift of the bias has not reached yet is no wish.
         if wanted.bias not in (was.bias, self.bias):
             self._ramp.go(wanted.bias, self.output.time_s)
-            self._own_offset.begin()
+            self._own_offset.begin(wanted.bias, is_measured=self._next_origin in _MEASURED)
             self.origin = self._next_origin
         self._make_plan()
         self.output.stops_on_saturation = wanted.on_saturation == "stop"
@@ -204,7 +206,7 @@ class CompensationControl:
             self.obstacles.hold(self.parameters, self.output)
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
             self._keeper.forget()
-        self._keeper.keep(self.bias, wanted, self._own_offset.of_bias)
+        self._keeper.keep(self.bias, wanted, self._own_offset.to_keep)
 
     def _make_plan(self) -> None:
         wanted = self.parameters
@@ -232,10 +234,11 @@ class CompensationControl:
             if info is None:
                 break
             is_another = self._keeper.serial is not None
-            offset = self._own_offset.begin()
+            offset = self._own_offset.begin(self.bias)
             begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters, offset)
             if begin is not None:
-                self._begin_with(*begin)
+                self._own_offset.has_bias = begin.is_one
+                self._begin_with(begin.bias, begin.origin)
             elif is_another:
                 # What was before in its history was the other's too.
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
@@ -245,7 +248,7 @@ class CompensationControl:
                 self._make_plan()
                 self.sensors += 1
             if not self.keeping and self.bias != NO_WRENCH:
-                self._keeper.keep(self.bias, self.parameters, self._own_offset.of_bias)
+                self._keeper.keep(self.bias, self.parameters, self._own_offset.to_keep)
         self._follow_offset()
         if self.bias != self.parameters.bias:
             self._live.put(bias=[*self.bias.values])  # shifted
@@ -255,7 +258,7 @@ class CompensationControl:
 
     def _follow_offset(self) -> None:
         """Shift the bias by the change of the sensor's own offset, from the next sample on; any thread."""
-        change = self._own_offset.follow(self.bias)
+        change = self._own_offset.follow()
         if change is not None:
             self._ramp.shift(change)
             self._log.info(

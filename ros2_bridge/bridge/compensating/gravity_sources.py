@@ -6,13 +6,15 @@ The reader alone calls `gravity`. `why_none` and `age_s` are for the diagnostics
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from bridge.parameters.compensation import CompensationParameters, Quaternion
 from ft_compensation.attitude.tilt import GyroscopeOffset
 from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
 from ft_compensation.quantities import EXACT, length
 from protocol.pdo import Sample, Vector3
+
+_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
 
 
 class Oriented(NamedTuple):
@@ -99,6 +101,9 @@ class AccelerometerSource:
     def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
         """From this sample and those before it."""
         acceleration = sample.acceleration
+        if not (any(acceleration) or any(sample.angular_rate)):
+            self._broken = _OFF  # what was known is of no use: nobody sees the sensor turn
+            return None
         if not sample.angular_rate_saturated:
             usable = None if sample.acceleration_saturated else acceleration
             if usable is not None and self._correct is not None:
@@ -109,10 +114,7 @@ class AccelerometerSource:
                 return None
         found = self._filter.gravity(time_s)
         if found is None:
-            self._broken = (
-                "" if any(acceleration)
-                else "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
-            )  # fmt: skip
+            self._broken = "" if any(acceleration) else _OFF
         return found
 
     def why_none(self, time_s: float) -> str:

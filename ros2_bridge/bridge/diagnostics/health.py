@@ -268,13 +268,20 @@ def _compensation(s: Snapshot, t: Thresholds) -> Status:
     elif c.why_partly:
         verdict.add(Level.ERROR, c.why_partly)
     elif s.new_withheld:
-        why = f"for lack of a current orientation ({c.source})"
-        if c.stops_on_saturation and s.new_saturated:
-            why = "because force or torque was saturated (on_saturation), or " + why
-        verdict.add(Level.WARN, f"{s.new_withheld} samples were not compensated, {why}")
+        verdict.add(Level.WARN, f"{s.new_withheld} samples were not compensated{_why_withheld(s)}")
     if c.problem:
         verdict.add(Level.WARN, c.problem)
     return verdict.status("compensation", c.good, c.values)
+
+
+def _why_withheld(s: Snapshot) -> str:
+    """What may have been the reason."""
+    c, reasons = s.compensation, []
+    if c.stops_on_saturation and s.new_saturated:
+        reasons.append("because force or torque was saturated (on_saturation)")
+    if c.payload.mass:
+        reasons.append(f"for lack of a current orientation ({c.source})")
+    return f", {', or '.join(reasons)}" if reasons else " while the sensor was looked up"
 
 
 def _rate_text(s: Snapshot) -> str:

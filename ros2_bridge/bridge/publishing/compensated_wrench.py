@@ -129,7 +129,7 @@ class CompensatedOutput:
         self.broken: str | None = None
         """What of the latest sample cannot be used although gravity is known; a sentence."""
         self.published = self.withheld = 0
-        """Samples since the node started that were compensated, and that were not."""
+        """Samples since the node started that were compensated, and that were not, but for the beginning."""
         self.is_stopped = False
         """Whether the latest could not be compensated; at the start, whether for long."""
         self._begins_s = math.inf
@@ -190,10 +190,10 @@ class CompensatedOutput:
         self.is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
         self.broken = self._unusable(plan, sample)
         if gravity is None or self.hold is not None or self.is_saturated or self.broken is not None:
-            self.withheld += 1
             self._begins_s = min(self._begins_s, time_s)
             is_new = gravity is None and 0.0 <= time_s - self._begins_s <= _BEGINS_S
             self.is_stopped = not is_new
+            self.withheld += not is_new
             return
         self.is_stopped, self._begins_s = False, -math.inf
         stages = self._stages(plan, sample, gravity, time_s)

@@ -23,6 +23,8 @@ The offset is learned at rest only: with f steady in the sensor's frame and the 
 about the vertical cannot be seen by the accelerometer, and a slow turn passes for rest. The filter
 therefore never learns the offset along gravity, until another pose has made it horizontal; its
 variance stays and becomes uncertainty of the tilt when the sensor is turned.
+
+Of an arm that never rests all this learns little: `MotionTilt` helps out.
 """
 
 from __future__ import annotations
@@ -31,14 +33,13 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ft_compensation.attitude.block import Block
+from ft_compensation.attitude.covariance import Array, inverse, largest
+from ft_compensation.attitude.in_motion import MotionTilt
 from ft_compensation.attitude.steadiness import Steadiness
 from ft_compensation.quantities import ZERO
 from protocol.pdo import Vector3
-
-Array = NDArray[np.float64]
 
 BLOCK_S: Final = 0.05
 """Long enough for a vibration of 20 Hz to cancel out, a quarter of the shortest move."""
@@ -112,6 +113,9 @@ _CONTRADICTED_S: Final = 10.0
 _DOUBT: Final = 0.02**2
 """rad² per s, then."""
 
+_IN_DOUBT: Final = 0.05**2, 0.02**2
+"""rad²: beyond it `MotionTilt` is taken, if its variance is half of the own; and while nothing is in use."""
+
 _MEASURED: Final = np.eye(2, 7) + np.eye(2, 7, 5)
 _ARM_ONLY: Final = np.eye(2, 7, 5)
 
@@ -138,6 +142,7 @@ class TiltFilter:
         """Since a block counted."""
         self._steady, self._rest, self._still = Steadiness(_STEADY), Steadiness(_AT_REST), Steadiness(_STILL)
         self._covariance: Array
+        self._motion = MotionTilt(magnitude)
         self.forget()
 
     def forget(self) -> None:
@@ -150,6 +155,7 @@ class TiltFilter:
         self._likely_s = self._held_s = self._turned = self.rejected_s = 0.0
         for each in (self._steady, self._rest, self._still):
             each.forget()
+        self._motion.forget(_START, self.offset.covariance)
 
     def begin_anew(self) -> None:
         """The still frame was leveled by `steady`."""
@@ -163,10 +169,7 @@ class TiltFilter:
     @property
     def tilt_95(self) -> float:
         """The true tilt is below this in 95 % of cases, rad."""
-        p = self._covariance
-        half = 0.5 * (p[0, 0] - p[1, 1])
-        largest = 0.5 * (p[0, 0] + p[1, 1]) + math.sqrt(half * half + p[0, 1] ** 2)
-        return COVERS_95 * math.sqrt(largest + _OWN_OFFSET)
+        return COVERS_95 * math.sqrt(largest(self._covariance) + _OWN_OFFSET)
 
     @property
     def steady(self) -> Vector3:
@@ -188,6 +191,7 @@ class TiltFilter:
         p = f @ self._covariance @ f.T
         grows = _RATE_NOISE * passed_s + _RATE_SCALE * turned * turned / passed_s
         grows += _LOST_TURN * block.longest_s**4
+        self._motion.follow(block, grows, _OFFSET_DRIFT * passed_s)
         if self.rejected_s > _CONTRADICTED_S:
             grows += _DOUBT * passed_s
         drift = _OFFSET_DRIFT * passed_s
@@ -195,12 +199,30 @@ class TiltFilter:
             p[axis, axis] += more
         self._covariance = p
 
-    def correct(self, block: Block) -> tuple[float, float] | None:
+    def correct(self, block: Block, *, in_use: bool) -> tuple[float, float] | None:
         """Take a block's acceleration.
 
         Returns the rotation about x and y by which to turn the attitude, rad; None if the block does not
         count. The offset is corrected in place.
         """
+        before = self.offset.value
+        found = self._take_motion(_IN_DOUBT[not in_use]) or self._measure(block)
+        if found is not None:
+            self._motion.corrected(found, np.subtract(self.offset.value, before))
+        return found
+
+    def _take_motion(self, doubt: float) -> tuple[float, float] | None:
+        """What the arm's velocity tells, where that is much better known."""
+        own, motion = largest(self._covariance), self._motion
+        if own < doubt or largest(motion.covariance) > 0.5 * own:
+            return None
+        p = self._covariance = np.diag((0.0, 0.0, 0.0, 0.0, 0.0, _ARM, _ARM))
+        p[:5, :5], self._first_arm = motion.covariance[:5, :5], _ARM
+        self._likely_s = self.rejected_s = 0.0
+        self._steady.forget()
+        return self._apply(np.array((*motion.error, 0.0, 0.0)))
+
+    def _measure(self, block: Block) -> tuple[float, float] | None:
         passed_s, mean = block.passed_s, block.acceleration
         self.rejected_s += passed_s
         size = 0.0 if mean is None else math.hypot(*mean)
@@ -219,7 +241,7 @@ class TiltFilter:
         agrees = (
             (_AGREES if lasted_s else _AGREES_MOVED) + _OTHER_POSE * min(1.0, self._turned) ** 2 + scatter
         )
-        if measured @ _inverse(self._covariance[:2, :2] + np.eye(2) * agrees) @ measured > _GATE:
+        if measured @ inverse(self._covariance[:2, :2] + np.eye(2) * agrees) @ measured > _GATE:
             self._held_s = max(self._held_s, min(lasted_s, self.rejected_s))
             return None
         self.rejected_s = 0.0
@@ -250,7 +272,7 @@ class TiltFilter:
         """Take `measured` (2,) = `h @ error` + noise (its variance); returns the new estimate."""
         p = self._covariance
         ph = p @ h.T
-        gain = ph @ _inverse(h @ ph + np.eye(2) * noise)
+        gain = ph @ inverse(h @ ph + np.eye(2) * noise)
         if not learns:  # a consider state: uncertain, but not corrected
             gain[2:5] = 0.0
         m = np.eye(7) - gain @ h
@@ -276,10 +298,3 @@ class TiltFilter:
         x, y, z = self._steady.mean  # the still frame is about to be turned
         self._steady.mean = x + tilt_y * z, y - tilt_x * z, z + tilt_x * y - tilt_y * x
         return tilt_x, tilt_y
-
-
-def _inverse(a: Array) -> Array:
-    """Of a symmetric 2 by 2 matrix."""
-    (xx, xy), (_, yy) = a.tolist()
-    found: Array = np.array(((yy, -xy), (-xy, xx))) / (xx * yy - xy * xy)
-    return found
