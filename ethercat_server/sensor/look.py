@@ -27,6 +27,8 @@ _MASTER_FRAMES: Final = 3
 _TIMEOUT_S: Final = 0.02
 _ATTEMPTS: Final = 5
 _PROBE_BYTES: Final = 1
+_SII_PAUSE_S: Final = 0.0002
+"""Until an EEPROM is asked again whether it has read a word, which takes it one to three milliseconds."""
 _MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
 """Start and length of a Bota sensor's sync managers 0 to 2."""
 _INPUTS: Final = 0x1180
@@ -125,7 +127,7 @@ def read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda
 
     def read(word: int, words: int) -> bytes:
         steps = read_sii(registers, position, word, words, owner)
-        return finish(steps, pause_s=0, clock=bus.clock, check_interrupt=check_interrupt)
+        return finish(steps, pause_s=_SII_PAUSE_S, clock=bus.clock, check_interrupt=check_interrupt)
 
     return sii_content.read_image(read)
 

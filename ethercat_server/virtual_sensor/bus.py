@@ -21,7 +21,8 @@ from typing import Any
 
 from ethercat_server.ethercat import wire
 from ethercat_server.virtual_sensor.esc import registers as reg
-from ethercat_server.virtual_sensor.esc.commands import execute
+from ethercat_server.virtual_sensor.esc.commands import pass_through
+from ethercat_server.virtual_sensor.esc.controller import Esc
 from ethercat_server.virtual_sensor.foreign.left_behind import leave_in
 from ethercat_server.virtual_sensor.foreign.slave import ForeignSlave
 from ethercat_server.virtual_sensor.options import BusOptions, ForeignOptions, SensorOptions
@@ -72,6 +73,7 @@ class Bus:
         self.frames = self.frames_lost = 0
         self._power_events: list[tuple[int, Slave]] = []
         self._alive: list[Application] = []
+        self._escs: list[Esc] = []
         self._last_frame = 0
         self.rewire()
         self._leave_behind()
@@ -103,6 +105,7 @@ class Bus:
             if slave.life is None or slave in self.disconnected:
                 break
             self._alive.append(slave.life)
+        self._escs = [life.esc for life in self._alive]
         for position, life in enumerate(self._alive):
             life.esc.set_line(position, len(self._alive) - 1 - position)
 
@@ -154,10 +157,10 @@ class Bus:
             self.frames_lost += 1
             return False
         position = self._damaged_at()
+        intact = self._escs[:position]
         for datagram in datagrams:
             if datagram.command:  # a NOP passes unchanged
-                for life in self._alive[:position]:
-                    execute(life.esc, frame, datagram)
+                pass_through(intact, frame, datagram)
         if position is not None:  # the network card of the master throws it away
             self.frames_lost += 1
             return False

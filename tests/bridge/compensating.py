@@ -17,6 +17,7 @@ QUICK: dict[str, object] = {
     "rest.duration": 0.3,
     "bias_ramp_time": 0.0,
     "accelerometer.time_constant": 0.05,
+    "accelerometer.tilt_limit": 0.1,
 }
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.server.bench import Bench, error
-from tests.simulation import Client
+from tests.simulation import Client, more_if_long
 
 CONFIGURATION, OFFSET, RATE = 0x8010, 0x8000, 0x8011
 IN_OP = {"temperature_compensation": True, "imu_active": 3}
@@ -16,9 +16,9 @@ ABORT = "0x08000021"
 
 
 def moments(step_ms: int, count: int) -> list[Any]:
-    """In ms; every second one, and all of them with --long."""
-    marks = ((), pytest.mark.long)
-    return [pytest.param(number * step_ms, marks=marks[number % 2]) for number in range(count)]
+    """In ms; every third one, and all of them with --long."""
+    every = range(0, count * step_ms, step_ms)
+    return more_if_long(every[::3], every)
 
 
 @pytest.fixture

@@ -13,12 +13,14 @@ import pytest
 
 from tests.clock_simulation import SECOND, Card, ClockSimulation, Machine, Outcome, Sensor
 from tests.server import sample_clock_figure as figure
+from tests.simulation import more_if_long
 
 ROOT = Path(__file__).parents[2]
 
 QUIET = Machine()
 SETTLED_S = 2.0
 SEEDS = range(1, 4)
+LONG = pytest.mark.long
 MOST_FAULTS = 5
 """In 100 runs of the sweep."""
 
@@ -48,7 +50,8 @@ def test_locks_at_once_and_learns_the_rate(rate_hz: float, ppm: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "round_trip_ns"), [(1600.0, 110e3), (1600.0, 200e3), (1600.0, 250e3), (800.0, 110e3)]
+    ("rate_hz", "round_trip_ns"),
+    [(1600.0, 110e3), pytest.param(1600.0, 200e3, marks=LONG), (1600.0, 250e3), (800.0, 110e3)],
 )
 def test_one_exchange_a_sample_nearly_always_suffices(rate_hz: float, round_trip_ns: float) -> None:
     for seed in SEEDS:
@@ -59,7 +62,7 @@ def test_one_exchange_a_sample_nearly_always_suffices(rate_hz: float, round_trip
         assert shown.ages_ns[len(shown.samples) // 2] < 0.9 * round_trip_ns
 
 
-@pytest.mark.parametrize("round_trip_ns", [300e3, 400e3])
+@pytest.mark.parametrize("round_trip_ns", more_if_long([400e3], [300e3, 400e3]))
 def test_a_tenth_of_the_time_stolen_costs_little_more(round_trip_ns: float) -> None:
     """Some thefts outlast a period: what they cost is lost for any clock, and flagged."""
     runs = [
@@ -78,10 +81,10 @@ def test_a_tenth_of_the_time_stolen_costs_little_more(round_trip_ns: float) -> N
     ("rate_hz", "card"),
     [
         (800.0, slow(0.86)),
-        (800.0, slow(3)),
+        pytest.param(800.0, slow(3), marks=LONG),
         (800.0, slow(3, 0.2)),
         (1600.0, slow(0.44)),
-        (1600.0, slow(2)),
+        pytest.param(1600.0, slow(2), marks=LONG),
         (1600.0, slow(2, 0.2)),
     ],
 )
@@ -143,7 +146,7 @@ def test_a_silent_sensor_is_watched_for_and_followed_again() -> None:
         assert simulation.outcome(SETTLED_S).counted <= 0
 
 
-@pytest.mark.parametrize("sleep_ns", [60e3, 100e3])
+@pytest.mark.parametrize("sleep_ns", more_if_long([100e3], [60e3, 100e3]))
 def test_follows_a_simulated_sensor_that_sleeps_between_its_samples(sleep_ns: float) -> None:
     """Such a one is some percent slow and its phase walks at random: no loss may be claimed that was none."""
     for seed in SEEDS:
@@ -168,10 +171,10 @@ def test_a_sensor_that_is_not_periodic_is_not_taken_for_one_for_long() -> None:
     ("rate_hz", "card", "bound"),
     [
         (1600.0, Card(), 1000),
-        (800.0, Card(), 1000),
+        pytest.param(800.0, Card(), 1000, marks=LONG),
         (1600.0, slow(2, 0.2), 1000),
         # Constant round trips leave no doubt of the phase, so it is long before it is tried again.
-        (800.0, slow(0.86), 10_000),
+        pytest.param(800.0, slow(0.86), 10_000, marks=LONG),
         (1600.0, slow(2), 10_000),
     ],
 )

@@ -56,6 +56,12 @@ def test_a_drive_that_is_not_at_work_may_be_scanned() -> None:
     assert [slave.name for slave in slaves] == ["BFT-SENS-ECAT-M8", "DRIVE"]
 
 
+def test_an_eeprom_is_not_asked_without_pause_whether_it_has_read_a_word() -> None:
+    backend = MemoryBackend()
+    bring_up(Bus(backend), Asked(), no_check)
+    assert backend.sensors.frames < 1500, "half of them are for the EEPROM: 107 reads of 2 ms"
+
+
 class OthersFrames(MemoryBackend):
     """Frames of another master come by, one each `every_s`."""
 

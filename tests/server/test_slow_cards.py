@@ -139,9 +139,13 @@ def test_many_sensors_with_clocks_of_their_own(count: int) -> None:
     assert running.status()["cycles"] - before < 800 * count * 1.15
 
 
-def test_process_data_in_two_frames_is_as_complete() -> None:
-    sensors = [SensorOptions(serial=n + 1, signal="clock", pdo_size=77, ppm=10.0 * n) for n in range(20)]
-    running = Simulation(*sensors)
+@pytest.mark.parametrize("sinc_length", more_if_long([256], [64, 256]))
+def test_process_data_in_two_frames_is_as_complete(sinc_length: int) -> None:
+    sensors = [
+        SensorOptions(serial=n + 1, signal="clock", pdo_size=77, ppm=10.0 * n, sinc_length=sinc_length)
+        for n in range(20)
+    ]
+    running = Simulation(*sensors, settings={"sinc_length": sinc_length})
     running.run(0.4)
     running.frames.clear()
     running.run(0.2)

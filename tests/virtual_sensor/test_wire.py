@@ -1,5 +1,6 @@
 """Frames: parsing, and what hostile ones do (nothing)."""
 
+import itertools
 import struct
 
 from hypothesis import given, settings
@@ -7,6 +8,10 @@ from hypothesis import strategies as st
 
 from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.wire import Command
+from ethercat_server.virtual_sensor.esc import registers as reg
+from ethercat_server.virtual_sensor.esc.commands import execute, pass_through
+from ethercat_server.virtual_sensor.esc.controller import Esc
+from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.virtual_sensor.raw_master import OP, RawMaster
 
 HEADERS = st.integers(0, 0xFFFF)
@@ -49,6 +54,32 @@ def test_a_broken_datagram_leaves_those_before_it_alone() -> None:
     assert master.bus.process(frame, len(frame), master.now)
     assert frame[second.header - 2 : second.header] == b"\1\0"
     assert frame[second.data : second.end + 2] == bytes(4)
+
+
+def chain_with_events() -> list[Esc]:
+    """Five: two of one station address, and two that show their events."""
+    master = RawMaster(*(SensorOptions(serial=number) for number in range(5)))
+    escs = [slave.life.esc for slave in master.bus.slaves if slave.life]
+    masks = (0, reg.EVENT_DL_STATUS, 0, 0, 0x0100)
+    for esc, station, mask in zip(escs, (0, 0x1001, 0x1002, 0x1001, 0x2001), masks, strict=True):
+        struct.pack_into("<H", esc.memory, reg.STATION_ADDRESS, station)
+        esc._events = mask
+        struct.pack_into("<H", esc.memory, reg.EVENT_MASK, mask)
+    return escs
+
+
+def test_passing_slaves_that_are_not_meant_is_the_same_as_asking_each() -> None:
+    adps = (0, 1, 0xFFFF, 0xFFFE, 0xFFFC, 0xFFFB, 0x1001, 0x1002, 0x2001)
+    for command, ado, adp in itertools.product(range(17), (0x0010, 0x0130), adps):
+        if adp == 0:  # what the frames before have written is gone
+            at_once, one_by_one = chain_with_events(), chain_with_events()
+        frame = wire.build((command, adp, ado, b"\2\1"))
+        other, (datagram,) = frame[:], wire.parse(frame, len(frame))
+        pass_through(at_once, frame, datagram)
+        for esc in one_by_one:
+            execute(esc, other, datagram)
+        assert frame == other, f"{command} {adp:#x} {ado:#x}"
+        assert [esc.memory for esc in at_once] == [esc.memory for esc in one_by_one]
 
 
 @given(st.binary(max_size=200))

@@ -6,6 +6,7 @@ Source: ETG.1000.4. A successful read counts 1, a write 1, and in a read-write c
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import Final
 
 from ethercat_server.ethercat.wire import Command, Datagram
@@ -18,13 +19,40 @@ _READS = frozenset({Command.APRD, Command.FPRD, Command.BRD})
 _WRITES = frozenset({Command.APWR, Command.FPWR, Command.BWR})
 _AUTO_INCREMENT = frozenset({Command.APRD, Command.APWR, Command.APRW, Command.ARMW})
 _BROADCAST = frozenset({Command.BRD, Command.BWR, Command.BRW})
+_ONE_BY_POSITION = frozenset({Command.APRD, Command.APWR, Command.APRW})
+_ONE_BY_STATION = frozenset({Command.FPRD, Command.FPWR, Command.FPRW})
 _READ_MULTIPLE_WRITE = frozenset({Command.ARMW, Command.FRMW})
 _KNOWN = frozenset(Command) - {Command.NOP}
 _PLANS_KEPT: Final = 64
 
 
+def pass_through(escs: Sequence[Esc], frame: bytearray, datagram: Datagram) -> None:
+    """Process one datagram in place as it passes these slaves, in their order.
+
+    Those that it is not meant for only show their events, if they have a mask for them.
+    """
+    command, at = datagram.command, datagram.header + 2
+    if command in _ONE_BY_STATION:
+        low = frame[at]  # which suffices to pass nearly all others
+        for esc in escs:
+            memory = esc.memory
+            if memory[reg.STATION_ADDRESS] == low or memory[reg.EVENT_MASK] or memory[reg.EVENT_MASK + 1]:
+                execute(esc, frame, datagram)
+    elif command in _ONE_BY_POSITION:
+        first = datagram.adp
+        for number, esc in enumerate(escs, first):
+            memory = esc.memory
+            if not number & 0xFFFF or memory[reg.EVENT_MASK] or memory[reg.EVENT_MASK + 1]:
+                _U16.pack_into(frame, at, number & 0xFFFF)
+                execute(esc, frame, datagram)
+        _U16.pack_into(frame, at, (first + len(escs)) & 0xFFFF)
+    else:
+        for esc in escs:
+            execute(esc, frame, datagram)
+
+
 def execute(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
-    """Process one datagram in place as it passes this slave."""
+    """Process one datagram in place as it passes one slave."""
     command = datagram.command
     if command in _LOGICAL:
         counted = _logical(esc, frame, datagram)
