@@ -1,7 +1,7 @@
 """When the next exchange is due: each sensor has a clock of its own, an exchange reads all of them.
 
 Polls that lie close together are merged: the earlier one waits for the later, by no more than the time that
-three exchanges cost this machine, as measured. So two thirds of its time are left.
+four exchanges cost this machine, as measured. So three quarters of its time are left.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 
 _COST_GAIN: Final = 1 / 64
 _FIRST_COST_NS: Final = 50_000.0
-_BUDGET: Final = 1 / 3
+_BUDGET: Final = 1 / 4
 """Part of the time that exchanges may take."""
-_LARGEST_WAIT: Final = 0.25
+_LARGEST_WAIT: Final = 0.3
 """What a poll may wait for another, in shortest sample periods."""
 _LONGEST_LEAD_NS: Final = 200_000.0
 """By how much polls are brought forward at most because this machine wakes late."""
