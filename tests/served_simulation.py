@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 
-from ethercat_server.acquisition.cycle import Made
+from ethercat_server.acquisition.stream import Made
 from ethercat_server.serving.transport.base import Transport
 from ethercat_server.serving.transport.sockets import SocketTransport
 from ethercat_server.simulation.backend import MemoryBackend

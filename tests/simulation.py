@@ -20,11 +20,11 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.acquisition.cycle import Cycle, Made
+from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
-from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.stream import Made, SensorStream
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.others import Others

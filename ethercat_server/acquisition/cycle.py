@@ -15,7 +15,7 @@ from ethercat_server.acquisition.health.round_trip import RoundTripHealth
 from ethercat_server.acquisition.histogram import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
-from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.stream import Made, SensorStream
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.timing.schedule import Schedule
 from ethercat_server.ethercat.bus import Bus
@@ -29,10 +29,6 @@ _RECOVERY_STEP_NS: Final = 500_000
 """Time between two exchanges while all sensors are lost."""
 _SUMMARY_NS: Final = 200_000_000
 """Interval between summaries of the distributions, which take some 100 µs each."""
-
-
-Made = tuple[bytes, int, int]
-"""A DATA frame, the number of its sensor, its flags."""
 
 
 class Outlet(Protocol):

@@ -21,6 +21,9 @@ from protocol.pdo import is_finite
 DISCARDED_AT_START: Final = 3
 """Bota's own driver discards the first three frames after entering OP."""
 
+Made = tuple[bytes, int, int]
+"""A DATA frame, the number of its sensor, its flags."""
+
 REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))
 
 

@@ -84,7 +84,6 @@ class ProcessData:
         self._tags = [
             (each or end) + _BEFORE_TAG for each, end in zip(self._written, self._ends, strict=True)
         ]
-        self._which = list(range(len(spans)))
         self._index = self._number = 0
         self._sent = [_NOTHING] * _INDICES
         """By index less the first: when a frame was sent that is not back, else 0; which it was; its tag."""
@@ -115,7 +114,7 @@ class ProcessData:
     def send(self) -> int:
         """Send an exchange, unless too many are on the wire. Returns when."""
         now_ns = 0
-        for which in self._which:
+        for which, frame in enumerate(self._frames):
             index = self._index
             if self.in_flight >= MOST_IN_FLIGHT or self._sent[index][0]:
                 now_ns = self._monotonic_ns()
@@ -127,7 +126,6 @@ class ProcessData:
                     index = (index + 1) % _INDICES
             self._index = (index + 1) % _INDICES
             self._number = number = (self._number + 1) & 0xFFFFFFFF
-            frame = self._frames[which]
             frame[DATAGRAM_INDEX] = index + FIRST_INDEX
             _TAG.pack_into(frame, self._tags[which], number)
             self.in_flight += 1

@@ -6,11 +6,11 @@ import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, TypeVar
 
-from ethercat_server.acquisition.cycle import Cycle, Made
+from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import AsFound, enter_op, find_sensors
-from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.stream import Made, SensorStream
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.errors import BusError, ServerError, UsageError
 from ethercat_server.ethercat.bus import Bus

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
+from ethercat_server.acquisition.stream import Made
 from ethercat_server.serving.outbox import Outbox, with_gap
 from ethercat_server.serving.state import TRANSITIONS, State
 from ethercat_server.serving.transport.base import Stream
@@ -222,7 +223,7 @@ class Connection:
             return
         self.outbox.send(encode_bare_json(message) if self.bare is not None else encode_json(message))
 
-    def offer(self, made: Sequence[tuple[bytes, int, int]], now_ns: int) -> None:
+    def offer(self, made: Sequence[Made], now_ns: int) -> None:
         """Send those DATA frames that the subscription wants, at once: one for a sensor."""
         wants = self.subscription
         if wants is None:

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from ethercat_server.acquisition.stream import Made
 from ethercat_server.serving.connection import Connection, Limits, Unreadable
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.state import State
@@ -63,8 +64,8 @@ class Hub:
         """Begin to accept; until now clients waited in the kernel's queue."""
         self._handler = handler
 
-    def publish(self, made: Sequence[tuple[bytes, int, int]], now_ns: int) -> None:
-        """Send DATA frames, with their sensors' numbers and flags, to every subscriber that wants them."""
+    def publish(self, made: Sequence[Made], now_ns: int) -> None:
+        """Send DATA frames to every subscriber that wants them."""
         for connection in self._subscribers:
             connection.offer(made, now_ns)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from ethercat_server.acquisition.cycle import Made
+from ethercat_server.acquisition.stream import Made
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.errors import UnreachableError
 from tests.bridge.simulated_node import STEP_S, Wire

@@ -14,7 +14,7 @@ from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
 from ft_compensation.quantities import EXACT, length
 from protocol.pdo import Sample, Vector3
 
-_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
+IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
 
 
 class Oriented(NamedTuple):
@@ -102,7 +102,7 @@ class AccelerometerSource:
         """From this sample and those before it."""
         acceleration = sample.acceleration
         if not (any(acceleration) or any(sample.angular_rate)):
-            self._broken = _OFF  # what was known is of no use: nobody sees the sensor turn
+            self._broken = IMU_IS_OFF  # what was known is of no use: nobody sees the sensor turn
             return None
         if not sample.angular_rate_saturated:
             usable = None if sample.acceleration_saturated else acceleration
@@ -114,7 +114,7 @@ class AccelerometerSource:
                 return None
         found = self._filter.gravity(time_s)
         if found is None:
-            self._broken = "" if any(acceleration) else _OFF
+            self._broken = "" if any(acceleration) else IMU_IS_OFF
         return found
 
     def why_none(self, time_s: float) -> str:

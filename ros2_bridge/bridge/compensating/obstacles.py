@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import Final
 
-from bridge.compensating.gravity_sources import AccelerometerSource, Listening, NoSource, SensorSource, Source
+from bridge.compensating.gravity_sources import (
+    IMU_IS_OFF,
+    AccelerometerSource,
+    Listening,
+    NoSource,
+    SensorSource,
+    Source,
+)
 from bridge.parameters.compensation import CompensationParameters
 from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.stream.link import Link
@@ -85,5 +92,5 @@ class Obstacles:
             sample is not None and not any(sample.acceleration)
         )
         if isinstance(source, AccelerometerSource) and is_off:
-            return "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
+            return IMU_IS_OFF
         return None
