@@ -20,8 +20,10 @@ from protocol.pdo import STANDARD_GRAVITY, Vector3
 _HAIR_S: Final = 1e-6
 _FASTEST: Final = 100.0
 """rad/s: three times the largest range. A rate beyond it is none."""
-_AT_FIRST: Final = 0.35
-"""Fraction of the tilt limit that applies at the start (hysteresis)."""
+_AT_FIRST: Final = 0.054
+"""rad: what `tilt_95` must be below, besides the limit, before there is an answer; 3°."""
+_AT_FIRST_BY_MOTION: Final = 0.07
+"""The same where only the motion of an arm that never rests tells it."""
 _MOST_RATES: Final = 4096
 """Remembered for orientations that come late: 2.5 s at 1600 Hz."""
 
@@ -51,7 +53,7 @@ class AccelerometerGravity:
             time_constant_s: with which trust grows in an accelerometer that is steady.
             gate: m/s²; a mean counts only if its length is this near `magnitude`.
             stale_after_s: without a sample for this long there is no answer; shorter gaps are bridged.
-            tilt_limit: rad; there is no answer while `tilt_95` is larger, nor at first until it is a third.
+            tilt_limit: rad; there is no answer while `tilt_95` is larger, nor at first until it is 3°.
             offset: what is known of the gyroscope; it is improved in place.
         """
         if not (magnitude > 0.0 and time_constant_s > 0.0):
@@ -110,10 +112,12 @@ class AccelerometerGravity:
         if correction is not None:
             attitude.rotate((*correction, 0.0))
             attitude.offset = self.offset.value
-        elif tilt.is_wrong:
+        if tilt.is_wrong:
             self._begin_anew()
         self.tilt_95 = tilt.tilt_95
-        self._is_known = self.tilt_95 <= self.tilt_limit * (1.0 if self._is_known else _AT_FIRST)
+        at_first = _AT_FIRST_BY_MOTION if tilt.is_by_motion else _AT_FIRST
+        limit = self.tilt_limit if self._is_known else min(self.tilt_limit, at_first)
+        self._is_known = self.tilt_95 <= limit
         self._sum.begin(time_s, self._attitude)
 
     def _begin_anew(self) -> None:

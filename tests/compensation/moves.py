@@ -182,13 +182,13 @@ def moves() -> Iterator[Move]:
         yield Move("translations", *there_and_back(axis, seconds, size))
     for axis, seconds in product(range(3), (1.0, 3.0)):
         yield Move("turns", seconds, rate=TURN_RATE, axis=axis)
-    for axis, seconds, size in product(range(3), (0.2, 0.5), (2.5, 5.0)):
+    for axis, seconds, size in product(range(3), (0.2, 0.5, 1.0), (2.5, 5.0)):
         yield Move("both at once", *there_and_back((axis + 1) % 3, seconds, size), TURN_RATE, axis)
     for axis, hertz in product((0, 2), (20.0, 31.0, 45.0, 60.0)):
         yield Move("vibration", 3.0, vibration(axis, hertz))
     yield Move("shocks, free fall", 2.0, shocks)
     yield Move("shocks, free fall", 0.4, free_fall)
-    for axis, seconds, size in product((0, 2), (0.4, 1.0), (2.5, 5.0)):
+    for axis, seconds, size in product((0, 2), (0.4, 1.0), (1.0, 2.5, 5.0)):
         there = there_and_back(axis, seconds, size)
         yield Move("start in motion", *there, rests=False)
         yield Move("start in motion", *there, TURN_RATE, axis, rests=False)

@@ -40,7 +40,7 @@ TOOL = Payload(scene.TOOL_MASS, scene.TOOL_CENTRE)
 SHAKEN = 128
 """SINC length where the wrist sways: what compensation does not know of that is below this noise."""
 RATE_HZ = 51200 / SHAKEN
-START_S = 0.6
+START_S = 1.3
 """Until the accelerometer is believed."""
 WITHIN_3_SIGMA = 0.9973
 """The share of pure noise that lies within three standard deviations."""

@@ -11,7 +11,19 @@ import pytest
 
 from tests.compensation import gravity_table
 from tests.compensation.estimators import ESTIMATORS, Found, before, compensated, node
-from tests.compensation.moves import HEALTHY, TURN_RATE, Array, Imu, Move, acceptance, along, feel, moves
+from tests.compensation.moves import (
+    HEALTHY,
+    TURN_RATE,
+    Array,
+    Imu,
+    Move,
+    acceptance,
+    along,
+    feel,
+    moves,
+    there_and_back,
+    vibration,
+)
 
 PAGE = Path(__file__).parents[2] / "docs" / "compensation.md"
 RMS_DEG, WORST_DEG = 1.0, 2.5
@@ -60,6 +72,19 @@ def test_every_move_is_survived_with_the_most_noise_that_the_maker_allows() -> N
 @pytest.mark.parametrize("imu", [Imu(rate_scale=0.01), Imu(acceleration_offset=0.2), Imu(rate_offset=0.05)])
 def test_what_the_sensor_itself_is_off_is_covered(imu: Imu) -> None:
     assert coverage(survived(400.0, 4000, imu)) > 0.95
+
+
+@pytest.mark.parametrize("rate_hz", [400.0, 800.0, 1600.0])
+def test_a_start_in_a_vibration(rate_hz: float) -> None:
+    """It is not white: more samples of it do not make the mean better, nor is it rest."""
+    found = node(feel(Move("vibration", 6.0, vibration(0, 31.0), rests=False), rate_hz, 1077))
+    check([found])
+    assert np.isfinite(found.error[-10:]).all()
+
+
+def test_a_start_in_a_gentle_move() -> None:
+    """1 m/s² for a second does not change the length of the acceleration: only waiting tells."""
+    check([node(feel(Move("start", *there_and_back(0, 1.0, 1.0), rests=False), 400.0, 10))])
 
 
 def test_a_noisy_sensor_at_rest() -> None:

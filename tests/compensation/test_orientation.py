@@ -64,7 +64,7 @@ def tilt(source: AccelerometerGravity, t: float, truth: Vector3 = UPRIGHT) -> fl
 
 def test_at_rest_it_is_minus_the_acceleration() -> None:
     source = AccelerometerGravity()
-    t = feed(source, 2.0, 1.0, (3.0, 4.0, 8.0))
+    t = feed(source, 3.0, 1.0, (3.0, 4.0, 8.0))
     got = source.gravity(t)
     assert got is not None
     assert math.hypot(*got) == pytest.approx(G), "the length is gravity's, whatever the accelerometer's scale"
@@ -82,7 +82,7 @@ def test_it_answers_within_a_second_of_rest_and_not_before_it_can_know() -> None
     t = feed(source, 0.3)
     assert source.gravity(t) is None
     assert source.tilt_95 > 0.07
-    t = feed(source, 0.6, t)
+    t = feed(source, 0.7, t)
     assert source.gravity(t) is not None
     assert source.tilt_95 < 0.07
 

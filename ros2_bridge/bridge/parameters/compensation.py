@@ -64,7 +64,7 @@ _TABLE: Final = (
     Row("accelerometer.gate", 0.5,
         "Largest deviation of a usable 50 ms mean from the magnitude of gravity, m/s²", 0.01, 10),
     Row("accelerometer.tilt_limit", 0.2,
-        "Stop while gravity may be tilted by more, rad; at the start by a third", 0.1, 3),
+        "Stop while gravity may be tilted by more, rad; at the start by 3 degrees", 0.1, 3),
     Row("accelerometer.offset", ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
     Row("accelerometer.scale", EXACT.scale,
         "Its scale factors; ~/identify finds them", 0, 2, lengths=(3,)),

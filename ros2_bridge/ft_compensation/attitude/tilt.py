@@ -11,20 +11,20 @@ estimate of up. The error state, 7 numbers, is
     measured  = tilt + arm + noise         measured = (fy, -fx) / |f|, f: mean acceleration in the still frame
 
 An arm's acceleration is no white noise: it keeps its direction for up to a second, and adds up to nothing
-over a move. While f is steady in the still frame, `arm` is one number, unknown at first, and the longer it
-lasts the less likely to be anything but zero. So the offset, which makes f turn, shows at once, and the
-direction is trusted after some time constants. While f is not steady, a block is worth little (`_MOTION`).
+over a move. While f is steady in the still frame, `arm` is one number (`ArmAcceleration`). So the offset,
+which makes f turn, shows at once, and the direction is trusted after some time constants. While f is not
+steady, a block is worth little (`_MOTION`).
 
-A block does not count at all if |f| - g is beyond the gate, or if its angle contradicts the estimate. Then
-only the gyroscope remains, and the uncertainty grows. A contradiction that is steady for longer than an arm
-can accelerate shows that the estimate is wrong: the filter restarts.
+A block's direction does not count if |f| - g is beyond the gate, or if its angle contradicts the estimate:
+then `arm` may be anything, and only how f turns while it is steady tells something of the tilt. The
+uncertainty grows. A contradiction that is steady for longer than an arm can accelerate shows that the
+estimate is wrong: the filter restarts.
 
 The offset is learned at rest only: with f steady in the sensor's frame and the rate steady and small. Turning
 about the vertical cannot be seen by the accelerometer, and a slow turn passes for rest. The filter
 therefore never learns the offset along gravity, until another pose has made it horizontal; its
 variance stays and becomes uncertainty of the tilt when the sensor is turned.
-
-Of an arm that never rests all this learns little: `MotionTilt` helps out.
+Of an arm that never rests all this learns little: `MotionTilt` helps.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ from typing import Final
 
 import numpy as np
 
+from ft_compensation.attitude.arm import ANY_ARM, ArmAcceleration
 from ft_compensation.attitude.block import Block
 from ft_compensation.attitude.covariance import Array, inverse, largest
 from ft_compensation.attitude.in_motion import MotionTilt
-from ft_compensation.attitude.steadiness import Steadiness
+from ft_compensation.attitude.steadiness import Rest, Steadiness
 from ft_compensation.quantities import ZERO
 from protocol.pdo import Vector3
 
@@ -65,33 +66,28 @@ _REST: Final = 0.005**2
 _SWAY: Final = 0.014**2 * 2 * 0.5 / BLOCK_S
 """rad²: sway of 0.2 m/s² (peak) that changes within half a second, as equivalent white noise: f is steady,
 but the sensor does not rest."""
+_STEADY_ARM: Final = 0.5 * _SWAY
+"""rad²: the same of an arm that accelerates."""
+_AT_FIRST: Final = 0.7
+"""Steadiness counts for so much of its time while nothing is in use: the arm may have been moving before."""
+_LONGEST_ARM_S: Final = 1.5
+"""Arms do not accelerate for longer."""
 _SWAYING: Final = 0.01**2
 """rad²: what remains of `arm` then, however long it lasts."""
 _MOTION: Final = 0.05**2 / BLOCK_S
 """rad²: accelerations of 0.5 m/s² that last for half a second, as equivalent white noise: f is not steady."""
-_LENGTH_NOISE: Final = 0.02
-"""m/s²: of |f|."""
-_ARM: Final = 0.064**2
-"""rad²: an acceleration across gravity, 0.6 m/s², that makes f longer by no more than that."""
-_UNEVEN: Final = 3 * 2.0
-"""rad² per relative error of |f|: an acceleration across gravity, a, makes f longer by a²/2g. Three times
-that, because it may also point down a little."""
 _OWN_OFFSET: Final = 0.01**2
 """rad²: tilt by an accelerometer offset of 0.1 m/s², which is not observable here."""
+_ANY_LENGTH: Final = 0.5
+"""Part of g by which |f| may differ from it: not in free fall or a shock."""
 _START: Final = math.radians(20.0) ** 2
 """rad²: of a first guess by a sensor that may be accelerated by 3.5 m/s²."""
 
-# When is f steady, when is the sensor at rest? Besides four times the noise of a block.
 _STEADY: Final = 0.2
-"""m/s², in the still frame: an offset of 0.03 rad/s turns f by 0.09 m/s² within the mean's time."""
-_AT_REST: Final = 0.08
-"""m/s², in the sensor's frame."""
-_STILL: Final = 0.006
-"""rad/s: change of the rate."""
+"""m/s², in the still frame, besides four times the noise of a block: an offset of 0.03 rad/s turns f by
+0.09 m/s² within the mean's time."""
 _TURNING: Final = 0.1
 """rad/s: beyond it an error of the scale would be learned as an offset."""
-_RESTS_S: Final = 0.275
-"""Seconds of both that are rest: at its turning points slow motion looks like it."""
 
 # When does a block contradict?
 _GATE: Final = 3.0**2
@@ -109,7 +105,7 @@ _HELD_S: Final = 30.0
 """Time constant, s, of the memory of how long the arm held an acceleration: nothing steady is trusted before
 it has lasted longer. Otherwise, on an arm that never rests, the filter would believe half of its moves."""
 _CONTRADICTED_S: Final = 10.0
-"""Seconds without a block that counts from which the estimate is doubted. Arms reverse much earlier."""
+"""Seconds without a block that counts before the estimate is doubted. Arms reverse earlier."""
 _DOUBT: Final = 0.02**2
 """rad² per s, then."""
 
@@ -140,9 +136,12 @@ class TiltFilter:
         self.offset = offset
         self.rejected_s = 0.0
         """Since a block counted."""
-        self._steady, self._rest, self._still = Steadiness(_STEADY), Steadiness(_AT_REST), Steadiness(_STILL)
+        self.is_by_motion = False
+        """Whether the last block's correction is `MotionTilt`'s."""
+        self._steady, self._rest = Steadiness(_STEADY), Rest()
         self._covariance: Array
         self._motion = MotionTilt(magnitude)
+        self._arm = ArmAcceleration(magnitude, time_constant_s)
         self.forget()
 
     def forget(self) -> None:
@@ -150,11 +149,10 @@ class TiltFilter:
         p = self._covariance = np.zeros((7, 7))
         p[0, 0] = p[1, 1] = _START
         p[2:5, 2:5] = self.offset.covariance
-        p[5, 5] = p[6, 6] = self._first_arm = _ARM
-        self._arm = 0.0, 0.0
-        self._likely_s = self._held_s = self._turned = self.rejected_s = 0.0
-        for each in (self._steady, self._rest, self._still):
-            each.forget()
+        self._arm.is_new(p)
+        self._held_s = self._turned = self.rejected_s = 0.0
+        self._steady.forget()
+        self._rest.forget()
         self._motion.forget(_START, self.offset.covariance)
 
     def begin_anew(self) -> None:
@@ -162,9 +160,7 @@ class TiltFilter:
         lasted_s, size = self._steady.lasted_s, math.hypot(*self._steady.mean)
         self.forget()
         self._steady.lasted_s, self._steady.mean = lasted_s, (0.0, 0.0, size)
-        self._likely_s = min(lasted_s, 5.0 * self.time_constant_s)
-        p = self._covariance
-        p[5, 5] = p[6, 6] = _ARM * math.exp(-2.0 * self._likely_s / self.time_constant_s)
+        self._arm.is_new(self._covariance, lasted_s=lasted_s)
 
     @property
     def tilt_95(self) -> float:
@@ -179,7 +175,8 @@ class TiltFilter:
     @property
     def is_wrong(self) -> bool:
         """Whether the accelerometer has contradicted steadily, so that the filter must restart."""
-        return min(self.rejected_s, self._steady.lasted_s) > _RECOVERS * self.time_constant_s
+        lasted_s = min(self.rejected_s, self._steady.lasted_s)
+        return lasted_s > _RECOVERS * self.time_constant_s and self._is_near_g(math.hypot(*self.steady))
 
     def predict(self, block: Block) -> None:
         """Propagate over the time of a block."""
@@ -206,7 +203,9 @@ class TiltFilter:
         count. The offset is corrected in place.
         """
         before = self.offset.value
-        found = self._take_motion(_IN_DOUBT[not in_use]) or self._measure(block)
+        found = self._take_motion(_IN_DOUBT[not in_use])
+        self.is_by_motion = found is not None
+        found = found or self._measure(block, in_use)
         if found is not None:
             self._motion.corrected(found, np.subtract(self.offset.value, before))
         return found
@@ -216,57 +215,66 @@ class TiltFilter:
         own, motion = largest(self._covariance), self._motion
         if own < doubt or largest(motion.covariance) > 0.5 * own:
             return None
-        p = self._covariance = np.diag((0.0, 0.0, 0.0, 0.0, 0.0, _ARM, _ARM))
-        p[:5, :5], self._first_arm = motion.covariance[:5, :5], _ARM
-        self._likely_s = self.rejected_s = 0.0
+        p = self._covariance = np.zeros((7, 7))
+        p[:5, :5] = motion.covariance[:5, :5]
+        self._arm.is_new(p)
+        self.rejected_s = 0.0
         self._steady.forget()
         return self._apply(np.array((*motion.error, 0.0, 0.0)))
 
-    def _measure(self, block: Block) -> tuple[float, float] | None:
+    def _measure(self, block: Block, in_use: bool) -> tuple[float, float] | None:
         passed_s, mean = block.passed_s, block.acceleration
         self.rejected_s += passed_s
         size = 0.0 if mean is None else math.hypot(*mean)
-        uneven = abs(size - self.magnitude)
-        if mean is None or not uneven <= self.gate:
+        if mean is None or not abs(size - self.magnitude) <= max(self.gate, _ANY_LENGTH * self.magnitude):
             self._steady.forget()
             self._rest.forget()
             return None
-        self._watch(block, mean, uneven)
+        self._watch(block, mean, size)
         measured = np.array((mean[1], -mean[0])) / size
         if mean[2] < 0.0:  # more than 90°: as far off as can be
             across = math.hypot(*measured)
             measured = measured / across if across > 1e-6 else np.array((1.0, 0.0))
         lasted_s = self._steady.lasted_s
         scatter = (block.noise / self.magnitude) ** 2
-        agrees = (
-            (_AGREES if lasted_s else _AGREES_MOVED) + _OTHER_POSE * min(1.0, self._turned) ** 2 + scatter
-        )
-        if measured @ inverse(self._covariance[:2, :2] + np.eye(2) * agrees) @ measured > _GATE:
-            self._held_s = max(self._held_s, min(lasted_s, self.rejected_s))
-            return None
+        agrees = _OTHER_POSE * min(1.0, self._turned) ** 2 + scatter
+        agrees += _AGREES if lasted_s else _AGREES_MOVED
+        is_near_g = self._is_near_g(size)
+        weight = inverse(self._covariance[:2, :2] + np.eye(2) * agrees)
+        if not is_near_g or measured @ weight @ measured > _GATE:
+            if is_near_g:
+                self._held_s = max(self._held_s, min(lasted_s, self.rejected_s))
+            if not lasted_s:
+                self._arm.is_new(self._covariance, ANY_ARM)
+            if not 0.0 < lasted_s < _LONGEST_ARM_S:
+                return None
+            variance = scatter + _STEADY_ARM
+            return self._apply(self._update(self._arm.error, _MEASURED, measured, variance, learns=False))
         self.rejected_s = 0.0
-        is_at_rest = min(self._rest.lasted_s, self._still.lasted_s) > _RESTS_S
+        is_at_rest = self._rest.is_rest
         learns = is_at_rest and math.hypot(*block.rate) <= _TURNING
         variance = scatter + (_MOTION if not lasted_s else _REST if is_at_rest else _SWAY)
-        error = np.array((0.0, 0.0, 0.0, 0.0, 0.0, *self._arm))
-        error = self._update(error, _MEASURED, measured, variance, learns)
+        error = self._update(self._arm.error, _MEASURED, measured, variance, learns)
         if lasted_s > self._held_s and (is_at_rest or self._covariance[5, 5] > _SWAYING):
-            error = self._update(error, _ARM_ONLY, np.zeros(2), self._less_likely(passed_s), learns)
+            error = self._update(
+                error,
+                _ARM_ONLY,
+                np.zeros(2),
+                self._arm.less_likely(passed_s * (1.0 if in_use else _AT_FIRST)),
+                learns,
+            )
         if lasted_s and self._covariance[5, 5] < _KNOWN_ARM:
             self._turned = 0.0
         return self._apply(error)
 
-    def _watch(self, block: Block, mean: Vector3, uneven: float) -> None:
+    def _watch(self, block: Block, mean: Vector3, size: float) -> None:
         """Follow for how long the acceleration has been steady; if it is another, `arm` is unknown again."""
-        x, y, z = (block.attitude.T @ mean).tolist()
-        self._rest.watch((x, y, z), block.passed_s, block.noise)
-        self._still.watch(block.rate, block.passed_s, block.rate_noise)
+        self._rest.watch(block, mean)
         if not self._steady.watch(mean, block.passed_s, block.noise):
-            self._arm, self._likely_s = (0.0, 0.0), 0.0
-            self._first_arm = _ARM + _UNEVEN * max(0.0, uneven - _LENGTH_NOISE - block.noise) / self.magnitude
-            p = self._covariance
-            p[5:] = p[:, 5:] = 0.0
-            p[5, 5] = p[6, 6] = self._first_arm
+            self._arm.is_new(self._covariance, self._arm.by_length(size, block.noise))
+
+    def _is_near_g(self, size: float) -> bool:
+        return abs(size - self.magnitude) <= self.gate
 
     def _update(self, error: Array, h: Array, measured: Array, noise: float, learns: bool) -> Array:
         """Take `measured` (2,) = `h @ error` + noise (its variance); returns the new estimate."""
@@ -280,18 +288,9 @@ class TiltFilter:
         self._covariance = 0.5 * (p + p.T)
         return error + gain @ (measured - h @ error)
 
-    def _less_likely(self, passed_s: float) -> float:
-        """Variance, rad², of measuring `arm` = 0, which a block more of steadiness amounts to.
-
-        All of them together leave `arm` a standard deviation that falls exponentially.
-        """
-        past, more = 2.0 * self._likely_s / self.time_constant_s, 2.0 * passed_s / self.time_constant_s
-        self._likely_s = min(self._likely_s + passed_s, 5.0 * self.time_constant_s)
-        return self._first_arm / (math.exp(past) * math.expm1(min(more, 10.0)))
-
     def _apply(self, error: Array) -> tuple[float, float]:
         tilt_x, tilt_y, dx, dy, dz, arm_x, arm_y = error.tolist()
-        self._arm = arm_x, arm_y
+        self._arm.tilt = arm_x, arm_y
         x, y, z = self.offset.value
         self.offset.value = x + dx, y + dy, z + dz
         self.offset.covariance = self._covariance[2:5, 2:5]
