@@ -1,4 +1,4 @@
-"""The C++ headers as a package: CMake installs them, a program finds them; colcon and rosdep can name them."""
+"""The C++ headers as a package that CMake, colcon and rosdep can find."""
 
 from __future__ import annotations
 
