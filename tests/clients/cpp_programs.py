@@ -22,7 +22,8 @@ from tests.server.running import PATIENCE_S, wait_until
 
 ROOT: Final = Path(__file__).parents[2]
 CLIENT: Final = ROOT / "clients" / "cpp"
-HEADER: Final = CLIENT / "include" / "bota_ethercat.hpp"
+INCLUDE: Final = CLIENT / "include"
+HEADERS: Final = sorted(INCLUDE.rglob("*.hpp"))
 SOURCES: Final = Path(__file__).parent / "cpp"
 GXX: Final = shutil.which("g++")
 needs_gxx: Final = pytest.mark.skipif(GXX is None, reason="no g++ here: sudo apt install g++")
@@ -32,6 +33,8 @@ patient: Final = pytest.mark.timeout(300)
 
 STRICT: Final = ("-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZED: Final = ("-g", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+WRAPPED: Final = ("socket", "connect", "close", "poll", "ppoll", "setsockopt", "getsockopt", "send", "recv")
+"""System calls that the driver counts."""
 
 BUILD_TIMEOUT_S: Final = 280.0
 KEPT_S: Final = 7 * 86400.0
@@ -54,10 +57,10 @@ def _folder() -> Path:
 
 
 @functools.cache
-def build(source: Path, flags: Sequence[str], compiler: str = "g++") -> Path:
-    """The program made of `source`, built once for its contents; every warning is an error."""
+def build(source: Path, flags: Sequence[str], others: Sequence[Path] = (), compiler: str = "g++") -> Path:
+    """The program made of `source` and `others`, built once for their contents; every warning is an error."""
     digest = hashlib.sha256(repr((compiler, STRICT, flags)).encode())
-    for path in (HEADER, source, *sorted(source.parent.glob("*.hpp"))):
+    for path in (*HEADERS, source, *others, *sorted(source.parent.glob("*.hpp"))):
         digest.update(path.read_bytes())
     program = _folder() / f"{source.stem}-{digest.hexdigest()[:16]}"
     with (_folder() / "lock").open("w") as lock:
@@ -67,7 +70,8 @@ def build(source: Path, flags: Sequence[str], compiler: str = "g++") -> Path:
                 if old.stat().st_mtime < time.time() - KEPT_S:
                     old.unlink()
             unfinished = program.with_suffix(".new")
-            command = [compiler, *STRICT, *flags, f"-I{HEADER.parent}", str(source), "-o", str(unfinished)]
+            sources = [str(path) for path in (source, *others)]
+            command = [compiler, *STRICT, *flags, f"-I{INCLUDE}", *sources, "-o", str(unfinished)]
             made = subprocess.run(
                 command, check=False, capture_output=True, text=True, timeout=BUILD_TIMEOUT_S
             )
@@ -78,7 +82,7 @@ def build(source: Path, flags: Sequence[str], compiler: str = "g++") -> Path:
 
 def driver_program() -> Path:
     """tests/clients/cpp/driver.cpp: one program for all tests, because g++ takes seconds."""
-    return build(SOURCES / "driver.cpp", SANITIZED)
+    return build(SOURCES / "driver.cpp", (*SANITIZED, *(f"-Wl,--wrap={name}" for name in WRAPPED)))
 
 
 _idle: list[subprocess.Popen[str]] = []
@@ -88,8 +92,8 @@ _idle: list[subprocess.Popen[str]] = []
 class Driver:
     """A C++ client that a test commands: tests/clients/cpp/driver.cpp, a process for many tests."""
 
-    def __init__(self, port: int, **options: object) -> None:
-        self.process = _idle.pop() if _idle else start_driver()
+    def __init__(self, port: int, process: subprocess.Popen[str] | None = None, **options: object) -> None:
+        self.process = process or (_idle.pop() if _idle else start_driver())
         self.begin("new", "host=127.0.0.1", f"port={port}", *(f"{k}={v}" for k, v in options.items()))
 
     def begin(self, *words: object) -> None:
@@ -134,9 +138,10 @@ class Driver:
         return last
 
 
-def start_driver() -> subprocess.Popen[str]:
+def start_driver(*inside: str) -> subprocess.Popen[str]:
+    """A driver, started by the command `inside`."""
     return subprocess.Popen(
-        [driver_program()],
+        [*inside, driver_program()],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -160,7 +165,7 @@ def end_driver(process: subprocess.Popen[str]) -> int:
 @contextmanager
 def driver(port: int, /, **options: object) -> Iterator[Driver]:
     """A driver with a new client. A module that uses it ends with `assert_no_faults`."""
-    running = Driver(port, **options)
+    running = Driver(port, None, **options)
     try:
         yield running
         running.do("close")

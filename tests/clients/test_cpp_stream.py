@@ -6,36 +6,33 @@ The test is the server, in the same thread: it sends, then asks the client what 
 from __future__ import annotations
 
 import contextlib
-import os
-import re
+import math
 import select
-import shutil
 import socket
 import struct
 import subprocess
+import sys
 import time
-import tomllib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
+from protocol.address import boot_id
 from protocol.control import request
 from protocol.framing import DataFlag, FrameDecoder, encode_data, encode_json
 from protocol.pdo import encode
 from protocol.text.json_text import JsonObject
 from tests.clients.cpp_programs import (
-    CLIENT,
-    HEADER,
     ROOT,
     Driver,
     assert_no_faults,
-    build,
     check,
     driver,
+    end_driver,
     needs_gxx,
     patient,
+    start_driver,
 )
 from tests.server.running import PATIENCE_S, free_port, wait_until
 
@@ -48,12 +45,17 @@ SENSOR = {"sensor": 0, "name": "BFT-SENS-ECAT-M8", "serial": 7, "pdo_size": 61, 
 GRANTED = {"reply": "subscribe", "ok": True, "protocol": 1, "version": "1.2.3", "sensors": [SENSOR]}
 
 
-def frame(sequence: int, flags: int = 0, *, sensor: int = 0, age_s: float = 0.0, **values: float) -> bytes:
-    """A DATA message; its force along x is its number."""
+OURS = boot_id() or pytest.fail("this machine has no boot id")
+
+
+def frame(
+    sequence: int, flags: int = 0, *, sensor: int = 0, age_s: float = 0.0, size: int = 61, **values: float
+) -> bytes:
+    """A DATA message; its force along x is its number. `values` by name, with `__` for the dot."""
     # A machine that has been up for less than `age_s` has no such instant yet.
     time.sleep(max(0.0, age_s - time.monotonic()))
     instant = time.monotonic_ns() - int(age_s * 1e9)
-    data = encode(61, {"force.x": sequence, **{k.replace("_", "."): v for k, v in values.items()}})
+    data = encode(size, {"force.x": sequence, **{k.replace("__", "."): v for k, v in values.items()}})
     return encode_data(sequence, 5, instant, sensor, flags, 3, data)
 
 
@@ -123,9 +125,9 @@ def server() -> Iterator[PlayedServer]:
     played.close()
 
 
-def connected(server: PlayedServer, running: Driver) -> Driver:
+def connected(server: PlayedServer, running: Driver, answer: JsonObject | None = None) -> Driver:
     running.begin("connect", int(PATIENCE_S * 1000))
-    server.accept()
+    server.accept(answer)
     told = running.answer()
     assert told == {"ok": True, "error": ""}
     return running
@@ -206,6 +208,63 @@ def test_the_age_counts_from_the_arrival_where_the_clock_is_another(
         assert reading["age_ns"] < 19e9
 
 
+@pytest.mark.parametrize("claimed", ["elsewhere", "", OURS + " 1 0", OURS[:-1], "x" * 60_000])
+def test_a_server_whose_clock_is_another_is_far_away_whatever_its_address(
+    server: PlayedServer, claimed: str
+) -> None:
+    """As through an SSH tunnel: the address is this machine's."""
+    with driver(server.port, **PATIENT) as running:
+        connected(server, running, {**GRANTED, "boot_id": claimed})
+        server.send(frame(1, age_s=-1000))
+        reading = running.latest()
+        assert picked(reading, "fresh", "age_is_lower_bound") == (True, True)
+        assert reading["age_ns"] < 19e9
+
+
+@pytest.mark.parametrize("claimed", [OURS, None, 7, [], {}, [OURS], True])
+def test_a_server_with_our_clock_or_none_that_can_be_read_is_near(
+    server: PlayedServer, claimed: object
+) -> None:
+    with driver(server.port, **PATIENT) as running:
+        connected(server, running, {**GRANTED, "boot_id": claimed})
+        server.send(frame(1, age_s=8))
+        reading = running.latest()
+        assert picked(reading, "fresh", "age_is_lower_bound") == (True, False)
+        assert reading["age_ns"] >= 8e9
+
+
+def test_a_clock_that_is_shifted_is_another_one(server: PlayedServer) -> None:
+    """A process in a time namespace: nothing but the kernel can make one."""
+    shifted = ("unshare", "--time", "--monotonic", "86400")
+    if subprocess.run([*shifted, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("this user or kernel makes no time namespace")
+    process = start_driver(*shifted)
+    try:
+        running = Driver(server.port, process, **PATIENT)
+        for claimed, far in ((OURS, True), (f"{OURS} 86400 0", False)):
+            connected(server, running, {**GRANTED, "boot_id": claimed})
+            server.send(frame(1))
+            assert picked(running.latest(), "age_is_lower_bound") == (far,)
+    finally:
+        assert end_driver(process) == 0
+    name = "from protocol.address import boot_id; print(boot_id())"
+    done = subprocess.run(
+        [*shifted, sys.executable, "-c", name], check=True, capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.stdout == f"{OURS} 86400 0\n"
+
+
+def test_a_sample_keeps_the_clock_of_its_own_connection(server: PlayedServer) -> None:
+    with stream(server, reconnect_every_ms=1) as running:
+        server.send(frame(1, age_s=8))
+        assert picked(running.latest(), "age_is_lower_bound") == (False,)
+        server.hang_up()
+        accept_while(server, running, {**GRANTED, "boot_id": "elsewhere"})
+        old = running.latest()
+        assert picked(old, "sequence", "connection", "age_is_lower_bound") == (1, 2, False)
+        assert old["age_ns"] >= 8e9
+
+
 def test_a_stamp_ahead_of_this_clock_is_never_fresh(server: PlayedServer) -> None:
     with stream(server) as running:
         server.send(frame(1, age_s=-1000))
@@ -262,6 +321,64 @@ def test_warnings_of_samples_that_were_passed_over_are_not_lost(server: PlayedSe
         server.send(frame(1, warnings=1), frame(2, warnings=64), frame(3))
         assert picked(running.latest(), "warnings_seen") == (65,)
         assert picked(running.latest(), "warnings_seen") == (0,)
+
+
+NAN, INF = math.nan, math.inf
+
+
+@pytest.mark.parametrize(
+    ("values", "condition", "with_imu"),
+    [
+        ({"force__x": NAN}, "not_finite", "not_finite"),
+        ({"torque__z": -INF}, "not_finite", "not_finite"),
+        ({"warnings": 1}, "saturated", "saturated"),
+        ({"warnings": 16}, "saturated", "saturated"),
+        ({"force_torque_saturated": 256}, "saturated", "saturated"),
+        ({"force_torque_saturated": 1, "force__y": INF}, "not_finite", "not_finite"),
+        ({"acceleration__x": NAN}, "fresh", "not_finite"),
+        ({"angular_rate__z": INF}, "fresh", "not_finite"),
+        ({"size": 77, "orientation__w": NAN}, "fresh", "not_finite"),
+        ({"warnings": 2}, "fresh", "saturated"),
+        ({"warnings": 4}, "fresh", "saturated"),
+        ({"acceleration_saturated": 1}, "fresh", "saturated"),
+        ({"angular_rate_saturated": 4}, "fresh", "saturated"),
+        ({"warnings": 8 + 32 + 64, "temperature": NAN}, "fresh", "fresh"),
+    ],
+)  # fmt: skip
+def test_a_recent_sample_that_is_worth_nothing_is_not_fresh(
+    server: PlayedServer, values: dict[str, Any], condition: str, with_imu: str
+) -> None:
+    for judge_imu, wanted in ((0, condition), (1, with_imu)):
+        with stream(server, judge_imu=judge_imu) as running:
+            server.send(frame(1, **values))
+            assert picked(running.latest(), "condition", "is_new", "has_sample") == (wanted, True, True)
+            assert picked(running.latest(), "condition") == (wanted,)
+            server.send(frame(2))
+            assert picked(running.latest(), "condition") == ("fresh",)
+
+
+def test_a_bad_sample_that_is_old_is_old_first(server: PlayedServer) -> None:
+    with stream(server, max_age_ms=5_000) as running:
+        server.send(frame(1, age_s=6, warnings=1, force__x=NAN))
+        assert picked(running.latest(), "condition") == ("late",)
+        server.hang_up()
+        running.until(lambda r: r["condition"] == "disconnected", "the end")
+
+
+def test_saturated_samples_can_be_used_on_purpose(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(7, warnings=1))
+        saturated = running.do("next", 1000)
+        assert picked(saturated, "condition", "sequence", "warnings_seen") == ("saturated", 7, 1)
+        assert saturated["array"][0] == 7
+
+
+def test_what_is_wrong_with_a_sample_that_was_passed_over_is_not_the_newest_ones(
+    server: PlayedServer,
+) -> None:
+    with stream(server) as running:
+        server.send(frame(1, warnings=1), frame(2, force__y=NAN), frame(3))
+        assert picked(running.latest(), "condition", "warnings_seen") == ("fresh", 1)
 
 
 def test_sensors_are_kept_apart(server: PlayedServer) -> None:
@@ -359,7 +476,7 @@ def test_next_waits_for_the_sample(server: PlayedServer) -> None:
 
 
 def test_next_says_at_once_that_the_connection_is_lost(server: PlayedServer) -> None:
-    with stream(server, max_age_ms=0, reconnect=0) as running:
+    with stream(server, max_age_ms=0, reconnect="when_told") as running:
         running.begin("next", int(PATIENCE_S * 1000))
         began = time.monotonic()
         server.hang_up()
@@ -461,7 +578,7 @@ def test_a_server_that_breaks_the_framing_is_left(server: PlayedServer, wire: by
 
 
 def test_nobody_listens() -> None:
-    with driver(free_port(), reconnect=0) as running:
+    with driver(free_port(), reconnect="when_told") as running:
         told = running.do("connect", 5000)
         assert not told["ok"]
         assert "nobody listens there: start ethercat-server" in told["error"]
@@ -494,7 +611,7 @@ def test_before_and_after_a_connection(server: PlayedServer) -> None:
     ],
 )  # fmt: skip
 def test_a_connection_that_is_refused(server: PlayedServer, answer: Any, said: str) -> None:
-    with driver(server.port, reconnect=0) as running:
+    with driver(server.port, reconnect="when_told") as running:
         running.begin("connect", int(PATIENCE_S * 1000))
         server.accept(answer)
         told = running.answer()
@@ -503,7 +620,7 @@ def test_a_connection_that_is_refused(server: PlayedServer, answer: Any, said: s
 
 
 def test_a_server_that_does_not_answer(server: PlayedServer) -> None:
-    with driver(server.port, reconnect=0) as running:
+    with driver(server.port, reconnect="when_told") as running:
         told = running.do("connect", 100)
         assert not told["ok"]
         assert "did not answer in time" in told["error"]
@@ -521,14 +638,14 @@ def test_it_starts_without_the_server() -> None:
         late.close()
 
 
-def accept_while(server: PlayedServer, running: Driver) -> None:
+def accept_while(server: PlayedServer, running: Driver, answer: JsonObject | None = None) -> None:
     """Take the connection that the client makes step by step, a step in each call."""
     wait_until(
         lambda: bool(running.latest() and select.select([server.listener], [], [], 0)[0]), "a connection"
     )
     running.latest()
     running.begin("next", 20)
-    server.accept()
+    server.accept(answer)
     running.answer()
     wait_until(lambda: bool(running.latest() and running.info()["link"] == "up"), "the subscription")
 
@@ -556,11 +673,85 @@ def test_a_connection_that_was_lost_is_made_anew(server: PlayedServer) -> None:
 
 
 def test_it_says_why_the_connection_ended(server: PlayedServer) -> None:
-    with stream(server, reconnect=0) as running:
+    with stream(server, reconnect="when_told") as running:
         server.send({"event": "shutting_down"})
         server.hang_up()
         wait_until(lambda: bool(running.latest()) and running.info()["link"] == "down", "the end")
         assert running.info()["error"] == f"127.0.0.1 port {server.port}: the server was shut down"
+
+
+def test_it_reconnects_only_where_it_is_told(server: PlayedServer) -> None:
+    """After the loss the control loop makes no system call; the step of reconnecting is its own call."""
+    with stream(server, reconnect="when_told", reconnect_every_ms=1) as running:
+        server.send(frame(1))
+        running.latest()
+        before = running.info()
+        assert (before["receives"], before["other_calls"]) == (1, 0)
+        server.hang_up()
+        wait_until(lambda: bool(running.latest()) and running.info()["link"] == "down", "the end")
+        lost = running.info()
+        assert lost["other_calls"] == 0, "not even close()"
+        for _ in range(5):
+            running.latest()
+            running.do("peek", 0)
+            assert picked(running.do("next", 3_600_000), "is_new", "connection") == (False, 1)
+        after = running.info()
+        assert (after["receives"], after["other_calls"]) == (lost["receives"], 0)
+        assert (after["fd"], select.select([server.listener], [], [], 0)[0]) == (-1, [])
+        wait_until(
+            lambda: (running.do("reconnect"), select.select([server.listener], [], [], 0)[0])[1] != [],
+            "an attempt",
+        )
+        running.do("reconnect")  # sends the subscription
+        server.accept()
+        wait_until(lambda: running.do("reconnect"), "the subscription")
+        server.send(frame(2))
+        assert picked(running.latest(), "fresh", "gap", "connection", "sequence") == (True, True, 2, 2)
+        assert running.info()["other_calls"] == 0
+
+
+def test_it_may_be_told_by_a_server_that_starts_later() -> None:
+    port = free_port()
+    with driver(port, reconnect="when_told", reconnect_every_ms=1) as running:
+        assert running.do("reconnect") is False
+        assert running.info()["error"] == "not connected yet: call connect()"
+        assert not running.do("connect", 1000)["ok"]
+        late = PlayedServer(port)
+        wait_until(
+            lambda: (running.do("reconnect"), select.select([late.listener], [], [], 0)[0])[1] != [],
+            "an attempt",
+        )
+        running.do("reconnect")
+        late.accept()
+        wait_until(lambda: running.do("reconnect"), "the subscription")
+        late.close()
+
+
+def test_a_refusal_does_not_stand_in_the_way_of_connect(server: PlayedServer) -> None:
+    with stream(server, reconnect_every_ms=1) as running:
+        server.hang_up()
+        refused = {"reply": "subscribe", "ok": False, "error": {"code": "busy", "message": "no 9"}}
+        running.do("next", int(PATIENCE_S * 1000))  # the loss
+        running.begin("next", int(PATIENCE_S * 1000))
+        server.accept(refused)
+        assert picked(running.answer(), "condition") == ("disconnected",)
+        assert "no 9" in running.info()["error"]
+        connected(server, running)
+
+
+def test_a_client_that_is_moved_goes_on(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(1), frame(2)[:50])
+        assert picked(running.latest(), "sequence") == (1,)
+        before = running.info()
+        running.do("moved")
+        server.send(frame(2)[50:], frame(3))
+        assert picked(running.latest(), "sequence", "passed_over", "connection") == (3, 1, 1)
+        after = running.info()
+        assert (after["fd"], after["connections"], after["samples"]) == (before["fd"], 1, 3)
+        running.do("close")
+        running.do("moved")
+        connected(server, running)
 
 
 def test_it_tries_again_no_more_often_than_it_may() -> None:
@@ -603,77 +794,3 @@ def test_nothing_is_allocated_in_any_state(server: PlayedServer) -> None:
         told = running.info()
         assert (told["connections"], told["bad_messages"], told["link"]) == (2, 1, "down")
         assert (told["allocated"], told["allocates"]) == (0, True)
-
-
-def test_the_documentation_shows_the_examples_as_they_are() -> None:
-    page = (ROOT / "docs" / "cpp.md").read_text()
-    code = (CLIENT / "examples" / "print_samples.cpp").read_text()
-    assert code[code.index("int main") :].strip() in page
-
-
-BEFORE_SNIPPETS = """
-#include <bota_ethercat.hpp>
-extern bool running;
-extern long due, period;
-void sleep_until(long);
-void control(const bota_ethercat::Vector3&, const bota_ethercat::Vector3&);
-void stop_safely(const char*);
-int fail(const char*);
-"""
-
-
-def test_examples_and_snippets_need_no_exceptions_and_give_no_warning(tmp_path: Path) -> None:
-    """Each in a namespace or function of its own, so that g++ has to read the header only once."""
-    page = re.findall(r"```cpp\n(.*?)```", (ROOT / "docs" / "cpp.md").read_text(), re.DOTALL)
-    header = re.findall(r"(?:^//     .*\n)+", HEADER.read_text(), re.MULTILINE)
-    examples = [path.read_text() for path in sorted((CLIENT / "examples").glob("*.cpp"))]
-    assert page
-    assert header
-    assert len(examples) == 2
-    includes = "".join(line for text in examples for line in re.findall(r"(?m)^#include.*\n", text))
-    code = includes + BEFORE_SNIPPETS
-    for number, example in enumerate(examples):
-        inside = re.sub(r"(?m)^#include.*\n", "", example).replace("int main", "int run")
-        code += f"namespace example_{number} {{\n{inside}\n}}\n"
-    for number, snippet in enumerate([*page, *(re.sub("(?m)^//", "", text) for text in header)]):
-        name = f"int snippet_{number}"
-        if "int main" in snippet:
-            code += snippet.replace("int main", name)
-        else:
-            code += f"{name}() {{\n{snippet}\n{{ return 0; }}\n}}\n"
-    source = tmp_path / "snippets.cpp"
-    source.write_text(code)
-    build(source, ("-O0", "-c", "-fno-exceptions", "-fno-rtti", "-Wsign-conversion", "-Wold-style-cast"))
-
-
-@pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake here: sudo apt install cmake")
-def test_cmake_installs_the_header_without_a_compiler(tmp_path: Path) -> None:
-    prefix = tmp_path / "prefix"
-    commands = (
-        ("cmake", "-Werror=dev", "-S", CLIENT, "-B", tmp_path / "b", f"-DCMAKE_INSTALL_PREFIX={prefix}"),
-        ("cmake", "--install", tmp_path / "b"),
-    )
-    for command in commands:
-        done = subprocess.run(
-            command, check=False, capture_output=True, text=True, env={**os.environ, "CXX": "false"}
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-    assert (prefix / "include/bota_ethercat.hpp").read_bytes() == (
-        CLIENT / "include/bota_ethercat.hpp"
-    ).read_bytes()
-    config = (prefix / "share/bota_ethercat/cmake/bota_ethercat-config.cmake").read_text()
-    assert "bota_ethercat::client" in config
-    user = tmp_path / "user"
-    user.mkdir()
-    (user / "CMakeLists.txt").write_text(
-        "cmake_minimum_required(VERSION 3.14)\nproject(user LANGUAGES NONE)\n"
-        "find_package(bota_ethercat 0.1 REQUIRED)\n"
-    )
-    use = ("cmake", "-S", user, "-B", user / "b", f"-DCMAKE_PREFIX_PATH={prefix}")
-    done = subprocess.run(use, check=False, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
-def test_the_version_is_the_projects() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert f"project(bota_ethercat VERSION {project['version']} " in (CLIENT / "CMakeLists.txt").read_text()

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
 from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
 
 from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.client import connect
 from protocol.framing import DataFlag
 from protocol.pdo import SampleDecoder
-from tests.clients.cpp_programs import Driver, Reading, assert_no_faults, driver, needs_gxx, patient
+from tests.clients.cpp_programs import (
+    SOURCES,
+    Driver,
+    Reading,
+    assert_no_faults,
+    build,
+    driver,
+    needs_gxx,
+    patient,
+)
 from tests.served_simulation import ServedSimulation, served
 from tests.server.running import free_port, wait_until
 
@@ -207,6 +218,20 @@ def test_a_server_that_is_stopped_and_goes_on(shared: ServedSimulation) -> None:
         assert after["monotonic_ns"] > before["monotonic_ns"]
 
 
+def test_a_server_of_another_machine_at_an_address_of_this_one(
+    shared: ServedSimulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As at this end of an SSH tunnel: C++ and Python count ages from the arrival."""
+    monkeypatch.setattr("ethercat_server.serving.actions.boot_id", lambda: "another machine's")
+    with served(sinc_length=SLOW) as far:
+        for server, is_far in ((far, True), (shared, False)):
+            with driver(server.port, **PATIENT) as running, connect(server.port) as client:
+                running.connect()
+                reading = running.do("next", 60_000)
+                assert (reading["fresh"], reading["age_is_lower_bound"]) == (True, is_far)
+                assert client.connection.same_machine is not is_far
+
+
 # -- requests
 
 
@@ -243,7 +268,7 @@ def test_describe_status_tare_and_refusals(shared: ServedSimulation) -> None:
 
 
 def test_a_sensor_that_there_is_not(shared: ServedSimulation) -> None:
-    with driver(shared.port, sensor=9, reconnect=0) as running:
+    with driver(shared.port, sensor=9, reconnect="when_told") as running:
         told = running.do("connect", 5000)
         assert not told["ok"]
         assert "9" in told["error"]
@@ -256,3 +281,14 @@ def test_requests_without_a_server() -> None:
             told = running.do(what)
             assert not told["ok"]
             assert "nobody listens there" in told["error"]
+
+
+@pytest.mark.long
+def test_threads_with_a_client_each_have_no_race() -> None:
+    """Real threads, under ThreadSanitizer."""
+    program = build(SOURCES / "threads.cpp", ("-g", "-O1", "-fsanitize=thread"))
+    with served(sinc_length=256) as running:
+        # Without randomized addresses, which ThreadSanitizer cannot have everywhere.
+        command = ["setarch", "-R", str(program), str(running.port)]
+        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
