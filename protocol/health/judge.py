@@ -94,7 +94,7 @@ def judge(seen: Observation, limits: Limits = LIMITS) -> Verdict:
         )
     findings += _values(seen, limits)
     findings += _losses(seen, limits)
-    if not silent:
+    if not silent and not seen.is_lost:
         findings += _arrival(seen, limits)
     findings += _circumstances(seen)
     return verdict(findings)
@@ -211,7 +211,7 @@ def _rate(seen: Observation, limits: Limits) -> Iterator[Finding]:
         return
     # One sample more or less at either end of a short observation is no deviation.
     slack = 2.0 / seen.seconds if seen.seconds > 0 else 2.0
-    with_lost = rate * (1 + seen.lost / max(seen.samples, 1))
+    with_lost = min(rate * (1 + seen.lost / max(seen.samples, 1)), nominal) if rate < nominal else rate
     off = max(abs(with_lost - nominal) - slack, 0.0) / nominal
     if off > limits.rate_tolerance:
         make = _trouble if off > limits.rate_error else _look
