@@ -100,12 +100,12 @@ def judge(seen: Observation, limits: Limits = LIMITS) -> Verdict:
     return verdict(findings)
 
 
-def _trouble(key: str, found: str, remedy: str, about: About = About.STREAM) -> Finding:
-    return Finding(Level.TROUBLE, about, key, found, remedy)
+def _trouble(key: str, found: str, remedy: str, about: About = About.STREAM, size: float = 0.0) -> Finding:
+    return Finding(Level.TROUBLE, about, key, found, remedy, size)
 
 
-def _look(key: str, found: str, remedy: str, about: About = About.STREAM) -> Finding:
-    return Finding(Level.LOOK, about, key, found, remedy)
+def _look(key: str, found: str, remedy: str, about: About = About.STREAM, size: float = 0.0) -> Finding:
+    return Finding(Level.LOOK, about, key, found, remedy, size)
 
 
 def _silence(seen: Observation) -> Finding:
@@ -119,7 +119,7 @@ def _silence(seen: Observation) -> Finding:
         why, remedy = f"the server has the sensor in state {seen.state}, not OP", "See its log"
     else:
         why, remedy = "the server sends none", "See its log"
-    return _trouble("silence", f"No new sample for {seen.silent_s:.1f} s, {why}", remedy)
+    return _trouble("silence", f"No new sample for {seen.silent_s:.1f} s, {why}", remedy, size=seen.silent_s)
 
 
 def _values(seen: Observation, limits: Limits) -> Iterator[Finding]:
@@ -148,7 +148,9 @@ def _values(seen: Observation, limits: Limits) -> Iterator[Finding]:
 def _temperature(celsius: float, limits: Limits) -> Iterator[Finding]:
     if celsius >= limits.temperature_warn:
         make = _trouble if celsius >= limits.temperature_error else _look
-        yield make("temperature", f"The sensor has {celsius:.1f} °C", "Let it cool down", About.SENSOR)
+        yield make(
+            "temperature", f"The sensor has {celsius:.1f} °C", "Let it cool down", About.SENSOR, celsius
+        )
     elif celsius < limits.coldest:
         found = f"The sensor says {celsius:.1f} °C, which its electronics cannot have"
         yield _look("temperature", found, "Do not use it; contact support", About.SENSOR)
@@ -170,7 +172,8 @@ def _losses(seen: Observation, limits: Limits) -> Iterator[Finding]:
         total = seen.samples + seen.lost
         found = f"{seen.lost} of {total} samples ({_percent(seen.lost, total)}) were lost"
         remedy = "The machine is too busy or the cable is bad; ethercat-doctor tells which"
-        yield Finding(_many(seen.lost, total, seen, limits), About.STREAM, "lost", found, remedy)
+        level = _many(seen.lost, total, seen, limits)
+        yield Finding(level, About.STREAM, "lost", found, remedy, seen.lost)
     if seen.recoveries:
         times = "once" if seen.recoveries == 1 else f"{seen.recoveries} times"
         yield _look("recoveries", f"The server lost the sensor {times} and has it back", _CABLE)
@@ -194,15 +197,18 @@ def _arrival(seen: Observation, limits: Limits) -> Iterator[Finding]:
         total = seen.samples + seen.invalid
         frames = "1 frame was" if seen.invalid == 1 else f"{seen.invalid} frames were"
         found = f"{frames} invalid, the sensor did not answer the bus"
-        yield Finding(_many(seen.invalid, total, seen, limits), About.STREAM, "invalid", found, _CABLE)
+        yield Finding(
+            _many(seen.invalid, total, seen, limits), About.STREAM, "invalid", found, _CABLE, seen.invalid
+        )
     if seen.repeated >= limits.lost_warn:
         frames = "1 frame was" if seen.repeated == 1 else f"{seen.repeated} frames were"
         found = f"{frames} repeated, the sensor had nothing new"
-        yield _look("repeated", found, "If it goes on, power-cycle it")
+        yield _look("repeated", found, "If it goes on, power-cycle it", size=seen.repeated)
     if seen.age_p99_us is not None and seen.age_p99_us >= limits.age_warn * 1e6:
         make = _trouble if seen.age_p99_us >= limits.age_error * 1e6 else _look
         found = f"Samples are {seen.age_p99_us / 1000:.1f} ms old on arrival (p99)"
-        yield make("age", found, "This machine, or the program that reads, is busy")
+        remedy = "This machine, or the program that reads, is busy"
+        yield make("age", found, remedy, size=seen.age_p99_us)
 
 
 def _rate(seen: Observation, limits: Limits) -> Iterator[Finding]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from enum import Enum, IntEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 
 class Level(IntEnum):
@@ -45,6 +45,8 @@ class Finding(NamedTuple):
     """A clause that begins with a capital and has no full stop."""
     remedy: str
     """What to do: likewise."""
+    size: float = 0.0
+    """How much of it there is, to compare it with the same at another time."""
 
     @property
     def sentence(self) -> str:
@@ -71,6 +73,9 @@ class Verdict(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.headline}: {self.sentence}"
+
+
+NOTHING_WRONG: Final = Verdict(Level.GOOD, ())
 
 
 def verdict(findings: Iterable[Finding]) -> Verdict:

@@ -85,7 +85,7 @@ def alerts(sensor: SensorState, width: int, most: int) -> list[Row]:
 def _alert(alert: Alert, width: int) -> list[Text]:
     present = alert.ago_s is None
     head = Text.assemble(
-        (f" {alert.severity} " if present else alert.severity, ALARM if present else BAD),
+        (f" {alert.level.words} " if present else alert.level.words, ALARM if present else BAD),
         (f" {words.seen(alert.ago_s)}: ", "" if present else LABEL),
         (alert.text, VALUE if present else ""),
     )
@@ -101,9 +101,9 @@ def _identity(sensor: SensorState, others: Sequence[SensorState], width: int) ->
     if sensor.old_s is not None:
         rest.append(f" values {numbers.duration(sensor.old_s)} old ", ALARM)
     for other in others:
-        present = any(alert.ago_s is None for alert in other.alerts)
+        level = other.verdict.level
         rest.append(f" {other.position}", LABEL)
-        rest.append(" error " if present else " ok", ALARM if present else "")
+        rest.append(f" {level.words} " if level else f" {level.words}", ALARM if level else "")
     if rest.cell_len:
         row.truncate(max(0, width - rest.cell_len - 1))
         row.pad_right(width - rest.cell_len - row.cell_len)

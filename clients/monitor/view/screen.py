@@ -105,6 +105,8 @@ def _title(state: State, look: Look, width: int) -> Text:
     server = state.server
     left = Text.assemble(("ethercat-monitor ", VALUE), server.address)
     right = Text()
+    if server.replay:
+        right.append(f" REPLAY {server.replay} ", NOTICE)
     if look.recording:
         right.append(f" {look.recording} ", NOTICE)
     if look.paused:

@@ -53,7 +53,9 @@ class ServerView:
         now_ns = clock.monotonic_ns()
         for position, of_one in groupby(sorted(frames, key=_POSITION), _POSITION):
             if position < len(self._observers):
-                self._observers[position].take(list(of_one), now_ns)
+                batch = list(of_one)
+                self._observers[position].take(batch, now_ns)
+                self._observers[position].note_age(batch[-1], now_ns)
 
     def observation(self, position: int) -> Observation:
         """What was seen of a sensor's stream."""
