@@ -142,6 +142,11 @@ class ServerLink(Link):
                     return
             settling = later
 
+    @property
+    def same_machine(self) -> bool:
+        """Whether CLOCK_MONOTONIC is the server's."""
+        return self._client.connection.same_machine
+
     def listen(self, seconds: float, on_frames: Callable[[Sequence[DataMessage]], None]) -> list[JsonObject]:
         """Stream every frame of all sensors to `on_frames` for some seconds; the events meanwhile."""
         self.ask("subscribe", fresh_only=False)

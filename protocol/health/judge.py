@@ -217,7 +217,8 @@ def _rate(seen: Observation, limits: Limits) -> Iterator[Finding]:
         return
     # One sample more or less at either end of a short observation is no deviation.
     slack = 2.0 / seen.seconds if seen.seconds > 0 else 2.0
-    with_lost = min(rate * (1 + seen.lost / max(seen.samples, 1)), nominal) if rate < nominal else rate
+    without = seen.lost + seen.invalid + seen.repeated  # periods without a sample that have a finding already
+    with_lost = min(rate * (1 + without / max(seen.samples, 1)), nominal) if rate < nominal else rate
     off = max(abs(with_lost - nominal) - slack, 0.0) / nominal
     if off > limits.rate_tolerance:
         make = _trouble if off > limits.rate_error else _look

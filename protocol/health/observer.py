@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import operator
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Final, NamedTuple
 
 from protocol.accounting import NOT_NEW, StreamAccounting, StreamCounts
@@ -145,6 +145,6 @@ def _figures(counts: StreamCounts) -> tuple[int, int, int, int]:
     return counts.new, counts.missing, counts.repeated, counts.invalid
 
 
-def p99(values: Sequence[float]) -> float | None:
+def p99(values: Collection[float]) -> float | None:
     """The value that 99 % do not exceed; None without values. A single outlier of a few is none of it."""
     return sorted(values)[(len(values) - 1) * 99 // 100] if values else None

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from protocol.health.limits import LIMITS
 from protocol.health.verdict import NOTHING_WRONG, Level, Verdict
 from protocol.pdo import PDO_FIELDS, Sample
 
@@ -15,7 +16,7 @@ WRENCH_FIELDS: Final = tuple(f.name for f in PDO_FIELDS if f.name.startswith(("f
 """The six axes of the wrench, as the process data names them."""
 AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """The same as people write them."""
-SILENT_S: Final = 1.0
+SILENT_S: Final = LIMITS.stale_after
 """A server that sends nothing for this time is silent; it normally sends a frame per sample period."""
 
 

@@ -11,7 +11,6 @@ from typing import Any, Final
 from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, warning
 from ethercat_server.doctor.verdict import age_finding, as_cause, exchange_finding, wake_finding
 from ethercat_server.errors import ServerError
-from ethercat_server.ethercat.clock import Clock
 from ethercat_server.links.remote import ServerLink
 from protocol.address import Address
 from protocol.control import Event
@@ -39,7 +38,7 @@ class ServerView:
             self.before: dict[str, Any] = link.ask("status")
             start_ns = link.clock.monotonic_ns()
             self._observers = [StreamObserver(float(row["rate_hz"] or 0), start_ns) for row in rows]
-            self._events = link.listen(seconds, functools.partial(self._take, link.clock)) if seconds else []
+            self._events = link.listen(seconds, functools.partial(self._take, link)) if seconds else []
             self._end_ns = link.clock.monotonic_ns()
             self.after: dict[str, Any] = link.ask("status")
             self.described: list[dict[str, Any]] = link.ask("describe")["sensors"]
@@ -49,13 +48,14 @@ class ServerView:
         if not all(isinstance(row, dict) for row in rows):
             raise ServerError("the server's reply is not understood: install the same version of both")
 
-    def _take(self, clock: Clock, frames: Sequence[DataMessage]) -> None:
-        now_ns = clock.monotonic_ns()
+    def _take(self, link: ServerLink, frames: Sequence[DataMessage]) -> None:
+        now_ns = link.clock.monotonic_ns()
         for position, of_one in groupby(sorted(frames, key=_POSITION), _POSITION):
             if position < len(self._observers):
                 batch = list(of_one)
                 self._observers[position].take(batch, now_ns)
-                self._observers[position].note_age(batch[-1], now_ns)
+                if link.same_machine:
+                    self._observers[position].note_age(batch[-1], now_ns)
 
     def observation(self, position: int) -> Observation:
         """What was seen of a sensor's stream."""
