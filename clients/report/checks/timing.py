@@ -37,7 +37,8 @@ class Timing:
         """The frames' kinds, as every client counts them."""
         frames = self.series.frames
         accounting = StreamAccounting(every=self.series.step, fresh_only=False)
-        accounting.rate_hz = self.series.rate * self.series.step
+        # Not the usual interval: where every other sample is lost, that is two periods.
+        accounting.rate_hz = self.series.step / (self.series.nominal_period or self.series.period)
         rows = zip(frames.sequence.tolist(), frames.monotonic_ns.tolist(), frames.flags.tolist(), strict=True)
         for sequence, monotonic_ns, flags in rows:
             accounting.take(sequence, monotonic_ns, flags)
