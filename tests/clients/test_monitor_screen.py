@@ -12,7 +12,7 @@ from rich.text import Text
 
 from clients.monitor.model.server import Model
 from clients.monitor.model.state import Client, Range, State
-from clients.monitor.view.bars import bar, scale_for, trace
+from clients.monitor.view.bars import bar, scale_for, trace, traces
 from clients.monitor.view.glyphs import ASCII, UNICODE
 from clients.monitor.view.json_line import json_line
 from clients.monitor.view.screen import KEYS, Look, render
@@ -80,6 +80,21 @@ def test_two_sensors_stand_one_below_the_other_where_there_is_room() -> None:
     other_first = plain(made.troubled(), Look(selected=1))
     assert "BFT-ROKS-ECAT-M8" in other_first
     assert "0 trouble" in other_first
+
+
+@pytest.mark.parametrize(("width", "height"), [(120, 40), (200, 60)])
+@pytest.mark.parametrize("name", ["healthy", "troubled"])
+def test_a_tall_screen_is_used(name: str, width: int, height: int) -> None:
+    rows = plain(STATES[name](), width=width, height=height).splitlines()
+    blank = [row for row in rows if not row.strip()]
+    assert len(blank) < 10, "less than one more row for each axis"
+    assert sum("█" in row for row in rows) > 12, "the traces have several rows"
+
+
+def test_a_tall_trace_is_the_same_on_more_rows() -> None:
+    past = [Range(0, 0), Range(5, 5), Range(10, 10), None]
+    assert traces(past, 10.0, 4, 2, ASCII) == [" _# ", "_## "]
+    assert traces(past, 10.0, 4, 1, ASCII) == [trace(past, 10.0, 4, ASCII)]
 
 
 def test_a_server_that_is_gone_is_said_with_why_and_since_when() -> None:

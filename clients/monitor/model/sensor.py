@@ -27,7 +27,7 @@ from protocol.text.json_text import JsonObject
 from protocol.text.untrusted import number, text, whole
 
 TRACE_STEP_S: Final = 0.25
-TRACE_STEPS: Final = 40
+TRACE_STEPS: Final = 80
 
 _COMMON: Final = LAYOUTS[min(LAYOUTS)]
 """The fields common to all sizes of process data."""

@@ -130,7 +130,8 @@ def check_losses(timing: Timing, findings: Findings) -> Check:
     total, lost = series.count + timing.lost, timing.lost
     if not lost:
         return judged(name, findings, f"None of {count(total, 'sample')}.", matters=_STALE)
-    details = f"{count(lost, 'sample')} are missing, in {count(int(np.sum(series.missing > 0)), 'place')}."
+    places = count(int(np.sum(series.missing > 0)), "place")
+    details = f"{count(lost, 'sample')} are missing where it was not silent, in {places}."
     remedies = []
     if timing.withheld:
         details += f" {timing.withheld} of them were available at the server, but not read in time."
