@@ -180,7 +180,7 @@ def test_nonsense_is_drawn_without_an_error(
         program="p",
     )
     Reader(page)
-    assert "Healthy" not in page
+    assert "✓ Good" not in page
 
 
 def test_no_frames_make_a_page_too(monkeypatch: pytest.MonkeyPatch) -> None:
