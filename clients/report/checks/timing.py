@@ -131,7 +131,8 @@ def check_losses(timing: Timing, findings: Findings) -> Check:
     if not lost:
         return judged(name, findings, f"None of {count(total, 'sample')}.", matters=_STALE)
     places = count(int(np.sum(series.missing > 0)), "place")
-    details = f"{count(lost, 'sample')} are missing where it was not silent, in {places}."
+    every = all(finding.size == lost for finding in findings)
+    details = f"In {places}." if every else f"{lost} of them where the sensor was not silent, in {places}."
     remedies = []
     if timing.withheld:
         details += f" {timing.withheld} of them were available at the server, but not read in time."
