@@ -21,6 +21,8 @@ _FLAGS: Final = tuple(
 _NO_FLAGS: Final = (0,) * len(_FLAGS)
 _TEMPERATURE: Final = _COMMON.index("temperature")
 _MOST_AGES: Final = 1 << 16
+_HIGHEST_HZ: Final = 1e6
+"""A rate beyond it is no sensor's, and not known."""
 
 
 class _Batch(NamedTuple):
@@ -56,8 +58,9 @@ class StreamObserver:
     def __init__(self, nominal_hz: float, start_ns: int, *, window_ns: int | None = None) -> None:
         """`window_ns`: look back no further than this."""
         self._accounting = StreamAccounting(fresh_only=False)
-        self._accounting.rate_hz = nominal_hz
-        self._nominal_hz, self._window_ns = nominal_hz, window_ns
+        self._nominal_hz = nominal_hz if 0 < nominal_hz <= _HIGHEST_HZ else 0.0
+        self._accounting.rate_hz = self._nominal_hz
+        self._window_ns = window_ns
         self._start_ns = self._fresh_at_ns = start_ns
         self._batches: deque[_Batch] = deque()
         self._ages: deque[tuple[int, float]] = deque(maxlen=_MOST_AGES)

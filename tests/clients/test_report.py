@@ -42,6 +42,7 @@ def wrong(examination: Examination) -> dict[str, Level]:
 def found(examination: Examination, name: str) -> str:
     [check] = [check for check in examination.checks if check.name == name]
     assert check.level is Level.GOOD or check.remedy, "says what to do"
+    assert "`" not in check.found + check.matters + check.remedy, "the page shows it as it is"
     return check.found
 
 

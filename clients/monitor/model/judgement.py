@@ -115,9 +115,17 @@ class Judgement:
             settings=settings if isinstance(settings, dict) else {},
         )
 
-    def alerts(self, now_s: float, *, present: bool) -> list[Alert]:
-        """What is there now, if `present`, the worst first; then what is past, the latest first."""
+    def alerts(self, now_s: float, *, present: bool, lost: str | None) -> list[Alert]:
+        """What is there now, if `present`, the worst first; then what is past, the latest first.
+
+        `lost`: the server's words of why it has lost the sensor, if it has.
+        """
         now = self.verdict.findings if present else ()
+        if lost is not None:
+            now = tuple(
+                finding._replace(remedy=f"{finding.remedy} ({lost})") if finding.key == "silence" else finding
+                for finding in now
+            )
         keys = {finding.key for finding in now}
         past = [entry for key, entry in self._seen.items() if key not in keys]
         past.sort(key=lambda entry: -entry[1])

@@ -133,7 +133,7 @@ class SensorModel:
             traces=self._traces(now_s),
             saturated=frozenset(self.judgement.saturated),
             verdict=self.judgement.verdict,
-            alerts=tuple(self.judgement.alerts(now_s, present=server_speaks)),
+            alerts=tuple(self.judgement.alerts(now_s, present=server_speaks, lost=self._lost)),
             stream=stream,
             clock=_clock(clock) if isinstance(clock, dict) else None,
             bus_lost=whole(self._status.get("lost_samples")),

@@ -18,6 +18,7 @@ from protocol.framing import DataMessage
 from protocol.health import verdict as health
 from protocol.health.judge import Observation, emergency, judge
 from protocol.health.observer import StreamObserver
+from protocol.text.untrusted import number
 
 Examine = Callable[[str, str, Callable[[], Iterator[Finding]]], Iterator[Finding]]
 
@@ -37,7 +38,7 @@ class ServerView:
             rows: list[dict[str, Any]] = link.ask("describe")["sensors"]
             self.before: dict[str, Any] = link.ask("status")
             start_ns = link.clock.monotonic_ns()
-            self._observers = [StreamObserver(float(row["rate_hz"] or 0), start_ns) for row in rows]
+            self._observers = [StreamObserver(number(row["rate_hz"]) or 0.0, start_ns) for row in rows]
             self._events = link.listen(seconds, functools.partial(self._take, link)) if seconds else []
             self._end_ns = link.clock.monotonic_ns()
             self.after: dict[str, Any] = link.ask("status")
