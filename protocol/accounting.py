@@ -73,7 +73,7 @@ class StreamCounts:
 class StreamAccounting:
     """Classifies and counts the frames of one sensor."""
 
-    __slots__ = ("_every", "_fresh_only", "_monotonic_ns", "_new_ns", "_sequence", "counts", "rate_hz")
+    __slots__ = ("_every", "_fresh_only", "_monotonic_ns", "_sequence", "counts", "new_ns", "rate_hz")
 
     def __init__(
         self, counts: StreamCounts | None = None, *, every: int = 1, fresh_only: bool = True
@@ -82,13 +82,15 @@ class StreamAccounting:
         self.counts: StreamCounts = StreamCounts() if counts is None else counts
         self.rate_hz = 0.0
         """The sensor's sampling rate; 0 if it is unknown."""
+        self.new_ns = -1
+        """`monotonic_ns` of the newest new frame; -1: none since the subscription began."""
         self._every = every
         self._fresh_only = fresh_only
         self.begin()
 
     def begin(self) -> None:
         """A new subscription begins: nothing before its first frame counts as missing, unless it has GAP."""
-        self._sequence = self._monotonic_ns = self._new_ns = -1
+        self._sequence = self._monotonic_ns = self.new_ns = -1
 
     def take(self, sequence: int, monotonic_ns: int, flags: int) -> FrameKind:
         """Count the next frame; what it is."""
@@ -110,7 +112,7 @@ class StreamAccounting:
             counts.repeated += 1
             return FrameKind.REPEATED
         counts.new += 1
-        self._new_ns = monotonic_ns
+        self.new_ns = monotonic_ns
         return FrameKind.NEW
 
     def select_new(self, frames: Iterable[DataMessage], sensor: int) -> list[DataMessage]:
@@ -122,7 +124,7 @@ class StreamAccounting:
                 continue
             if sequence == self._sequence + 1 and not flags:  # as `take` has it, but faster
                 self._sequence = sequence
-                self._monotonic_ns = self._new_ns = monotonic_ns
+                self._monotonic_ns = self.new_ns = monotonic_ns
                 self.counts.new += 1
             elif self.take(sequence, monotonic_ns, flags) is not FrameKind.NEW:
                 continue
@@ -138,7 +140,7 @@ class StreamAccounting:
             return
         counts.gaps += 1
         lost = 0 if jump > skipped else 1
-        if self._new_ns >= 0 and self.rate_hz:
-            room = round((monotonic_ns - self._new_ns) * self.rate_hz / 1e9) - 1
+        if self.new_ns >= 0 and self.rate_hz:
+            room = round((monotonic_ns - self.new_ns) * self.rate_hz / 1e9) - 1
             lost = max(lost, room - jump)
         counts.lost += lost

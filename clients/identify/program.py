@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Sequence
 from functools import partial
+from typing import Final
 
 from rich.console import Console
 
@@ -24,6 +25,8 @@ from ft_compensation.quantities import CompensationError
 from protocol.pdo import STANDARD_GRAVITY
 
 _say = partial(say, "ethercat-identify")
+_WIDTH: Final = 80
+"""Every table fits."""
 
 
 class SensorChoiceError(CompensationError):
@@ -59,7 +62,8 @@ def _identify(options: IdentifyOptions) -> int:
         sys.stdout.write(json.dumps(answer, indent=1) + "\n")
         sys.stdout.flush()
     else:
-        console = Console(highlight=False)
+        # A narrower terminal wraps the lines: cells would be cut off.
+        console = Console(highlight=False, width=max(_WIDTH, Console().width))
         if poses:
             show_poses(console, taken, poses, result)
         if result is not None:

@@ -26,7 +26,7 @@ def parse(argv: Sequence[str] | None) -> Options:
     made = parser(
         "ethercat-monitor",
         "Shows the stream of ethercat-server live in the terminal. Press ? for the keys.",
-        "With --once: exit code 0 if all is well, 1 if there is no server or a sensor has an error.",
+        "With --once: exit code 0 if all is good or worth a look, 1 if there is trouble, or no server.",
     )
     add_address(made)
     add = made.add_argument

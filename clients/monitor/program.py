@@ -14,8 +14,9 @@ from clients.monitor.options import Options
 from clients.monitor.reader import Reader
 from clients.monitor.view.glyphs import ASCII, UNICODE, can_show, to_ascii
 from clients.monitor.view.json_line import json_line
-from clients.monitor.view.table import line, problems, table
+from clients.monitor.view.table import line, table, verdict
 from clients.monitor.view.words import trouble
+from protocol.health.verdict import Level
 
 _PERIOD_S: Final = 1.0
 _ONCE_S: Final = 1.0
@@ -59,7 +60,7 @@ def _once(options: Options, model: Model, reader: Reader) -> int:
         _say(json_line(state, time.time()))
     else:
         _say(*table(state), spelled=_spelled(options))
-    return 1 if problems(state) else 0
+    return 1 if verdict(state)[0] is Level.TROUBLE else 0
 
 
 def _live(options: Options, model: Model) -> int:

@@ -36,8 +36,7 @@ def parse_options(argv: Sequence[str] | None) -> ReportOptions:
     made = parser(
         "ethercat-report",
         "Writes a one-page sensor health report (HTML) from a recording or a live stream.",
-        "exit code: 0 healthy, 1 no report was made, 2 wrong usage, 3 nothing wrong was found but not "
-        "everything could be checked, 4 attention, 5 fault",
+        "exit code: 0 good, worth a look or not conclusive, 1 trouble, or no report was made, 2 wrong usage",
     )
     add = made.add_argument
     add("recording", type=Path, nargs="?", metavar="FILE.mcap", help="a recording of ethercat-record")

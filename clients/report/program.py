@@ -20,7 +20,7 @@ from clients.report.subjects import live, recorded
 from clients.report.subjects.subject import Subject
 from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
 
-EXIT_CODES = {Level.OK: 0, Level.NOT_POSSIBLE: 3, Level.ATTENTION: 4, Level.FAULT: 5}
+EXIT_CODES = {Level.GOOD: 0, Level.NOT_POSSIBLE: 0, Level.LOOK: 0, Level.TROUBLE: 1}
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +85,7 @@ def _summary(examinations: Sequence[Examination]) -> str:
         subject = each.subject
         who = f"Sensor {subject.position} ({subject.name}, serial {subject.serial})"
         lines.append(f"{who}: {each.verdict.headline}. {each.verdict.sentence}")
+        lines += [f"  {remark}" for remark in subject.remarks]
         for check in each.checks:
             if check.level >= Level.NOT_POSSIBLE:
                 lines.append(f"  {check.level.word}: {check.name}: {check.found}")

@@ -23,10 +23,7 @@ if TYPE_CHECKING:
     from ethercat_server.doctor.machine.machine import Machine
 
 _PROGRAM: Final = "ethercat-doctor"
-_EXIT_CODES: Final = (
-    "exit codes: 0 nothing worse than a note, 1 the doctor itself failed or was stopped, 2 wrong arguments, "
-    "3 warnings, 4 something is bad"
-)
+_EXIT_CODES: Final = "exit codes: 0 good or worth a look, 1 trouble, failed or stopped, 2 wrong arguments"
 _LONGEST_S: Final = 3600.0
 
 

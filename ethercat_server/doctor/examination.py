@@ -71,7 +71,8 @@ def examine(subject: str, name: str, look: Callable[[], Iterator[Finding]]) -> I
 
 def examine_machine(machine: Machine) -> Iterator[Finding]:
     """All checks that need no bus."""
-    there = isinstance(machine.facts.link, Link)
+    link = machine.facts.link
+    there = isinstance(link, Link) and not link.loopback
     for check in CHECKS:
         if there or check.subject not in _ABOUT_THE_INTERFACE or check.look is nic.link:
             for finding in examine(check.subject, check.name, functools.partial(check.look, machine)):
@@ -79,4 +80,4 @@ def examine_machine(machine: Machine) -> Iterator[Finding]:
                 gone = check.subject in _ABOUT_THE_INTERFACE and machine.asked == VIRTUAL_INTERFACE
                 yield replace(finding, commands=()) if gone else finding
         if check.look is nic.link and not there:
-            yield replace(skipped("no interface"), subject=check.subject, check="the rest")
+            yield replace(skipped("no interface for a sensor"), subject=check.subject, check="the rest")

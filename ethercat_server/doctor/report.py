@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, TextIO
 
 from ethercat_server.doctor.finding import Finding, Level
+from protocol.health import verdict as health
 from protocol.text.visible import visible
 
 _COLORS: Final = {
@@ -25,12 +26,20 @@ _NAME_WIDTH: Final = 20
 _INDENT: Final = " " * (2 + _LEVEL_WIDTH + 2 + _NAME_WIDTH + 2)
 _USUAL_WIDTH: Final = 120
 _LEAST_TEXT: Final = 30
-EXIT_CODES: Final = {Level.OK: 0, Level.SKIPPED: 0, Level.NOTE: 0, Level.WARNING: 3, Level.BAD: 4}
+EXIT_CODES: Final = {Level.OK: 0, Level.SKIPPED: 0, Level.NOTE: 0, Level.WARNING: 0, Level.BAD: 1}
+_VERDICTS: Final = {Level.WARNING: health.Level.LOOK, Level.BAD: health.Level.TROUBLE}
+_MOST_REPEATED: Final = 8
+"""Findings that the end repeats: with the verdict they fit 80 x 24."""
 
 
 def worst(findings: Iterable[Finding]) -> Level:
     """The worst level, skipped checks aside."""
     return max((f.level for f in findings if f.level is not Level.SKIPPED), default=Level.OK)
+
+
+def verdict(findings: Iterable[Finding]) -> health.Level:
+    """What all findings come to; notes are nothing to look at."""
+    return _VERDICTS.get(worst(findings), health.Level.GOOD)
 
 
 def wants_color(stream: TextIO, environment: Mapping[str, str]) -> bool:
@@ -77,10 +86,23 @@ class Report:
             self._say(f"{_INDENT}$ {command}")
 
     def summary(self, findings: Sequence[Finding]) -> None:
-        """The number of findings per level."""
+        """The verdict, with what matters once more, for the rest may have scrolled away."""
         counts = {level: sum(f.level is level for f in findings) for level in reversed(Level)}
         text = ", ".join(f"{count} {_counted(level, count)}" for level, count in counts.items() if count)
-        self._say(f"\n{text}")
+        level = worst(findings)
+        self._say(f"\n{self._painted(verdict(findings).words.capitalize(), _COLORS[level])}: {text}")
+        matters = [f for f in findings if f.level >= Level.WARNING]
+        matters.sort(key=lambda finding: -finding.level)
+        width = self._width + len(_INDENT)
+        for finding in matters[:_MOST_REPEATED]:
+            name = finding.level.name.lower().ljust(_LEVEL_WIDTH)
+            text = f"  {name}  {finding.subject}, {finding.check}: {finding.found}"
+            lines = textwrap.wrap(
+                text, width, subsequent_indent=" " * (4 + _LEVEL_WIDTH), max_lines=2, placeholder=" ..."
+            )
+            self._say("\n".join(lines))
+        if len(matters) > _MOST_REPEATED:
+            self._say(f"  and {len(matters) - _MOST_REPEATED} more above")
 
     def _lines(self, text: str) -> list[str]:
         return textwrap.wrap(text, self._width, break_on_hyphens=False, break_long_words=False) or [""]
@@ -119,5 +141,6 @@ def _lines(text: str) -> str:
 
 def as_json(header: Mapping[str, Any], findings: Sequence[Finding]) -> str:
     """The whole report as one object."""
-    found = {**header, "worst": worst(findings).name.lower(), "findings": [f.as_json() for f in findings]}
+    found = {**header, "verdict": verdict(findings).key, "worst": worst(findings).name.lower()}
+    found |= {"findings": [f.as_json() for f in findings]}
     return json.dumps(found, indent=2, ensure_ascii=False, default=str)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 from ethercat_server.acquisition.health.round_trip import SLOW_US, cost
 from ethercat_server.doctor.bus.measurement import PERIOD_NS, Measured, summary_us
-from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, skipped, warning
+from ethercat_server.doctor.finding import Finding, Level, bad, cannot_look, note, ok, skipped, warning
+from protocol.health.limits import LIMITS
 
 _PERIOD_US: Final = PERIOD_NS / 1000
 _WAKE_NOTE_US: Final = 100
@@ -109,7 +111,7 @@ def messages(measured: Measured) -> Iterator[Finding]:
     missing = len(measured.late) - len(measured.messages)
     if summary["p99"] > _MESSAGE_NOTE_US or missing:
         why = "clients have ordinary scheduling, so other programs preempt them: reduce the load"
-        yield note(text, why, missing=missing, **summary)
+        yield _by_age(summary["p99"])(text, why, missing=missing, **summary)
     else:
         yield ok(text, missing=missing, **summary)
 
@@ -133,5 +135,18 @@ def age_finding(what: str, summary: Mapping[str, Any], how: str) -> Finding:
     """The finding for a summary of ages; `how` it was obtained."""
     text = f"{what}: {points(summary)}"
     if summary["p99"] > _PERIOD_US:
-        return note(text, f"occasionally more than a sample period ({how})", **summary)
+        make = _by_age(summary["p99"])
+        return make(text, f"occasionally more than a sample period ({how})", **summary)
     return ok(text, how, **summary)
+
+
+def _by_age(p99_us: float) -> Callable[..., Finding]:
+    """What the judge of streams would say of samples that are so late or old."""
+    if p99_us >= LIMITS.age_error * 1e6:
+        return bad
+    return warning if p99_us >= LIMITS.age_warn * 1e6 else note
+
+
+def as_cause(finding: Finding) -> Finding:
+    """The same about a server that streams: its stream has a verdict, this may be the cause."""
+    return replace(finding, level=min(finding.level, Level.WARNING))

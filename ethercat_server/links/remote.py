@@ -29,6 +29,7 @@ from protocol.errors import (
     RefusedError,
     UnreachableError,
 )
+from protocol.framing import DataMessage
 from protocol.settings import SettingValue
 from protocol.text.json_text import JsonObject
 
@@ -140,6 +141,23 @@ class ServerLink(Link):
                 if not settled.take(frame, frame.sensor in settling):
                     return
             settling = later
+
+    @property
+    def same_machine(self) -> bool:
+        """Whether CLOCK_MONOTONIC is the server's."""
+        return self._client.connection.same_machine
+
+    def listen(self, seconds: float, on_frames: Callable[[Sequence[DataMessage]], None]) -> list[JsonObject]:
+        """Stream every frame of all sensors to `on_frames` for some seconds; the events meanwhile."""
+        self.ask("subscribe", fresh_only=False)
+        end = Deadline(self.clock, seconds)
+        while not end.passed:
+            try:
+                on_frames(self._client.receive(_IDLE_S))
+            except ConnectionFailedError as error:
+                raise ServerError(f"{self._name} closed the connection ({error}): see its log") from None
+        self.ask("unsubscribe")
+        return list(self._client.events)
 
     def wait_settled(self, numbers: Sequence[int]) -> None:
         """See `Link`."""

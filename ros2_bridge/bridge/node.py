@@ -79,7 +79,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
             self, parameters, compensated, link, self.reader.watch, live, lambda: self.reader.not_finite
         )
         self.monitor = Monitor(
-            self, parameters.thresholds, self.reader, self.compensation.state, outputs, self.fail
+            self, parameters.limits, self.reader, self.compensation.state, outputs, self.fail
         )
         self.triggers = (
             Services(self, link, self.requests, self.sensor_settings, self.compensation.after_sensor_tare),
@@ -115,7 +115,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         return node
 
     def _apply(self, parameters: Parameters) -> None:
-        self.monitor.thresholds = parameters.thresholds
+        self.monitor.limits = parameters.limits
         self.reader.limit_rate(parameters.publishing_frequency)
         self._outputs.configure(parameters)
 

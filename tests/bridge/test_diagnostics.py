@@ -75,7 +75,7 @@ def test_warning_bits_of_one_frame_each_are_told_once(node: SimulatedNode, serve
 
     def all_are_told() -> bool:
         told.append(node.statuses()["sensor"])
-        return all(any(f"{row.meaning}: {row.remedy}" in one.message for one in told) for row in WARNINGS)
+        return all(any(row.meaning in one.message for one in told) for row in WARNINGS)
 
     node.run_until(all_are_told, "each bit")
     registers = [int(values(one)["warnings_register"], 16) for one in told]
@@ -87,7 +87,7 @@ def test_warning_bits_of_one_frame_each_are_told_once(node: SimulatedNode, serve
 def test_saturation_and_heat(node: SimulatedNode, server: SimulatedServer) -> None:
     for _ in range(3):
         server.once(process_data=encode(61, {"force_torque_saturated": 0b101}))
-    array = node.until("force torque saturated: axes 0x5 (3 samples)", sensor=WARN)
+    array = node.until("Force/torque (ADC) saturated: Fx, Fz", sensor=ERROR)
     assert values(array["sensor"])["saturated_samples"] == "3"
     node.until(sensor=OK)
     server.changes = {"process_data": encode(61, {"temperature": 85.0})}
@@ -97,10 +97,10 @@ def test_saturation_and_heat(node: SimulatedNode, server: SimulatedServer) -> No
 def test_lost_samples_are_counted(node: SimulatedNode, server: SimulatedServer) -> None:
     server.sequence += 7
     server.once(flags=DataFlag.GAP)
-    node.until("7 samples lost", stream=WARN)
+    node.until("7 of ", " were lost", stream=ERROR)
     node.until(**HEALTHY)
     server.answers["status"] = lambda _: status(lost_samples=11)
-    array = node.until("11 samples lost", stream=WARN)
+    array = node.until("11 of ", " were lost", stream=ERROR)
     assert values(array["stream"])["server_lost"] == "11"
 
 
@@ -108,14 +108,14 @@ def test_what_the_server_found_not_finite_is_told(node: SimulatedNode, server: S
     answer = status()
     answer["sensors"][0]["not_finite"] = 3
     server.answers["status"] = lambda _: answer
-    array = node.until("3 samples had values that are not finite", stream=ERROR)
+    array = node.until("Samples have values that are not finite", stream=ERROR)
     assert values(array["stream"])["server_not_finite"] == "3"
     node.until(**HEALTHY)
 
 
 def test_another_rate_than_expected(node: SimulatedNode, server: SimulatedServer) -> None:
     server.description["sensors"][0]["rate_hz"] = 200
-    node.until("100 samples a second instead of 200", stream=WARN)
+    node.until("100 samples a second instead of 200", stream=ERROR)
 
 
 def test_a_change_says_the_rate_that_its_settings_do_not(
@@ -131,7 +131,7 @@ def test_a_change_says_the_rate_that_its_settings_do_not(
 
 def test_samples_that_come_late(node: SimulatedNode, server: SimulatedServer) -> None:
     server.ahead_ns = -12_000_000
-    node.until("samples are 12.0 ms old (p99)", stream=WARN)
+    node.until("Samples are 12.0 ms old on arrival (p99)", stream=WARN)
 
 
 def test_a_sensor_that_repeats_itself(node: SimulatedNode, server: SimulatedServer) -> None:
@@ -147,7 +147,7 @@ def test_a_lost_sensor(node: SimulatedNode, server: SimulatedServer) -> None:
     server.send_json({"event": "sensor_lost", "sensor": 0, "message": "sensor 0 is lost: no power"})
     array = node.until("sensor 0 is lost: no power", sensor=ERROR, stream=ERROR, clock=STALE)
     assert array["sensor"].message.startswith("sensor 0 is lost: no power")
-    assert "sensor 0 is lost: no power" in array["stream"].message
+    assert array["stream"].message == "The server has lost the sensor: check its cable and power"
     server.changes = {}
     server.send_json({"event": "sensor_back", "sensor": 0})
     node.until(**HEALTHY)
@@ -155,7 +155,7 @@ def test_a_lost_sensor(node: SimulatedNode, server: SimulatedServer) -> None:
 
 def test_a_clock_that_is_not_followed(node: SimulatedNode, server: SimulatedServer) -> None:
     server.answers["status"] = lambda _: status(mode="oversampling")
-    node.until("oversampling", clock=WARN)
+    node.until("does not follow", clock=WARN)
 
 
 def test_a_server_that_does_not_answer(node: SimulatedNode, server: SimulatedServer) -> None:
@@ -175,7 +175,7 @@ def test_a_server_that_is_gone_and_comes_back(node: SimulatedNode, server: Simul
     array = node.until(*words, link=ERROR, stream=STALE, sensor=STALE, clock=STALE)
     assert values(array["link"])["connected"] == "false"
     server.listens = True
-    array = node.until("connected to localhost:12001 again", link=WARN)
+    array = node.until("was interrupted", link=WARN)
     assert values(array["link"])["reconnects"] == "1"
     node.until(**HEALTHY)
 

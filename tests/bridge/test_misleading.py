@@ -46,7 +46,7 @@ def configure(server: SimulatedServer, **changed: Any) -> None:
 def test_counts_are_no_newtons(node: SimulatedNode, server: SimulatedServer) -> None:
     node.until(sensor=OK)
     configure(server, calibration_matrix=False)
-    node.until("force and torque are counts and not N and Nm, switch it on", sensor=ERROR)
+    node.until("force and torque are counts and not N and Nm: switch it on", sensor=ERROR)
     configure(server, calibration_matrix=True)
     node.until(sensor=OK)
 
@@ -56,7 +56,12 @@ def test_a_wrench_in_a_configured_frame(node: SimulatedNode, server: SimulatedSe
     stages = Stages(node)
     stages.settle(ZERO6)
     configure(server, coordinate_system=True)
-    node.until("not in frame_id as in the URDF", "has stopped", sensor=WARN, compensation=ERROR)
+    node.until(
+        "are in a frame configured in the sensor: switch it off, or correct the URDF",
+        "has stopped",
+        sensor=WARN,
+        compensation=ERROR,
+    )
     assert stages.are_silent()
     assert "the rotation from the IMU to it is unknown" in node.trigger("tare")[1]
     assert node.trigger("identify/start")[0]

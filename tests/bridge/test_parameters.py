@@ -31,7 +31,7 @@ def test_defaults_are_the_contracts() -> None:
         "orientation_covariance": (0.0, 0.0, 0.0), "angular_velocity_covariance": (0.0, 0.0, 0.0),
         "linear_acceleration_covariance": (0.0, 0.0, 0.0), "wrench_frames": ("",),
         "diagnostics.stale_after": 0.5,
-        "diagnostics.rate_tolerance": 0.05, "diagnostics.age_warn": 0.01, "diagnostics.age_error": 0.1,
+        "diagnostics.rate_tolerance": 0.01, "diagnostics.age_warn": 0.01, "diagnostics.age_error": 0.1,
         "diagnostics.lost_warn": 1, "diagnostics.temperature_warn": 60.0,
         "diagnostics.temperature_error": 80.0,
         "tool_mass": 0.0, "tool_center_of_gravity": (0.0, 0.0, 0.0), "gravity": (0.0, 0.0, -9.80665),

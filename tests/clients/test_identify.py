@@ -109,6 +109,17 @@ def test_a_person_sees_tables(
     assert max(map(len, shown.splitlines())) <= 100
 
 
+def test_no_number_is_cut_off_on_a_narrow_terminal(
+    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    assert run([str(recording)]) == 0
+    said = capsys.readouterr().out
+    assert "…" not in said
+    assert "0.00016" in said
+    assert max(map(len, said.splitlines())) <= 80
+
+
 def test_the_yaml_is_what_the_node_takes(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

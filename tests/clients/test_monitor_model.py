@@ -13,10 +13,12 @@ import pytest
 from clients.monitor.model.server import Model
 from clients.monitor.model.state import SensorState
 from clients.monitor.reader import Reader
+from clients.monitor.view.screen import Look, render
 from protocol.address import Address
 from protocol.client import Client
 from protocol.control import Event
 from protocol.framing import DataFlag, DataMessage
+from protocol.health.verdict import Level
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S, description, frame, now, status
 
@@ -83,7 +85,10 @@ def test_repeated_and_invalid_frames_are_counted_and_bring_no_values(model: Mode
     assert (stream.samples, stream.repeated, stream.invalid) == (1, 1, 2)
     assert sensor.peaks is not None
     assert sensor.peaks[0].high == 0
-    assert not sensor.alerts
+    assert texts(sensor) == [
+        "2 frames were invalid, the sensor did not answer the bus",
+        "1 frame was repeated, the sensor had nothing new",
+    ]
 
 
 def test_frames_that_did_not_come_are_counted_and_make_no_jitter(model: Model) -> None:
@@ -136,6 +141,23 @@ def test_a_new_connection_is_no_loss_and_keeps_the_peaks(model: Model) -> None:
     assert tuple(sensor.peaks[0]) == (0, 7)
 
 
+def test_a_tare_moves_the_zero_so_the_peaks_begin_anew(model: Model) -> None:
+    take(model, *run(0, 10, **{"force.x": 7.0, "warnings": 8}))
+    model.take_event({"event": Event.OFFSET_CHANGED, "sensor": 0}, now(10))
+    sensor = take(model, *run(10, 10))
+    assert sensor.peaks is not None
+    assert tuple(sensor.peaks[0]) == (0, 0)
+    assert texts(sensor) == ["ADC out of sync"], "it is not forgotten"
+
+
+def test_a_replay_is_told_from_a_server(model: Model) -> None:
+    assert model.state(now(0)).server.replay == ""
+    model.described({**description(), "replay": {"files": ["run.mcap", "b.mcap"]}}, now(0))
+    state = model.state(now(0))
+    assert state.server.replay == "run.mcap and 1 more"
+    assert "REPLAY run.mcap and 1 more" in render(state, Look(), 80, 24)[0].plain
+
+
 def test_another_sensor_in_its_place_has_its_own_peaks(model: Model) -> None:
     take(model, *run(0, 10, **{"force.x": 7.0}))
     other = description()
@@ -147,15 +169,20 @@ def test_another_sensor_in_its_place_has_its_own_peaks(model: Model) -> None:
 def test_a_warning_of_one_sample_is_present_for_a_while_then_past(model: Model) -> None:
     take(model, frame(0, {**REST, "warnings": 0b1000}), *run(1, 40))
     (present,) = only(model, now(40)).alerts
-    assert (present.severity, present.text, present.ago_s) == ("error", "ADC out of sync", None)
+    assert (present.level, present.text, present.ago_s) == (Level.TROUBLE, "ADC out of sync", None)
     assert present.remedy == "Contact support (repair required)"
-    (past,) = take(model, *run(3200, 1)).alerts
-    assert past.ago_s == pytest.approx(4, abs=0.1)
+    for first in range(41, 3241, 40):
+        last = take(model, *run(first, 40))
+    (past,) = last.alerts
+    assert past.text == "ADC out of sync"
+    assert past.ago_s == pytest.approx(3, abs=0.1)
+    assert last.verdict.level is Level.GOOD
 
 
 def test_the_worst_present_warning_comes_first(model: Model) -> None:
     take(model, frame(0, {**REST, "warnings": 0b1000}))
-    sensor = take(model, frame(4000, {**REST, "warnings": 0b1100000}))
+    for first in range(1, 901, 300):
+        sensor = take(model, *run(first, 300, warnings=0b1100000))
     assert texts(sensor) == ["Wrong supply voltage", "Overtemperature", "ADC out of sync"]
 
 
@@ -172,14 +199,14 @@ def test_saturated_axes_are_named_with_their_remedy(model: Model, bits: int) -> 
 def test_values_that_are_no_numbers_are_told_and_spoil_no_peak(model: Model) -> None:
     bad = frame(3, {**REST, "force.z": math.nan}), frame(4, {**REST, "torque.x": math.inf})
     sensor = take(model, *run(0, 3), *bad)
-    assert texts(sensor) == ["A measured value is not a finite number"]
+    assert texts(sensor) == ["Samples have values that are not finite"]
     assert sensor.peaks is not None
     assert all(math.isfinite(value) for peak in sensor.peaks for value in peak)
     assert tuple(sensor.peaks[2]) == (-8, -8)
 
 
 def test_values_that_only_the_server_saw_are_told_too(model: Model) -> None:
-    for not_finite, told in ((5, []), (5, []), (6, ["A measured value is not a finite number"])):
+    for not_finite, told in ((5, []), (5, []), (6, ["Samples have values that are not finite"])):
         reply = status()
         reply["sensors"][0]["not_finite"] = not_finite
         model.take_status(reply, now(0))
@@ -195,11 +222,13 @@ def test_the_last_emergency_is_told_until_it_is_over_or_reset(model: Model) -> N
         return texts(only(model, at_s))
 
     assert after(0, 0, now(0)) == []
-    assert after(1, 0x4210, now(0)) == ["Emergency 0x4210: temperature"]
-    assert only(model, now(0)).alerts[0].ago_s == pytest.approx(2.0)
+    assert after(1, 0x4210, now(0)) == ["Emergency 0x4210 (temperature)"]
+    assert only(model, now(0)).verdict.level is Level.LOOK
     model.reset()
     assert after(1, 0x4210, now(80)) == []
-    assert after(2, 0x4210, now(160)) == ["Emergency 0x4210: temperature"]
+    assert after(2, 0x4210, now(160)) == ["Emergency 0x4210 (temperature)"]
+    assert only(model, now(160 + 70 * 800)).alerts[-1].ago_s == pytest.approx(70, abs=1)
+    model.reset()
     assert after(3, 0x0000, now(240)) == []
 
 
@@ -209,10 +238,12 @@ def test_a_lost_sensor_is_told_until_it_is_back(model: Model) -> None:
     model.take_event(gone, now(10))
     lost = only(model, now(10))
     assert lost.al_state == "LOST"
-    assert texts(lost) == ["sensor 0 is lost: no carrier"]
+    assert texts(lost) == ["The server has lost the sensor"]
+    assert lost.verdict.level is Level.TROUBLE
+    assert lost.alerts[0].remedy == "Check its cable and power (sensor 0 is lost: no carrier)"
     model.take_event({"event": Event.SENSOR_BACK, "sensor": 0}, now(20))
     assert only(model, now(20)).al_state == "OP"
-    assert not only(model, now(20)).alerts
+    assert only(model, now(20)).verdict.level is Level.GOOD
 
 
 def test_silence_is_the_sensors_only_if_the_server_speaks(model: Model) -> None:
@@ -220,9 +251,9 @@ def test_silence_is_the_sensors_only_if_the_server_speaks(model: Model) -> None:
     later_s = now(10) + 3
     assert model.state(later_s).server.silent
     assert not only(model, later_s).alerts
-    model.take([frame(11, REST, flags=DataFlag.INVALID)], later_s)
+    model.take([frame(10, REST, flags=DataFlag.INVALID)], later_s)
     assert not model.state(later_s).server.silent
-    assert texts(only(model, later_s)) == ["No new sample for 3 s"]
+    assert texts(only(model, later_s)) == ["No new sample for 3.0 s, the sensor does not answer the bus"]
     assert only(model, later_s).old_s == pytest.approx(3, abs=0.1)
 
 
@@ -286,6 +317,8 @@ ODD: list[Any] = [
     -1,
     10**400,
     1.5,
+    math.nan,
+    math.inf,
     True,
     "x",
     "\x1b[2J",

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from clients.monitor.model.server import Model
 from clients.monitor.model.state import Client, Range, State
-from clients.monitor.view.bars import bar, scale_for, trace
+from clients.monitor.view.bars import bar, scale_for, trace, traces
 from clients.monitor.view.glyphs import ASCII, UNICODE
 from clients.monitor.view.json_line import json_line
 from clients.monitor.view.screen import KEYS, Look, render
@@ -57,9 +57,8 @@ def test_80x24_has_all_warnings_with_their_remedies() -> None:
     text = plain(made.troubled())
     for fact in (
         "Fz!", "Force/torque (ADC) saturated: Fz -> Reduce sensor loading",
-        "warning  now: Overtemperature -> Power off the sensor and let it cool down",
-        "error 4 s ago: ADC out of sync -> Contact support (repair required)",
-        "oversampling", "5 on the way here", "not tared: it is not at rest", "1 ok",
+        "worth a look  now: Overtemperature -> Power off the sensor and let it cool down",
+        "oversampling", "5 on the way here", "not tared: it is not at rest", "1 worth a look",
     ):  # fmt: skip
         assert fact in text, fact
 
@@ -80,7 +79,22 @@ def test_two_sensors_stand_one_below_the_other_where_there_is_room() -> None:
     assert tall.index("BFT-SENS-ECAT-M8") < tall.index("BFT-ROKS-ECAT-M8")
     other_first = plain(made.troubled(), Look(selected=1))
     assert "BFT-ROKS-ECAT-M8" in other_first
-    assert "0 error" in other_first
+    assert "0 trouble" in other_first
+
+
+@pytest.mark.parametrize(("width", "height"), [(120, 40), (200, 60)])
+@pytest.mark.parametrize("name", ["healthy", "troubled"])
+def test_a_tall_screen_is_used(name: str, width: int, height: int) -> None:
+    rows = plain(STATES[name](), width=width, height=height).splitlines()
+    blank = [row for row in rows if not row.strip()]
+    assert len(blank) < 10, "less than one more row for each axis"
+    assert sum("█" in row for row in rows) > 12, "the traces have several rows"
+
+
+def test_a_tall_trace_is_the_same_on_more_rows() -> None:
+    past = [Range(0, 0), Range(5, 5), Range(10, 10), None]
+    assert traces(past, 10.0, 4, 2, ASCII) == [" _# ", "_## "]
+    assert traces(past, 10.0, 4, 1, ASCII) == [trace(past, 10.0, 4, ASCII)]
 
 
 def test_a_server_that_is_gone_is_said_with_why_and_since_when() -> None:
@@ -114,7 +128,7 @@ def test_no_fact_is_told_by_color_alone() -> None:
     """Where color marks something bad, a word or a sign does too."""
     rows = render(made.troubled(), Look(), 80, 24)
     spans = [(row.plain[s.start : s.end].strip(), str(s.style)) for row in rows for s in row.spans]
-    assert {text for text, style in spans if "#d55e00" in style} == {"Fz!", "error", "warning"}
+    assert {text for text, style in spans if "#d55e00" in style} == {"Fz!", "trouble", "worth a look"}
 
 
 @pytest.mark.parametrize("name", ["monitor.svg", "monitor-warnings.svg", "monitor-gone.svg"])
@@ -204,7 +218,7 @@ def test_whatever_a_sensor_sends_is_shown() -> None:
         model.take([odd], made.now(k))
         state = model.state(made.now(k))
         render(state, Look(glyphs=ASCII if k % 2 else UNICODE), 80, 24)
-        assert table(state)[-1].startswith(("Not fine: ", "Fine."))
+        assert table(state)[-1].startswith(("Trouble: ", "Worth a look: ", "Good: "))
         json.loads(json_line(state, 0.0))
 
 

@@ -117,7 +117,7 @@ def test_every_color_of_a_plot_is_the_pages(page: str) -> None:
 
 def test_outcomes_are_words_and_not_colors_alone(page: str) -> None:
     words = " ".join(Reader(page).words)
-    assert "✗ Fault" in words
+    assert "✗ Trouble" in words
     assert "2 of 12 checks found something: noise of force and torque, lost samples." in words or (
         "2 of 12 checks found something: lost samples, noise of force and torque." in words
     )
@@ -180,7 +180,7 @@ def test_nonsense_is_drawn_without_an_error(
         program="p",
     )
     Reader(page)
-    assert "Healthy" not in page
+    assert "✓ Good" not in page
 
 
 def test_no_frames_make_a_page_too(monkeypatch: pytest.MonkeyPatch) -> None:

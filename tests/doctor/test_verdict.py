@@ -99,6 +99,8 @@ def test_messages_that_did_not_come_through() -> None:
     assert (found.level, found.values["missing"]) == (Level.NOTE, 1)
     with pytest.raises(CannotLookError):
         list(verdict.messages(Measured(late=[1])))
+    for late_us, level in ((900, Level.NOTE), (11_000, Level.WARNING), (110_000, Level.BAD)):
+        assert next(verdict.messages(of([1] * 10, message_us=late_us))).level is level, "as of old samples"
 
 
 def test_measuring_leaves_the_process_as_it_was() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -127,11 +128,26 @@ def test_an_eeprom_that_cannot_be_read_says_so(bench: SimulatedBus) -> None:
 
 def test_every_row_of_table_iii_1_is_read_by_name(bench: SimulatedBus) -> None:
     names = [name for _, _, name in NOTE_NAMES]
-    found = tool_here("read", bench.near, *names, "--json").json["sensors"][0]["objects"]
+    ended = tool_here("read", bench.near, *names, "--json", code=1)
+    found = ended.json["sensors"][0]["objects"]
     read = {(int(row["index"], 16), row["subindex"]) for row in found}
     assert {(index, subindex) for index, subindex, _ in NOTE_NAMES} <= read
     unreadable = {row["index"] for row in found if "error" in row}
     assert unreadable == {"0x8003", "0x6000"}, "no range, and no quaternion in 61 bytes"
+    assert re.search(
+        r"sensor 0 gave no value of .*: .*does not have it .*; and \d+ more$", one_sentence(ended)
+    )
+
+
+def test_a_sensor_that_sends_nothing_is_watched_in_vain() -> None:
+    with simulated_bus("--sinc", "512") as bus:
+        bus.at(0.6, "deaf 9")
+        ended = tool_here("watch", bus.near, "--seconds", 3, "--interval", 9, code=1)
+    assert "0 samples" in ended.out
+    said = complaints(ended.err)[-1]
+    assert said.endswith(
+        "No new sample for 3.0 s, the sensor does not answer the bus: check its cable and power"
+    )
 
 
 def test_objects_of_a_chain_by_place_serial_and_name(chain: SimulatedBus) -> None:
@@ -145,7 +161,8 @@ def test_objects_of_a_chain_by_place_serial_and_name(chain: SimulatedBus) -> Non
 
 
 def test_watch_shows_each_block_and_writes_nothing(bench: SimulatedBus) -> None:
-    ended = tool_here("watch", bench.near, "--seconds", 0.6, "--interval", 0.2)
+    ended = tool_here("watch", bench.near, "--seconds", 0.6, "--interval", 0.2, code=1)
+    assert "No new sample for 0.6 s, the sensor repeats the same sample" in one_sentence(ended)
     blocks = [line for line in ended.out.splitlines() if "samples" in line and line.startswith("sensor 0  ")]
     assert 2 <= len(blocks) <= 4
     assert "repeated" in blocks[1], "it gives nothing new, and shows"

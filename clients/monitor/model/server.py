@@ -38,7 +38,7 @@ class Model:
         self._since: tuple[float, str] | None = None
         self._reason = ""
         self._heard_s = 0.0
-        self._version = ""
+        self._version = self._replay = ""
         self._own_peer = ""
         self._status: JsonObject = {}
         self._status_s = 0.0
@@ -49,12 +49,13 @@ class Model:
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
         """Connected; `own_peer` is the address of this end, as in `status`."""
         with self._lock:
+            again = self._since is not None
             self._connected, self._reason = True, ""
             self._since = (now_s, clock_text())
             self._heard_s, self._own_peer = now_s, own_peer
             self._status, self._clients = {}, ()
             for sensor in self._sensors.values():
-                sensor.restart()
+                sensor.restart(now_s, again=again)
             self._describe(description, now_s)
 
     def described(self, description: JsonObject, now_s: float) -> None:
@@ -86,6 +87,7 @@ class Model:
             sensor = self._sensors.get(frame.sensor)
             if sensor is not None and not frame.flags & NOT_NEW:
                 sensor.meter.note_age((now_ns - frame.monotonic_ns) * 1e-3, now_ns * 1e-9)
+                sensor.judgement.note_age(frame, now_ns)
 
     def take_status(self, status: JsonObject, now_s: float) -> None:
         """A reply to `status`."""
@@ -112,6 +114,8 @@ class Model:
                 sensor.lost(said or "The server has lost this sensor")
             elif name == Event.SENSOR_BACK and sensor is not None:
                 sensor.lost(None)
+            elif name == Event.OFFSET_CHANGED and sensor is not None:
+                sensor.reset_peaks()
             where = "" if position is None else f" {position}"
             self._events.append(f"{clock_text()} {name}{where}{': ' + said if said else ''}")
 
@@ -144,6 +148,7 @@ class Model:
 
     def _describe(self, description: JsonObject, now_s: float) -> None:
         self._version = text(description.get("version"))
+        self._replay = _replay(description.get("replay"))
         found = {}
         for row in rows(description.get("sensors")):
             position = whole(row.get("sensor"))
@@ -180,6 +185,7 @@ class Model:
             reason=self._reason,
             heard_s=now_s - self._heard_s if self._connected else None,
             version=self._version,
+            replay=self._replay,
             uptime_s=uptime_s,
             cycles=whole(status.get("cycles")),
             missed_deadlines=whole(status.get("missed_deadlines")),
@@ -187,6 +193,16 @@ class Model:
             wake_us=spread(timing.get("wake_us")),
             exchange_us=spread(timing.get("exchange_us")),
         )
+
+
+def _replay(given: Any) -> str:
+    """What a replay plays; empty for a server with sensors."""
+    if not isinstance(given, dict):
+        return ""
+    files = given.get("files")
+    names = [text(name) for name in files] if isinstance(files, list) else []
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    return f"{names[0]}{more}" if names else "a recording"
 
 
 def clock_text() -> str:

@@ -8,13 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from protocol.health.limits import LIMITS
+from protocol.health.verdict import NOTHING_WRONG, Level, Verdict
 from protocol.pdo import PDO_FIELDS, Sample
 
 WRENCH_FIELDS: Final = tuple(f.name for f in PDO_FIELDS if f.name.startswith(("force.", "torque.")))
 """The six axes of the wrench, as the process data names them."""
 AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """The same as people write them."""
-SILENT_S: Final = 1.0
+SILENT_S: Final = LIMITS.stale_after
 """A server that sends nothing for this time is silent; it normally sends a frame per sample period."""
 
 
@@ -42,10 +44,9 @@ class Clock(NamedTuple):
 
 
 class Alert(NamedTuple):
-    """A problem, in words."""
+    """Something the judge of streams found."""
 
-    severity: str
-    """`warning`, `error` or `fatal`."""
+    level: Level
     text: str
     remedy: str
     ago_s: float | None
@@ -114,6 +115,8 @@ class SensorState:
     """Of the six axes, oldest first: a range per time step, None without samples."""
     saturated: frozenset[str] = frozenset()
     """The axes that are saturated now."""
+    verdict: Verdict = NOTHING_WRONG
+    """On the last second."""
     alerts: tuple[Alert, ...] = ()
     """Present ones first, then the latest."""
     stream: StreamState = field(default_factory=StreamState)
@@ -145,6 +148,8 @@ class ServerState:
     heard_s: float | None = None
     """Time since anything came from it, while connected."""
     version: str = ""
+    replay: str = ""
+    """What it replays; empty if it has sensors."""
     uptime_s: float | None = None
     cycles: int | None = None
     missed_deadlines: int | None = None

@@ -53,22 +53,31 @@ def bar(value: float, peak: Range | None, scale: float, width: int, glyphs: Glyp
 
 def trace(past: Sequence[Range | None], scale: float, width: int, glyphs: Glyphs) -> str:
     """The last `width` time steps; of each the value furthest from the median."""
+    return traces(past, scale, width, 1, glyphs)[0]
+
+
+def traces(
+    past: Sequence[Range | None], scale: float, width: int, height: int, glyphs: Glyphs
+) -> list[str]:  # fmt: skip
+    """The same on `height` rows, the top first."""
     shown = list(past[-width:]) if width else []
     known = [r for r in shown if r is not None]
     if not known:
-        return " " * width
+        return [" " * width] * height
     low, high = min(r.low for r in known), max(r.high for r in known)
     middle, usual = (low + high) / 2, statistics.median((r.low + r.high) / 2 for r in known)
     half = max((high - low) / 2, _QUIET * scale / 2)
-    top = len(glyphs.levels) - 1
+    steps = len(glyphs.levels)
     drawn = []
     for piece in shown:
         if piece is None:
-            drawn.append(" ")
+            drawn.append(" " * height)
             continue
         value = piece.high if piece.high - usual >= usual - piece.low else piece.low
-        drawn.append(glyphs.levels[round((value - middle + half) / (2 * half) * top)])
-    return "".join(drawn).rjust(width)
+        full, rest = divmod(round((value - middle + half) / (2 * half) * (height * steps - 1)), steps)
+        column = glyphs.full * full + glyphs.levels[rest]
+        drawn.append(column[:height].ljust(height))
+    return ["".join(column[row] for column in drawn).rjust(width) for row in reversed(range(height))]
 
 
 def joined(cells: Sequence[str], styles: Sequence[str]) -> Text:

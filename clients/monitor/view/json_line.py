@@ -24,6 +24,7 @@ def as_json(state: State, unix_s: float) -> dict[str, Any]:
         "since_s": server.since_s,
         "heard_s": server.heard_s,
         "reason": server.reason or None,
+        "replay": server.replay or None,
         "server": {
             "version": server.version,
             "uptime_s": server.uptime_s,
@@ -69,7 +70,8 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
         "temperature": sample and sample.temperature,
         "orientation": sample and sample.orientation and list(sample.orientation),
         "saturated": sorted(sensor.saturated),
-        "alerts": [{"severity": a.severity, "text": a.text, "remedy": a.remedy} for a in sensor.alerts],
+        "verdict": sensor.verdict.level.key,
+        "alerts": [{"severity": a.level.key, "text": a.text, "remedy": a.remedy} for a in sensor.alerts],
         "samples": stream.samples,
         "rate_hz": stream.rate_hz,
         "age_us": _spread(stream.age_us, "worst"),

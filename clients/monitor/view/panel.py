@@ -11,7 +11,7 @@ from clients import numbers
 from clients.monitor.model.sensor import TRACE_STEP_S
 from clients.monitor.model.state import AXES, Alert, Range, SensorState
 from clients.monitor.view import words
-from clients.monitor.view.bars import bar, joined, scale_for, trace
+from clients.monitor.view.bars import bar, joined, scale_for, traces
 from clients.monitor.view.glyphs import ALARM, BAD, BAR, LABEL, NOTICE, PEAK, VALUE, Glyphs
 
 _LEAST_SCALE: Final = {"N": 5.0, "Nm": 0.2, "counts": 1000.0}
@@ -20,6 +20,10 @@ _VALUE_WIDTH: Final = 9
 _PEAK_WIDTH: Final = 9
 _FIELD_WIDTH: Final = 9
 """Width of the label before a row, such as `Stream`."""
+
+
+MOST_TALL: Final = 8
+"""More rows show no more of a trace."""
 
 
 class Row(NamedTuple):
@@ -39,7 +43,7 @@ class _Columns(NamedTuple):
 
 
 def _columns(width: int) -> _Columns:
-    trace_width = 24 if width >= 110 else 16 if width >= 76 else 0
+    trace_width = 80 if width >= 180 else 24 if width >= 110 else 16 if width >= 76 else 0
     peaks = width >= 56
     left = width - _LABEL_WIDTH - _VALUE_WIDTH - 1
     left -= 2 * _PEAK_WIDTH if peaks else 0
@@ -47,13 +51,18 @@ def _columns(width: int) -> _Columns:
     return _Columns(max(5, left - 1 + left % 2), peaks, trace_width)
 
 
-def panel(sensor: SensorState, others: Sequence[SensorState], width: int, glyphs: Glyphs) -> list[Row]:
-    """The rows of `sensor`, without its alerts; of `others` only the state is shown."""
+def panel(
+    sensor: SensorState, others: Sequence[SensorState], width: int, glyphs: Glyphs, tall: int = 1
+) -> list[Row]:
+    """The rows of `sensor`, without its alerts; of `others` only the state is shown.
+
+    `tall`: rows of the trace of each axis.
+    """
     force, torque = sensor.units
     return [
         Row(2, _identity(sensor, others, width)),
-        *_bars(sensor, "Force", force, range(3), width, glyphs),
-        *_bars(sensor, "Torque", torque, range(3, 6), width, glyphs),
+        *_bars(sensor, "Force", force, range(3), width, glyphs, tall),
+        *_bars(sensor, "Torque", torque, range(3, 6), width, glyphs, tall),
         *_imu(sensor),
         Row(3, field("Stream", _stream(sensor))),
         Row(4, _losses(sensor)),
@@ -85,7 +94,7 @@ def alerts(sensor: SensorState, width: int, most: int) -> list[Row]:
 def _alert(alert: Alert, width: int) -> list[Text]:
     present = alert.ago_s is None
     head = Text.assemble(
-        (f" {alert.severity} " if present else alert.severity, ALARM if present else BAD),
+        (f" {alert.level.words} " if present else alert.level.words, ALARM if present else BAD),
         (f" {words.seen(alert.ago_s)}: ", "" if present else LABEL),
         (alert.text, VALUE if present else ""),
     )
@@ -101,9 +110,9 @@ def _identity(sensor: SensorState, others: Sequence[SensorState], width: int) ->
     if sensor.old_s is not None:
         rest.append(f" values {numbers.duration(sensor.old_s)} old ", ALARM)
     for other in others:
-        present = any(alert.ago_s is None for alert in other.alerts)
+        level = other.verdict.level
         rest.append(f" {other.position}", LABEL)
-        rest.append(" error " if present else " ok", ALARM if present else "")
+        rest.append(f" {level.words} " if level else f" {level.words}", ALARM if level else "")
     if rest.cell_len:
         row.truncate(max(0, width - rest.cell_len - 1))
         row.pad_right(width - rest.cell_len - row.cell_len)
@@ -111,8 +120,8 @@ def _identity(sensor: SensorState, others: Sequence[SensorState], width: int) ->
 
 
 def _bars(
-    sensor: SensorState, title: str, unit: str, axes: range, width: int, glyphs: Glyphs
-) -> list[Row]:  # fmt: skip
+    sensor: SensorState, title: str, unit: str, axes: range, width: int, glyphs: Glyphs, tall: int
+) -> list[Row]:
     columns = _columns(width)
     peaks = sensor.peaks
     scale = scale_for([] if peaks is None else [peaks[axis] for axis in axes], _LEAST_SCALE[unit])
@@ -133,9 +142,12 @@ def _bars(
         row.append_text(bar(values[axis], peak, scale, columns.bar, glyphs))
         if columns.peaks:
             row.append(_peak_text(peak, digits), PEAK)
-        if columns.trace:
-            row.append(" " + trace(sensor.traces[axis], scale, columns.trace, glyphs), BAR)
         rows.append(Row(0, row))
+        if columns.trace:
+            first, *more = traces(sensor.traces[axis], scale, columns.trace, tall, glyphs)
+            left = " " * (row.cell_len + 1)
+            row.append(f" {first}", BAR)
+            rows += [Row(8, Text.assemble(left, (line, BAR))) for line in more]
     return rows
 
 

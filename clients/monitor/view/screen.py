@@ -9,10 +9,10 @@ from typing import Final
 from rich.text import Text
 
 from clients import numbers
-from clients.monitor.model.state import State
+from clients.monitor.model.state import AXES, State
 from clients.monitor.view import words
 from clients.monitor.view.glyphs import ALARM, BAD, LABEL, NOTICE, UNICODE, VALUE, Glyphs, to_ascii
-from clients.monitor.view.panel import Row, alerts, field, panel
+from clients.monitor.view.panel import MOST_TALL, Row, alerts, field, panel
 
 KEYS: Final = (
     ("t", "tare", "zero this sensor's reading, in the sensor; asks first"),
@@ -84,11 +84,14 @@ def _sensors(state: State, look: Look, width: int, height: int) -> list[Row]:
     for number, sensor in enumerate(shown):
         if number:
             rows.append(Row(7, Text()))
-        own = panel(
-            sensor, sorted(others, key=lambda s: s.position) if not number else (), width, look.glyphs
-        )
-        spare = height // count - len(own)
-        rows += [*own, *alerts(sensor, width, max(2, spare))]
+        told = sorted(others, key=lambda s: s.position) if not number else ()
+        own = panel(sensor, told, width, look.glyphs)
+        room = height // count - bool(number)
+        wrong = alerts(sensor, width, max(2, room - len(own)))
+        tall = min(MOST_TALL, 1 + (room - len(own) - len(wrong)) // len(AXES))
+        if tall > 1:
+            own = panel(sensor, told, width, look.glyphs, tall)
+        rows += [*own, *wrong]
     return rows
 
 
@@ -105,6 +108,8 @@ def _title(state: State, look: Look, width: int) -> Text:
     server = state.server
     left = Text.assemble(("ethercat-monitor ", VALUE), server.address)
     right = Text()
+    if server.replay:
+        right.append(f" REPLAY {server.replay} ", NOTICE)
     if look.recording:
         right.append(f" {look.recording} ", NOTICE)
     if look.paused:

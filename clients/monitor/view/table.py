@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from clients import numbers
 from clients.monitor.model.state import Alert, SensorState, State
 from clients.monitor.view import words
+from protocol.health.verdict import Level
 
 _WIDTH = 20
 
@@ -16,6 +17,8 @@ def table(state: State) -> list[str]:
     server = state.server
     trouble = words.trouble(server)
     lines = [f"Server {server.address}  {words.link(server)}"]
+    if server.replay:
+        lines.append(f"  REPLAY of {server.replay}")
     if trouble is not None:
         lines.append(f"  {trouble}")
     elif server.uptime_s is not None:
@@ -29,23 +32,26 @@ def table(state: State) -> list[str]:
     lines += [f"  client {words.client(client)}" for client in state.clients]
     for sensor in state.sensors:
         lines += ["", *_sensor(sensor)]
-    wrong = problems(state)
-    return [*lines, "", f"Not fine: {'; '.join(wrong)}." if wrong else "Fine."]
+    level, what = verdict(state)
+    return [*lines, "", f"{level.words.capitalize()}: {what}."]
 
 
-def problems(state: State) -> list[str]:
-    """What is wrong; empty if nothing is. Alerts of severity `warning` do not count."""
-    if not state.server.connected:
-        return ["there is no server"]
+def verdict(state: State) -> tuple[Level, str]:
+    """How bad all that is there is, and what was found."""
+    wrong = words.trouble(state.server)
+    if wrong is not None or not state.server.connected:
+        return Level.TROUBLE, f"there is no server: {wrong}" if wrong else "there is no server"
     if not state.sensors:
-        return ["the server has no sensor"]
-    found = []
-    for sensor in state.sensors:
-        said = [_alert(alert) for alert in sensor.alerts if alert.severity != "warning"]
-        if sensor.sample is None and not said:
-            said = ["no sample came"]
-        found += [f"sensor {sensor.position}: {text}" for text in said]
-    return found
+        return Level.TROUBLE, "the server has no sensor"
+    found = [
+        (finding.level, f"sensor {sensor.position}: {finding.sentence}")
+        for sensor in state.sensors
+        for finding in sensor.verdict.findings
+    ]
+    if not found:
+        return Level.GOOD, state.sensors[0].verdict.sentence
+    found.sort(key=lambda one: -one[0])
+    return found[0][0], "; ".join(sentence for _, sentence in found)
 
 
 def line(sensor: SensorState, clock_text: str) -> str:
@@ -61,7 +67,7 @@ def line(sensor: SensorState, clock_text: str) -> str:
     parts += [words.rate(sensor), f"age {words.age(sensor.stream.age_us, 'worst')}"]
     stream = sensor.stream
     parts.append(f"lost {words.count(sensor.bus_lost)}+{stream.missed} repeated {stream.repeated}")
-    alerts = [f"{alert.severity}: {_alert(alert)}" for alert in sensor.alerts if alert.ago_s is None]
+    alerts = [f"{alert.level.words}: {_alert(alert)}" for alert in sensor.alerts if alert.ago_s is None]
     return "  ".join([*parts, *alerts])
 
 
@@ -97,7 +103,7 @@ def _sensor(sensor: SensorState) -> list[str]:
         f"  clock     {words.clock(sensor)}, age at hand-out {words.age(sensor.hand_out_us, 'p99')}",
     ]
     for alert in sensor.alerts:
-        rows.append(f"  {alert.severity.ljust(9)} {_alert(alert)} -> {alert.remedy}")
+        rows.append(f"  {alert.level.words.ljust(12)}  {_alert(alert)} -> {alert.remedy}")
     if not sensor.alerts:
         rows.append("  warnings  none")
     return rows

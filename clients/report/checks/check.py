@@ -5,19 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Final
+
+from protocol.health import verdict as health
 
 
 class Level(IntEnum):
     """Severity, worst last."""
 
-    OK = 0
+    GOOD = 0
     NOT_APPLICABLE = 1
     """There is nothing to check, for example because the IMU is off; a sensor can still be healthy."""
     NOT_POSSIBLE = 2
     """It could not be checked."""
-    ATTENTION = 3
+    LOOK = 3
     """Needs attention; the data can be used."""
-    FAULT = 4
+    TROUBLE = 4
     """The data cannot be trusted, or the sensor needs service."""
 
     @property
@@ -37,11 +40,11 @@ class Level(IntEnum):
 
 
 _WORDS = {
-    Level.OK: ("ok", "✓"),
+    Level.GOOD: (health.Level.GOOD.words, "✓"),
     Level.NOT_APPLICABLE: ("not applicable", "-"),
     Level.NOT_POSSIBLE: ("not possible", "?"),
-    Level.ATTENTION: ("attention", "!"),
-    Level.FAULT: ("fault", "✗"),
+    Level.LOOK: (health.Level.LOOK.words, "!"),
+    Level.TROUBLE: (health.Level.TROUBLE.words, "✗"),
 }
 
 
@@ -59,11 +62,27 @@ class Check:
     """What to do; empty where nothing is wrong."""
 
 
+OF_STREAM: Final = {health.Level.LOOK: Level.LOOK, health.Level.TROUBLE: Level.TROUBLE}
+"""Levels of what the judge of streams found."""
+
+
+def judged(
+    name: str, findings: Sequence[health.Finding], good: str, *, details: str = "", matters: str = "",
+    remedy: str = "",
+) -> Check:  # fmt: skip
+    """What the judge of streams found, with more `details` and `remedy`; `good` if it found nothing."""
+    if not findings:
+        return Check(name, Level.GOOD, good)
+    found = " ".join([*(f"{each.found}." for each in findings), *([details] if details else [])])
+    remedies = dict.fromkeys([*(f"{each.remedy}." for each in findings), *([remedy] if remedy else [])])
+    return Check(name, OF_STREAM[findings[0].level], found, matters, " ".join(remedies))
+
+
 HEADLINES = {
-    Level.OK: "Healthy",
+    Level.GOOD: health.Level.GOOD.words.capitalize(),
     Level.NOT_POSSIBLE: "Not conclusive",
-    Level.ATTENTION: "Attention",
-    Level.FAULT: "Fault",
+    Level.LOOK: health.Level.LOOK.words.capitalize(),
+    Level.TROUBLE: health.Level.TROUBLE.words.capitalize(),
 }
 
 
@@ -72,7 +91,7 @@ class Verdict:
     """The overall result."""
 
     level: Level
-    """OK, NOT_POSSIBLE, ATTENTION or FAULT."""
+    """GOOD, NOT_POSSIBLE, LOOK or TROUBLE."""
     sentence: str
 
     @property
@@ -83,7 +102,7 @@ class Verdict:
 
 def verdict(checks: Sequence[Check]) -> Verdict:
     """The worst check decides; only a sensor that could be checked completely is healthy."""
-    wrong = [check for check in checks if check.level >= Level.ATTENTION]
+    wrong = [check for check in checks if check.level >= Level.LOOK]
     unchecked = [check for check in checks if check.level is Level.NOT_POSSIBLE]
     left_out = [check for check in checks if check.level is Level.NOT_APPLICABLE]
     not_checked = f"It could not be checked: {_names(unchecked)}." if unchecked else ""
@@ -98,7 +117,7 @@ def verdict(checks: Sequence[Check]) -> Verdict:
     sentence = "All checks passed."
     if left_out:
         sentence = f"All applicable checks passed. Not applicable: {_names(left_out)}."
-    return Verdict(Level.OK, sentence)
+    return Verdict(Level.GOOD, sentence)
 
 
 def _names(checks: Sequence[Check]) -> str:

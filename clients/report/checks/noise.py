@@ -175,12 +175,12 @@ def check_imu(series: Series, noise: Noise) -> Check:
         IMU_NAME, noise, range(6, 12), "Gravity compensation and the like become noisy.",
         "Record again with the sensor stationary. If it persists, contact the manufacturer.",
     )  # fmt: skip
-    if found.level is not Level.OK:
+    if found.level is not Level.GOOD:
         return found
     uneven = [text for group in (ACCELERATION, ANGULAR_RATE) for text in _uneven(group.name, noise)]
     if uneven:
         return Check(
-            IMU_NAME, Level.ATTENTION, f"{listing(uneven)}. That is below the limit.",
+            IMU_NAME, Level.LOOK, f"{listing(uneven)}. That is below the limit.",
             "Three axes of one chip should be alike, unless the sensor vibrates about one axis.",
             "Record again with the sensor stationary. If it persists, contact the manufacturer.",
         )  # fmt: skip
@@ -223,7 +223,7 @@ def _judge(name: str, noise: Noise, indices: range, matters: str, remedy: str) -
             f"{figure(ratio[p], 2)} times the limit of {figure(noise.limit[p])}"
             for p in above
         ]
-        return Check(name, Level.FAULT, f"{listing(texts)}.", matters, remedy)
+        return Check(name, Level.TROUBLE, f"{listing(texts)}.", matters, remedy)
     noisy = [index for index in indices if noise.noisy[index] >= _FEWEST_NOISY]
     if noisy:
         times = noise.worst / noise.limit
@@ -233,7 +233,7 @@ def _judge(name: str, noise: Noise, indices: range, matters: str, remedy: str) -
             f"{figure(times[p], 2)} times the limit of {figure(noise.limit[p])}"
             for p in noisy
         ]
-        level = Level.FAULT if max(times[noisy]) > _VERY_NOISY else Level.ATTENTION
+        level = Level.TROUBLE if max(times[noisy]) > _VERY_NOISY else Level.LOOK
         return Check(name, level, f"{listing(texts)}.", matters, remedy)
     if unknown:
         return _not_possible(
@@ -242,6 +242,6 @@ def _judge(name: str, noise: Noise, indices: range, matters: str, remedy: str) -
         )  # fmt: skip
     worst = max(indices, key=lambda index: float(ratio[index]))
     return Check(
-        name, Level.OK, f"At most {figure(100 * ratio[worst], 2)} % of a healthy sensor's limit "
+        name, Level.GOOD, f"At most {figure(100 * ratio[worst], 2)} % of a healthy sensor's limit "
         f"({CHANNELS[worst].title}: {figure(noise.deviation[worst])} {CHANNELS[worst].group.unit}).",
     )  # fmt: skip

@@ -81,11 +81,11 @@ def check(series: Series) -> Check:
             for run in stuck
         ]
         return Check(
-            NAME, Level.FAULT, f"{listing(texts)}.", "The channel does not measure.",
+            NAME, Level.TROUBLE, f"{listing(texts)}.", "The channel does not measure.",
             "Power-cycle the sensor. If it persists, it needs repair.",
         )  # fmt: skip
     longest = max((run for run in runs if not run.channel.group.is_imu), key=lambda run: run.samples)
     run = count(longest.samples, "sample")
     return Check(
-        NAME, Level.OK, f"No channel is stuck; the longest constant run of a force or torque is {run}."
+        NAME, Level.GOOD, f"No channel is stuck; the longest constant run of a force or torque is {run}."
     )

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from clients.numbers import figure
-from clients.report.checks.check import Check, Level
+from clients.report.checks.check import Check, Level, judged
 from clients.report.checks.timing import too_few
 from clients.report.subjects.series import Floats, Series
+from protocol.health.verdict import Finding
 from protocol.pdo import STANDARD_GRAVITY
 
 _GRAVITY_TOLERANCE: Final = 1.0
 """m/s²: an accelerometer's offset is well below it."""
-_COLDEST, _HOTTEST = -40.0, 125.0
-"""°C: electronics of this kind do not work outside this range."""
 _FEWEST_POINTS: Final = 4
 _MOST_POINTS: Final = 300
 _TURNED_DEG: Final = 2.0
@@ -127,16 +127,16 @@ def check_gravity(series: Series) -> Check:
         f"The accelerometer measures {figure(usual)} m/s² (median of the norm); {STANDARD_GRAVITY} is one g."
     )
     if abs(usual - STANDARD_GRAVITY) <= _GRAVITY_TOLERANCE:
-        return Check(name, Level.OK, found)
+        return Check(name, Level.GOOD, found)
     remedy = "If the sensor was stationary: check acceleration_range_g and the acceleration offset (0x8001)."
     if abs(usual / STANDARD_GRAVITY - STANDARD_GRAVITY) < _GRAVITY_TOLERANCE:
         remedy = "This firmware sends SI units: use --imu-raw-units si (ROS node: imu_raw_units)."
     elif abs(usual * STANDARD_GRAVITY - STANDARD_GRAVITY) < _GRAVITY_TOLERANCE:
         remedy = "This firmware sends g: omit --imu-raw-units si."
-    return Check(name, Level.ATTENTION, found, "Gravity compensation subtracts the wrong weight.", remedy)
+    return Check(name, Level.LOOK, found, "Gravity compensation subtracts the wrong weight.", remedy)
 
 
-def check_temperature(series: Series) -> Check:
+def check_temperature(series: Series, findings: Sequence[Finding]) -> Check:
     """Is the temperature plausible?"""
     name = "Temperature"
     finite = series.samples.temperature[np.isfinite(series.samples.temperature)]
@@ -144,9 +144,4 @@ def check_temperature(series: Series) -> Check:
         return too_few(name, 0)
     low, high = float(finite.min()), float(finite.max())
     found = f"{figure(low)} to {figure(high)} °C."
-    if low < _COLDEST or high > _HOTTEST:
-        return Check(
-            name, Level.ATTENTION, found, "The electronics cannot have this temperature.",
-            "Do not use it for compensation; contact the manufacturer.",
-        )  # fmt: skip
-    return Check(name, Level.OK, found)
+    return judged(name, findings, found, details=found)

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
 import numpy as np
 
-from clients.numbers import count, figure, seconds, share
-from clients.report.checks.check import Check, Level
+from clients.numbers import count, figure, seconds
+from clients.report.checks.check import Check, Level, judged
 from clients.report.subjects.series import Bools, Floats, Series
 from protocol.accounting import StreamAccounting, StreamCounts
+from protocol.health.limits import LIMITS
+from protocol.health.verdict import Finding
 
+Findings = Sequence[Finding]
+"""What the judge of streams found that belongs to one check."""
+
+_STALE: Final = "A controller acts on stale data; spectra and derivatives are wrong there."
 _FEWEST: Final = 100
 """Minimum number of samples to judge by."""
-_LOST_FAULT: Final = 0.005
-"""Share of the samples above which losses are a fault."""
-_SILENT_FAULT_S: Final = 0.1
-_IRREGULAR: Final = 0.2
-"""Share of a period that 95 % of the intervals may deviate by."""
 _STEP_NS: Final = 1_000_000
 """CLOCK_REALTIME that moves against CLOCK_MONOTONIC by more than this between two samples was adjusted."""
-RATE_TOLERANCE: Final = 0.002
-"""Relative deviation of a sensor's clock from its nominal rate."""
-_RATE_TOLERANCE_ROUNDED: Final = 0.01
-"""The same where only the rate in whole Hz is known."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +37,8 @@ class Timing:
         """The frames' kinds, as every client counts them."""
         frames = self.series.frames
         accounting = StreamAccounting(every=self.series.step, fresh_only=False)
+        # Not the usual interval: where every other sample is lost, that is two periods.
+        accounting.rate_hz = self.series.step / (self.series.nominal_period or self.series.period)
         rows = zip(frames.sequence.tolist(), frames.monotonic_ns.tolist(), frames.flags.tolist(), strict=True)
         for sequence, monotonic_ns, flags in rows:
             accounting.take(sequence, monotonic_ns, flags)
@@ -99,72 +99,69 @@ class Timing:
         periods = float(np.sum(1 + s.missing[kept]))
         return float(s.intervals[kept].sum() / periods) if periods else s.period
 
+    @property
+    def judges_intervals(self) -> bool:
+        """Whether there are enough samples to judge their intervals."""
+        return self.series.count >= _FEWEST
 
-def check_losses(timing: Timing) -> Check:
+    @cached_property
+    def is_irregular(self) -> bool:
+        """Whether the stamps are not those of a clock that is followed."""
+        return self.usual_deviation > LIMITS.irregular * self.series.period
+
+    @cached_property
+    def usual_deviation(self) -> float:
+        """What 95 % of the regular intervals deviate by at most, s."""
+        return float(np.quantile(np.abs(self.deviations), 0.95)) if len(self.deviations) else 0.0
+
+    @cached_property
+    def not_finite(self) -> Bools:
+        """(n,) samples with a value that is no finite number."""
+        s = self.series
+        wrong: Bools = ~s.finite.all(axis=1) | ~np.isfinite(s.samples.temperature)
+        return wrong
+
+
+def check_losses(timing: Timing, findings: Findings) -> Check:
     """Are all samples there?"""
     name, series = "Lost samples", timing.series
     if series.count < _FEWEST:
         return too_few(name, series.count)
     total, lost = series.count + timing.lost, timing.lost
     if not lost:
-        unsure = (
-            f" {count(timing.counts.gaps, 'frame')} marked GAP, but no time is missing."
-            if timing.counts.gaps
-            else ""
-        )
-        return Check(name, Level.OK, f"None of {count(total, 'sample')}.{unsure}")
-    gaps = count(int(np.sum(series.missing > 0)), "place")
-    found = f"{lost} of {count(total, 'sample')} ({share(lost, total)}) are missing, in {gaps}."
+        return judged(name, findings, f"None of {count(total, 'sample')}.", matters=_STALE)
+    places = count(int(np.sum(series.missing > 0)), "place")
+    every = all(finding.size == lost for finding in findings)
+    details = f"In {places}." if every else f"{lost} of them where the sensor was not silent, in {places}."
     remedies = []
     if timing.withheld:
-        found += f" {timing.withheld} of them were available at the server, but not read in time."
+        details += f" {timing.withheld} of them were available at the server, but not read in time."
         remedies.append("Record on a less busy machine, or fewer sensors at once.")
     if timing.withheld < lost:
         which = f"{lost - timing.withheld} of them" if timing.withheld else "All of them"
-        found += f" {which} never reached the server."
-        remedies.append(
-            "Check missed_deadlines and lost_frames in the server's status: a busy machine (use real-time "
-            "priority: see ethercat-server --help) or a bad cable. If both are zero, the sensor skipped them."
-        )
-    return Check(
-        name, Level.FAULT if lost > _LOST_FAULT * total else Level.ATTENTION, found,
-        "A controller acts on stale data; spectra and derivatives are wrong there.", " ".join(remedies),
-    )  # fmt: skip
+        details += f" {which} never reached the server."
+        remedies.append("If missed_deadlines and lost_frames in status are zero, the sensor skipped them.")
+    return judged(name, findings, "", details=details, matters=_STALE, remedy=" ".join(remedies))
 
 
-def check_silence(timing: Timing) -> Check:
+def check_silence(timing: Timing, findings: Findings) -> Check:
     """Did the sensor always send new samples?"""
     name, spans = "Silent or stuck sensor", timing.silences
     if timing.series.duration <= 0:
         return Check(name, Level.NOT_POSSIBLE, "There are no frames.", "", "Record again.")
-    if not len(spans) and not timing.counts.repeated and not timing.counts.invalid:
-        return Check(name, Level.OK, "The sensor sent new samples all the time.")
     longest, total = (float(spans.max()), float(spans.sum())) if len(spans) else (0.0, 0.0)
-    kinds = (
-        f"{count(timing.counts.repeated, 'repeated frame')}, {count(timing.counts.invalid, 'invalid one')}"
+    details = (
+        f"In {count(len(spans), 'stretch')} without a new sample, the longest {seconds(longest)}, together "
+        f"{seconds(total)}: {count(timing.counts.repeated, 'repeated frame')}, "
+        f"{count(timing.counts.invalid, 'invalid one')}."
     )
-    found = (
-        f"No new sample came in {count(len(spans), 'stretch')}, the longest {seconds(longest)}, together "
-        f"{seconds(total)} ({kinds})."
+    good = "The sensor sent new samples all the time."
+    return judged(
+        name, findings, good, details=details, matters="What is published in the meantime is stale."
     )
-    if not timing.series.count:
-        found = f"No new sample came in {seconds(total)} ({kinds})."
-    remedies = []
-    if timing.counts.repeated:
-        remedies.append(
-            "Repeated frames: the sensor is stuck, or its rate is lower than nominal; power-cycle it."
-        )
-    if timing.counts.invalid:
-        remedies.append(
-            "Invalid frames: the sensor did not answer; check cable, supply and the server's log."
-        )
-    return Check(
-        name, Level.FAULT if longest > _SILENT_FAULT_S else Level.ATTENTION, found,
-        "What is published in the meantime is stale.", " ".join(remedies),
-    )  # fmt: skip
 
 
-def check_stamps(timing: Timing) -> Check:
+def check_stamps(timing: Timing, findings: Findings) -> Check:
     """Are the stamps regular and ascending, and was the clock not adjusted?"""
     name, series = "Stamps", timing.series
     if series.count < _FEWEST:
@@ -181,25 +178,22 @@ def check_stamps(timing: Timing) -> Check:
         )
         remedies.append("Wait for chrony or NTP to converge before recording.")
     off = np.abs(timing.deviations)
-    usual, most = (float(np.quantile(off, q)) if len(off) else 0.0 for q in (0.95, 1.0))
     usually = (
-        f"95 % of the intervals are within {seconds(usual)} of {seconds(series.period)}, all within "
-        f"{seconds(most)}."
+        f"95 % of the intervals are within {seconds(timing.usual_deviation)} of {seconds(series.period)}, "
+        f"all within {seconds(float(off.max()) if len(off) else 0.0)}."
     )
-    if usual > _IRREGULAR * series.period:
-        wrong.append(usually)
-        remedies.append(
-            "The server did not follow the sensor's clock: is its machine busy? See status, `locked`."
-        )
+    for finding in findings:
+        wrong += [f"{finding.found}.", usually]
+        remedies.append(f"{finding.remedy}.")
     if wrong:
         return Check(
-            name, Level.ATTENTION, " ".join(wrong), "Sensor fusion and derivatives suffer.",
+            name, Level.LOOK, " ".join(wrong), "Sensor fusion and derivatives suffer.",
             " ".join(remedies),
         )  # fmt: skip
-    return Check(name, Level.OK, usually)
+    return Check(name, Level.GOOD, usually)
 
 
-def check_rate(timing: Timing) -> Check:
+def check_rate(timing: Timing, findings: Findings) -> Check:
     """Is the sampling rate that of the settings?"""
     name, series = "Sampling rate", timing.series
     nominal = series.nominal_period
@@ -212,14 +206,7 @@ def check_rate(timing: Timing) -> Check:
     rate, wanted = 1 / timing.mean_period, 1 / nominal
     pull = rate / wanted - 1
     found = f"{rate:.3f} Hz; the settings say {wanted:.3f} Hz ({pull * 1e6:+.0f} ppm)."
-    tolerance = RATE_TOLERANCE if series.subject.sinc_length is not None else _RATE_TOLERANCE_ROUNDED
-    if abs(pull) > tolerance:
-        return Check(
-            name, Level.ATTENTION, found, "The filters in effect are not those of the "
-            "settings.",
-            "Read them from the sensor (`ethercat-sensor plan`) and set them again.",
-        )  # fmt: skip
-    return Check(name, Level.OK, found)
+    return judged(name, findings, found, details=found)
 
 
 def too_few(name: str, samples: int) -> Check:

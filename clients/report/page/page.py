@@ -160,7 +160,8 @@ def as_json(examinations: Sequence[Examination]) -> str:
             {
                 "sensor": each.subject.position, "name": each.subject.name, "serial": each.subject.serial,
                 "source": each.subject.source, "verdict": each.verdict.level.key,
-                "sentence": each.verdict.sentence,
+                "sentence": each.verdict.sentence, "remarks": list(each.subject.remarks),
+                "stream": {"verdict": each.stream.level.key, "sentence": each.stream.sentence},
                 "checks": [
                     {"check": c.name, "outcome": c.level.key, "found": c.found, "matters": c.matters,
                     "remedy": c.remedy}

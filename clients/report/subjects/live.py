@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from clients.errors import ReportError
 from clients.recording.columns import columns
 from clients.report.subjects.recorded import event_remarks, no_sensor
 from clients.report.subjects.subject import Subject, subject
+from protocol.accounting import NOT_NEW
 from protocol.address import Address
 from protocol.client import Client, connect
 from protocol.errors import ConnectionFailedError
 from protocol.framing import DataMessage
+from protocol.health.observer import p99
 from protocol.pdo import ImuUnits
 from protocol.sensor_choice import MOST_PLACES, SensorChoice
 from protocol.text import untrusted
 from protocol.text.json_text import JsonObject
 
 _BATCH_S: Final = 0.05
+_MOST_AGES: Final = 1 << 16
 
 MOST_FRAMES: Final = 4_000_000
 """About half an hour at 1600 Hz; more than that is what a recording is for."""
@@ -31,6 +35,15 @@ class Received:
 
     def __init__(self) -> None:
         self.all: deque[DataMessage] = deque(maxlen=MOST_FRAMES)
+        self.ages_us: dict[int, deque[float]] = {}
+        """By sensor, of the samples that were waited for."""
+
+    def take(self, frames: Sequence[DataMessage], now_ns: int | None) -> None:
+        """Add what came just now; `now_ns` is CLOCK_MONOTONIC if it is the server's too."""
+        self.all.extend(frames)
+        if frames and now_ns is not None and not frames[-1].flags & NOT_NEW:
+            ages_us = self.ages_us.setdefault(frames[-1].sensor, deque(maxlen=_MOST_AGES))
+            ages_us.append((now_ns - frames[-1].monotonic_ns) * 1e-3)
 
     def frames(self, sensor: int | None = None) -> Iterable[DataMessage]:
         """The frames of the sensor at this position, or of all."""
@@ -55,8 +68,9 @@ def subjects(
         changed = "" if ended else _changed(client, rows)
     remarks = [*([ended] if ended else []), *([changed] if changed else []), *event_remarks(names)]
     return [
-        subject(
-            row, row.get("settings"), columns(received, position, imu_units), str(address), position
+        replace(
+            subject(row, row.get("settings"), columns(received, position, imu_units), str(address), position),
+            age_p99_us=p99(received.ages_us.get(position, ())),
         ).with_remarks(remarks)
         for position, row in rows.items()
     ]
@@ -88,18 +102,19 @@ def _chosen(
 def _listen(client: Client, seconds: float, progress: Callable[[float], None]) -> tuple[Received, str]:
     """The frames of `seconds`, and why they ended early, if they did."""
     received = Received()
-    begin = time.monotonic()
+    begin, same_clock = time.monotonic(), client.connection.same_machine
     while (passed := time.monotonic() - begin) < seconds:
         progress(passed)
         try:
-            received.all.extend(client.receive(min(_BATCH_S, seconds - passed)))
+            frames = client.receive(min(_BATCH_S, seconds - passed))
+            received.take(frames, round(time.monotonic() * 1e9) if same_clock else None)
         except ConnectionFailedError as error:
             if not received.all:
                 raise
             return received, f"The connection ended after {passed:.1f} s of {seconds:g}: {error}."
     if not received.all:
         raise ReportError(
-            f"nothing was received in {seconds:g} s: check `ethercat-sensor watch` and the server's log"
+            f"nothing was received in {seconds:g} s: check ethercat-sensor watch and the server's log"
         )
     return received, ""
 

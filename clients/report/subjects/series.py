@@ -100,7 +100,7 @@ class Series:
     @cached_property
     def step(self) -> int:
         """One sample in so many was asked of the server (`every`)."""
-        jumps = np.diff(self.samples.sequence)
+        jumps = np.diff(self.frames.sequence)
         return max(1, int(np.median(jumps))) if len(jumps) else 1
 
     @cached_property

@@ -36,6 +36,8 @@ class Subject:
     columns: Columns
     source: str
     """A file name or a server's address."""
+    age_p99_us: float | None = None
+    """Of the samples on arrival; None from a recording, or another machine."""
     remarks: tuple[str, ...] = ()
     """Sentences about the recording for the reader of the report."""
 

@@ -1,36 +1,81 @@
-"""The figures and clients of a server that uses the interface, instead of the bus."""
+"""The stream, the figures and the clients of a server that uses the interface, instead of the bus."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
+from operator import attrgetter
+from typing import Any, Final
 
 from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, warning
-from ethercat_server.doctor.verdict import age_finding, exchange_finding, wake_finding
+from ethercat_server.doctor.verdict import age_finding, as_cause, exchange_finding, wake_finding
 from ethercat_server.errors import ServerError
 from ethercat_server.links.remote import ServerLink
 from protocol.address import Address
+from protocol.control import Event
+from protocol.framing import DataMessage
+from protocol.health import verdict as health
+from protocol.health.judge import Observation, emergency, judge
+from protocol.health.observer import StreamObserver
+from protocol.text.untrusted import number
 
 Examine = Callable[[str, str, Callable[[], Iterator[Finding]]], Iterator[Finding]]
 
+_POSITION: Final = attrgetter("sensor")
+_FATES: Final = frozenset({Event.SENSOR_LOST, Event.SENSOR_BACK})
+_LOG: Final = "see the server's log (journalctl -u 'ethercat-server@*')"
+
 
 class ServerView:
-    """The `status` of a server before and after the measuring time."""
+    """The stream and the `status` of a server over the measuring time."""
 
     def __init__(self, address: Address, holder: str, seconds: float) -> None:
         """ServerError if it does not answer."""
         self.holder, self.address = holder, address
         link = ServerLink(address)
         try:
-            self.described: list[dict[str, Any]] = link.ask("describe")["sensors"]
+            rows: list[dict[str, Any]] = link.ask("describe")["sensors"]
             self.before: dict[str, Any] = link.ask("status")
-            link.clock.sleep(seconds)
+            start_ns = link.clock.monotonic_ns()
+            self._observers = [StreamObserver(number(row["rate_hz"]) or 0.0, start_ns) for row in rows]
+            self._events = link.listen(seconds, functools.partial(self._take, link)) if seconds else []
+            self._end_ns = link.clock.monotonic_ns()
             self.after: dict[str, Any] = link.ask("status")
+            self.described: list[dict[str, Any]] = link.ask("describe")["sensors"]
         finally:
             link.close()
         rows = [*self.described, *self.before["sensors"], *self.after["sensors"]]
         if not all(isinstance(row, dict) for row in rows):
             raise ServerError("the server's reply is not understood: install the same version of both")
+
+    def _take(self, link: ServerLink, frames: Sequence[DataMessage]) -> None:
+        now_ns = link.clock.monotonic_ns()
+        for position, of_one in groupby(sorted(frames, key=_POSITION), _POSITION):
+            if position < len(self._observers):
+                batch = list(of_one)
+                self._observers[position].take(batch, now_ns)
+                if link.same_machine:
+                    self._observers[position].note_age(batch[-1], now_ns)
+
+    def observation(self, position: int) -> Observation:
+        """What was seen of a sensor's stream."""
+        described = self.described[position]
+        before, after = self.before["sensors"][position], self.after["sensors"][position]
+        settings = described.get("settings")
+        fates = [event["event"] for event in self._events if event.get("sensor") == position]
+        return (
+            self._observers[position]
+            .observation(self._end_ns)
+            ._replace(
+                locked=after["clock"]["mode"] == "locked",
+                recoveries=max(0, int(after["recoveries"]) - int(before["recoveries"])),
+                is_lost=[fate for fate in fates if fate in _FATES][-1:] == [Event.SENSOR_LOST],
+                state=str(described["state"]),
+                emergency=emergency(after.get("emergency")),
+                settings=settings if isinstance(settings, dict) else {},
+            )
+        )
 
     def grown(self, name: str) -> int:
         """Increase of a counter."""
@@ -45,52 +90,50 @@ class ServerView:
         )
 
     def sensors(self) -> Iterator[Finding]:
-        """Each sensor: state, clock, losses."""
+        """Each sensor: the verdict on its stream."""
         for position, described in enumerate(self.described):
             before, after = self.before["sensors"][position], self.after["sensors"][position]
             clock = after["clock"]["mode"]
+            verdict = judge(self.observation(position))
             names = ("fresh", "repeated", "invalid", "lost_samples", "recoveries")
-            new = {name: int(after[name]) - int(before[name]) for name in names}
             values: dict[str, Any] = {
                 "sensor": position,
                 "serial": described["serial"],
                 "state": described["state"],
                 "clock": clock,
+                "verdict": verdict.level.key,
             }
-            values |= {name: after[name] for name in names} | {f"new_{name}": new[name] for name in names}
+            values |= {name: after[name] for name in names}
+            values |= {f"new_{name}": int(after[name]) - int(before[name]) for name in names}
             text = (
                 f"{described['name']}, serial {described['serial']}, {described['state']} at "
                 f"{described['rate_hz']} Hz, clock {clock}"
             )
-            log = "see the server's log (journalctl -u 'ethercat-server@*')"
-            if described["state"] != "OP" or new["invalid"]:
-                yield bad(f"{text}, no valid process data", f"the sensor is lost: {log}", **values)
-            elif new["lost_samples"] or new["recoveries"]:
-                lost = f"{new['lost_samples']} samples lost meanwhile, {new['recoveries']} recoveries"
-                yield warning(f"{text}, {lost}", f"wake-ups, exchanges or the cable: {log}", **values)
-            elif clock != "locked":
-                why = "its samples are polled, which takes more exchanges and makes time stamps less accurate"
-                yield note(text, why, **values)
+            if verdict.findings:
+                make = bad if verdict.level is health.Level.TROUBLE else warning
+                found = "; ".join(each.found for each in verdict.findings)
+                why = "; ".join(dict.fromkeys(each.remedy for each in verdict.findings))
+                yield make(f"{text}: {found}", why, **values)
             elif after["lost_samples"] or after["recoveries"]:
-                lost = (
-                    f"{after['lost_samples']} samples lost and {after['recoveries']} recoveries since "
-                    "its start"
-                )
-                yield note(f"{text}, {lost}", f"none meanwhile; {log}", **values)
+                lost = f"{after['lost_samples']} samples lost and {after['recoveries']} recoveries"
+                why = f"none meanwhile; {_LOG}"
+                yield note(f"{text}, {lost} since its start", why, **values)
             else:
-                yield ok(f"{text}, nothing lost", **values)
+                yield ok(f"{text}: {verdict.sentence[0].lower()}{verdict.sentence[1:]}", **values)
 
     def wake_ups(self) -> Iterator[Finding]:
         """The server's lateness in the last ten seconds."""
         missed = self.grown("missed_deadlines")
-        yield wake_finding(self.after["last_10s"]["wake_us"], missed, max(1, self.grown("cycles")))
+        summary, cycles = self.after["last_10s"]["wake_us"], max(1, self.grown("cycles"))
+        yield as_cause(wake_finding(summary, missed, cycles))
 
     def exchanges(self) -> Iterator[Finding]:
         """The server's exchanges in the last ten seconds."""
         summary = self.after["last_10s"]["exchange_us"]
         lost, count = self.grown("lost_frames"), max(1, self.grown("cycles"))
         text = "".join(f"{name} {summary[key]:.0f}, " for name, key in (("p50", "p50"), ("p99", "p99")))
-        yield exchange_finding(f"{text}max {summary['max']:.0f} µs in the last 10 s", summary, lost, count)
+        text += f"max {summary['max']:.0f} µs in the last 10 s"
+        yield as_cause(exchange_finding(text, summary, lost, count))
 
     def ages(self) -> Iterator[Finding]:
         """The age of samples when the server sends them."""
@@ -116,8 +159,7 @@ class ServerView:
             yield ok(f"{text}, none too slow", **values)
 
     def examine(self, examine: Examine) -> Iterator[Finding]:
-        """All checks."""
-        yield from examine("server", "server", self.server)
+        """All checks but that of the server itself."""
         yield from examine("server", "sensors", self.sensors)
         yield from examine("server", "wake-ups", self.wake_ups)
         yield from examine("server", "exchanges", self.exchanges)

@@ -129,14 +129,15 @@ def _read(args: argparse.Namespace) -> int:
             hint = f"did you mean {near}?" if near else "the command objects lists all"
             raise UsageError(f"no object is called {name!r}: {hint}")
         rows |= {row.address: row for row in found}
-    return _show(args, list(rows.values()))
+    return _show(args, list(rows.values()), all_wanted=True)
 
 
 def _objects(args: argparse.Namespace) -> int:
     return _show(args, KNOWN_OBJECTS)
 
 
-def _show(args: argparse.Namespace, rows: Sequence[ObjectEntry]) -> int:
+def _show(args: argparse.Namespace, rows: Sequence[ObjectEntry], *, all_wanted: bool = False) -> int:
+    """`all_wanted`: an object that cannot be read is a failure, also where the firmware does not have it."""
     with link(args, any_slave=True) as opened:
         sensors = [_read_sensor(opened, found, rows) for found in opened.chosen(args.sensor)]
     errors = [sensor.error for sensor in sensors if sensor.error]
@@ -147,9 +148,19 @@ def _show(args: argparse.Namespace, rows: Sequence[ObjectEntry]) -> int:
     else:
         for sensor in sensors:
             _say_sensor(sensor)
-    for error in errors:
-        note(str(error))
-    return FAILED if errors else DONE
+    failed = [str(error) for error in errors]
+    if all_wanted:
+        failed += [text for sensor in sensors if (text := _unread(sensor))]
+    for sentence in failed:
+        note(sentence)
+    return FAILED if failed else DONE
+
+
+def _unread(sensor: _Sensor) -> str:
+    """Which objects were not read, and why, a sentence; empty if all were."""
+    rows = [f"{row.name}: {read['error']}" for row, read in sensor.objects if "error" in read]
+    more = f"; and {len(rows) - 1} more" if len(rows) > 1 else ""
+    return f"sensor {sensor.found.number} gave no value of {rows[0]}{more}" if rows else ""
 
 
 def _say_sensor(sensor: _Sensor) -> None:

@@ -9,11 +9,14 @@ from typing import Any, Final
 
 from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.clock import Clock, Deadline
-from ethercat_server.links.link import Found
+from ethercat_server.links.link import Found, note
+from ethercat_server.process.command_line import FAILED
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.commands.block import Block
 from ethercat_server.tool.show import columns, say, say_json
-from protocol.framing import DataMessage
+from protocol.framing import DataFlag, DataMessage
+from protocol.health.judge import Observation, judge
+from protocol.health.limits import LIMITS
 
 _TERMINAL_INTERVAL_S: Final = 0.25
 _LINE_INTERVAL_S: Final = 1.0
@@ -32,6 +35,9 @@ class _Watch:
         self._sensors = {sensor.number: sensor for sensor in sensors}
         self._blocks = {number: Block() for number in self._sensors}
         self._taken = dict.fromkeys(self._sensors, 0)
+        self._silent = {number: Observation() for number in self._sensors}
+        """What came instead of samples."""
+        self._began_ns = clock.monotonic_ns()
         self._samples, self._json = args.samples, args.json
         self._clock, self._seconds = clock, args.seconds
         self._end: Deadline | None = None
@@ -43,7 +49,13 @@ class _Watch:
         number = frame.sensor
         if self._samples is not None and self._taken[number] >= self._samples:
             return not self._enough()
-        self._taken[number] += self._blocks[number].take(frame)
+        if self._blocks[number].take(frame):
+            self._taken[number] += 1
+        else:
+            invalid, seen = bool(frame.flags & DataFlag.INVALID), self._silent[number]
+            self._silent[number] = seen._replace(
+                invalid=seen.invalid + invalid, repeated=seen.repeated + (not invalid)
+            )
         return not self._enough()
 
     def _enough(self) -> bool:
@@ -52,6 +64,7 @@ class _Watch:
     def idle(self) -> bool:
         """Show what is due; returns whether to continue."""
         if self._show is None:  # it begins: the sensors have settled
+            self._began_ns = self._clock.monotonic_ns()
             self._show = Deadline(self._clock, self._interval_s)
             self._end = Deadline(self._clock, self._seconds) if self._seconds else None
         if self._end is not None and self._end.passed:
@@ -85,6 +98,17 @@ class _Watch:
     def summary(self) -> str:
         """Number of samples per sensor."""
         return ", ".join(f"sensor {number}: {count} samples" for number, count in self._taken.items())
+
+    def problems(self) -> list[str]:
+        """A sentence for each sensor that sent nothing."""
+        if self._show is None:  # it ended before it began
+            return []
+        silent_s = (self._clock.monotonic_ns() - self._began_ns) * 1e-9
+        return [
+            f"sensor {number}: {judge(seen._replace(silent_s=silent_s)).sentence}"
+            for number, seen in self._silent.items()
+            if not self._taken[number] and silent_s > LIMITS.stale_after
+        ]
 
 
 def _counts(row: dict[str, Any]) -> str:
@@ -163,7 +187,10 @@ def _watch(args: argparse.Namespace) -> int:
             watch.show()
         if not args.json:
             say(watch.summary())
-    return DONE
+        problems = watch.problems()
+    for problem in problems:
+        note(problem)
+    return FAILED if problems else DONE
 
 
 COMMANDS = (Command("watch", "show live values until Ctrl-C", _arguments, _watch),)

@@ -18,9 +18,9 @@ from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.health import Status, judge, text_of
 from bridge.diagnostics.observer import Observer
 from bridge.diagnostics.snapshot import Snapshot
-from bridge.parameters.table import Thresholds
 from bridge.publishing.messages import Outputs, create_publisher
 from bridge.stream.reader import Reader
+from protocol.health.limits import Limits
 
 TICK_S: Final = 0.1
 REPORT_S: Final = 1.0
@@ -32,14 +32,14 @@ class Monitor:
     def __init__(
         self,
         node: Node,
-        thresholds: Thresholds,
+        limits: Limits,
         reader: Reader,
         compensation: Callable[[], CompensationState],
         outputs: Outputs,
         on_failure: Callable[[str], object],
     ) -> None:
         self._observer, self._clock = Observer(reader, compensation), reader.link.clock
-        self.thresholds = thresholds
+        self.limits = limits
         """May be replaced at any time."""
         self._outputs, self._on_failure = outputs, on_failure
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
@@ -75,7 +75,7 @@ class Monitor:
         if regular:
             self._observer.measure(now_s)
         snapshot = self._observer.look(now_s)
-        statuses = judge(snapshot, self.thresholds)
+        statuses = judge(snapshot, self.limits)
         levels = [int(status.level) for status in statuses]
         if regular or levels != self._levels:
             self._levels, self._published_s = levels, now_s

@@ -14,6 +14,7 @@ from bridge.stream.frame_selector import FrameCounts
 from bridge.stream.reader import Reader
 from bridge.stream.watch import Flags
 from protocol.errors import ConnectionFailedError
+from protocol.health.observer import p99
 
 _SHORTEST_RATE_S: Final = 0.8
 """A rate measured over less time than this says little."""
@@ -31,8 +32,8 @@ class Observer:
         self._rate_hz: float | None = None
         self._fresh, self._fresh_s, self._epoch = 0, self._link.clock.monotonic(), -1
         """The last number of fresh samples, when it changed, and the link's epoch."""
-        self._rate_fresh, self._rate_s = 0, self._fresh_s
-        """Where the rate is measured from."""
+        self._rate_fresh, self._rate_s, self._rate_ns = 0, self._fresh_s, -1
+        """Where the rate is measured from: samples, time here, and the newest one's stamp."""
         self._then, self._then_not_finite = FrameCounts(), 0
         self._then_connects = self._then_withheld = self._then_saturated = 0
         self._then_server: ServerCounts | None = None
@@ -47,7 +48,7 @@ class Observer:
         counts = dataclasses.replace(reader.counts)
         if link.epoch != self._epoch:
             self._epoch, self._rate_hz = link.epoch, None
-            self._rate_fresh, self._rate_s = counts.new, now_s
+            self._rate_fresh, self._rate_s, self._rate_ns = counts.new, now_s, reader.newest_ns
         if counts.new != self._fresh:
             self._fresh, self._fresh_s = counts.new, now_s
         self._flags = self._flags.merge(reader.watch.take_flags())
@@ -92,12 +93,15 @@ class Observer:
         ages = self._reader.watch.take_ages()
         self._age_us = None
         if ages and connection is not None and connection.same_machine:
-            self._age_us = ages[len(ages) // 2] / 1e3, ages[min(len(ages) * 99 // 100, len(ages) - 1)] / 1e3
+            self._age_us = ages[len(ages) // 2] / 1e3, (p99(ages) or 0) / 1e3
         if self._link.epoch != self._epoch:
             return
-        fresh, elapsed_s = self._reader.counts.new, now_s - self._rate_s
-        self._rate_hz = (fresh - self._rate_fresh) / elapsed_s if elapsed_s >= _SHORTEST_RATE_S else None
-        self._rate_fresh, self._rate_s = fresh, now_s
+        fresh, elapsed_s, newest_ns = self._reader.counts.new, now_s - self._rate_s, self._reader.newest_ns
+        # By the stamps, as a delay here is none of the sensor's; by the clock if it has become silent.
+        span_s = (newest_ns - self._rate_ns) * 1e-9 if self._rate_ns >= 0 else 0.0
+        span_s = span_s if span_s >= _SHORTEST_RATE_S else elapsed_s
+        self._rate_hz = (fresh - self._rate_fresh) / span_s if elapsed_s >= _SHORTEST_RATE_S else None
+        self._rate_fresh, self._rate_s, self._rate_ns = fresh, now_s, newest_ns
 
     def begin_interval(self, reported: Snapshot, now_s: float) -> None:
         """`reported` was a regular report: what is new counts from there on. Asks the server again."""

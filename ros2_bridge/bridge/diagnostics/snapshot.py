@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.stream.connection import SensorInfo
 from bridge.stream.frame_selector import FrameCounts
 from bridge.stream.watch import Flags
+from protocol.health.judge import Observation, emergency
+
+SLOW_ANSWER_S: Final = 2.0
+"""A server that owes an answer for this time is stopped or overloaded."""
 
 
 class Snapshot(NamedTuple):
@@ -54,6 +58,37 @@ class Snapshot(NamedTuple):
     """Samples that could not be compensated."""
 
     @property
+    def observation(self) -> Observation:
+        """The same as every judge of a stream wants it."""
+        mode = mapping(self.server_row.get("clock")).get("mode")
+        return Observation(
+            seconds=1.0,
+            samples=self.new.new,
+            lost=max(self.new.missing, self.new_server.lost_samples),
+            repeated=self.new.repeated,
+            invalid=self.new.invalid,
+            silent_s=self.silent_s,
+            rate_hz=self.rate_hz,
+            nominal_hz=self.expected_hz,
+            age_p99_us=None if self.age_us is None else self.age_us[1],
+            # The node checks those that it publishes, the server all.
+            not_finite=max(self.new_not_finite, self.new_server.not_finite),
+            warnings=self.flags.warnings,
+            force_torque_saturated=self.flags.force_torque_saturated,
+            acceleration_saturated=self.flags.acceleration_saturated,
+            angular_rate_saturated=self.flags.angular_rate_saturated,
+            temperature=self.temperature,
+            locked=None if mode is None else mode == "locked",
+            recoveries=self.new_server.recoveries,
+            reconnects=self.new_connects if self.connects > 1 else 0,
+            is_lost=self.lost is not None,
+            state="?" if self.info is None else self.info.state,
+            server_silent=self.answer_s > SLOW_ANSWER_S / 2,
+            emergency=emergency(self.server_row.get("emergency")),
+            settings=self.settings,
+        )
+
+    @property
     def server_row(self) -> Mapping[str, Any]:
         """Our sensor's row of `server`; empty if it has none."""
         return row_of(self.server.get("sensors"), self.sensor)
@@ -74,6 +109,7 @@ class ServerCounts(NamedTuple):
 
     lost_samples: int = 0
     not_finite: int = 0
+    recoveries: int = 0
 
     @classmethod
     def of(cls, status: Mapping[str, Any], position: int) -> ServerCounts:

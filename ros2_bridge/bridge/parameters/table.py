@@ -13,13 +13,22 @@ from bridge.parameters.compensation import ROWS as COMPENSATION_ROWS
 from bridge.parameters.compensation import CompensationParameters, gather
 from bridge.parameters.row import NO_TEXTS, Numbers, ParameterError, Row
 from bridge.parameters.wrench_frames import WrenchFrame, parse
+from protocol.health.limits import LIMITS, Limits
 from protocol.pdo import ImuUnits
 
 _UNKNOWN: Final = (0.0, 0.0, 0.0)
 _COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"
 
+_LIMITS: Final = "diagnostics."
+"""Prefix of those limits of every verdict that can be set for this node."""
+
+
+def _limit(name: str, meaning: str, low: float, high: float) -> Row:
+    return Row(_LIMITS + name, getattr(LIMITS, name), meaning, low, high)
+
+
 SERVER_PORT: Final = Row("server_port", 12001, "TCP port of ethercat-server", 1, 65535)
-_LIVE: Final = ("publishing_frequency", "temperature_variance", "diagnostics.")
+_LIVE: Final = ("publishing_frequency", "temperature_variance", _LIMITS)
 """Prefixes of what can be set while the node runs; covariances can, too."""
 _TABLE: Final = (
     Row("server_host", "localhost", "Host that ethercat-server runs on"),
@@ -45,31 +54,61 @@ _TABLE: Final = (
     Row("angular_velocity_covariance", _UNKNOWN, f"Of the IMU, (rad/s)²: {_COVARIANCE}", 0, 1e12),
     Row("linear_acceleration_covariance", _UNKNOWN, f"Of the IMU, (m/s²)²: {_COVARIANCE}", 0, 1e12),
     Row("temperature_variance", 0.0, "Of the temperature, K²; 0 = unknown", 0, 1e6),
-    Row("diagnostics.stale_after", 0.5, "Seconds without a new sample that are an error", 0.05, 60),
-    Row("diagnostics.rate_tolerance", 0.05, "Part by which the rate may differ before it is a warning", 0, 1),
-    Row("diagnostics.age_warn", 0.01, "Age of the samples (p99), s, from which it is a warning", 0, 60),
-    Row("diagnostics.age_error", 0.1, "Age of the samples (p99), s, from which it is an error", 0, 60),
-    Row("diagnostics.lost_warn", 1, "Samples lost or skipped in a second that are a warning", 1, 10**6),
-    Row("diagnostics.temperature_warn", 60.0, "Temperature, °C, from which it is a warning", -40, 200),
-    Row("diagnostics.temperature_error", 80.0, "Temperature, °C, from which it is an error", -40, 200),
+    Row(
+        "diagnostics.stale_after",
+        LIMITS.stale_after,
+        "Seconds without a new sample that are an error",
+        0.05,
+        60,
+    ),
+    Row(
+        "diagnostics.rate_tolerance",
+        LIMITS.rate_tolerance,
+        "Part by which the rate may differ before it is a warning",
+        0,
+        1,
+    ),
+    Row(
+        "diagnostics.age_warn",
+        LIMITS.age_warn,
+        "Age of the samples (p99), s, from which it is a warning",
+        0,
+        60,
+    ),
+    Row(
+        "diagnostics.age_error",
+        LIMITS.age_error,
+        "Age of the samples (p99), s, from which it is an error",
+        0,
+        60,
+    ),
+    Row(
+        "diagnostics.lost_warn",
+        LIMITS.lost_warn,
+        "Samples lost or skipped in a second that are a warning",
+        1,
+        10**6,
+    ),
+    Row(
+        "diagnostics.temperature_warn",
+        LIMITS.temperature_warn,
+        "Temperature, °C, from which it is a warning",
+        -40,
+        200,
+    ),
+    Row(
+        "diagnostics.temperature_error",
+        LIMITS.temperature_error,
+        "Temperature, °C, from which it is an error",
+        -40,
+        200,
+    ),
     *COMPENSATION_ROWS,
 )
 PARAMETERS: Final = tuple(
     row._replace(live=row.live or row.name.startswith(_LIVE) or row.name.endswith("_covariance"))
     for row in _TABLE
 )
-
-
-class Thresholds(NamedTuple):
-    """Limits of the diagnostics: the parameters `diagnostics.*`."""
-
-    stale_after: float = 0.5
-    rate_tolerance: float = 0.05
-    age_warn: float = 0.01
-    age_error: float = 0.1
-    lost_warn: int = 1
-    temperature_warn: float = 60.0
-    temperature_error: float = 80.0
 
 
 class Parameters(NamedTuple):
@@ -88,7 +127,7 @@ class Parameters(NamedTuple):
     linear_acceleration_covariance: Numbers = _UNKNOWN
     temperature_variance: float = 0.0
     wrench_frames: tuple[WrenchFrame, ...] = ()
-    thresholds: Thresholds = Thresholds()
+    limits: Limits = LIMITS
     compensation: CompensationParameters = CompensationParameters()
     """As they are at start."""
 
@@ -110,8 +149,9 @@ def gather_all(values: dict[str, Any]) -> Parameters:
                 f"{values[name].lstrip('/') or 'a name'!r}"
             )
     compensation = gather({row.name: values.pop(row.name) for row in COMPENSATION_ROWS})
-    thresholds = Thresholds(**{name: values.pop(f"diagnostics.{name}") for name in Thresholds._fields})
+    rows = [row.name for row in _TABLE if row.name.startswith(_LIMITS)]
+    limits = LIMITS._replace(**{name.removeprefix(_LIMITS): values.pop(name) for name in rows})
     units, frames = ImuUnits(values.pop("imu_raw_units")), parse(values.pop("wrench_frames"))
     return Parameters(
-        **values, imu_units=units, wrench_frames=frames, thresholds=thresholds, compensation=compensation
+        **values, imu_units=units, wrench_frames=frames, limits=limits, compensation=compensation
     )

@@ -116,6 +116,11 @@ class Reader:
                 self._selector.limit(hz)
             self._warn_of_aliases()
 
+    @property
+    def newest_ns(self) -> int:
+        """CLOCK_MONOTONIC of the server when the newest sample was taken; -1 before the first."""
+        return -1 if self._selector is None else self._selector.accounting.new_ns
+
     def _warn_of_aliases(self) -> None:
         if 0 < self._limit_hz < self.link.rate_hz:
             self._log.warning(

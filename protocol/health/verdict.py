@@ -1,0 +1,84 @@
+"""What a verdict is: a level, and what was found, each with a remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import Enum, IntEnum
+from typing import Final, NamedTuple
+
+
+class Level(IntEnum):
+    """The three verdicts."""
+
+    GOOD = 0
+    LOOK = 1
+    TROUBLE = 2
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        return ("good", "worth a look", "trouble")[self]
+
+    @property
+    def key(self) -> str:
+        """For programs."""
+        return self.name.lower()
+
+
+class About(Enum):
+    """What a finding is about."""
+
+    STREAM = "stream"
+    SENSOR = "sensor"
+    CLOCK = "clock"
+    LINK = "link"
+
+
+class Finding(NamedTuple):
+    """One thing that is not as it should be."""
+
+    level: Level
+    about: About
+    key: str
+    """The same for the same thing at another time."""
+    found: str
+    """A clause that begins with a capital and has no full stop."""
+    remedy: str
+    """What to do: likewise."""
+    size: float = 0.0
+    """How much of it there is, to compare it with the same at another time."""
+
+    @property
+    def sentence(self) -> str:
+        """Both."""
+        return f"{self.found}: {self.remedy[0].lower()}{self.remedy[1:]}"
+
+
+class Verdict(NamedTuple):
+    """What all findings come to."""
+
+    level: Level
+    findings: tuple[Finding, ...]
+    """The worst first."""
+
+    @property
+    def headline(self) -> str:
+        """Good, Worth a look or Trouble."""
+        return self.level.words.capitalize()
+
+    @property
+    def sentence(self) -> str:
+        """The most important finding."""
+        return self.findings[0].sentence if self.findings else "Nothing is wrong with the stream"
+
+    def __str__(self) -> str:
+        return f"{self.headline}: {self.sentence}"
+
+
+NOTHING_WRONG: Final = Verdict(Level.GOOD, ())
+
+
+def verdict(findings: Iterable[Finding]) -> Verdict:
+    """The worst decides; findings of one level stay in order."""
+    ordered = tuple(sorted(findings, key=lambda finding: -finding.level))
+    return Verdict(ordered[0].level if ordered else Level.GOOD, ordered)
