@@ -82,11 +82,12 @@ def test_a_start_in_a_vibration(rate_hz: float) -> None:
     assert np.isfinite(found.error[-10:]).all()
 
 
-def test_a_start_in_a_gentle_move() -> None:
+@pytest.mark.parametrize("seed", [10, 11, 12])
+def test_a_start_in_a_gentle_move(seed: int) -> None:
     """1 m/s² for a second does not change the length of the acceleration: only waiting tells."""
-    found = node(feel(Move("start", *there_and_back(0, 1.0, 1.0), rests=False), 400.0, 11))
-    assert np.degrees(np.nanmax(found.error)) < WORST_DEG
+    found = node(feel(Move("start", *there_and_back(0, 1.0, 1.0), rests=False), 400.0, seed))
     assert coverage([found]) == 1.0
+    assert np.degrees(np.nanmax(found.error)) < 3.0, "it was 5"
 
 
 def test_a_noisy_sensor_at_rest() -> None:
