@@ -22,7 +22,8 @@ from tests.server.running import PATIENCE_S, wait_until
 
 ROOT: Final = Path(__file__).parents[2]
 CLIENT: Final = ROOT / "clients" / "cpp"
-HEADER: Final = CLIENT / "include" / "bota_ethercat.hpp"
+INCLUDE: Final = CLIENT / "include"
+HEADERS: Final = sorted(INCLUDE.rglob("*.hpp"))
 SOURCES: Final = Path(__file__).parent / "cpp"
 GXX: Final = shutil.which("g++")
 needs_gxx: Final = pytest.mark.skipif(GXX is None, reason="no g++ here: sudo apt install g++")
@@ -54,10 +55,10 @@ def _folder() -> Path:
 
 
 @functools.cache
-def build(source: Path, flags: Sequence[str], compiler: str = "g++") -> Path:
-    """The program made of `source`, built once for its contents; every warning is an error."""
+def build(source: Path, flags: Sequence[str], others: Sequence[Path] = (), compiler: str = "g++") -> Path:
+    """The program made of `source` and `others`, built once for their contents; every warning is an error."""
     digest = hashlib.sha256(repr((compiler, STRICT, flags)).encode())
-    for path in (HEADER, source, *sorted(source.parent.glob("*.hpp"))):
+    for path in (*HEADERS, source, *others, *sorted(source.parent.glob("*.hpp"))):
         digest.update(path.read_bytes())
     program = _folder() / f"{source.stem}-{digest.hexdigest()[:16]}"
     with (_folder() / "lock").open("w") as lock:
@@ -67,7 +68,8 @@ def build(source: Path, flags: Sequence[str], compiler: str = "g++") -> Path:
                 if old.stat().st_mtime < time.time() - KEPT_S:
                     old.unlink()
             unfinished = program.with_suffix(".new")
-            command = [compiler, *STRICT, *flags, f"-I{HEADER.parent}", str(source), "-o", str(unfinished)]
+            sources = [str(path) for path in (source, *others)]
+            command = [compiler, *STRICT, *flags, f"-I{INCLUDE}", *sources, "-o", str(unfinished)]
             made = subprocess.run(
                 command, check=False, capture_output=True, text=True, timeout=BUILD_TIMEOUT_S
             )

@@ -18,7 +18,7 @@ from protocol.errors import BadMessageError, RemoteProtocolError
 from protocol.framing import DataMessage, FrameDecoder
 from protocol.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder, layout_for
 from protocol.sensor.warnings_register import WarningFlag
-from tests.clients.cpp_programs import CLIENT, driver_program, needs_gxx, patient
+from tests.clients.cpp_programs import INCLUDE, driver_program, needs_gxx, patient
 from tests.golden_vectors import (
     ACCOUNTED,
     BROKEN,
@@ -321,7 +321,7 @@ def test_numbers_at_the_edge() -> None:
 
 
 def test_offsets_and_names_are_those_of_the_python_tables() -> None:
-    header = (CLIENT / "include" / "bota_ethercat.hpp").read_text()
+    header = (INCLUDE / "bota_ethercat" / "process_data.hpp").read_text()
     offsets = layout_for(77).offsets
     for field in PDO_FIELDS:
         name, _, part = field.name.partition(".")

@@ -243,7 +243,7 @@ def test_describe_status_tare_and_refusals(shared: ServedSimulation) -> None:
 
 
 def test_a_sensor_that_there_is_not(shared: ServedSimulation) -> None:
-    with driver(shared.port, sensor=9, reconnect=0) as running:
+    with driver(shared.port, sensor=9, reconnect="when_told") as running:
         told = running.do("connect", 5000)
         assert not told["ok"]
         assert "9" in told["error"]

@@ -90,7 +90,7 @@ int main(int argc, char** argv) {
         sleep_until(due_ns);
         const bota_ethercat::Reading reading = sensor.latest();
         Vector3 velocity{};  // stands still unless the force is known
-        if (reading.fresh() && reading.sample.is_finite()) {
+        if (reading.fresh()) {
             velocity = follow(reading.sample.force);
             ++(reading.is_new ? used : held);  // a loop faster than the sensor holds each sample for a while
             if (reading.age_ns > oldest_ns) oldest_ns = reading.age_ns;

@@ -1,7 +1,8 @@
 // Runs the C++ client for tests: a command per line on standard input, and for each a line of JSON on standard output.
 //
 //   new [OPTION=VALUE ...]    another client; the one before is gone
-//   connect MS | close | latest [POSITION] | peek [POSITION] | next MS | collect COUNT MS | follow COUNT HZ [POSITION]
+//   moved                     the same client, moved to another place and back
+//   connect MS | reconnect | close | latest [POSITION] | peek [POSITION] | next MS | collect COUNT MS | follow COUNT HZ [POSITION]
 //   info [POSITION] | ask REQUEST | describe | status | tare SAMPLES FX FY FZ MX MY MZ
 //
 // Built with ASan, whose hook counts what `latest` and `next` allocate.
@@ -46,7 +47,8 @@ std::string quoted(std::string_view text) {
 }
 
 const char* name(Condition condition) {
-    constexpr const char* kNames[] = {"fresh", "late", "repeated", "invalid", "sensor_lost", "silent", "disconnected", "bad_clock"};
+    constexpr const char* kNames[] = {"fresh",    "saturated", "not_finite", "late",        "bad_clock",
+                                      "repeated", "invalid",   "silent",     "sensor_lost", "disconnected"};
     return kNames[static_cast<int>(condition)];
 }
 
@@ -82,7 +84,8 @@ Options options_from(std::istringstream& words) {
         else if (key == "every") options.every = static_cast<std::uint32_t>(number());
         else if (key == "fresh_only") options.fresh_only = number() != 0;
         else if (key == "max_age_ms") options.max_age = std::chrono::milliseconds(number());
-        else if (key == "reconnect") options.reconnect = number() != 0;
+        else if (key == "reconnect") options.reconnect = value == "when_told" ? Reconnect::when_told : Reconnect::by_itself;
+        else if (key == "judge_imu") options.judge_imu = number() != 0;
         else if (key == "reconnect_every_ms") options.reconnect_every = std::chrono::milliseconds(number());
         else if (key == "age_from") options.age_from = value == "arrival" ? AgeFrom::arrival : value == "instant" ? AgeFrom::instant : AgeFrom::automatic;
         else if (key == "max_bytes_per_call") options.max_bytes_per_call = static_cast<std::size_t>(number());
@@ -179,6 +182,13 @@ int main(int argc, char** argv) {
         if (command == "connect") {
             const bool ok = client.connect(std::chrono::milliseconds(number));
             std::printf("{\"ok\":%s,\"error\":%s}", yes(ok), quoted(client.error()).c_str());
+        } else if (command == "reconnect") {
+            std::printf("%s", yes(client.reconnect()));
+        } else if (command == "moved") {
+            Client other("nowhere", 1);
+            other = std::move(client);
+            maybe_client.emplace(std::move(other));
+            std::printf("{}");
         } else if (command == "close") {
             client.close();
             std::printf("{}");
