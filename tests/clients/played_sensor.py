@@ -37,6 +37,7 @@ class PlayedSensor:
     def __init__(self, port: int = 0, **sensor: Any) -> None:
         self.sensor: JsonObject = described(**sensor)
         self.protocol = 1
+        self.refusal: JsonObject | None = None
         self.streams: list[socket.socket] = []
         self.asked: list[str] = []
         self._listener = socket.create_server(("127.0.0.1", port))
@@ -61,6 +62,8 @@ class PlayedSensor:
         assert isinstance(message, dict)
         self.asked.append(str(message["action"]))
         reply = {"reply": message["action"], "ok": True, "protocol": self.protocol, "sensors": [self.sensor]}
+        if self.refusal:
+            reply = {"reply": message["action"], "ok": False, "error": self.refusal}
         connection.sendall(encode_json(reply))
         if message["action"] == "subscribe":
             self.streams.append(connection)

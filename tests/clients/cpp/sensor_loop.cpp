@@ -114,7 +114,7 @@ bool allow_recv_only() {
     std::vector<sock_filter> filter = {BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(seccomp_data, nr))};
     // clock_gettime: a machine whose clock the vdso cannot read. The last ones are how a thread ends.
     for (const unsigned call : {SYS_recvfrom, SYS_clock_nanosleep, SYS_clock_gettime, SYS_exit, SYS_futex, SYS_munmap, SYS_madvise,
-                                SYS_rt_sigprocmask, SYS_sigaltstack, SYS_mmap, SYS_mprotect, SYS_gettid, SYS_sched_yield}) {
+                                SYS_rt_sigprocmask, SYS_sigaltstack, SYS_mmap}) {
         filter.push_back(BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, call, 0, 1));
         filter.push_back(BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW));
     }
@@ -123,18 +123,28 @@ bool allow_recv_only() {
     return prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0 && prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &program) == 0;
 }
 
-void sealed(SensorLoop& loop, long count) {
-    long good = 0;
-    bool is_sealed = false;
-    std::thread([&] {
-        is_sealed = allow_recv_only();
-        std::int64_t due = bota_ethercat::monotonic_now_ns();
-        for (long i = 0; i < count; ++i) {
-            sleep_until(due += 1'000'000);
-            good += loop.read();
-        }
-    }).join();
-    std::printf("{\"sealed\":%s,\"good\":%ld}", yes(is_sealed), good);
+struct Sealed {
+    SensorLoop& loop;
+    long cycles, good;
+    bool is_sealed;
+};
+
+void* cycles_of(void* given) {
+    Sealed& sealed = *static_cast<Sealed*>(given);
+    sealed.is_sealed = allow_recv_only();
+    std::int64_t due = bota_ethercat::monotonic_now_ns();
+    for (long i = 0; i < sealed.cycles; ++i) {
+        sleep_until(due += 1'000'000);
+        sealed.good += sealed.loop.read();
+    }
+    return nullptr;
+}
+
+void run_sealed(SensorLoop& loop, long count) {
+    Sealed sealed{loop, count, 0, false};
+    pthread_t thread{};  // not std::thread: to check its virtual calls UBSan makes system calls
+    if (pthread_create(&thread, nullptr, cycles_of, &sealed) == 0) pthread_join(thread, nullptr);
+    std::printf("{\"sealed\":%s,\"good\":%ld}", yes(sealed.is_sealed), sealed.good);
 }
 
 }  // namespace
@@ -202,7 +212,7 @@ int main() {
         } else if (command == "sealed") {
             long count = 0;
             words >> count;
-            sealed(*maybe, count);
+            run_sealed(*maybe, count);
         } else if (command == "stop") {
             maybe.reset();
             std::printf("{}");
