@@ -1,11 +1,18 @@
-"""HOST:PORT as written on a command line."""
+"""Where a server is: HOST:PORT as written on a command line, and whose CLOCK_MONOTONIC it has."""
 
 from __future__ import annotations
 
+import functools
+import os
+import uuid
+from pathlib import Path
 from typing import Final, NamedTuple
 
 DEFAULT_HOST: Final = "localhost"
 DEFAULT_PORT: Final = 12001
+
+_BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
+_CLOCK_OFFSETS: Final = Path("/proc/self/timens_offsets")
 
 
 class Address(NamedTuple):
@@ -32,3 +39,25 @@ class Address(NamedTuple):
     def __str__(self) -> str:
         """As written on a command line."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+@functools.cache
+def boot_id() -> str | None:
+    """The name of this process's CLOCK_MONOTONIC, `boot_id` in messages; None if it cannot be known.
+
+    The kernel's boot id: whoever has the same has the same clock. In a time namespace that shifts the clock
+    the offset follows, in s and ns.
+    """
+    try:
+        text = _BOOT_ID.read_text()
+    except OSError:  # hidden by ProcSubset=pid; the unit has it from systemd
+        text = os.environ.get("BOOT_ID", "")
+    try:
+        name = str(uuid.UUID(text.strip()))
+        offsets = dict(line.split(maxsplit=1) for line in _CLOCK_OFFSETS.read_text().splitlines())
+        seconds, ns = map(int, offsets["monotonic"].split())
+    except FileNotFoundError:  # a kernel without time namespaces
+        return name
+    except (OSError, ValueError, KeyError):
+        return None
+    return f"{name} {seconds} {ns}" if seconds or ns else name

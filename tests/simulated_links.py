@@ -252,6 +252,9 @@ class _Connection:
         """See `FramedConnection`."""
         return self._decoder.next_message()
 
+    def take_description(self, description: JsonObject) -> None:
+        """See `FramedConnection`."""
+
     def send(self, message: JsonObject) -> None:
         """See `FramedConnection`."""
         self._end.send(encode_json(message))

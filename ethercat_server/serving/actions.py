@@ -13,6 +13,7 @@ from typing import Any, Final, Protocol
 from ethercat_server import __version__
 from ethercat_server.serving.connection import Connection, Subscription
 from ethercat_server.serving.hub import Hub
+from protocol.address import boot_id
 from protocol.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
 from protocol.errors import RequestError
 from protocol.text.json_text import JsonObject
@@ -70,7 +71,8 @@ class Actions:
         """`extra` is added to the reply of `describe`."""
         self._hub = hub
         self._cycle = cycle
-        self._extra = extra or {}
+        boot = boot_id()
+        self._extra = {**({} if boot is None else {"boot_id": boot}), **(extra or {})}
         self._on_sensors = on_sensors
         self._sensors = on_sensors.sensors
         self._handlers: dict[str, Callable[[Connection, Request], JsonObject]] = {

@@ -89,6 +89,7 @@ class Client:
         try:
             self.description = self.ask("describe")
             check_version(self.description)
+            self.connection.take_description(self.description)
         except BaseException:
             self.connection.close()
             raise

@@ -12,6 +12,7 @@ import socket
 import struct
 from typing import Final
 
+from protocol.address import boot_id
 from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
 from protocol.framing import DataMessage, FrameDecoder, encode_json
 from protocol.text.json_text import JsonObject
@@ -27,7 +28,7 @@ class FramedConnection:
     """A connection to the server at `host`:`port`.
 
     Attributes:
-        same_machine: whether the server's CLOCK_MONOTONIC is ours.
+        same_machine: whether the server's CLOCK_MONOTONIC is ours; by its address until `take_description`.
         sock: the socket, blocking, with the kernel's timeouts of SILENCE_S.
     """
 
@@ -60,6 +61,12 @@ class FramedConnection:
         self.sock.settimeout(None)
         self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(SILENCE_S))
         self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _timeval(SILENCE_S))
+
+    def take_description(self, description: JsonObject) -> None:
+        """Learn whose clock the server has from its reply to `describe`: the address may be a tunnel's."""
+        theirs, ours = description.get("boot_id"), boot_id()
+        if isinstance(theirs, str) and ours is not None:
+            self.same_machine = theirs == ours
 
     def fileno(self) -> int:
         """For `select` and `poll`: readable when something has arrived, besides what is buffered here."""

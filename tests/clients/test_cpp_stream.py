@@ -6,6 +6,7 @@ The test is the server, in the same thread: it sends, then asks the client what 
 from __future__ import annotations
 
 import contextlib
+import math
 import select
 import socket
 import struct
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from protocol.address import boot_id
 from protocol.control import request
 from protocol.framing import DataFlag, FrameDecoder, encode_data, encode_json
 from protocol.pdo import encode
@@ -31,12 +33,17 @@ SENSOR = {"sensor": 0, "name": "BFT-SENS-ECAT-M8", "serial": 7, "pdo_size": 61, 
 GRANTED = {"reply": "subscribe", "ok": True, "protocol": 1, "version": "1.2.3", "sensors": [SENSOR]}
 
 
-def frame(sequence: int, flags: int = 0, *, sensor: int = 0, age_s: float = 0.0, **values: float) -> bytes:
-    """A DATA message; its force along x is its number."""
+OURS = boot_id() or pytest.fail("this machine has no boot id")
+
+
+def frame(
+    sequence: int, flags: int = 0, *, sensor: int = 0, age_s: float = 0.0, size: int = 61, **values: float
+) -> bytes:
+    """A DATA message; its force along x is its number. `values` by name, with `__` for the dot."""
     # A machine that has been up for less than `age_s` has no such instant yet.
     time.sleep(max(0.0, age_s - time.monotonic()))
     instant = time.monotonic_ns() - int(age_s * 1e9)
-    data = encode(61, {"force.x": sequence, **{k.replace("_", "."): v for k, v in values.items()}})
+    data = encode(size, {"force.x": sequence, **{k.replace("__", "."): v for k, v in values.items()}})
     return encode_data(sequence, 5, instant, sensor, flags, 3, data)
 
 
@@ -106,9 +113,9 @@ def server() -> Iterator[PlayedServer]:
     played.close()
 
 
-def connected(server: PlayedServer, running: Driver) -> Driver:
+def connected(server: PlayedServer, running: Driver, answer: JsonObject | None = None) -> Driver:
     running.begin("connect", int(PATIENCE_S * 1000))
-    server.accept()
+    server.accept(answer)
     told = running.answer()
     assert told == {"ok": True, "error": ""}
     return running
@@ -189,6 +196,42 @@ def test_the_age_counts_from_the_arrival_where_the_clock_is_another(
         assert reading["age_ns"] < 19e9
 
 
+@pytest.mark.parametrize("claimed", ["elsewhere", "", OURS + " 1 0", OURS[:-1], "x" * 60_000])
+def test_a_server_whose_clock_is_another_is_far_away_whatever_its_address(
+    server: PlayedServer, claimed: str
+) -> None:
+    """As through an SSH tunnel: the address is this machine's."""
+    with driver(server.port, **PATIENT) as running:
+        connected(server, running, {**GRANTED, "boot_id": claimed})
+        server.send(frame(1, age_s=-1000))
+        reading = running.latest()
+        assert picked(reading, "fresh", "age_is_lower_bound") == (True, True)
+        assert reading["age_ns"] < 19e9
+
+
+@pytest.mark.parametrize("claimed", [OURS, None, 7, [], {}, [OURS], True])
+def test_a_server_with_our_clock_or_none_that_can_be_read_is_near(
+    server: PlayedServer, claimed: object
+) -> None:
+    with driver(server.port, **PATIENT) as running:
+        connected(server, running, {**GRANTED, "boot_id": claimed})
+        server.send(frame(1, age_s=8))
+        reading = running.latest()
+        assert picked(reading, "fresh", "age_is_lower_bound") == (True, False)
+        assert reading["age_ns"] >= 8e9
+
+
+def test_a_sample_keeps_the_clock_of_its_own_connection(server: PlayedServer) -> None:
+    with stream(server, reconnect_every_ms=1) as running:
+        server.send(frame(1, age_s=8))
+        assert picked(running.latest(), "age_is_lower_bound") == (False,)
+        server.hang_up()
+        accept_while(server, running, {**GRANTED, "boot_id": "elsewhere"})
+        old = running.latest()
+        assert picked(old, "sequence", "connection", "age_is_lower_bound") == (1, 2, False)
+        assert old["age_ns"] >= 8e9
+
+
 def test_a_stamp_ahead_of_this_clock_is_never_fresh(server: PlayedServer) -> None:
     with stream(server) as running:
         server.send(frame(1, age_s=-1000))
@@ -245,6 +288,64 @@ def test_warnings_of_samples_that_were_passed_over_are_not_lost(server: PlayedSe
         server.send(frame(1, warnings=1), frame(2, warnings=64), frame(3))
         assert picked(running.latest(), "warnings_seen") == (65,)
         assert picked(running.latest(), "warnings_seen") == (0,)
+
+
+NAN, INF = math.nan, math.inf
+
+
+@pytest.mark.parametrize(
+    ("values", "condition", "with_imu"),
+    [
+        ({"force__x": NAN}, "not_finite", "not_finite"),
+        ({"torque__z": -INF}, "not_finite", "not_finite"),
+        ({"warnings": 1}, "saturated", "saturated"),
+        ({"warnings": 16}, "saturated", "saturated"),
+        ({"force_torque_saturated": 256}, "saturated", "saturated"),
+        ({"force_torque_saturated": 1, "force__y": INF}, "not_finite", "not_finite"),
+        ({"acceleration__x": NAN}, "fresh", "not_finite"),
+        ({"angular_rate__z": INF}, "fresh", "not_finite"),
+        ({"size": 77, "orientation__w": NAN}, "fresh", "not_finite"),
+        ({"warnings": 2}, "fresh", "saturated"),
+        ({"warnings": 4}, "fresh", "saturated"),
+        ({"acceleration_saturated": 1}, "fresh", "saturated"),
+        ({"angular_rate_saturated": 4}, "fresh", "saturated"),
+        ({"warnings": 8 + 32 + 64, "temperature": NAN}, "fresh", "fresh"),
+    ],
+)  # fmt: skip
+def test_a_recent_sample_that_is_worth_nothing_is_not_fresh(
+    server: PlayedServer, values: dict[str, Any], condition: str, with_imu: str
+) -> None:
+    for judge_imu, wanted in ((0, condition), (1, with_imu)):
+        with stream(server, judge_imu=judge_imu) as running:
+            server.send(frame(1, **values))
+            assert picked(running.latest(), "condition", "is_new", "has_sample") == (wanted, True, True)
+            assert picked(running.latest(), "condition") == (wanted,)
+            server.send(frame(2))
+            assert picked(running.latest(), "condition") == ("fresh",)
+
+
+def test_a_bad_sample_that_is_old_is_old_first(server: PlayedServer) -> None:
+    with stream(server, max_age_ms=5_000) as running:
+        server.send(frame(1, age_s=6, warnings=1, force__x=NAN))
+        assert picked(running.latest(), "condition") == ("late",)
+        server.hang_up()
+        running.until(lambda r: r["condition"] == "disconnected", "the end")
+
+
+def test_saturated_samples_can_be_used_on_purpose(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(7, warnings=1))
+        saturated = running.do("next", 1000)
+        assert picked(saturated, "condition", "sequence", "warnings_seen") == ("saturated", 7, 1)
+        assert saturated["array"][0] == 7
+
+
+def test_what_is_wrong_with_a_sample_that_was_passed_over_is_not_the_newest_ones(
+    server: PlayedServer,
+) -> None:
+    with stream(server) as running:
+        server.send(frame(1, warnings=1), frame(2, force__y=NAN), frame(3))
+        assert picked(running.latest(), "condition", "warnings_seen") == ("fresh", 1)
 
 
 def test_sensors_are_kept_apart(server: PlayedServer) -> None:
@@ -504,14 +605,14 @@ def test_it_starts_without_the_server() -> None:
         late.close()
 
 
-def accept_while(server: PlayedServer, running: Driver) -> None:
+def accept_while(server: PlayedServer, running: Driver, answer: JsonObject | None = None) -> None:
     """Take the connection that the client makes step by step, a step in each call."""
     wait_until(
         lambda: bool(running.latest() and select.select([server.listener], [], [], 0)[0]), "a connection"
     )
     running.latest()
     running.begin("next", 20)
-    server.accept()
+    server.accept(answer)
     running.answer()
     wait_until(lambda: bool(running.latest() and running.info()["link"] == "up"), "the subscription")
 
@@ -544,6 +645,80 @@ def test_it_says_why_the_connection_ended(server: PlayedServer) -> None:
         server.hang_up()
         wait_until(lambda: bool(running.latest()) and running.info()["link"] == "down", "the end")
         assert running.info()["error"] == f"127.0.0.1 port {server.port}: the server was shut down"
+
+
+def test_it_reconnects_only_where_it_is_told(server: PlayedServer) -> None:
+    """After the loss the control loop makes no system call; the step of reconnecting is its own call."""
+    with stream(server, reconnect="when_told", reconnect_every_ms=1) as running:
+        server.send(frame(1))
+        running.latest()
+        before = running.info()
+        assert (before["receives"], before["other_calls"]) == (1, 0)
+        server.hang_up()
+        wait_until(lambda: bool(running.latest()) and running.info()["link"] == "down", "the end")
+        lost = running.info()
+        assert lost["other_calls"] == 0, "not even close()"
+        for _ in range(5):
+            running.latest()
+            running.do("peek", 0)
+            assert picked(running.do("next", 3_600_000), "is_new", "connection") == (False, 1)
+        after = running.info()
+        assert (after["receives"], after["other_calls"]) == (lost["receives"], 0)
+        assert (after["fd"], select.select([server.listener], [], [], 0)[0]) == (-1, [])
+        wait_until(
+            lambda: (running.do("reconnect"), select.select([server.listener], [], [], 0)[0])[1] != [],
+            "an attempt",
+        )
+        running.do("reconnect")  # sends the subscription
+        server.accept()
+        wait_until(lambda: running.do("reconnect"), "the subscription")
+        server.send(frame(2))
+        assert picked(running.latest(), "fresh", "gap", "connection", "sequence") == (True, True, 2, 2)
+        assert running.info()["other_calls"] == 0
+
+
+def test_it_may_be_told_by_a_server_that_starts_later() -> None:
+    port = free_port()
+    with driver(port, reconnect="when_told", reconnect_every_ms=1) as running:
+        assert running.do("reconnect") is False
+        assert running.info()["error"] == "not connected yet: call connect()"
+        assert not running.do("connect", 1000)["ok"]
+        late = PlayedServer(port)
+        wait_until(
+            lambda: (running.do("reconnect"), select.select([late.listener], [], [], 0)[0])[1] != [],
+            "an attempt",
+        )
+        running.do("reconnect")
+        late.accept()
+        wait_until(lambda: running.do("reconnect"), "the subscription")
+        late.close()
+
+
+def test_a_refusal_does_not_stand_in_the_way_of_connect(server: PlayedServer) -> None:
+    with stream(server, reconnect_every_ms=1) as running:
+        server.hang_up()
+        refused = {"reply": "subscribe", "ok": False, "error": {"code": "busy", "message": "no 9"}}
+        running.do("next", int(PATIENCE_S * 1000))  # the loss
+        running.begin("next", int(PATIENCE_S * 1000))
+        server.accept(refused)
+        assert picked(running.answer(), "condition") == ("disconnected",)
+        assert "no 9" in running.info()["error"]
+        connected(server, running)
+
+
+def test_a_client_that_is_moved_goes_on(server: PlayedServer) -> None:
+    with stream(server) as running:
+        server.send(frame(1), frame(2)[:50])
+        assert picked(running.latest(), "sequence") == (1,)
+        before = running.info()
+        running.do("moved")
+        server.send(frame(2)[50:], frame(3))
+        assert picked(running.latest(), "sequence", "passed_over", "connection") == (3, 1, 1)
+        after = running.info()
+        assert (after["fd"], after["connections"], after["samples"]) == (before["fd"], 1, 3)
+        running.do("close")
+        running.do("moved")
+        connected(server, running)
 
 
 def test_it_tries_again_no_more_often_than_it_may() -> None:

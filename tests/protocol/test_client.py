@@ -7,11 +7,14 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from bridge.stream.connection import Connection
+from protocol import address
+from protocol.address import boot_id
 from protocol.client import Client, connect
 from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
 from protocol.framing import DataFlag
@@ -97,6 +100,67 @@ def test_receive_hands_out_the_last_frames_of_a_connection_that_ended(scripted: 
         assert len(sensor.receive(5.0)) == 1
         with pytest.raises(ConnectionFailedError):
             sensor.receive(5.0)
+
+
+OURS = boot_id()
+
+
+CLAIMED: list[tuple[object, bool]] = [
+    (OURS, True), ("elsewhere", False), ("", False), (f"{OURS} 5 0", False), ("x" * 60_000, False),
+    (None, True), (7, True), (True, True), ([OURS], True), ({}, True),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("claimed", "near"), CLAIMED)
+def test_the_clock_that_a_server_names_decides_whose_it_is(
+    scripted: ScriptedServer, claimed: object, near: bool
+) -> None:
+    """By its address the server is always here, as behind an SSH tunnel; what cannot be a name is none."""
+    scripted.description = description(boot_id=claimed)
+    with Client(scripted.port) as client:
+        assert client.connection.same_machine == near
+    connection = Connection("localhost", scripted.port)
+    try:
+        connection.subscribe(0)
+        assert connection.same_machine == near
+    finally:
+        connection.close()
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., str | None]]:
+    """`boot_id` of a machine whose kernel says these things; None: there is no such file."""
+
+    def named(boot: str | None, offsets: str | None) -> str | None:
+        for name, text in (("_BOOT_ID", boot), ("_CLOCK_OFFSETS", offsets)):
+            path = tmp_path / name
+            path.unlink(missing_ok=True)
+            if text is not None:
+                path.write_text(text)
+            monkeypatch.setattr(address, name, path)
+        boot_id.cache_clear()
+        return boot_id()
+
+    monkeypatch.delenv("BOOT_ID", raising=False)
+    yield named
+    boot_id.cache_clear()
+
+
+def test_a_clock_is_named_by_boot_and_offset(
+    machine: Callable[..., str | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    boot = "30f330ff-4912-4148-a536-d779e31b74a6"
+    unshifted = "monotonic           0         0\nboottime            7         0\n"
+    assert machine(boot + "\n", unshifted) == boot
+    assert machine(boot + "\n", None) == boot, "a kernel without time namespaces"
+    assert machine(boot, unshifted.replace("0         0", "-86400         5", 1)) == f"{boot} -86400 5"
+    for odd in ("", "monotonic", "monotonic 1\n", "monotonic a b\n", "boottime 0 0\n"):
+        assert machine(boot, odd) is None
+    assert machine("", unshifted) is None
+    assert machine("no id", unshifted) is None
+    assert machine(None, unshifted) is None
+    monkeypatch.setenv("BOOT_ID", boot.replace("-", ""))  # as systemd's %b has it
+    assert machine(None, unshifted) == boot
 
 
 def test_a_refusal_is_the_servers_sentence(scripted: ScriptedServer) -> None:

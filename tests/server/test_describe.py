@@ -12,6 +12,7 @@ from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.connection import Connection
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.sensor_actions import SensorActions
+from protocol.address import boot_id
 from protocol.framing import encode_json
 from protocol.sensor.meaning import value_meaning
 from protocol.settings import SETTINGS, SettingValue, start_up_defaults
@@ -52,6 +53,12 @@ def test_a_reply_never_outgrows_a_message(count: int) -> None:
     assert len(reply["sensors"]) == count
     assert len(encode_json(reply)) <= MAX_JSON_LENGTH
     assert all(("meaning" in row) == (count <= 32) for row in reply["sensors"])
+
+
+def test_a_server_names_the_clock_of_its_stamps(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert describe(1)["boot_id"] == boot_id()
+    monkeypatch.setattr("ethercat_server.serving.actions.boot_id", lambda: None)
+    assert "boot_id" not in describe(1)
 
 
 def test_every_setting_is_explained_and_only_when_it_changes() -> None:

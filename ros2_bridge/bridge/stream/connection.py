@@ -115,6 +115,7 @@ class Connection(FramedConnection):
         """Check that the server is one we understand and has that sensor, and start its stream."""
         description = self.ask("describe")
         check_version(description)
+        self.take_description(description)
         info = find_sensor(description, sensor)
         self.ask("subscribe", sensors=[sensor])
         return info

@@ -21,17 +21,35 @@ static std::size_t allocations = 0;
 // Of ASan's runtime; g++ does not always come with <sanitizer/allocator_interface.h>.
 extern "C" int __sanitizer_install_malloc_and_free_hooks(void (*)(const volatile void*, std::size_t), void (*)(const volatile void*));
 
+// System calls of the client, by the linker's --wrap; `WRAPPED` in cpp_programs.py has their names.
+static std::size_t receives = 0, other_calls = 0;
+#define WRAPPED(result, name, counter, parameters, ...) \
+    extern "C" result __real_##name parameters;         \
+    extern "C" result __wrap_##name parameters { return ++counter, __real_##name(__VA_ARGS__); }
+WRAPPED(int, socket, other_calls, (int domain, int type, int protocol), domain, type, protocol)
+WRAPPED(int, connect, other_calls, (int fd, const sockaddr* address, socklen_t length), fd, address, length)
+WRAPPED(int, close, other_calls, (int fd), fd)
+WRAPPED(int, poll, other_calls, (pollfd* all, nfds_t count, int timeout), all, count, timeout)
+WRAPPED(int, ppoll, other_calls, (pollfd* all, nfds_t count, const timespec* timeout, const sigset_t* mask), all, count, timeout, mask)
+WRAPPED(int, setsockopt, other_calls, (int fd, int level, int what, const void* value, socklen_t size), fd, level, what, value, size)
+WRAPPED(int, getsockopt, other_calls, (int fd, int level, int what, void* value, socklen_t* size), fd, level, what, value, size)
+WRAPPED(ssize_t, send, other_calls, (int fd, const void* bytes, size_t size, int flags), fd, bytes, size, flags)
+WRAPPED(ssize_t, recv, receives, (int fd, void* into, size_t size, int flags), fd, into, size, flags)
+
 namespace {
 
 using namespace bota_ethercat;
 
-std::size_t allocated = 0;  // in calls that promise not to
+std::size_t allocated = 0;           // in calls that promise not to
+std::size_t received = 0, called = 0;  // in the same calls
 
 template <typename Call>
 Reading watched(Call&& call) {
-    const std::size_t before = allocations;
+    const std::size_t before = allocations, receives_before = receives, calls_before = other_calls;
     const Reading reading = call();
     allocated += allocations - before;
+    received += receives - receives_before;
+    called += other_calls - calls_before;
     return reading;
 }
 
@@ -52,10 +70,21 @@ const char* name(Condition condition) {
     return kNames[static_cast<int>(condition)];
 }
 
+/// As Python's JSON has it.
+void print(double number) {
+    if (std::isfinite(number))
+        std::printf("%.17g", number);
+    else
+        std::printf("%s", std::isnan(number) ? "NaN" : number > 0.0 ? "Infinity" : "-Infinity");
+}
+
 template <std::size_t Size>
 void print(const char* key, const std::array<double, Size>& numbers) {
     std::printf(",\"%s\":", key);
-    for (std::size_t i = 0; i < Size; ++i) std::printf("%c%.17g", i == 0 ? '[' : ',', numbers[i]);
+    for (std::size_t i = 0; i < Size; ++i) {
+        std::printf("%c", i == 0 ? '[' : ',');
+        print(numbers[i]);
+    }
     std::printf("]");
 }
 
@@ -70,7 +99,9 @@ void print(const Reading& r) {
                 ",\"connection\":%" PRIu32 ",\"more_waits\":%s",
                 yes(r.gap), r.withheld, r.lost, r.passed_over, r.warnings_seen, r.connection, yes(r.more_waits));
     print("array", r.sample.array());
-    std::printf(",\"temperature\":%.17g}", r.sample.temperature);
+    std::printf(",\"temperature\":");
+    print(r.sample.temperature);
+    std::printf("}");
 }
 
 Options options_from(std::istringstream& words) {
@@ -140,9 +171,9 @@ void info(const Client& client, std::uint8_t place) {
     const Counters c = client.counters(place);
     constexpr const char* kLinks[] = {"down", "connecting", "subscribing", "up"};
     std::printf("{\"link\":\"%s\",\"error\":%s,\"connections\":%u,\"reconfigurations\":%u,\"bad_messages\":%" PRIu64
-                ",\"allocated\":%zu,\"allocates\":%s,\"fd\":%d",
+                ",\"allocated\":%zu,\"allocates\":%s,\"receives\":%zu,\"other_calls\":%zu,\"fd\":%d",
                 kLinks[static_cast<int>(client.link())], quoted(client.error()).c_str(), client.connections(),
-                client.reconfigurations(), client.bad_messages(), allocated, yes(allocations > 0), client.fd());
+                client.reconfigurations(), client.bad_messages(), allocated, yes(allocations > 0), received, called, client.fd());
     std::printf(",\"frames\":%" PRIu64 ",\"samples\":%" PRIu64 ",\"repeated\":%" PRIu64 ",\"invalid\":%" PRIu64 ",\"gaps\":%" PRIu64
                 ",\"withheld\":%" PRIu64 ",\"skipped\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"names\":[",
                 c.frames(), c.samples, c.repeated, c.invalid, c.gaps, c.withheld, c.skipped, c.passed_over);
@@ -170,7 +201,7 @@ int main(int argc, char** argv) {
             const Options options = options_from(words);
             maybe_client.emplace(options);
             maybe_control.emplace(options.host, options.port);
-            allocated = 0;
+            allocated = received = called = 0;
             continue;
         }
         if (!maybe_client) return 2;
