@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -11,7 +12,16 @@ import pytest
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.framing import DataFlag
 from protocol.pdo import SampleDecoder
-from tests.clients.cpp_programs import Driver, Reading, assert_no_faults, driver, needs_gxx, patient
+from tests.clients.cpp_programs import (
+    SOURCES,
+    Driver,
+    Reading,
+    assert_no_faults,
+    build,
+    driver,
+    needs_gxx,
+    patient,
+)
 from tests.served_simulation import ServedSimulation, served
 from tests.server.running import free_port, wait_until
 
@@ -256,3 +266,14 @@ def test_requests_without_a_server() -> None:
             told = running.do(what)
             assert not told["ok"]
             assert "nobody listens there" in told["error"]
+
+
+@pytest.mark.long
+def test_threads_with_a_client_each_have_no_race() -> None:
+    """Real threads, under ThreadSanitizer."""
+    program = build(SOURCES / "threads.cpp", ("-g", "-O1", "-fsanitize=thread"))
+    with served(sinc_length=256) as running:
+        # Without randomized addresses, which ThreadSanitizer cannot have everywhere.
+        command = ["setarch", "-R", str(program), str(running.port)]
+        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
