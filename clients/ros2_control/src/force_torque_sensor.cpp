@@ -129,9 +129,9 @@ private:
 
     void log(Level level, const std::string& text) const {
         switch (level) {
-            case Level::info: RCLCPP_INFO(get_logger(), "%s: %s", info_.name.c_str(), text.c_str()); break;
-            case Level::warning: RCLCPP_WARN(get_logger(), "%s: %s", info_.name.c_str(), text.c_str()); break;
-            case Level::error: RCLCPP_ERROR(get_logger(), "%s: %s", info_.name.c_str(), text.c_str()); break;
+            case Level::info: RCLCPP_INFO(get_logger(), "%s", text.c_str()); break;
+            case Level::warning: RCLCPP_WARN(get_logger(), "%s", text.c_str()); break;
+            case Level::error: RCLCPP_ERROR(get_logger(), "%s", text.c_str()); break;
         }
     }
 
