@@ -1,4 +1,4 @@
-"""A simulated sensor, a controller manager at 1 kHz, and an arm that gives way to the force that the sensor measures."""
+"""A simulated sensor, a controller manager at 1 kHz, and an arm that gives way to the force measured."""
 
 import shlex
 
@@ -12,26 +12,28 @@ from launch import LaunchDescription
 
 PACKAGE = FindPackageShare("bota_ethercat_hardware")
 CONTROLLERS = PathJoinSubstitution([PACKAGE, "config", "mock_arm_controllers.yaml"])
+BROADCASTERS = "joint_state_broadcaster force_torque_sensor_broadcaster"
 ARGUMENTS = (
     ("host", "localhost", "Of ethercat-server"),
     ("port", "12001", "Of ethercat-server"),
-    ("server_command", "ethercat-server virtual", "Starts it; needs root. '' if it is running"),
-    ("controllers", "joint_state_broadcaster force_torque_sensor_broadcaster admittance_controller", "To activate"),
+    ("virtual", "true", "Start that server, with a simulated sensor; false: it is running"),
+    ("server_command", "ethercat-server", "Which needs root: 'sudo -n /path/to/ethercat-server', say"),
+    ("controllers", f"{BROADCASTERS} admittance_controller", "To activate"),
 )
 
 
 def start(context):
+    """What the arguments ask for."""
     def value(name):
         return LaunchConfiguration(name).perform(context)
 
     urdf = PathJoinSubstitution([PACKAGE, "urdf", "mock_arm.urdf.xacro"])
     description = Command(["xacro ", urdf, f" host:={value('host')} port:={value('port')}"])
-    server = shlex.split(value("server_command"))
     actions = []
-    if server:
+    if value("virtual").lower() == "true":
         actions.append(
             ExecuteProcess(
-                cmd=[*server, value("port")],
+                cmd=[*shlex.split(value("server_command")), "virtual", value("port")],
                 name="ethercat-server",
                 output="screen",
                 on_exit=Shutdown(reason="ethercat-server has ended"),
@@ -61,5 +63,6 @@ def start(context):
 
 
 def generate_launch_description():
+    """See the top."""
     arguments = [DeclareLaunchArgument(name, default_value=d, description=text) for name, d, text in ARGUMENTS]
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])
