@@ -92,8 +92,8 @@ _idle: list[subprocess.Popen[str]] = []
 class Driver:
     """A C++ client that a test commands: tests/clients/cpp/driver.cpp, a process for many tests."""
 
-    def __init__(self, port: int, **options: object) -> None:
-        self.process = _idle.pop() if _idle else start_driver()
+    def __init__(self, port: int, process: subprocess.Popen[str] | None = None, **options: object) -> None:
+        self.process = process or (_idle.pop() if _idle else start_driver())
         self.begin("new", "host=127.0.0.1", f"port={port}", *(f"{k}={v}" for k, v in options.items()))
 
     def begin(self, *words: object) -> None:
@@ -138,9 +138,10 @@ class Driver:
         return last
 
 
-def start_driver() -> subprocess.Popen[str]:
+def start_driver(*inside: str) -> subprocess.Popen[str]:
+    """A driver, started by the command `inside`."""
     return subprocess.Popen(
-        [driver_program()],
+        [*inside, driver_program()],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -164,7 +165,7 @@ def end_driver(process: subprocess.Popen[str]) -> int:
 @contextmanager
 def driver(port: int, /, **options: object) -> Iterator[Driver]:
     """A driver with a new client. A module that uses it ends with `assert_no_faults`."""
-    running = Driver(port, **options)
+    running = Driver(port, None, **options)
     try:
         yield running
         running.do("close")

@@ -18,7 +18,9 @@ EXAMPLES: Final = sorted((CLIENT / "examples").glob("*.cpp"))
 PAGES: Final = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *CLIENT.rglob("*.md")])
 INCLUDED: Final = re.compile(r"(?m)^#include.*\n")
 IN_A_COMMENT: Final = re.compile(r"(?:^[ \t]*///? {5}.*\n)+", re.MULTILINE)
-IN_A_PAGE: Final = re.compile(r"^```(?:cpp|c\+\+|cc|hpp)\b.*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+IN_A_PAGE: Final = re.compile(
+    r"^[ \t]*```(?:cpp|c\+\+|cc|hpp)\b[^\n]*\n(.*?)^[ \t]*```", re.MULTILINE | re.DOTALL
+)
 
 BEFORE_SNIPPETS: Final = """
 #include <bota_ethercat.hpp>
@@ -92,6 +94,7 @@ def test_examples_and_snippets_need_no_exceptions_and_give_no_warning(tmp_path: 
     """
     found = list(snippets())
     assert {"cpp.md", "bota_ethercat.hpp", "stream.hpp"} <= {name for name, _ in found}
+    assert all(";" in snippet for _, snippet in found)
     assert len(EXAMPLES) == 2
     code = "".join(line for path in EXAMPLES for line in INCLUDED.findall(path.read_text()))
     code += "".join(line for _, snippet in found for line in INCLUDED.findall(snippet)) + BEFORE_SNIPPETS

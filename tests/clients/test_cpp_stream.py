@@ -10,6 +10,8 @@ import math
 import select
 import socket
 import struct
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -21,7 +23,17 @@ from protocol.control import request
 from protocol.framing import DataFlag, FrameDecoder, encode_data, encode_json
 from protocol.pdo import encode
 from protocol.text.json_text import JsonObject
-from tests.clients.cpp_programs import Driver, assert_no_faults, check, driver, needs_gxx, patient
+from tests.clients.cpp_programs import (
+    ROOT,
+    Driver,
+    assert_no_faults,
+    check,
+    driver,
+    end_driver,
+    needs_gxx,
+    patient,
+    start_driver,
+)
 from tests.server.running import PATIENCE_S, free_port, wait_until
 
 pytestmark = [needs_gxx, patient]
@@ -219,6 +231,27 @@ def test_a_server_with_our_clock_or_none_that_can_be_read_is_near(
         reading = running.latest()
         assert picked(reading, "fresh", "age_is_lower_bound") == (True, False)
         assert reading["age_ns"] >= 8e9
+
+
+def test_a_clock_that_is_shifted_is_another_one(server: PlayedServer) -> None:
+    """A process in a time namespace: nothing but the kernel can make one."""
+    shifted = ("unshare", "--time", "--monotonic", "86400")
+    if subprocess.run([*shifted, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("this user or kernel makes no time namespace")
+    process = start_driver(*shifted)
+    try:
+        running = Driver(server.port, process, **PATIENT)
+        for claimed, far in ((OURS, True), (f"{OURS} 86400 0", False)):
+            connected(server, running, {**GRANTED, "boot_id": claimed})
+            server.send(frame(1))
+            assert picked(running.latest(), "age_is_lower_bound") == (far,)
+    finally:
+        assert end_driver(process) == 0
+    name = "from protocol.address import boot_id; print(boot_id())"
+    done = subprocess.run(
+        [*shifted, sys.executable, "-c", name], check=True, capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.stdout == f"{OURS} 86400 0\n"
 
 
 def test_a_sample_keeps_the_clock_of_its_own_connection(server: PlayedServer) -> None:

@@ -10,6 +10,7 @@ from itertools import pairwise
 import pytest
 
 from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.client import connect
 from protocol.framing import DataFlag
 from protocol.pdo import SampleDecoder
 from tests.clients.cpp_programs import (
@@ -215,6 +216,20 @@ def test_a_server_that_is_stopped_and_goes_on(shared: ServedSimulation) -> None:
         after = new_again(running, silent)
         assert after["connection"] == 1, "a stopped server is not gone: its connection is kept"
         assert after["monotonic_ns"] > before["monotonic_ns"]
+
+
+def test_a_server_of_another_machine_at_an_address_of_this_one(
+    shared: ServedSimulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As at this end of an SSH tunnel: C++ and Python count ages from the arrival."""
+    monkeypatch.setattr("ethercat_server.serving.actions.boot_id", lambda: "another machine's")
+    with served(sinc_length=SLOW) as far:
+        for server, is_far in ((far, True), (shared, False)):
+            with driver(server.port, **PATIENT) as running, connect(server.port) as client:
+                running.connect()
+                reading = running.do("next", 60_000)
+                assert (reading["fresh"], reading["age_is_lower_bound"]) == (True, is_far)
+                assert client.connection.same_machine is not is_far
 
 
 # -- requests
