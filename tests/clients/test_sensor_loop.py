@@ -313,6 +313,9 @@ def test_settings_that_changed_are_checked(running: Loop, server: PlayedSensor) 
     loop = running.opened(server.port)
     server.send(frame(1))
     loop.until(FRESH)
+    server.send(event(Event.RECONFIGURED, sensor=1), frame(2))  # another one of the chain
+    wait_until(lambda: wrench(loop.read()) == 2, "the sample behind the event")
+    assert loop.read()["condition"] == FRESH
     server.reconfigure(rate_hz=400)
     assert wrench(loop.until(UNCHECKED)) is None
     loop.logged("info: connected again to BFT-SENS-ECAT-M8, serial 7")
