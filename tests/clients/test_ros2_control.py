@@ -1,4 +1,4 @@
-"""The ros2_control package: what it says of itself, and, where ROS is sourced, what a real controller manager makes of it."""
+"""The ros2_control package: what it says of itself and, with ROS, what a real controller manager says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What controllers see of the ros2_control plugin: the class behind it, without ROS, against played and real servers."""
+"""What controllers see through the ros2_control plugin: the class behind it, without ROS."""
 
 from __future__ import annotations
 
@@ -393,7 +393,7 @@ def test_a_server_killed_and_started_again(running: Loop) -> None:
 
 
 def test_a_cycle_receives_and_nothing_else(running: Loop, server: PlayedSensor) -> None:
-    """The kernel kills the program for any other system call; also while settings are checked and a new client taken."""
+    """The kernel kills the program for any other system call, also while a new client is taken."""
     loop = running.opened(server.port)
     server.send(frame(1))
     loop.begin("sealed", 300)

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """A simulated sensor, a controller manager at 1 kHz, and an arm that gives way to the force measured."""
 
 import shlex
@@ -24,6 +25,7 @@ ARGUMENTS = (
 
 def start(context):
     """What the arguments ask for."""
+
     def value(name):
         return LaunchConfiguration(name).perform(context)
 
@@ -64,5 +66,7 @@ def start(context):
 
 def generate_launch_description():
     """See the top."""
-    arguments = [DeclareLaunchArgument(name, default_value=d, description=text) for name, d, text in ARGUMENTS]
+    arguments = [
+        DeclareLaunchArgument(name, default_value=d, description=text) for name, d, text in ARGUMENTS
+    ]
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])
