@@ -68,9 +68,11 @@ def test_the_macro_lists_what_is_asked_for(tmp_path: Path) -> None:
     for flag in ("false", "true"):
         flags = " ".join(f'{name}="{flag}"' for name in ("imu", "orientation", "temperature"))
         description.write_text(
-            f'<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="{macro}"/>'
-            f'<xacro:bota_force_torque_sensor name="wrist" {flags}><parameters><param name="port">12002</param>'
-            "</parameters></xacro:bota_force_torque_sensor></robot>"
+            '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+            f'<xacro:include filename="{macro}"/>'
+            f'<xacro:bota_force_torque_sensor name="wrist" {flags}>'
+            '<parameters><param name="port">12002</param></parameters>'
+            "</xacro:bota_force_torque_sensor></robot>"
         )
         robot = ElementTree.fromstring(xacro.process_file(str(description)).toxml())
         listed = [str(each.get("name")) for each in robot.iter("state_interface")]
@@ -162,8 +164,11 @@ def launched(setup: Path, output: Path, **arguments: object) -> Iterator[subproc
                 os.killpg(process.pid, signal.SIGKILL)
 
 
+MISSING = missing()
+
+
 @pytest.mark.skipif(
-    bool(missing()), reason=f"no ROS with ros2_control is sourced; missing: {', '.join(missing())}"
+    bool(MISSING), reason=f"no ROS 2 with ros2_control is sourced ({', '.join(MISSING[:3])}, ... missing)"
 )
 @pytest.mark.timeout(300)
 def test_a_real_controller_manager(installed: Path, tmp_path: Path) -> None:
