@@ -121,6 +121,10 @@ def server(running: Loop) -> Iterator[PlayedSensor]:
         running.do("stop")
 
 
+def threads(loop: Loop) -> int:
+    return len(list(Path(f"/proc/{loop.process.pid}/task").iterdir()))
+
+
 def wrench(seen: Seen) -> Any:
     return seen["force.x"]
 
@@ -389,7 +393,9 @@ def test_a_server_killed_and_started_again(running: Loop) -> None:
             assert client.ask("configure", settings={"calibration_matrix": False})["ok"]
             loop.logged("sends ADC counts instead of N and Nm")
             assert wrench(loop.read()) is None
+        assert threads(loop) == 2
         loop.do("stop")
+        assert threads(loop) == 1
 
 
 def test_a_cycle_receives_and_nothing_else(running: Loop, server: PlayedSensor) -> None:

@@ -74,6 +74,7 @@ public:
             client_.reset(next);
         }
         const bota_ethercat::Reading reading = client_->latest(parameters_.sensor);
+        age_is_lower_bound_ = reading.age_is_lower_bound;
         const bool is_checked = client_->reconfigurations() == 0;
         if (!client_->connected())
             connector_.ask(client_->error());
@@ -87,8 +88,14 @@ public:
     const Values& values() const noexcept { return gate_.values(); }
     int condition() const noexcept { return gate_.condition(); }
 
-    /// The connector's thread ends soon; does not wait.
-    void stop_soon() noexcept { connector_.stop_soon(); }
+    /// The server is on another machine: ages count from the arrival.
+    bool age_is_lower_bound() const noexcept { return age_is_lower_bound_; }
+
+    /// For the control thread after an error: no connection any more, and the connector's thread ends soon; does not wait.
+    void stop_soon() noexcept {
+        connector_.stop_soon();
+        client_->close();
+    }
 
 private:
     using Client = bota_ethercat::Client;
@@ -97,6 +104,7 @@ private:
     Connector connector_;
     Gate gate_;
     std::unique_ptr<Client> client_;
+    bool age_is_lower_bound_ = false;
 };
 
 }  // namespace bota_ethercat_hardware
