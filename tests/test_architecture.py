@@ -95,6 +95,8 @@ def modules() -> Iterator[tuple[str, Path]]:
     for package in ("protocol", S, "bridge", "ft_compensation", "clients"):
         root = ROOTS.get(package, ROOT)
         for path in sorted((root / package).rglob("*.py")):
+            if "ros2_control" in path.parts:  # a ROS package in C++; this is its launch file
+                continue
             parts = path.relative_to(root).with_suffix("").parts
             yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
 

@@ -17,10 +17,11 @@ PRODUCT = sorted(
         "ros2_bridge/ft_compensation",
     )
     for path in (ROOT / folder).rglob("*.py")
+    if "ros2_control" not in path.parts  # a ROS package in C++
 )
 OTHERS = sorted(
     path
-    for folder in ("ros2_bridge/launch", "ros2_bridge/test", "scripts", "tests")
+    for folder in ("clients/ros2_control", "ros2_bridge/launch", "ros2_bridge/test", "scripts", "tests")
     for path in (ROOT / folder).rglob("*.py")
 )
 

@@ -7,6 +7,7 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <memory>
 #include <new>
 #include <string>
@@ -140,7 +141,7 @@ public:
     }
     /// Connections made so far.
     std::uint32_t connections() const noexcept { return connections_; }
-    /// How often a sensor was reconfigured while connected: ranges, filters or rate may be others now.
+    /// How often a wanted sensor was reconfigured while connected: ranges, filters or rate may be others now.
     std::uint32_t reconfigurations() const noexcept { return reconfigurations_; }
     /// JSON messages that could not be understood; they were left out.
     std::uint64_t bad_messages() const noexcept { return bad_messages_; }
@@ -238,7 +239,8 @@ private:
         } else if (event.is("sensor_back") && of_a_sensor) {
             sensors_[place].lost = false;
         } else if (event.is("reconfigured")) {
-            ++reconfigurations_;
+            const auto& wanted = options_.sensors;
+            if (!of_a_sensor || wanted.empty() || std::memchr(wanted.data(), place, wanted.size())) ++reconfigurations_;
             if (of_a_sensor) sensors_[place].accounting.rate_hz = 0.0;  // it may be another one now
         } else if (event.is("shutting_down")) {
             connection_.is_shutting_down();

@@ -1,0 +1,148 @@
+// The plugin `bota_ethercat_hardware/ForceTorqueSensor`: a SensorLoop as a component of ros2_control.
+//
+// Reading goes on while the component is inactive, where trouble is only seen (NaN, `condition`); once active, trouble that
+// lasts makes read() fail. What is done in which condition: gate.hpp; what is refused: identity.hpp, parameters.hpp.
+#include <memory>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+#include "bota_ethercat_hardware/sensor_loop.hpp"
+#include "bota_ethercat_hardware/signals.hpp"
+#include "hardware_interface/sensor_interface.hpp"
+#include "pluginlib/class_list_macros.hpp"
+#include "rclcpp/rclcpp.hpp"
+
+namespace bota_ethercat_hardware {
+
+using hardware_interface::CallbackReturn;
+using hardware_interface::return_type;
+
+class ForceTorqueSensor : public hardware_interface::SensorInterface {
+public:
+    CallbackReturn on_init(const hardware_interface::HardwareComponentInterfaceParams& params) override {
+        if (SensorInterface::on_init(params) != CallbackReturn::SUCCESS) return CallbackReturn::ERROR;
+        parameters_ = Parameters();
+        std::string wrong;
+        for (const auto& [name, value] : info_.hardware_parameters)
+            if (wrong.empty()) wrong = set_parameter(parameters_, name, value);
+        if (wrong.empty()) wrong = take_sensor();
+        return wrong.empty() ? CallbackReturn::SUCCESS : refuse(wrong, CallbackReturn::ERROR);
+    }
+
+    CallbackReturn on_configure(const rclcpp_lifecycle::State&) override {
+        handles_.clear();
+        for (const auto& interface : info_.sensors[0].state_interfaces)
+            handles_.emplace_back(get_state_interface_handle(info_.sensors[0].name + "/" + interface.name), signal(interface.name));
+        loop_.reset();
+        auto loop = std::make_unique<SensorLoop>(parameters_, [this](Level level, const std::string& text) { log(level, text); });
+        std::string why;
+        if (!loop->open(why)) return refuse(why, CallbackReturn::FAILURE);
+        loop_ = std::move(loop);
+        introduce();
+        return CallbackReturn::SUCCESS;
+    }
+
+    CallbackReturn on_activate(const rclcpp_lifecycle::State&) override {
+        std::string why;
+        if (parameters_.on_activate_tare && !loop_->tare(why)) return refuse(why, CallbackReturn::FAILURE);
+        if (!loop_->wait_until_usable(why)) return refuse(why, CallbackReturn::FAILURE);
+        if (loop_->age_is_lower_bound())
+            log(Level::warning, "the server is on another machine: the age counts from the arrival, without network latency");
+        show();
+        is_active_ = true;
+        return CallbackReturn::SUCCESS;
+    }
+
+    CallbackReturn on_deactivate(const rclcpp_lifecycle::State&) override {
+        is_active_ = false;
+        return CallbackReturn::SUCCESS;
+    }
+
+    CallbackReturn on_cleanup(const rclcpp_lifecycle::State&) override { return end(); }
+    CallbackReturn on_shutdown(const rclcpp_lifecycle::State&) override { return end(); }
+
+    /// In the control thread if read() has failed, and then twice: the connector's thread is told to end, not waited for.
+    CallbackReturn on_error(const rclcpp_lifecycle::State&) override {
+        if (is_active_) log(Level::error, std::string("given up: ") + condition_text(loop_->condition()));
+        is_active_ = false;
+        if (loop_) loop_->stop_soon();
+        return CallbackReturn::SUCCESS;  // unconfigured: may be configured again
+    }
+
+    return_type read(const rclcpp::Time&, const rclcpp::Duration&) override {
+        if (!loop_) return return_type::OK;
+        const bool good = loop_->read();
+        show();
+        return good || !is_active_ ? return_type::OK : return_type::ERROR;
+    }
+
+private:
+    /// The one <sensor> of the URDF; what is wrong with it, or nothing.
+    std::string take_sensor() {
+        if (info_.sensors.size() != 1 || !info_.joints.empty() || !info_.gpios.empty())
+            return "its <ros2_control> tag must have one <sensor> and nothing else";
+        const hardware_interface::ComponentInfo& sensor = info_.sensors[0];
+        if (sensor.state_interfaces.empty()) return "the <sensor> " + sensor.name + " has no <state_interface>";
+        for (const auto& interface : sensor.state_interfaces) {
+            const std::size_t which = signal(interface.name);
+            if (which == kSignals.size())
+                return "there is no state interface \"" + interface.name + "\"" + detail::meant(interface.name, kSignals) +
+                       "; there are: " + detail::listed(kSignals);
+            if (interface.data_type != "double")
+                return "the state interface " + interface.name + " has the data type " + interface.data_type + "; it must be double";
+            if (which >= kImu && which < kOrientation) parameters_.wants_imu = true;
+            if (which >= kOrientation && which < kTemperature) parameters_.wants_orientation = true;
+        }
+        return {};
+    }
+
+    /// Which sensor it is, and what its user should know of it.
+    void introduce() {
+        const Identity& sensor = loop_->identity();
+        const auto rate = detail::text(sensor.rate_hz);
+        log(Level::info, "sensor " + std::to_string(parameters_.sensor) + " is " + detail::named(sensor) + ", " + rate +
+                             " Hz; a sample is fresh up to " + detail::text(loop_->max_age()) + " s");
+        if (sensor.rate_hz > 0.0 && sensor.rate_hz < 0.99 * info_.rw_rate)
+            log(Level::warning, "the sensor gives " + rate + " samples a second and is read " + std::to_string(info_.rw_rate) +
+                                    " times: some cycles see the sample of the cycle before");
+        if (sensor.coordinate_system == true)
+            log(Level::warning, "the sensor's setting coordinate_system is on: forces are in the frame stored in the sensor");
+        if (sensor.inertia_compensation == true)
+            log(Level::warning, "the sensor's setting inertia_compensation is on: it subtracts gravity and inertia itself");
+    }
+
+    void show() {
+        const Values& values = loop_->values();
+        for (const auto& [handle, which] : handles_) (void)set_state(handle, values[which], false);
+    }
+
+    CallbackReturn end() {
+        is_active_ = false;
+        loop_.reset();
+        return CallbackReturn::SUCCESS;
+    }
+
+    CallbackReturn refuse(const std::string& why, CallbackReturn result) {
+        log(Level::error, why);
+        return result;
+    }
+
+    void log(Level level, const std::string& text) const {
+        switch (level) {
+            case Level::info: RCLCPP_INFO(get_logger(), "%s", text.c_str()); break;
+            case Level::warning: RCLCPP_WARN(get_logger(), "%s", text.c_str()); break;
+            case Level::error: RCLCPP_ERROR(get_logger(), "%s", text.c_str()); break;
+        }
+    }
+
+    Parameters parameters_;
+    std::unique_ptr<SensorLoop> loop_;
+    std::vector<std::pair<hardware_interface::StateInterface::SharedPtr, std::size_t>> handles_;  // place in `Values`
+    bool is_active_ = false;
+};
+
+}  // namespace bota_ethercat_hardware
+
+PLUGINLIB_EXPORT_CLASS(bota_ethercat_hardware::ForceTorqueSensor, hardware_interface::SensorInterface)

@@ -1,0 +1,226 @@
+// Runs the class behind the ros2_control plugin for tests: a command per line on standard input, for each a line of JSON.
+//
+//   new [PARAMETER=VALUE ...] [imu] [orientation]   another loop; the one before is gone
+//   open | wait MS | tare | log | stop
+//   read                 one cycle
+//   run SECONDS HZ       cycles at a steady pace: how many in which condition, how long they took
+//   sealed COUNT         the same at 1 kHz, in a thread to which the kernel allows recv() and sleeping only
+//   take CONDITION NOW_MS AGE_MS CHECKED FORCE      what controllers see of this, with the parameters of `new`
+//   check JSON           what speaks against sensor 0 of this description
+//
+// Built with ASan or TSan, whose hook counts what the cycles allocate.
+#include "bota_ethercat_hardware/sensor_loop.hpp"
+
+#include <linux/filter.h>
+#include <linux/seccomp.h>
+#include <sys/prctl.h>
+#include <sys/syscall.h>
+
+#include <algorithm>
+#include <cinttypes>
+#include <cstdio>
+#include <cstdlib>
+#include <iostream>
+#include <map>
+#include <mutex>
+#include <optional>
+#include <sstream>
+
+static thread_local std::size_t allocations = 0;
+
+extern "C" int __sanitizer_install_malloc_and_free_hooks(void (*)(const volatile void*, std::size_t), void (*)(const volatile void*));
+
+namespace {
+
+using namespace bota_ethercat_hardware;
+
+const char* yes(bool value) { return value ? "true" : "false"; }
+
+std::string quoted(std::string_view text) {
+    std::string result = "\"";
+    for (const char c : text) {
+        if (c == '"' || c == '\\') result += '\\';
+        result += c;
+    }
+    return result + "\"";
+}
+
+std::mutex lines_lock;
+std::vector<std::string> lines;
+
+void keep(Level level, const std::string& text) {
+    constexpr const char* kLevels[] = {"info: ", "warning: ", "error: "};
+    const std::lock_guard<std::mutex> guard(lines_lock);
+    lines.push_back(kLevels[static_cast<int>(level)] + text);
+}
+
+void number(const char* key, double value) {
+    std::printf(",\"%s\":", key);
+    if (std::isnan(value)) std::printf("null");
+    else if (std::isinf(value)) std::printf("1e999");
+    else std::printf("%.17g", value);
+}
+
+void print(bool good, const Values& values) {
+    const std::size_t allocated = allocations;
+    std::printf("{\"good\":%s", yes(good));
+    for (std::size_t i = 0; i < values.size(); ++i) number(std::string(kSignals[i]).c_str(), values[i]);
+    std::printf(",\"allocated\":%zu}", allocated);
+}
+
+bool watched_read(SensorLoop& loop) {
+    allocations = 0;
+    return loop.read();
+}
+
+void sleep_until(std::int64_t due) {
+    const timespec at{static_cast<time_t>(due / 1'000'000'000), static_cast<long>(due % 1'000'000'000)};
+    clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &at, nullptr);
+}
+
+void run(SensorLoop& loop, double seconds, double hz) {
+    const auto cycles = static_cast<std::size_t>(seconds * hz);
+    std::vector<double> took, ages;
+    took.reserve(cycles), ages.reserve(cycles);
+    std::map<int, long> conditions;
+    std::size_t allocated = 0, bad = 0;
+    std::int64_t due = bota_ethercat::monotonic_now_ns();
+    for (std::size_t i = 0; i < cycles; ++i) {
+        sleep_until(due += static_cast<std::int64_t>(1e9 / hz));
+        const std::int64_t before = bota_ethercat::monotonic_now_ns();
+        bad += !watched_read(loop);
+        took.push_back(static_cast<double>(bota_ethercat::monotonic_now_ns() - before) * 1e-3);
+        allocated += allocations;
+        ages.push_back(loop.values()[kAge] * 1e6);
+        ++conditions[loop.condition()];
+    }
+    std::sort(took.begin(), took.end());
+    std::sort(ages.begin(), ages.end());
+    std::printf("{\"cycles\":%zu,\"bad\":%zu,\"allocated\":%zu", cycles, bad, allocated);
+    if (cycles > 0)
+        for (const auto& [name, each] : {std::pair{"read_us", &took}, std::pair{"age_us", &ages}}) {
+            std::printf(",\"%s\":{\"p50\":%.1f,\"p99\":%.1f", name, (*each)[cycles / 2], (*each)[cycles * 99 / 100]);
+            number("max", each->back());
+            std::printf("}");
+        }
+    std::printf(",\"conditions\":{");
+    const char* separator = "";
+    for (const auto& [condition, count] : conditions) std::printf("%s\"%d\":%ld", separator, condition, count), separator = ",";
+    std::printf("}}");
+}
+
+/// From here on this thread is killed, and the process with it, for any other system call.
+bool allow_recv_only() {
+    std::vector<sock_filter> filter = {BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(seccomp_data, nr))};
+    // clock_gettime: a machine whose clock the vdso cannot read. The last ones are how a thread ends.
+    for (const unsigned call : {SYS_recvfrom, SYS_clock_nanosleep, SYS_clock_gettime, SYS_exit, SYS_futex, SYS_munmap, SYS_madvise,
+                                SYS_rt_sigprocmask, SYS_sigaltstack, SYS_mmap}) {
+        filter.push_back(BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, call, 0, 1));
+        filter.push_back(BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW));
+    }
+    filter.push_back(BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_KILL_PROCESS));
+    const sock_fprog program{static_cast<unsigned short>(filter.size()), filter.data()};
+    return prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0 && prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &program) == 0;
+}
+
+struct Sealed {
+    SensorLoop& loop;
+    long cycles, good;
+    bool is_sealed;
+};
+
+void* cycles_of(void* given) {
+    Sealed& sealed = *static_cast<Sealed*>(given);
+    sealed.is_sealed = allow_recv_only();
+    std::int64_t due = bota_ethercat::monotonic_now_ns();
+    for (long i = 0; i < sealed.cycles; ++i) {
+        sleep_until(due += 1'000'000);
+        sealed.good += sealed.loop.read();
+    }
+    return nullptr;
+}
+
+void run_sealed(SensorLoop& loop, long count) {
+    Sealed sealed{loop, count, 0, false};
+    pthread_t thread{};  // not std::thread: to check its virtual calls UBSan makes system calls
+    if (pthread_create(&thread, nullptr, cycles_of, &sealed) == 0) pthread_join(thread, nullptr);
+    std::printf("{\"sealed\":%s,\"good\":%ld}", yes(sealed.is_sealed), sealed.good);
+}
+
+}  // namespace
+
+int main() {
+    __sanitizer_install_malloc_and_free_hooks([](const volatile void*, std::size_t) { ++allocations; }, [](const volatile void*) {});
+    std::optional<SensorLoop> maybe;
+    Parameters parameters;
+    std::optional<Gate> gate;
+    for (std::string line, command; std::getline(std::cin, line);) {
+        std::istringstream words(line);
+        words >> command;
+        std::string why;
+        bool ok = true;
+        if (command == "new") {
+            maybe.reset();
+            lines.clear();
+            parameters = Parameters();
+            for (std::string word; words >> word;) {
+                const std::size_t at = word.find('=');
+                if (word == "imu") parameters.wants_imu = true;
+                else if (word == "orientation") parameters.wants_orientation = true;
+                else if (why.empty()) why = set_parameter(parameters, word.substr(0, at), at == std::string::npos ? "" : word.substr(at + 1));
+            }
+            maybe.emplace(parameters, keep);
+            gate.emplace(parameters);
+            std::printf("{\"why\":%s}", quoted(why).c_str());
+        } else if (command == "check") {
+            Identity found;
+            const std::string text = line.substr(6);
+            std::printf("{\"found\":%s", yes(find(bota_ethercat::json::Value(text), 0, found)));
+            std::printf(",\"why\":%s,\"max_age\":%g}", quoted(objection(parameters, found)).c_str(), max_age(parameters, found));
+        } else if (command == "take") {
+            double now = 0, age = 0, force = 0;
+            int condition = 0, checked = 0;
+            words >> condition >> now >> age >> checked >> force;
+            bota_ethercat::Reading reading;
+            reading.condition = static_cast<bota_ethercat::Condition>(condition);
+            reading.has_sample = age >= 0;
+            if (age >= 0) reading.age_ns = std::llround(age * 1e6);
+            reading.sample.force[0] = force;
+            allocations = 0;
+            const bool good = gate->take(reading, checked != 0, std::llround(now * 1e6));
+            print(good, gate->values());
+        } else if (command == "log") {
+            const std::lock_guard<std::mutex> guard(lines_lock);
+            std::printf("[");
+            for (std::size_t i = 0; i < lines.size(); ++i) std::printf("%s%s", i ? "," : "", quoted(lines[i]).c_str());
+            std::printf("]");
+        } else if (!maybe) {
+            return 2;
+        } else if (command == "open" || command == "tare" || command == "wait") {
+            long ms = 0;
+            words >> ms;
+            if (command == "open") ok = maybe->open(why);
+            else ok = command == "tare" ? maybe->tare(why) : maybe->wait_until_usable(why, std::chrono::milliseconds(ms));
+            std::printf("{\"ok\":%s,\"why\":%s}", yes(ok), quoted(ok ? "" : why).c_str());
+        } else if (command == "read") {
+            ok = watched_read(*maybe);
+            print(ok, maybe->values());
+        } else if (command == "run") {
+            double seconds = 0, hz = 1000;
+            words >> seconds >> hz;
+            run(*maybe, seconds, hz);
+        } else if (command == "sealed") {
+            long count = 0;
+            words >> count;
+            run_sealed(*maybe, count);
+        } else if (command == "stop") {
+            maybe.reset();
+            std::printf("{}");
+        } else {
+            return 2;
+        }
+        std::printf("\n");
+        std::fflush(stdout);
+    }
+    return 0;
+}

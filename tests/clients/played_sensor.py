@@ -1,0 +1,104 @@
+"""A server with one sensor, played by a test: it answers by itself, and sends what it is told to."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from protocol.control import Event, event
+from protocol.framing import FrameDecoder, encode_data, encode_json
+from protocol.pdo import encode
+from protocol.text.json_text import JsonObject
+from tests.server.running import PATIENCE_S, wait_until
+
+SETTINGS = {
+    "calibration_matrix": True,
+    "coordinate_system": False,
+    "inertia_compensation": False,
+    "orientation_estimation": False,
+    "imu_active": 1,
+}
+
+
+def described(**changed: Any) -> JsonObject:
+    """A sensor as `describe` has it."""
+    settings = SETTINGS | {name: changed.pop(name) for name in SETTINGS if name in changed}
+    sensor = {"sensor": 0, "name": "BFT-SENS-ECAT-M8", "serial": 7, "pdo_size": 61, "rate_hz": 800}
+    return sensor | changed | {"settings": settings}
+
+
+class PlayedSensor:
+    """Listens until `close`; `sensor` is what it describes."""
+
+    def __init__(self, port: int = 0, **sensor: Any) -> None:
+        self.sensor: JsonObject = described(**sensor)
+        self.protocol = 1
+        self.refusal: JsonObject | None = None
+        self.streams: list[socket.socket] = []
+        self.asked: list[str] = []
+        self._listener = socket.create_server(("127.0.0.1", port))
+        self.port: int = self._listener.getsockname()[1]
+        self._thread = threading.Thread(target=self._serve, name="played sensor")
+        self._thread.start()
+
+    def _serve(self) -> None:
+        with contextlib.suppress(OSError):  # the listener was closed
+            while True:
+                connection, _ = self._listener.accept()
+                connection.settimeout(PATIENCE_S)
+                self._answer(connection)
+
+    def _answer(self, connection: socket.socket) -> None:
+        decoder = FrameDecoder()
+        while (message := decoder.next_message()) is None:
+            data = connection.recv(4096)
+            if not data:
+                return
+            decoder.feed(data)
+        assert isinstance(message, dict)
+        self.asked.append(str(message["action"]))
+        reply = {"reply": message["action"], "ok": True, "protocol": self.protocol, "sensors": [self.sensor]}
+        if self.refusal:
+            reply = {"reply": message["action"], "ok": False, "error": self.refusal}
+        connection.sendall(encode_json(reply))
+        if message["action"] == "subscribe":
+            self.streams.append(connection)
+        else:
+            connection.close()
+
+    def send(self, *messages: bytes | JsonObject) -> None:
+        """To the newest subscriber."""
+        wait_until(lambda: bool(self.streams), "a subscriber")
+        for message in messages:
+            self.streams[-1].sendall(message if isinstance(message, bytes) else encode_json(message))
+
+    def reconfigure(self, **changed: Any) -> None:
+        self.sensor = described(**changed)
+        self.send(event(Event.RECONFIGURED, sensor=0, settings=self.sensor["settings"]))
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self._thread.join(PATIENCE_S)
+        for stream in self.streams:
+            stream.close()
+
+
+@contextlib.contextmanager
+def played(port: int = 0, **sensor: Any) -> Iterator[PlayedSensor]:
+    server = PlayedSensor(port, **sensor)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def frame(sequence: int, flags: int = 0, **values: float) -> bytes:
+    """A DATA message of a sample taken now; its force along x is its number."""
+    data = encode(61, {"force.x": sequence, **{name.replace("_", "."): v for name, v in values.items()}})
+    return encode_data(sequence, time.time_ns(), time.monotonic_ns(), 0, flags, 3, data)

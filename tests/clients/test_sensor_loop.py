@@ -1,0 +1,430 @@
+"""What controllers see through the ros2_control plugin: the class behind it, without ROS."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import select
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from protocol.control import Event, event
+from protocol.framing import DataFlag
+from tests.clients.cpp_programs import ROOT, SANITIZED, SOURCES, build, end_driver, needs_gxx, patient
+from tests.clients.played_sensor import PlayedSensor, described, frame, played
+from tests.served_simulation import served
+from tests.server.running import PATIENCE_S, free_port, wait_until
+
+pytestmark = [needs_gxx, patient]
+
+PACKAGE = ROOT / "clients" / "ros2_control"
+HEADERS = sorted((PACKAGE / "include" / "bota_ethercat_hardware").glob("*.hpp"))
+THREADS = ("-g", "-O1", "-fsanitize=thread", "-fno-sanitize-recover=all")
+FRESH, SATURATED, NOT_FINITE, LATE, BAD_CLOCK, REPEATED, INVALID, SILENT, LOST, DISCONNECTED = range(10)
+UNCHECKED = 100
+FOREVER = {"max_age": 10, "error_after": "inf"}
+"""For what must not depend on how fast this machine is."""
+
+Seen = dict[str, Any]
+
+
+def program(sanitized: tuple[str, ...] = SANITIZED) -> Path:
+    contents = hashlib.sha256(b"".join(path.read_bytes() for path in HEADERS)).hexdigest()
+    flags = (*sanitized, "-pthread", f"-I{PACKAGE / 'include'}", f"-DHEADERS=0x{contents[:15]}")
+    return build(SOURCES / "sensor_loop.cpp", flags)
+
+
+class Loop:
+    """tests/clients/cpp/sensor_loop.cpp, a process for many tests."""
+
+    def __init__(self, path: Path) -> None:
+        self.process = subprocess.Popen([path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def begin(self, *words: object) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(" ".join(map(str, words)) + "\n")
+        self.process.stdin.flush()
+
+    def answer(self) -> Any:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, f"the program ended with {self.process.wait(10)}"
+        return json.loads(line)
+
+    def do(self, *words: object) -> Any:
+        self.begin(*words)
+        return self.answer()
+
+    def has_answered(self) -> bool:
+        assert self.process.stdout is not None
+        return bool(select.select([self.process.stdout], [], [], 0.005)[0])
+
+    def new(self, *flags: str, **parameters: object) -> str:
+        """What is wrong with the parameters."""
+        return str(self.do("new", *flags, *(f"{name}={value}" for name, value in parameters.items()))["why"])
+
+    def opened(self, port: int, *flags: str, **parameters: object) -> Loop:
+        assert self.new(*flags, host="127.0.0.1", port=port, **{**FOREVER, **parameters}) == ""
+        told = self.do("open")
+        assert told["ok"], told
+        return self
+
+    def refused(self, port: int, *flags: str, **parameters: object) -> str:
+        assert self.new(*flags, host="127.0.0.1", port=port, connect_timeout=0, **parameters) == ""
+        told = self.do("open")
+        assert not told["ok"]
+        return str(told["why"])
+
+    def read(self) -> Seen:
+        seen: Seen = self.do("read")
+        assert seen["allocated"] == 0
+        return seen
+
+    def until(self, condition: int, holds: Callable[[Seen], bool] = lambda _: True) -> Seen:
+        """The first cycle with this condition; `holds` for every one before it."""
+        last: Seen = {}
+
+        def so() -> bool:
+            last.update(self.read())
+            assert last["condition"] == condition or holds(last), last
+            return bool(last["condition"] == condition)
+
+        wait_until(so, f"condition {condition}")
+        return last
+
+    def logged(self, text: str) -> None:
+        """Go on reading until the log says it."""
+        wait_until(
+            lambda: bool(self.read()) and any(text in line for line in self.do("log")),
+            f"the log to say: {text}",
+        )
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[Loop]:
+    loop = Loop(program())
+    yield loop
+    assert end_driver(loop.process) == 0
+
+
+@pytest.fixture
+def server(running: Loop) -> Iterator[PlayedSensor]:
+    with played() as sensor:
+        yield sensor
+        running.do("stop")
+
+
+def threads(loop: Loop) -> int:
+    return len(list(Path(f"/proc/{loop.process.pid}/task").iterdir()))
+
+
+def wrench(seen: Seen) -> Any:
+    return seen["force.x"]
+
+
+# -- parameters
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("port", "0", 'the parameter port is "0"; allowed: 1 to 65535'),
+        ("port", "12001x", "allowed: 1 to 65535"),
+        ("sensor", "-1", "allowed: a position on the bus, 0 to 255"),
+        ("max_age", "0,01", "allowed: 0.001 to 10 (s)"),
+        ("max_age", "nan", "allowed: 0.001 to 10 (s)"),
+        ("error_after", "-0.1", "allowed: 0 or more (s), or inf for never"),
+        ("on_stale", "use", 'the parameter on_stale is "use"; allowed: error, nan or hold'),
+        ("on_saturated", "NaN", "allowed: error, nan, hold or use"),
+        ("on_activate_tare", "yes", "allowed: true or false"),
+        (
+            "max_agee",
+            "1",
+            'there is no parameter "max_agee" (did you mean "max_age"?); there are: host, port,',
+        ),
+        ("quality", "1", 'there is no parameter "quality"; there are: host'),
+    ],
+)
+def test_wrong_parameters_are_refused_in_a_sentence(running: Loop, name: str, value: str, said: str) -> None:
+    assert said in running.new(**{name: value})
+
+
+def test_parameters_as_xacro_writes_them(running: Loop) -> None:
+    assert running.new(host="::1", serial=4294967295, on_activate_tare="True", error_after="1e-1") == ""
+
+
+# -- what controllers see
+
+
+GROUPS = {
+    "on_stale": (LATE, REPEATED, SILENT, LOST, DISCONNECTED),
+    "on_invalid": (INVALID, NOT_FINITE, BAD_CLOCK),
+    "on_saturated": (SATURATED,),
+}
+
+
+@pytest.mark.parametrize(("parameter", "conditions"), GROUPS.items())
+def test_what_controllers_see_in_each_condition(
+    running: Loop, parameter: str, conditions: tuple[int, ...]
+) -> None:
+    for condition in conditions:
+        for reaction, momentary in (("nan", None), ("hold", 5.0), ("error", None)):
+            running.new(**{parameter: reaction, "error_after": 0.5})
+            good = running.do("take", FRESH, 1000, 1, 1, 5.0)
+            assert (good["good"], wrench(good), good["condition"], good["age"]) == (True, 5.0, FRESH, 0.001)
+            first = running.do("take", condition, 1100, 101, 1, 9.0)
+            assert (first["good"], wrench(first)) == (reaction != "error", momentary)
+            assert (first["condition"], first["age"], first["allocated"]) == (condition, 0.101, 0)
+            assert running.do("take", condition, 1599, 600, 1, 9.0)["good"] == (reaction != "error")
+            lasting = running.do("take", condition, 1600, 601, 1, 9.0)
+            assert (lasting["good"], wrench(lasting)) == (False, None)
+            # Usable again: the time counts anew.
+            assert running.do("take", FRESH, 1700, 1, 1, 6.0)["good"]
+            assert running.do("take", condition, 1800, 101, 1, 9.0)["good"] == (reaction != "error")
+
+
+def test_changed_settings_are_unusable_until_they_are_checked(running: Loop) -> None:
+    running.new(on_invalid="hold")
+    running.do("take", FRESH, 0, 1, 1, 5.0)
+    seen = running.do("take", FRESH, 1, 1, 0, 9.0)
+    assert (wrench(seen), seen["condition"]) == (5.0, UNCHECKED)
+    assert running.do("take", LATE, 2, 50, 0, 9.0)["condition"] == LATE
+
+
+def test_saturated_samples_can_be_used(running: Loop) -> None:
+    running.new(on_saturated="use", error_after=0)
+    seen = running.do("take", SATURATED, 0, 1, 1, 900.0)
+    assert (seen["good"], wrench(seen), seen["condition"]) == (True, 900.0, SATURATED)
+
+
+def test_no_time_limit(running: Loop) -> None:
+    running.new(error_after="inf")
+    for now_ms in (0, 1_000_000_000):
+        seen = running.do("take", SILENT, now_ms, -1, 1, 0.0)
+        assert (seen["good"], wrench(seen), seen["age"]) == (True, None, math.inf)
+
+
+# -- which sensors are refused
+
+
+@pytest.mark.parametrize(
+    ("flags", "parameters", "sensor", "said"),
+    [
+        ("", {"serial": 8}, {}, "is BFT-SENS-ECAT-M8, serial 7, but the parameter serial is 8"),
+        ("", {}, {"calibration_matrix": False}, "sends ADC counts instead of N and Nm"),
+        (
+            "",
+            {"max_age": 0.01},
+            {"rate_hz": 150},
+            "has a sample every 0.006667 s: raise max_age (0.01 s) to at least 0.01333",
+        ),
+        ("imu", {}, {"imu_active": 0}, "has its IMU switched off"),
+        ("orientation", {}, {}, "does not map its orientation (61 bytes of process data)"),
+        ("orientation", {}, {"pdo_size": 77}, "does not estimate its orientation"),
+        ("", {}, {"imu_active": 0, "rate_hz": None}, ""),
+        ("orientation", {}, {"pdo_size": 77, "orientation_estimation": True}, ""),
+    ],
+)
+def test_sensors_that_cannot_give_what_the_urdf_asks_for(
+    running: Loop, flags: str, parameters: dict[str, object], sensor: dict[str, object], said: str
+) -> None:
+    running.new(*flags.split(), **parameters)
+    told = running.do("check", json.dumps({"sensors": [described(**sensor)]}))
+    assert told["found"]
+    assert told["why"].startswith(said)
+    assert bool(told["why"]) == bool(said)
+
+
+def test_by_default_a_sample_is_fresh_for_four_periods_or_10_ms(running: Loop) -> None:
+    for rate_hz, max_age in ((800, 0.01), (100, 0.04)):
+        running.new()
+        assert (
+            running.do("check", json.dumps({"sensors": [described(rate_hz=rate_hz)]}))["max_age"] == max_age
+        )
+
+
+# -- connections
+
+
+def test_wrong_ports_positions_and_versions(running: Loop, server: PlayedSensor) -> None:
+    assert "nobody listens there" in running.refused(free_port())
+    assert "sensor 3 is not on the bus" in running.refused(server.port, sensor=3)
+    server.protocol = 2
+    assert "another version of the protocol" in running.refused(server.port)
+
+
+def test_the_server_may_come_later(running: Loop) -> None:
+    port = free_port()
+    running.new(host="127.0.0.1", port=port, connect_timeout=60)
+    running.begin("open")
+    with played(port):
+        assert running.answer()["ok"]
+        running.do("stop")
+
+
+def test_it_becomes_usable_with_the_first_sample(running: Loop, server: PlayedSensor) -> None:
+    loop = running.opened(server.port)
+    seen = loop.read()
+    assert (wrench(seen), seen["condition"], seen["age"]) == (None, SILENT, math.inf)
+    assert "no usable sample within 0.02 s; silent" in loop.do("wait", 20)["why"]
+    loop.begin("wait", PATIENCE_S * 1000)
+    sequence = 1
+    while not loop.has_answered():
+        server.send(frame(sequence := sequence + 1))
+    assert loop.answer()["ok"]
+    assert wrench(loop.read()) > 1
+
+
+def test_nan_and_saturation_in_the_stream(running: Loop, server: PlayedSensor) -> None:
+    loop = running.opened(server.port, on_saturated="hold")
+    server.send(frame(1))
+    loop.until(FRESH)
+    server.send(frame(2, torque_z=math.nan))
+    assert wrench(loop.until(NOT_FINITE)) is None
+    server.send(frame(3))
+    loop.until(FRESH)
+    server.send(frame(4, warnings=1))
+    assert wrench(loop.until(SATURATED)) == 3
+
+
+def test_stale_samples_and_a_lost_sensor(running: Loop, server: PlayedSensor) -> None:
+    loop = running.opened(server.port, max_age=0.05, on_stale="hold", error_after=0.2)
+    server.send(frame(1))
+    loop.until(FRESH)
+    begin = time.monotonic()
+    stale = loop.until(SILENT)
+    assert wrench(stale) == 1
+    wait_until(lambda: not loop.read()["good"], "the error")
+    assert time.monotonic() - begin >= 0.2
+    assert wrench(loop.read()) is None
+    server.send(
+        event(Event.SENSOR_LOST, sensor=0, reason="cable", message="sensor 0 is lost"),
+        frame(2, DataFlag.INVALID),
+    )
+    loop.until(LOST)
+    server.send(frame(3))
+    assert wrench(loop.until(FRESH)) == 3
+
+
+def test_settings_that_changed_are_checked(running: Loop, server: PlayedSensor) -> None:
+    loop = running.opened(server.port)
+    server.send(frame(1))
+    loop.until(FRESH)
+    server.send(event(Event.RECONFIGURED, sensor=1), frame(2))  # another one of the chain
+    wait_until(lambda: wrench(loop.read()) == 2, "the sample behind the event")
+    assert loop.read()["condition"] == FRESH
+    server.reconfigure(rate_hz=400)
+    assert wrench(loop.until(UNCHECKED)) is None
+    loop.logged("info: connected again to BFT-SENS-ECAT-M8, serial 7")
+    loop.until(SILENT)
+    server.send(frame(2))
+    assert wrench(loop.until(FRESH)) == 2
+    # Counts instead of N are never passed on; they are refused until that is mended.
+    server.reconfigure(calibration_matrix=False)
+    server.send(frame(3))
+    loop.until(UNCHECKED)
+    loop.logged("error: 127.0.0.1 port")
+    server.send(frame(4))
+    assert wrench(loop.read()) is None
+    server.sensor = described()
+    loop.until(SILENT, lambda seen: wrench(seen) is None)
+    server.send(frame(5))
+    assert wrench(loop.until(FRESH)) == 5
+    server.reconfigure(coordinate_system=True)
+    loop.logged("has another coordinate_system than when configured")
+
+
+def test_a_tare_that_is_refused(running: Loop, server: PlayedSensor) -> None:
+    loop = running.opened(server.port)
+    server.refusal = {"code": "not_ready", "message": "sensor 0 moves: hold it still"}
+    assert loop.do("tare") == {
+        "ok": False,
+        "why": "the sensor could not be tared: sensor 0 moves: hold it still",
+    }
+
+
+def test_another_sensor_in_its_place_is_refused(running: Loop) -> None:
+    with played() as first:
+        loop = running.opened(first.port, max_age=0.3)
+        first.send(frame(1))
+        loop.until(FRESH)
+    with played(first.port, serial=8) as other:
+        loop.logged(
+            "sensor 0 is BFT-SENS-ECAT-M8, serial 8, and was BFT-SENS-ECAT-M8, serial 7, when configured"
+        )
+        assert "subscribe" not in other.asked
+        loop.until(DISCONNECTED)
+    with played(first.port) as same:
+        loop.logged("connected again")
+        loop.until(SILENT)
+        same.send(frame(2))
+        assert wrench(loop.until(FRESH)) == 2
+        loop.do("stop")
+
+
+# -- a real server
+
+
+def test_a_server_killed_and_started_again(running: Loop) -> None:
+    with contextlib.ExitStack() as ends:
+        first = ends.enter_context(served(sinc_length=512))
+        loop = running.opened(first.port, max_age=0.3)
+        assert loop.do("wait", PATIENCE_S * 1000)["ok"]
+        first.kill()
+        gone = loop.until(DISCONNECTED)
+        assert wrench(gone) is None
+        loop.logged("warning: disconnected; on such samples: nan")
+        second = ends.enter_context(served(port=first.port, sinc_length=512))
+        back = loop.until(FRESH, lambda seen: wrench(seen) is None)
+        assert back["age"] <= 0.3
+        loop.logged("samples are usable again")
+        second.command("power off")
+        loop.until(LOST)
+        second.command("power on")
+        loop.until(FRESH)
+        with second.client() as client:
+            assert client.ask("configure", settings={"calibration_matrix": False})["ok"]
+            loop.logged("sends ADC counts instead of N and Nm")
+            assert wrench(loop.read()) is None
+        assert threads(loop) == 2
+        loop.do("stop")
+        assert threads(loop) == 1
+
+
+def test_a_cycle_receives_and_nothing_else(running: Loop, server: PlayedSensor) -> None:
+    """The kernel kills the program for any other system call, also while a new client is taken."""
+    loop = running.opened(server.port)
+    server.send(frame(1))
+    loop.begin("sealed", 300)
+    server.reconfigure(rate_hz=400)
+    assert loop.answer() == {"sealed": True, "good": 300}
+    loop.logged("connected again")
+
+
+@pytest.mark.long
+def test_the_two_threads_under_the_thread_sanitizer() -> None:
+    """Real seconds: a server that comes and goes while a loop runs at 1 kHz."""
+    loop = Loop(program(THREADS))
+    with played() as first:
+        port = first.port
+        loop.opened(port)
+        loop.begin("run", 8, 1000)
+        end = time.monotonic() + 1
+        while time.monotonic() < end:
+            first.send(frame(int(time.monotonic() * 1e6)))
+            first.reconfigure(rate_hz=400)
+    for _ in range(20):
+        with played(port) as again:
+            wait_until(lambda: bool(again.streams), "the next connection")
+            again.send(frame(int(time.monotonic() * 1e6)))
+    told = loop.answer()
+    assert (told["bad"], told["allocated"]) == (0, 0)
+    assert told["conditions"].keys() >= {str(FRESH), str(UNCHECKED)}
+    assert end_driver(loop.process) == 0
