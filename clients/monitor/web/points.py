@@ -2,7 +2,8 @@
 
 A message to the page, little-endian: u8 kind (1), u8 position of the sensor, u16 number of points n,
 u32 unused, f64 time t0; then f32: 13 values of the newest sample, n times after t0, and n values of each of
-the 13 channels. Times are CLOCK_MONOTONIC of the server in seconds, values in SI units; NaN: not a finite number.
+the 13 channels. Times are the server's CLOCK_MONOTONIC in seconds, values in SI units or counts; NaN: not a
+finite number.
 """
 
 from __future__ import annotations
