@@ -65,7 +65,6 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
         "units": sensor.units,
         "digits": [words.DIGITS[unit] for unit in sensor.units],
         "imu_off": sensor.imu_off,
-        "orientation": sample and sample.orientation,
         "peaks": None if sensor.peaks is None else dict(zip(AXES, sensor.peaks, strict=True)),
         "saturated": sorted(sensor.saturated),
         "alerts": [_alert(alert) for alert in sensor.alerts],
@@ -75,10 +74,22 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
             ("Age at hand-out", words.age(sensor.hand_out_us, "p99")),
             ("Jitter", words.jitter(sensor)),
             ("Clock", words.clock(sensor)),
+            *_beside(sensor),
         ],
         "losses": words.losses(sensor),
         "settings": _settings(sensor),
     }
+
+
+def _beside(sensor: SensorState) -> list[tuple[str, str]]:
+    """What has no trace."""
+    sample = sensor.sample
+    if sample is None:
+        return []
+    found = [("Temperature", f"{sample.temperature:.1f} °C")]
+    if sample.orientation is not None:
+        found.append(("Orientation xyzw", " ".join(f"{part:+.2f}" for part in sample.orientation)))
+    return found
 
 
 def _alert(alert: Alert) -> dict[str, Any]:

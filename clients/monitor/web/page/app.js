@@ -76,7 +76,7 @@ function showSensor(found) {
   fill(byId("lost").lastElementChild, found.losses, (losses) =>
     losses.map(([text, bad]) => element("li", { class: bad ? "bad" : "" }, text)));
   fill(byId("settings").querySelector("dl"), found.settings, (settings) => settings.flatMap(([name, value, meaning]) => [
-    element("dt", {}, name), element("dd", {}, element("b", {}, value), element("small", {}, meaning))]));
+    element("dt", {}, ...broken(name)), element("dd", {}, element("b", {}, value), element("small", {}, meaning))]));
   for (const trace of traces) {
     const { group } = trace;
     if (!group.imu) {
@@ -93,6 +93,9 @@ function showSensor(found) {
     }
   }
 }
+
+/** A name that may be broken after an underscore. */
+const broken = (name) => name.split(/(?<=_)/).flatMap((part) => [part, element("wbr", {})]);
 
 const pairs = (rows) => rows.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]);
 

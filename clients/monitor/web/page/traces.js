@@ -101,16 +101,18 @@ export class Trace {
 
   /** Once it is in the page. */
   start() {
-    const axis = { stroke: () => colors.muted, font: "11px system-ui, sans-serif",
+    const em = 0.78 * parseFloat(getComputedStyle(document.documentElement).fontSize);
+    const axis = { stroke: () => colors.muted, font: `${em}px system-ui, sans-serif`,
       grid: { stroke: () => colors.grid, width: 1 }, ticks: { show: false } };
     this.plot = new uPlot({
       ...this.#size(), padding: [6, 8, 0, 0], legend: { show: false }, pxAlign: 0,
       cursor: { y: false, drag: { x: false, y: false }, points: { size: 6 }, sync: { key: "traces" } },
       scales: { x: { time: false }, y: { range: (_, low, high) => this.#range(low, high) } },
       axes: [
-        { ...axis, size: 22, gap: 4, splits: () => this.#splits(),
+        { ...axis, size: 2 * em, gap: 4, splits: () => this.#splits(),
           values: (u, at) => at.map((t) => { const s = Math.round(t - u.scales.x.max); return s ? `−${-s}` : "0 s"; }) },
-        { ...axis, size: 52, gap: 4, space: 26 },
+        { ...axis, size: 4.4 * em, gap: 4, space: 3.2 * em,
+          values: (_, at) => at.map((value) => String(Number(value.toPrecision(6))).replace("-", "−")) },
       ],
       series: [{}, ...["x", "y", "z"].map((name) => (
         { stroke: () => colors[name], width: 1.25, points: { show: false }, spanGaps: false }))],
@@ -139,7 +141,7 @@ export class Trace {
 
   #splits() {
     const { max } = this.plot.scales.x;
-    const step = [1, 2, 5, 10, 20].find((s) => this.span / s <= Math.max(2, this.box.clientWidth / 70)) ?? 30;
+    const step = [1, 2, 5, 10, 20].find((s) => this.span / s <= Math.max(2, this.box.clientWidth / 62)) ?? 30;
     return Array.from({ length: Math.floor(this.span / step) + 1 }, (_, i) => max - i * step).reverse();
   }
 

@@ -54,8 +54,8 @@ export class Wrench {
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
     pen.lineCap = pen.lineJoin = "round";
-    this.center = [width / 2, height * 0.54];
-    this.unit = Math.min(width, height) * 0.42;
+    this.center = [width / 2, height / 2];
+    this.unit = Math.min(width / 2.3, height / 2.2);
     this.#body(pen);
     this.#axes(pen);
     return [[force, colors.ink, 0], [torque, colors.torque, 1]].map(([vector, color, i]) => {
@@ -89,7 +89,7 @@ export class Wrench {
     pen.lineWidth = 1.25;
     pen.strokeStyle = colors.muted;
     pen.fillStyle = colors.raised;
-    const [radius, depth] = [0.5, -0.24];
+    const [radius, depth] = [0.36, -0.16];
     const far = this.pitch >= 0 ? [depth, 0] : [0, depth];
     this.#circle(pen, radius, far[0]);
     pen.fill();
@@ -110,15 +110,15 @@ export class Wrench {
   }
 
   #axes(pen) {
-    pen.font = "600 12px system-ui, sans-serif";
+    pen.font = `600 ${Math.max(11, this.unit * 0.11)}px system-ui, sans-serif`;
     pen.textAlign = "center";
     pen.textBaseline = "middle";
     for (const [name, axis] of [["x", [1, 0, 0]], ["y", [0, 1, 0]], ["z", [0, 0, 1]]]) {
       pen.strokeStyle = pen.fillStyle = colors[name];
       pen.lineWidth = 1.5;
-      this.#path(pen, [[0, 0, 0], axis.map((v) => v * 0.82)]);
+      this.#path(pen, [[0, 0, 0], axis.map((v) => v * 0.62)]);
       pen.stroke();
-      pen.fillText(name, ...this.#project(axis.map((v) => v * 0.92)));
+      pen.fillText(name, ...this.#project(axis.map((v) => v * 0.7)));
     }
   }
 
@@ -127,9 +127,9 @@ export class Wrench {
     const [x1, y1] = this.#project(vector);
     const length = Math.hypot(x1 - x0, y1 - y0);
     pen.strokeStyle = pen.fillStyle = color;
-    pen.lineWidth = 4;
+    pen.lineWidth = Math.max(3, this.unit * 0.035);
     const [dx, dy] = length ? [(x1 - x0) / length, (y1 - y0) / length] : [0, -1];
-    const head = Math.min(13, length * 0.6);
+    const head = Math.min(Math.max(11, this.unit * 0.12), length * 0.6);
     pen.beginPath();
     pen.moveTo(x0, y0);
     pen.lineTo(x1 - dx * head * 0.8, y1 - dy * head * 0.8);
