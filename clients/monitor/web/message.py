@@ -25,7 +25,7 @@ def state_text(state: State, position: int, number: int) -> str:
         "clients": [words.client(client) for client in state.clients],
         "message": None if said is None else {"text": said.text, "bad": said.bad},
         "events": list(state.events),
-        "sensors": [_brief(sensor) for sensor in state.sensors],
+        "sensors": [_brief(sensor, server) for sensor in state.sensors],
         "sensor": next((_sensor(sensor) for sensor in state.sensors if sensor.position == position), None),
     }
     return json.dumps(finite(message), allow_nan=False, separators=(",", ":"), ensure_ascii=False)
@@ -45,11 +45,12 @@ def _server(server: ServerState) -> list[tuple[str, str]]:
     ]
 
 
-def _brief(sensor: SensorState) -> dict[str, Any]:
+def _brief(sensor: SensorState, server: ServerState) -> dict[str, Any]:
+    present = any(alert.ago_s is None for alert in sensor.alerts)
     return {
         "position": sensor.position,
         "name": sensor.name,
-        "ok": not any(alert.ago_s is None for alert in sensor.alerts),
+        "ok": None if words.trouble(server) else not present,
     }
 
 

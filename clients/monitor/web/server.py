@@ -8,7 +8,7 @@ import errno
 import logging
 import socket
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Final
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
@@ -33,9 +33,12 @@ _QUIET: Final = logging.Logger(__name__, logging.CRITICAL)
 class WebServer:
     """Serves the pages of a hub while `serving`."""
 
-    def __init__(self, hub: Hub[ServerConnection], model: WebModel) -> None:
+    def __init__(
+        self, hub: Hub[ServerConnection], model: WebModel, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._hub = hub
         self._model = model
+        self._clock = clock
         self._files = Files()
 
     @contextlib.asynccontextmanager
@@ -103,14 +106,13 @@ class WebServer:
 
     async def _send_states(self) -> None:
         while True:
-            now_s = time.monotonic()
-            for pages, text in self._hub.states(now_s):
+            for pages, text in self._hub.states(self._clock()):
                 broadcast(pages, text)
             self._send_points()
             await asyncio.sleep(STATE_S)
 
     def _send_points(self) -> None:
-        for pages, batch in self._hub.points(time.monotonic()):
+        for pages, batch in self._hub.points(self._clock()):
             broadcast(pages, batch)
 
 

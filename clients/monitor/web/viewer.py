@@ -6,6 +6,7 @@ then the newest: it never has more than that on the way.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Final, NamedTuple
 
 from clients.monitor.web.access import Token
@@ -44,22 +45,18 @@ class Viewer:
         self.sensor = 0
         self.control = False
         self.end = ""
-        self._sent: int | None = None
-        self._seen: int | None = None
+        self._unseen: deque[int] = deque()
+        """Numbers of the states that it has been sent and has not acknowledged."""
         self._messages = 0
 
     @property
     def behind(self) -> bool:
         """Whether it has too much on the way already."""
-        if self._sent is None or self._seen is None:
-            return False
-        return self._sent - self._seen >= MOST_BEHIND
+        return len(self._unseen) >= MOST_BEHIND
 
     def sends(self, number: int) -> None:
         """State `number` is sent to it."""
-        if self._seen is None:
-            self._seen = number - 1
-        self._sent = number
+        self._unseen.append(number)
         self._messages = 0
 
     def hear(self, text: str | bytes) -> Wish | str | None:
@@ -77,8 +74,8 @@ class Viewer:
 
     def _obey(self, message: JsonObject) -> Wish | str | None:
         seen, position = whole(message.get("seen")), whole(message.get("sensor"))
-        if seen is not None and self._sent is not None:
-            self._seen = min(max(seen, self._seen or 0), self._sent)
+        while seen is not None and self._unseen and self._unseen[0] <= seen:
+            self._unseen.popleft()
         if position is not None and 0 <= position < MOST_PLACES:
             self.sensor = position
         if "token" in message:

@@ -8,6 +8,7 @@ import { Wrench } from "./wrench.js";
 const SPANS_S = [5, 10, 30, 60];
 const READ_MS = 200;
 const DRAW_MS = 33;
+const SAID_MS = 30000;
 
 const history = new History();
 const traces = GROUPS.map((group) => new Trace(group));
@@ -37,7 +38,9 @@ const link = new Link({
     showControl();
   },
   trouble(text) {
+    if (text && !link.connected) control = false;
     troubles.link = text;
+    showControl();
     showTrouble();
   },
 });
@@ -49,11 +52,11 @@ function showState(state) {
   troubles.server = state.trouble;
   sensor = state.sensor;
   setText(byId("link").lastElementChild, `${address} ${state.link}`);
-  if (!sensor && state.sensors.length) link.select(state.sensors[0].position);
+  if (!sensor && state.sensors.length) choose(state.sensors[0].position);
   if (sensor) showSensor(sensor);
   fill(byId("sensors"), [state.sensors, link.sensor], ([sensors, shown]) => sensors.map((each) => {
-    const button = element("button", { type: "button", "aria-pressed": each.position === shown, class: each.ok ? "" : "bad" },
-      `${each.position} ${each.ok ? "ok" : "error"}`);
+    const button = element("button", { type: "button", "aria-pressed": each.position === shown, class: each.ok === false ? "bad" : "" },
+      each.ok === null ? `${each.position}` : `${each.position} ${each.ok ? "ok" : "error"}`);
     button.title = each.name;
     button.addEventListener("click", () => choose(each.position));
     return button;
@@ -118,12 +121,15 @@ function showTrouble() {
 }
 
 let said = "";
+let saidTimer = 0;
 
 function say(text, bad) {
   if (text === said) return;
   said = text;
   byId("message").hidden = false;
   byId("message").classList.toggle("bad", bad);
+  clearTimeout(saidTimer);
+  saidTimer = setTimeout(() => { byId("message").hidden = true; }, SAID_MS);
   setText(byId("message"), text);
 }
 
@@ -162,11 +168,12 @@ byId("pause").addEventListener("click", () => {
 
 byId("reset").addEventListener("click", () => link.send({ do: "reset" }));
 byId("tare").addEventListener("click", () => {
+  byId("ask").dataset.sensor = link.sensor;
   byId("ask").firstElementChild.textContent = `Tare sensor ${link.sensor}? Its reading becomes zero. Keep it stationary.`;
   byId("ask").showModal();
 });
 byId("ask").addEventListener("click", ({ target }) => {
-  if (target.value === "yes") link.send({ do: "tare" });
+  if (target.value === "yes") link.send({ do: "tare", sensor: Number(byId("ask").dataset.sensor) });
   if (target.value) byId("ask").close();
 });
 

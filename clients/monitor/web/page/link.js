@@ -36,8 +36,12 @@ export class Link {
     this.#open();
   }
 
+  get connected() {
+    return this.socket?.readyState === WebSocket.OPEN;
+  }
+
   send(message) {
-    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+    if (this.connected) this.socket.send(JSON.stringify(message));
   }
 
   select(sensor) {
