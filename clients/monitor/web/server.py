@@ -92,6 +92,7 @@ class WebServer:
         if viewer is None:
             await page.close(_TRY_AGAIN_LATER, TOO_MANY)
             return
+        self._send_state()
         try:
             async for text in page:
                 reply = self._hub.hear(page, text)
@@ -106,10 +107,13 @@ class WebServer:
 
     async def _send_states(self) -> None:
         while True:
-            for pages, text in self._hub.states(self._clock()):
-                broadcast(pages, text)
+            self._send_state()
             self._send_points()
             await asyncio.sleep(STATE_S)
+
+    def _send_state(self) -> None:
+        for pages, text in self._hub.states(self._clock()):
+            broadcast(pages, text)
 
     def _send_points(self) -> None:
         for pages, batch in self._hub.points(self._clock()):
