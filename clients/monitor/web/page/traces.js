@@ -118,6 +118,7 @@ export class Trace {
         { stroke: () => colors[name], width: 1.25, points: { show: false }, spanGaps: false }))],
       hooks: { setCursor: [(u) => this.#point(u)] },
     }, [[], [], [], []], this.box);
+    this.card.plot = this.plot;
     new ResizeObserver(() => this.plot.setSize(this.#size())).observe(this.box);
   }
 
