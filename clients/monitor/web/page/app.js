@@ -7,7 +7,7 @@ import { Wrench } from "./wrench.js";
 
 const SPANS_S = [5, 10, 30, 60];
 const READ_MS = 200;
-const DRAW_MS = 33;
+const DRAW_MS = 40;
 const SAID_MS = 30000;
 
 const history = new History();
@@ -162,6 +162,7 @@ byId("spans").append(...SPANS_S.map((seconds) => {
 
 byId("pause").addEventListener("click", () => {
   paused = paused ? null : { history: history.copy(), edge: history.edge() };
+  for (const trace of traces) trace.read(newest);
   setText(byId("pause"), paused ? "Resume" : "Pause");
   byId("pause").setAttribute("aria-pressed", Boolean(paused));
 });
@@ -193,7 +194,7 @@ addEventListener("hashchange", takeToken);
 takeToken();
 showControl();
 
-// Drawing: as often as a trace moves by a pixel, at most 30 times a second.
+// Drawing: as often as a trace moves by a pixel, at most 25 times a second.
 
 function frame(now) {
   requestAnimationFrame(frame);

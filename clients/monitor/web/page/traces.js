@@ -111,11 +111,11 @@ export class Trace {
       axes: [
         { ...axis, size: 2 * em, gap: 4, splits: () => this.#splits(),
           values: (u, at) => at.map((t) => { const s = Math.round(t - u.scales.x.max); return s ? `−${-s}` : "0 s"; }) },
-        { ...axis, size: 4.4 * em, gap: 4, space: 3.2 * em,
+        { ...axis, size: 4.4 * em, gap: 4, space: 2.6 * em,
           values: (_, at) => at.map((value) => String(Number(value.toPrecision(6))).replace("-", "−")) },
       ],
       series: [{}, ...["x", "y", "z"].map((name) => (
-        { stroke: () => colors[name], width: 1.25, points: { show: false }, spanGaps: false }))],
+        { stroke: () => colors[name], width: 1, points: { show: false }, spanGaps: false }))],
       hooks: { setCursor: [(u) => this.#point(u)] },
     }, [[], [], [], []], this.box);
     this.card.plot = this.plot;
