@@ -25,6 +25,7 @@ from clients.monitor.web.viewer import MOST_BEHIND, Viewer
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.clients import monitor_states as made
+from tests.clients import web_capture
 from tests.clients.monitor_states import START_S, frame, moving
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -377,6 +378,11 @@ def test_every_file_is_in_the_package_and_the_library_with_its_license() -> None
     packed = {path for pattern in patterns for path in base.glob(pattern) if path.is_file()}
     assert packed == {path for path in PAGE.rglob("*") if path.is_file()}
     assert "Leon Sorokin" in (PAGE / "uplot/LICENSE").read_text()
+
+
+def test_the_picture_in_the_docs_is_of_this_page() -> None:
+    assert web_capture.digest_in(web_capture.PICTURE) == web_capture.digest(), web_capture.AGAIN
+    assert web_capture.PICTURE.stat().st_size < 60_000
 
 
 # What it says.

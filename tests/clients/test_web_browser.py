@@ -19,7 +19,6 @@ pytestmark = needs_chromium
 
 SPIKE = 501
 COUNT = 800
-DATA = "document.querySelector('#{id}').plot.data"
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +93,9 @@ def test_what_is_shown_is_what_was_sent(page: Page, web: Web) -> None:
     wait_for_text(page, "#force", "\u2212412.00 \u2026")
     assert "none" in page.text("#warnings")
     assert page.complaints == []
+    page.size(360, 800, dark=True)
+    page.wait_for("document.documentElement.dataset.theme === 'dark'")
+    fits(page, 360)
 
 
 def test_a_lost_server_is_said_and_comes_back(page: Page, web: Web) -> None:
@@ -198,22 +200,37 @@ def test_warnings_have_their_remedies_and_hostile_text_is_text(page: Page, web: 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("width", [360, 820, 2560])
-def test_nothing_is_wider_than_the_screen_in_light_and_dark(page: Page, web: Web, width: int) -> None:
+def test_nothing_is_wider_than_the_screen_in_light_and_dark(page: Page, web: Web) -> None:
+    web.model.connected(made.description(("one", "two")), made.OWN_PEER, web.now_s)
     web.model.say("A long message " + 20 * "and more ", bad=True)
     feed(web, 80)
-    paper = []
+    wait_for_text(page, "#sensors", "1")
+    for width in (360, 390, 480, 481, 600, 819, 820, 1100, 1499, 1500, 2560):
+        page.size(width, 900, dark=width % 2 == 0)
+        fits(page, width)
+
+
+@pytest.mark.long
+def test_light_and_dark_are_as_the_system_is_or_as_the_button_says(page: Page, web: Web) -> None:
     for dark in (False, True):
-        page.size(width, 800, dark=dark)
+        page.size(900, 900, dark=dark)
         page.wait_for(f"document.documentElement.dataset.theme === '{'dark' if dark else 'light'}'")
-        assert page.value("document.documentElement.scrollWidth") == width
-        boxes = "[...document.querySelectorAll('.reading, .card, button')]"
-        assert page.value(f"{boxes}.filter(e => e.scrollWidth > e.clientWidth + 1).length") == 0
-        paper.append(
-            sum(page.value("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)"))
-        )
-    assert paper[0] > 650
-    assert paper[1] < 100
-    page.click("#theme")
-    page.wait_for("document.documentElement.dataset.theme === 'light'")
-    page.click("#theme")
+        assert (paper(page) < 100) is dark
+        page.click("#theme")
+        assert (paper(page) < 100) is not dark
+        page.click("#theme")
+        page.size(900, 900, dark=not dark)
+        page.wait_for(f"document.documentElement.dataset.theme === '{'light' if dark else 'dark'}'")
+
+
+def paper(page: Page) -> int:
+    """How light the page is: red, green and blue together."""
+    color = "getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)"
+    return int(sum(page.value(color)))
+
+
+def fits(page: Page, width: int) -> None:
+    assert page.value("document.documentElement.scrollWidth") == width
+    boxes = "[...document.querySelectorAll('.reading, .card, button')]"
+    assert page.value(f"{boxes}.filter(e => e.scrollWidth > e.clientWidth + 1).length") == 0
+    assert page.value("Math.max(...[...document.querySelectorAll('button')].map(e => e.offsetHeight))") < 50
