@@ -42,7 +42,8 @@ def run_web(options: Options, where: Address) -> int:
 async def _serve(options: Options, where: Address) -> None:
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        loop.add_signal_handler(number, stop.set)
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+            loop.add_signal_handler(number, stop.set)
     token, model = Token(), WebModel(str(options.address), options.imu_units)
     hub = Hub[ServerConnection](
         model, token, lambda position, said: start_tare(options.address, position, said)

@@ -117,6 +117,7 @@ function showTrouble() {
   setText(byId("trouble"), text ?? old ?? "");
   document.body.classList.toggle("stale", Boolean(text || old || !sensor?.has_sample));
   if (troubles.link) setText(byId("link").lastElementChild, "connection lost");
+  document.title = `${text || old ? "✗ " : ""}${sensor ? `Sensor ${sensor.position} – ` : ""}ethercat-monitor`;
   byId("link").className = text ? "bad" : old ? "warn" : "good";
 }
 
