@@ -8,11 +8,9 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 
-from websockets.asyncio.server import ServerConnection
-
 from clients.monitor.web.access import Token
-from clients.monitor.web.hub import Hub, WebModel
-from clients.monitor.web.server import WebServer
+from clients.monitor.web.hub import WebModel
+from clients.monitor.web.server import PageHub, WebServer
 from protocol.framing import DataMessage
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S
@@ -31,7 +29,7 @@ class Web:
         self.model = WebModel(made.ADDRESS)
         self.model.connected(made.description(), made.OWN_PEER, START_S)
         self.token = Token()
-        self.hub = Hub[ServerConnection](self.model, self.token, self._tare)
+        self.hub = PageHub(self.model, self.token, self._tare)
         self.now_s = START_S
         self.port = 0
         self.tared: list[int] = []

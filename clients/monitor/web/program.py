@@ -8,14 +8,12 @@ import signal
 import sys
 from typing import Final
 
-from websockets.asyncio.server import ServerConnection
-
 from clients.monitor.options import Options
 from clients.monitor.reader import Reader
 from clients.monitor.tare import start_tare
 from clients.monitor.web.access import Token
-from clients.monitor.web.hub import Hub, WebModel
-from clients.monitor.web.server import WebServer
+from clients.monitor.web.hub import WebModel
+from clients.monitor.web.server import PageHub, WebServer
 from clients.program import say
 from protocol.address import Address
 
@@ -45,9 +43,7 @@ async def _serve(options: Options, where: Address) -> None:
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
             loop.add_signal_handler(number, stop.set)
     token, model = Token(), WebModel(str(options.address), options.imu_units)
-    hub = Hub[ServerConnection](
-        model, token, lambda position, said: start_tare(options.address, position, said)
-    )
+    hub = PageHub(model, token, lambda position, said: start_tare(options.address, position, said))
     reader = Reader(options.address, model, POINTS_S)
     async with WebServer(hub, model).serving(*where) as port:
         sys.stdout.write(

@@ -30,12 +30,13 @@ _TRY_AGAIN_LATER: Final = 1013
 _QUIET: Final = logging.Logger(__name__, logging.CRITICAL)
 
 
+PageHub = Hub[ServerConnection]
+
+
 class WebServer:
     """Serves the pages of a hub while `serving`."""
 
-    def __init__(
-        self, hub: Hub[ServerConnection], model: WebModel, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, hub: PageHub, model: WebModel, clock: Callable[[], float] = time.monotonic) -> None:
         self._hub = hub
         self._model = model
         self._clock = clock
