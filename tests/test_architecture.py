@@ -69,6 +69,7 @@ PACKAGES: Final[dict[str, set[str]]] = {
     "jinja2": {"clients.report.page"},
     "rich": {"clients"},
     "textual": {"clients.monitor.app"},
+    "websockets": {"clients.monitor.web.server"},
 } | {
     ros: {"bridge"}
     for ros in (

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from typing import Final
 
-from clients.arguments import add_address, add_imu_units, parser, seconds
-from protocol.address import Address
+from clients.arguments import add_address, add_imu_units, address, parser, seconds
+from clients.monitor.web.access import is_loopback
+from protocol.address import DEFAULT_HOST, Address
 from protocol.pdo import ImuUnits
+
+DEFAULT_WEB: Final = Address(DEFAULT_HOST, 12080)
 
 
 class Options(argparse.Namespace):
@@ -19,6 +23,7 @@ class Options(argparse.Namespace):
     seconds: float | None
     imu_units: ImuUnits
     ascii: bool
+    web: Address | None
 
 
 def parse(argv: Sequence[str] | None) -> Options:
@@ -35,7 +40,22 @@ def parse(argv: Sequence[str] | None) -> Options:
     add("--seconds", type=seconds, metavar="S", help="exit after S seconds")
     add_imu_units(made)
     add("--ascii", action="store_true", help="use ASCII characters only")
+    add(
+        "--web", type=_loopback, nargs="?", const=DEFAULT_WEB, metavar="PORT",
+        help=f"show it in a browser instead, on this port of this machine (default {DEFAULT_WEB.port})",
+    )  # fmt: skip
     options = made.parse_args(argv, Options())
     if options.once and options.seconds is not None:
         made.error("--seconds cannot be combined with --once")
+    if options.web is not None and (options.once or options.json):
+        made.error("--web cannot be combined with --once or --json")
     return options
+
+
+def _loopback(text: str) -> Address:
+    where = address(text)
+    if is_loopback(where.host):
+        return where
+    raise argparse.ArgumentTypeError(
+        f"{text!r}: the page is for this machine only: give a port, and reach it from elsewhere over ssh -L"
+    )

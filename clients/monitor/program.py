@@ -25,6 +25,10 @@ _ANSWER_S: Final = 6.0
 
 def run(options: Options) -> int:
     """Run the monitor; returns the exit code."""
+    if options.web is not None:
+        from clients.monitor.web.program import run_web  # noqa: PLC0415 - not needed otherwise
+
+        return run_web(options, options.web)
     model = Model(str(options.address), options.imu_units)
     reader = Reader(options.address, model)
     reader.start()

@@ -30,9 +30,11 @@ _ANSWER_TIMEOUT_S: Final = 10.0
 class Reader:
     """Reads until closed."""
 
-    def __init__(self, address: Address, model: Model) -> None:
+    def __init__(self, address: Address, model: Model, batch_s: float = BATCH_S) -> None:
+        """`batch_s`: how long samples queue before they are taken."""
         self._address = address
         self._model = model
+        self._batch_s = batch_s
         self._closing = threading.Event()
         self._client: Client | None = None
         self._changed = threading.Condition()
@@ -84,7 +86,7 @@ class Reader:
             client.subscribe(fresh_only=False)
             self._model.connected(client.description, _own_peer(client), time.monotonic())
             status_at_s = 0.0
-            while not self._closing.wait(BATCH_S):
+            while not self._closing.wait(self._batch_s):
                 self._take(client)
                 if time.monotonic() >= status_at_s:
                     status_at_s = time.monotonic() + _STATUS_EVERY_S

@@ -23,6 +23,7 @@ from clients.monitor.model.state import (
 from clients.monitor.model.stream_meter import StreamMeter
 from protocol.framing import DataMessage
 from protocol.pdo import LAYOUTS, ImuUnits, SampleDecoder
+from protocol.settings import SETTINGS
 from protocol.text.json_text import JsonObject
 from protocol.text.untrusted import number, text, whole
 
@@ -139,6 +140,7 @@ class SensorModel:
             bus_lost=whole(self._status.get("lost_samples")),
             recoveries=whole(self._status.get("recoveries")),
             hand_out_us=spread(self._last_10s),
+            settings={name: settings[name] for name in SETTINGS if isinstance(settings.get(name), int)},
         )
 
     def _traces(self, now_s: float) -> tuple[tuple[Range | None, ...], ...]:

@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from protocol.health.limits import LIMITS
 from protocol.health.verdict import NOTHING_WRONG, Level, Verdict
 from protocol.pdo import PDO_FIELDS, Sample
+from protocol.settings import SettingValue
 
 WRENCH_FIELDS: Final = tuple(f.name for f in PDO_FIELDS if f.name.startswith(("force.", "torque.")))
 """The six axes of the wrench, as the process data names them."""
@@ -126,6 +128,8 @@ class SensorState:
     recoveries: int | None = None
     hand_out_us: Spread | None = None
     """Age of the samples when the server hands them out, last ten seconds."""
+    settings: Mapping[str, SettingValue] = field(default_factory=dict)
+    """Those that `describe` has."""
 
     @property
     def units(self) -> tuple[str, str]:

@@ -1,0 +1,437 @@
+"""What a page of `ethercat-monitor --web` is sent, and who may see and tare: without sockets or time."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+import tomllib
+from array import array
+from collections.abc import Callable
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from clients.monitor.options import parse
+from clients.monitor.web.access import HEADERS, Token, refused_host, refused_origin
+from clients.monitor.web.files import STREAM, Files
+from clients.monitor.web.hub import MOST_VIEWERS, Hub, WebModel
+from clients.monitor.web.message import state_text
+from clients.monitor.web.points import CHANNELS, HEADER, STEP_NS, Feed
+from clients.monitor.web.viewer import MOST_BEHIND, Viewer
+from protocol.framing import DataFlag, DataMessage
+from protocol.pdo import STANDARD_GRAVITY, ImuUnits
+from tests.clients import monitor_states as made
+from tests.clients import web_capture
+from tests.clients.monitor_states import START_S, frame, moving
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "clients/monitor/web/page"
+FX, FZ, AZ, WX = (CHANNELS.index(n) for n in ("force.x", "force.z", "acceleration.z", "angular_rate.x"))
+
+
+class Batch(NamedTuple):
+    """A message to the page, as the page reads it."""
+
+    sensor: int
+    times: list[float]
+    newest: list[float]
+    columns: list[list[float]]
+
+
+def decode(message: bytes) -> Batch:
+    kind, sensor, count, _, start = HEADER.unpack_from(message)
+    assert kind == 1
+    values = array("f", message[HEADER.size :])
+    assert len(values) == len(CHANNELS) + count * (1 + len(CHANNELS))
+    body = values[len(CHANNELS) :].tolist()
+    parts = [body[k : k + count] for k in range(0, len(body), count)]
+    return Batch(sensor, [start + t for t in parts[0]], values[: len(CHANNELS)].tolist(), parts[1:])
+
+
+def batch(feed: Feed, frames: list[DataMessage]) -> Batch:
+    feed.take(frames)
+    return decode(feed.batches(silent=True)[0])
+
+
+@pytest.fixture
+def feed() -> Feed:
+    made = Feed()
+    made.watch({0})
+    return made
+
+
+def f32(value: float) -> float:
+    return float(struct.unpack("f", struct.pack("f", value))[0])
+
+
+def test_no_peak_of_a_single_sample_is_lost(feed: Feed) -> None:
+    frames = [frame(k, {**moving(k), **({"force.z": -412.0} if k == 333 else {})}) for k in range(800)]
+    found = batch(feed, frames)
+    assert len(found.times) < 210, "two points in ten milliseconds"
+    assert found.times == sorted(found.times)
+    spikes = [t for t, z in zip(found.times, found.columns[FZ], strict=True) if z == -412.0]
+    assert len(spikes) == 1
+    assert abs(spikes[0] - frames[333].monotonic_ns * 1e-9) < 2 * STEP_NS * 1e-9
+    for channel, name in ((FX, "force.x"), (FZ, "force.z")):
+        sent = [moving(k)[name] for k in range(800) if k != 333]
+        extremes = {f32(min(sent)), f32(max(sent))}
+        assert extremes <= set(found.columns[channel])
+    assert found.newest[FX] == f32(moving(799)["force.x"])
+
+
+def test_extremes_come_in_the_order_in_which_they_came(feed: Feed) -> None:
+    start = frame(0).monotonic_ns // STEP_NS * STEP_NS + STEP_NS
+    values = [(0.0, 5.0), (9.0, 5.0), (-9.0, 7.0), (1.0, 6.0)]
+    found = batch(
+        feed,
+        [frame(k, {"force.x": x, "force.z": z})._replace(monotonic_ns=start + k * 10**6)
+         for k, (x, z) in enumerate(values)],
+    )  # fmt: skip
+    assert found.columns[FX] == [9.0, -9.0]
+    assert found.columns[FZ] == [5.0, 7.0]
+
+
+def test_a_slow_sensor_has_a_point_for_each_sample_at_its_time(feed: Feed) -> None:
+    frames = [frame(k)._replace(monotonic_ns=10**12 + k * 20_000_000) for k in range(20)]
+    found = batch(feed, frames)
+    assert found.times == pytest.approx([f.monotonic_ns * 1e-9 for f in frames], abs=1e-6)
+    assert found.columns[FX] == [f32(moving(k)["force.x"]) for k in range(20)]
+
+
+def test_only_new_samples_are_points_and_old_ones_never(feed: Feed) -> None:
+    high = {"force.x": 99.0}
+    other = [frame(k, high, flags=flag) for k, flag in enumerate(DataFlag.__members__.values(), start=100)]
+    new = [f for f in other if f.flags == DataFlag.GAP]
+    assert batch(feed, [frame(200), *other]).newest[FX] == f32(moving(200)["force.x"]), "out of order"
+    feed.restart()
+    assert batch(feed, [*other, *other]).columns[FX] == [99.0] * len(new)
+
+
+def test_what_is_not_a_number_is_none_and_hides_no_other(feed: Feed) -> None:
+    bad = {"force.x": math.nan, "force.z": math.inf}
+    found = batch(feed, [frame(1, bad), frame(2, {"force.z": 3.0}), frame(3, bad)])
+    assert set(found.columns[FZ]) == {3.0}
+    found = batch(feed, [frame(k, bad) for k in range(100, 103)])
+    assert all(math.isnan(value) for value in found.columns[FX])
+    assert batch(feed, [frame(200, bad)]).columns[FX] != [0.0]
+    found = batch(feed, [frame(300, {"acceleration.z": 3.4e38})])
+    assert found.columns[AZ] == [math.inf], "too large for a float: the page shows nothing"
+
+
+@pytest.mark.parametrize(
+    ("units", "g", "dps"), [(ImuUnits.G_DPS, STANDARD_GRAVITY, math.pi / 180), (ImuUnits.SI, 1, 1)]
+)
+def test_the_imu_is_in_si_units(units: ImuUnits, g: float, dps: float) -> None:
+    feed = Feed(units)
+    feed.watch({0})
+    found = batch(feed, [frame(0, {"acceleration.z": 2.0, "angular_rate.x": 90.0})])
+    assert (found.newest[AZ], found.columns[AZ]) == (f32(2 * g), [f32(2 * g)])
+    assert found.newest[WX] == f32(90 * dps)
+
+
+def test_nothing_is_kept_for_nobody_and_not_endlessly_for_somebody(feed: Feed) -> None:
+    idle = Feed()
+    assert not idle.take([frame(0)])
+    assert idle.batches(silent=True) == {}
+    feed.take([frame(k)._replace(monotonic_ns=10**12 + k * 20_000_000) for k in range(6000)])
+    assert len(decode(feed.batches()[0]).times) == 4096
+    assert decode(feed.batches(silent=True)[0]).sensor == 0
+    assert feed.batches(silent=True) == {}
+
+
+# Who gets what.
+
+
+class Harness:
+    """A hub whose pages are names."""
+
+    def __init__(self) -> None:
+        self.model = WebModel(made.ADDRESS)
+        self.model.connected(made.description(("one", "two")), made.OWN_PEER, START_S)
+        self.token = Token()
+        self.tares: list[tuple[int, Callable[[str, bool], None]]] = []
+        self.hub = Hub[str](self.model, self.token, lambda *tare: self.tares.append(tare))
+
+    def states(self) -> dict[str, Any]:
+        return {page: json.loads(text) for pages, text in self.hub.states(START_S) for page in pages}
+
+    def hear(self, page: str, **message: Any) -> dict[str, Any] | None:
+        reply = self.hub.hear(page, json.dumps(message))
+        return None if reply is None else dict(json.loads(reply))
+
+    def message(self) -> str:
+        said = self.model.state(START_S).message
+        return said.text if said else ""
+
+
+@pytest.fixture
+def web() -> Harness:
+    harness = Harness()
+    assert harness.hub.join("page") is not None
+    return harness
+
+
+def test_each_page_gets_the_sensor_that_it_shows(web: Harness) -> None:
+    web.hub.join("other")
+    web.hear("other", sensor=1)
+    states = web.states()
+    assert states["page"]["sensor"]["identity"].startswith("Sensor 0  one")
+    assert states["other"]["sensor"]["identity"].startswith("Sensor 1  two")
+    web.model.take([frame(k, sensor=s) for k in range(40) for s in (0, 1)], START_S + 0.05)
+    sent = {page: decode(text).sensor for pages, text in web.hub.points(START_S + 1) for page in pages}
+    assert sent == {"page": 0, "other": 1}
+    web.hub.leave("other")
+    web.model.take([frame(k, sensor=s) for k in range(40, 80) for s in (0, 1)], START_S + 0.1)
+    assert [pages for pages, _ in web.hub.points(START_S + 2)] == [["page"]]
+
+
+def test_a_page_that_lags_misses_what_came_and_goes_on_with_the_newest(web: Harness) -> None:
+    web.hub.join("quick")
+    slow: list[int] = []
+    for number in range(1, 31):
+        states = web.states()
+        web.hear("quick", seen=states["quick"]["state"])
+        assert states["quick"]["state"] == number
+        slow += [states["page"]["state"]] if "page" in states else []
+    assert slow == list(range(1, MOST_BEHIND + 1))
+    web.model.take([frame(k) for k in range(100)], START_S + 1)
+    assert [pages for pages, _ in web.hub.points(START_S + 1)] == [["quick"]]
+    web.hear("page", seen=MOST_BEHIND)
+    assert web.states()["page"]["state"] == 31, "the newest"
+    web.model.take([frame(k) for k in range(100, 200)], START_S + 1)
+    [(pages, _)] = web.hub.points(START_S + 2)
+    assert set(pages) == {"page", "quick"}
+
+
+def test_an_acknowledgement_of_what_was_not_sent_buys_nothing() -> None:
+    viewer = Viewer(Token())
+    viewer.hear('{"seen":999999999}')
+    for number in range(5, 5 + MOST_BEHIND):
+        assert not viewer.behind
+        viewer.sends(number)
+        viewer.hear('{"seen":-3}')
+        viewer.hear('{"seen":4}')
+    assert viewer.behind
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{", '{"do":"shutdown"}', '{"do":5}', b"\xff", "\ud800", "[" * 900]
+)
+def test_a_message_that_no_page_sends_ends_the_connection(text: str | bytes) -> None:
+    viewer = Viewer(Token())
+    assert viewer.hear(text) is None
+    assert viewer.end == "Not a message of this page"
+
+
+def test_a_flood_of_messages_ends_the_connection() -> None:
+    viewer = Viewer(Token())
+    heard = 0
+    while not viewer.end and heard < 1000:
+        viewer.hear('{"sensor":1}')
+        heard += 1
+    assert heard < 100
+    assert viewer.end == "Too many messages"
+
+
+def test_pages_are_limited_in_number(web: Harness) -> None:
+    assert all(web.hub.join(f"page {n}") for n in range(1, MOST_VIEWERS))
+    assert web.hub.join("one more") is None
+    web.hub.leave("page")
+    assert web.hub.join("one more") is not None
+
+
+# Who may.
+
+
+@pytest.mark.parametrize("action", ["tare", "reset"])
+def test_without_the_token_nothing_is_done(web: Harness, action: str) -> None:
+    for token in ("", "wrong", web.token.text[:-1], web.token.text + "A", None, 5, ["x"], "\ud800é"):
+        reply = web.hear("page", token=token, do=action)
+        assert reply is not None
+        assert reply["control"] is False
+        assert "token" in reply["refused"]
+    reply = web.hear("page", do=action)
+    assert reply == {
+        "control": False,
+        "refused": "Only a page opened by the link that ethercat-monitor printed may do this",
+    }
+    assert web.tares == []
+    assert web.message() == ""
+
+
+def test_with_the_token_the_sensor_is_tared_once_at_a_time(web: Harness) -> None:
+    assert web.hear("page", token=web.token.text) == {"control": True, "refused": None}
+    web.hub.join("other")
+    refused = web.hear("other", do="tare")
+    assert refused is not None, "the token of one page is no other's"
+    assert not refused["control"]
+    web.hear("page", do="tare", sensor=1)
+    [(position, said)] = web.tares
+    assert position == 1
+    assert "Taring sensor 1" in web.message()
+    web.hear("page", do="tare")
+    assert "A tare is running already" in web.message()
+    said("Sensor 1 was tared", False)
+    assert web.states()["page"]["message"]["text"].endswith("Sensor 1 was tared")
+    web.hear("page", do="tare")
+    assert len(web.tares) == 2
+
+
+def test_with_the_token_peaks_are_reset(web: Harness) -> None:
+    web.model.take([frame(0, {"force.x": 77.0})], START_S)
+    web.model.take([frame(1, {"force.x": 1.0})], START_S)
+    assert web.states()["page"]["sensor"]["peaks"]["Fx"] == [1, 77]
+    web.hear("page", token=web.token.text, do="reset")
+    assert web.states()["page"]["sensor"]["peaks"] is None
+
+
+def test_every_run_has_another_token_that_no_one_guesses() -> None:
+    tokens = {Token().text for _ in range(100)}
+    assert len(tokens) == 100
+    assert all(re.fullmatch(r"[\w-]{32,}", token) for token in tokens)
+
+
+@pytest.mark.parametrize(
+    ("host", "right"),
+    [("localhost:12080", True), ("LocalHost", True), ("127.0.0.1:1", True), ("[::1]:12080", True),
+     ("evil.example:12080", False), ("localhost.evil.example", False), ("127.0.0.1.evil.example", False),
+     ("localhost@evil.example", False), ("192.168.1.5:12080", False), ("0.0.0.0:12080", False), ("", False),
+     ("[::1", False), (None, False)],
+)  # fmt: skip
+def test_only_names_of_this_machine_are_answered(host: str | None, right: bool) -> None:
+    assert (refused_host(host) is None) is right
+    answer = Files().answer("/", host, None)
+    assert answer is not None
+    assert answer.status is (HTTPStatus.OK if right else HTTPStatus.FORBIDDEN)
+
+
+@pytest.mark.parametrize(
+    ("origin", "right"),
+    [("http://localhost:12080", True), ("http://LOCALHOST:12080", True), ("http://localhost:3000", False),
+     ("https://localhost:12080", False), ("http://127.0.0.1:12080", False), ("http://evil.example", False),
+     ("http://localhost:12080.evil.example", False), ("null", False), ("", False), (None, False)],
+)  # fmt: skip
+def test_the_stream_is_for_the_page_alone(origin: str | None, right: bool) -> None:
+    assert (refused_origin(origin, "localhost:12080") is None) is right
+    answer = Files().answer(STREAM, "localhost:12080", origin)
+    assert (answer is None) is right
+
+
+def test_a_name_that_leads_here_does_not_open_the_stream() -> None:
+    """DNS rebinding: Host and Origin agree, and both are the attacker's."""
+    answer = Files().answer(STREAM, "evil.example:12080", "http://evil.example:12080")
+    assert answer is not None
+    assert answer.status is HTTPStatus.FORBIDDEN
+
+
+# The page's files.
+
+
+def test_the_page_is_whole_small_and_keeps_its_own_policy() -> None:
+    files = Files()
+    assert sum(len(body) for body, _ in files.by_path.values()) < 200_000
+    html = files.by_path["/"][0].decode()
+    used = set(re.findall(r'(?:src|href)="([^"]+)"', html))
+    modules = {
+        f"/{name}"
+        for path, (body, _) in files.by_path.items()
+        if path.endswith(".js")
+        for name in re.findall(r'from "\./(\w+\.js)"', body.decode())
+    }
+    assert used | modules | {"/"} == set(files.by_path), "each file is used, and each used file is there"
+    assert not re.search(r"<style|\sstyle=|\son\w+=|<script>", html)
+    assert "unsafe" not in HEADERS["Content-Security-Policy"]
+    assert "//" not in re.sub(r"http://www\.w3\.org/2000/svg|ws://\$|^\s*//.*$| //.*$", "", "".join(
+        body.decode() for path, (body, _) in files.by_path.items() if "/uplot/" not in path
+    ), flags=re.MULTILINE), "nothing from elsewhere"  # fmt: skip
+
+
+def test_every_answer_has_the_headers_and_nothing_else_is_served() -> None:
+    files = Files()
+    for path in (
+        "/",
+        "/app.js",
+        "/uplot/uPlot.iife.min.js",
+        "/?x=1",
+        "/nothing",
+        "/../server.py",
+        "/page/app.js",
+        "//",
+    ):
+        answer = files.answer(path, "localhost", None)
+        assert answer is not None
+        assert answer.headers.items() >= HEADERS.items()
+        assert answer.headers["Content-Length"] == str(len(answer.body))
+        known = path.partition("?")[0] in files.by_path
+        assert answer.status is (HTTPStatus.OK if known else HTTPStatus.NOT_FOUND), path
+
+
+def test_every_file_is_in_the_package_and_the_library_with_its_license() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    assert "clients.monitor.web" in settings["packages"]
+    patterns = settings["package-data"]["clients.monitor.web"]
+    base = PAGE.parent
+    packed = {path for pattern in patterns for path in base.glob(pattern) if path.is_file()}
+    assert packed == {path for path in PAGE.rglob("*") if path.is_file()}
+    assert "Leon Sorokin" in (PAGE / "uplot/LICENSE").read_text()
+
+
+def test_the_picture_in_the_docs_is_of_this_page() -> None:
+    assert web_capture.digest_in(web_capture.PICTURE) == web_capture.digest(), web_capture.AGAIN
+    assert web_capture.PICTURE.stat().st_size < 60_000
+
+
+# What it says.
+
+
+def test_a_page_says_what_the_monitor_says() -> None:
+    found = json.loads(state_text(made.troubled(), 0, 7))
+    sensor = found["sensor"]
+    assert found["state"] == 7
+    assert [s["ok"] for s in found["sensors"]] == [False, True]
+    state = made.troubled().sensors[0]
+    assert [(a["severity"], a["text"], a["remedy"]) for a in sensor["alerts"]] == [
+        (a.level.key, a.text, a.remedy) for a in state.alerts
+    ]
+    assert sensor["saturated"] == ["Fz"]
+    assert sensor["losses"] == [["2 on the bus", True], ["5 on the way here", True], ["repeated 0", False],
+                                ["invalid 0", False]]  # fmt: skip
+    assert ["sinc_length", "64", "800 Hz; cut-off 209.5 Hz with FIR off, 31.5 Hz with FIR on"] in sensor[
+        "settings"
+    ]
+    assert dict(sensor["stream"])["Temperature"] == "34.6 °C"
+    assert found["message"] == {"text": "Sensor 0 is not tared: it is not at rest", "bad": True}
+    gone = json.loads(state_text(made.gone(), 0, 8))
+    assert gone["trouble"] == "gone at 12:00:00: no server answers (Connection refused); reconnecting"
+    assert (gone["server"], gone["sensors"][0]["ok"], gone["sensor"]["old"]) == ([], None, "1m05s")
+    assert json.loads(state_text(made.gone(), 5, 9))["sensor"] is None
+
+
+@pytest.mark.parametrize(
+    ("argv", "where"),
+    [([], None), (["--web"], "localhost:12080"), (["--web", "8000"], "localhost:8000"),
+     (["--web", "[::1]:8000"], "[::1]:8000"), (["host:5", "--web"], "localhost:12080")],
+)  # fmt: skip
+def test_the_port_is_one_of_this_machine(argv: list[str], where: str | None) -> None:
+    web = parse(argv).web
+    assert (web and str(web)) == where
+
+
+@pytest.mark.parametrize(
+    ("argv", "sentence"),
+    [(["--web", "0.0.0.0:8000"], "'0.0.0.0:8000': the page is for this machine only: give a port, and "
+      "reach it from elsewhere over ssh -L"),
+     (["--web", "70000"], "'70000': it must be HOST:PORT"), (["--web", "--once"], "cannot be combined"),
+     (["--web", "--json"], "cannot be combined")],
+)  # fmt: skip
+def test_wrong_usage_is_one_sentence(
+    argv: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        parse(argv)
+    assert ended.value.code == 2
+    assert sentence in capsys.readouterr().err

@@ -1,0 +1,159 @@
+"""`ethercat-monitor --web` over real sockets, which are what is tested here, and as a program."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import re
+import signal
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
+
+from clients.monitor import cli
+from clients.monitor.web.access import HEADERS
+from clients.monitor.web.hub import MOST_VIEWERS, TOO_MANY
+from ethercat_server.virtual_sensor.options import SensorOptions
+from tests.clients.monitor_states import frame
+from tests.clients.web_pages import Web
+from tests.served_simulation import served
+from tests.server.running import PATIENCE_S, Program, free_port, has_ipv6
+
+
+@pytest.fixture(scope="module")
+def web() -> Iterator[Web]:
+    shared = Web()
+    with shared.serving():
+        yield shared
+
+
+@contextlib.contextmanager
+def stream_of(port: int, origin: str | None = "") -> Iterator[ClientConnection]:
+    """As the page opens it, or a page of another `origin`."""
+    origin = f"http://localhost:{port}" if origin == "" else origin
+    given = None if origin is None else Origin(origin)
+    with connect(f"ws://localhost:{port}/stream", origin=given, compression=None) as stream:
+        yield stream
+
+
+def message(stream: ClientConnection, key: str) -> dict[str, Any]:
+    """The next message with this key; states are acknowledged, as the page does."""
+    while True:
+        text = stream.recv(PATIENCE_S)
+        found = {} if isinstance(text, bytes) else json.loads(text)
+        if "state" in found:
+            stream.send(json.dumps({"seen": found["state"]}))
+        if key in found:
+            return dict(found)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_the_page_is_served_on_both_loopback_addresses_and_nothing_is_kept(web: Web, host: str) -> None:
+    if host == "::1" and not has_ipv6():
+        pytest.skip("no IPv6 here")
+    for path, status in (("/", 200), ("/app.js", 200), ("/none", 404)):
+        asking = http.client.HTTPConnection(host, web.port, timeout=PATIENCE_S)
+        asking.request("GET", path, headers={"Host": "localhost"})
+        answer = asking.getresponse()
+        assert answer.status == status
+        assert dict(answer.getheaders()).items() >= HEADERS.items()
+        assert len(answer.read()) == int(answer.headers["Content-Length"])
+        assert web.token.text not in str(answer.headers)
+        asking.close()
+
+
+def test_a_foreign_host_gets_one_sentence(web: Web) -> None:
+    asking = http.client.HTTPConnection("127.0.0.1", web.port, timeout=PATIENCE_S)
+    asking.request("GET", "/", headers={"Host": "evil.example"})
+    answer = asking.getresponse()
+    assert answer.status == 403
+    assert answer.read().startswith(b"The page is for this machine only")
+    asking.close()
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://localhost:1", "null", None])
+def test_the_stream_is_refused_to_a_foreign_origin(web: Web, origin: str | None) -> None:
+    with pytest.raises(InvalidStatus) as refused, stream_of(web.port, origin):
+        pass
+    assert refused.value.response.status_code == 403
+
+
+def test_states_and_points_come_and_a_wish_is_answered(web: Web) -> None:
+    with stream_of(web.port) as stream:
+        assert message(stream, "state")["sensor"]["identity"].startswith("Sensor 0")
+        web.feed(*(frame(k) for k in range(40)))
+        while isinstance(stream.recv(PATIENCE_S), str):
+            pass
+        stream.send('{"do":"tare"}')
+        assert "printed" in message(stream, "control")["refused"]
+        assert web.tared == []
+        stream.send(json.dumps({"token": web.token.text}))
+        assert message(stream, "control") == {"control": True, "refused": None}
+        stream.send('{"do":"tare"}')
+        while "was tared" not in str(message(stream, "state")["message"]):
+            pass
+        assert web.tared == [0]
+
+
+@pytest.mark.parametrize(
+    ("text", "code"), [("x" * 2000, 1009), ("[]", 1008), (b"\x00\x01", 1008)], ids=["long", "list", "bytes"]
+)
+def test_what_no_page_sends_ends_its_connection_and_no_other(web: Web, text: str, code: int) -> None:
+    with stream_of(web.port) as good, stream_of(web.port) as bad:
+        bad.send(text)
+        with pytest.raises(ConnectionClosed) as closed:
+            message(bad, "never")
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == code
+        assert message(good, "state")
+
+
+def test_one_page_too_many_is_told_so(web: Web) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(MOST_VIEWERS):
+            message(stack.enter_context(stream_of(web.port)), "state")
+        with stream_of(web.port) as late, pytest.raises(ConnectionClosed) as closed:
+            late.recv(PATIENCE_S)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.reason == TOO_MANY
+
+
+def test_a_port_in_use_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    handler = signal.getsignal(signal.SIGTERM)
+    with socket.create_server(("127.0.0.1", free_port())) as other:
+        port = other.getsockname()[1]
+        assert cli.main(["--web", str(port), "localhost:1"]) == 1
+    signal.signal(signal.SIGTERM, handler)
+    sentence = f"ethercat-monitor: localhost:{port} is in use: choose another port with --web PORT\n"
+    assert capsys.readouterr() == ("", sentence)
+
+
+def test_the_program_shows_tares_and_ends_with_ctrl_c() -> None:
+    """With a real server: the link that it prints is enough to tare."""
+    port = free_port()
+    with served(SensorOptions(signal="rest")) as server:
+        program = Program("clients.monitor.cli", [f"localhost:{server.port}", "--web", str(port)])
+        try:
+            program.wait_for("Ctrl-C ends it")
+            link = re.search(rf"http://localhost:{port}/#token=(\S+)", program.said())
+            assert link is not None
+            with stream_of(port) as stream:
+                stream.send(json.dumps({"token": link[1]}))
+                while not (message(stream, "state")["sensor"] or {}).get("has_sample"):
+                    pass
+                stream.send('{"do":"tare"}')
+                while "was tared; residual" not in (said := str(message(stream, "state")["message"])):
+                    assert "not tared" not in said
+                program.signal(signal.SIGINT)
+                with pytest.raises(ConnectionClosed):
+                    message(stream, "never")
+            assert program.wait() == 0
+            assert len(program.said().splitlines()) == 2, program.said()
+        finally:
+            program.close()

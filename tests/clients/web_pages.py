@@ -1,0 +1,74 @@
+"""`ethercat-monitor --web` in a thread: real sockets, a model that the test feeds, and its clock."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+
+from clients.monitor.web.access import Token
+from clients.monitor.web.hub import WebModel
+from clients.monitor.web.server import PageHub, WebServer
+from protocol.framing import DataMessage
+from tests.clients import monitor_states as made
+from tests.clients.monitor_states import START_S
+from tests.server.running import PATIENCE_S
+
+
+class Web:
+    """A monitor that is connected to a server with one sensor, at START_S.
+
+    Attributes:
+        tared: the positions that were to be tared.
+        tare_answer: what taring says.
+    """
+
+    def __init__(self) -> None:
+        self.model = WebModel(made.ADDRESS)
+        self.model.connected(made.description(), made.OWN_PEER, START_S)
+        self.token = Token()
+        self.hub = PageHub(self.model, self.token, self._tare)
+        self.now_s = START_S
+        self.port = 0
+        self.tared: list[int] = []
+        self.tare_answer = ("Sensor 0 was tared", False)
+
+    def _tare(self, position: int, said: Callable[[str, bool], None]) -> None:
+        self.tared.append(position)
+        said(*self.tare_answer)
+
+    @property
+    def origin(self) -> str:
+        return f"http://localhost:{self.port}"
+
+    def feed(self, *frames: DataMessage) -> None:
+        self.now_s = made.now(frames[-1].sequence)
+        self.model.take(frames, self.now_s)
+
+    @contextlib.contextmanager
+    def serving(self) -> Iterator[None]:
+        """On the same port when it is served again."""
+        ready, loop, stop = Future[int](), asyncio.new_event_loop(), asyncio.Event()
+
+        async def serve() -> None:
+            async with WebServer(self.hub, self.model, lambda: self.now_s).serving(
+                "localhost", self.port
+            ) as at:
+                ready.set_result(at)
+                await stop.wait()
+
+        def run() -> None:
+            with asyncio.Runner(loop_factory=lambda: loop) as runner:
+                runner.run(serve())
+
+        thread = threading.Thread(target=run, name="web")
+        thread.start()
+        try:
+            self.port = ready.result(PATIENCE_S)
+            yield
+        finally:
+            loop.call_soon_threadsafe(stop.set)
+            thread.join(PATIENCE_S)
+            assert not thread.is_alive()
