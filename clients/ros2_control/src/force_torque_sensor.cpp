@@ -63,7 +63,7 @@ public:
     CallbackReturn on_cleanup(const rclcpp_lifecycle::State&) override { return end(); }
     CallbackReturn on_shutdown(const rclcpp_lifecycle::State&) override { return end(); }
 
-    /// In the control thread if read() has failed, and then twice: the connector's thread is told to end, not waited for.
+    /// In the control thread if read() has failed, and then twice: the receiving thread is told to end, not waited for.
     CallbackReturn on_error(const rclcpp_lifecycle::State&) override {
         if (is_active_) log(Level::error, std::string("given up: ") + condition_text(loop_->condition()));
         is_active_ = false;

@@ -4,8 +4,9 @@
 //   open | wait MS | tare | log | stop
 //   read                 one cycle
 //   run SECONDS HZ       cycles at a steady pace: how many in which condition, how long they took
-//   sealed COUNT         the same at 1 kHz, in a thread to which the kernel allows recv() and sleeping only
-//   take CONDITION NOW_MS AGE_MS CHECKED FORCE      what controllers see of this, with the parameters of `new`
+//   sealed COUNT         the same at 1 kHz, in a thread to which the kernel allows nothing but sleeping
+//   take CONDITION NOW_MS AGE_MS CHECKED FORCE [RECEIVED_MS CONNECTED]
+//                        what controllers see of this, with the parameters of `new`
 //   check JSON           what speaks against sensor 0 of this description
 //
 // Built with ASan or TSan, whose hook counts what the cycles allocate.
@@ -110,10 +111,10 @@ void run(SensorLoop& loop, double seconds, double hz) {
 }
 
 /// From here on this thread is killed, and the process with it, for any other system call.
-bool allow_recv_only() {
+bool allow_sleeping_only() {
     std::vector<sock_filter> filter = {BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(seccomp_data, nr))};
     // clock_gettime: a machine whose clock the vdso cannot read. The last ones are how a thread ends.
-    for (const unsigned call : {SYS_recvfrom, SYS_clock_nanosleep, SYS_clock_gettime, SYS_exit, SYS_futex, SYS_munmap, SYS_madvise,
+    for (const unsigned call : {SYS_clock_nanosleep, SYS_clock_gettime, SYS_exit, SYS_futex, SYS_munmap, SYS_madvise,
                                 SYS_rt_sigprocmask, SYS_sigaltstack, SYS_mmap}) {
         filter.push_back(BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, call, 0, 1));
         filter.push_back(BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW));
@@ -131,7 +132,7 @@ struct Sealed {
 
 void* cycles_of(void* given) {
     Sealed& sealed = *static_cast<Sealed*>(given);
-    sealed.is_sealed = allow_recv_only();
+    sealed.is_sealed = allow_sleeping_only();
     std::int64_t due = bota_ethercat::monotonic_now_ns();
     for (long i = 0; i < sealed.cycles; ++i) {
         sleep_until(due += 1'000'000);
@@ -170,7 +171,7 @@ int main() {
                 else if (why.empty()) why = set_parameter(parameters, word.substr(0, at), at == std::string::npos ? "" : word.substr(at + 1));
             }
             maybe.emplace(parameters, keep);
-            gate.emplace(parameters);
+            gate.emplace(parameters).set_max_age(parameters.max_age.value_or(1e6));
             std::printf("{\"why\":%s}", quoted(why).c_str());
         } else if (command == "check") {
             Identity found;
@@ -181,13 +182,20 @@ int main() {
             double now = 0, age = 0, force = 0;
             int condition = 0, checked = 0;
             words >> condition >> now >> age >> checked >> force;
-            bota_ethercat::Reading reading;
+            Received received;
+            bota_ethercat::Reading& reading = received.reading;
+            received.is_checked = checked != 0;
+            double at = now;
+            int connected = 1;
+            if (!(words >> at >> connected)) at = now, connected = 1;
+            received.at_ns = std::llround(at * 1e6);
+            received.is_connected = connected != 0;
             reading.condition = static_cast<bota_ethercat::Condition>(condition);
             reading.has_sample = age >= 0;
             if (age >= 0) reading.age_ns = std::llround(age * 1e6);
             reading.sample.force[0] = force;
             allocations = 0;
-            const bool good = gate->take(reading, checked != 0, std::llround(now * 1e6));
+            const bool good = gate->take(received, std::llround(now * 1e6));
             print(good, gate->values());
         } else if (command == "log") {
             const std::lock_guard<std::mutex> guard(lines_lock);

@@ -44,6 +44,7 @@ struct Parameters {
     double error_after = 0.5;                ///< s of nan or hold until read() fails; infinity: never
     double connect_timeout = 5.0;            ///< s that on_configure waits for the server
     bool on_activate_tare = false;
+    int receive_priority = 50;               ///< SCHED_FIFO, of the receiving thread; 0: none
     bota_ethercat::ImuUnits imu_raw_units = bota_ethercat::ImuUnits::g_dps;
     // From the <sensor> tag:
     bool wants_imu = false, wants_orientation = false;
@@ -101,6 +102,7 @@ inline constexpr Row kRows[] = {
      [](S t, P& p) { return number(t, 0.0, std::numeric_limits<double>::infinity(), p.error_after); }},
     {"connect_timeout", "0 to 600 (s)", [](S t, P& p) { return number(t, 0.0, 600.0, p.connect_timeout); }},
     {"on_activate_tare", "true or false", [](S t, P& p) { return flag(t, p.on_activate_tare); }},
+    {"receive_priority", "0 to 99", [](S t, P& p) { return number(t, 0, 99, p.receive_priority); }},
     {"imu_raw_units", "g_dps or si",
      [](S t, P& p) {
          p.imu_raw_units = t == "si" ? bota_ethercat::ImuUnits::si : bota_ethercat::ImuUnits::g_dps;

@@ -1,10 +1,11 @@
-// Connections, made and checked outside the control thread, and handed to it.
+// The thread that receives: it makes and checks connections, reads what arrives, and leaves the newest reading to the
+// control thread, which so makes no system call (a recv() of TCP costs 10 us and more, because it sends the acknowledgement).
 //
-// A connection that is lost, or whose sensor was reconfigured, is replaced: the connector's thread makes another client,
-// checks that sensor and settings are those of `open`, and leaves it in a slot. The control thread takes it, and leaves the
-// old one in another slot, for the connector to destroy. Neither waits for the other: each slot is an atomic pointer.
+// A connection that is lost, or whose sensor was reconfigured, is replaced by another one whose sensor and settings are
+// those of `open`.
 #pragma once
 
+#include <poll.h>
 #include <pthread.h>
 #include <sched.h>
 
@@ -12,11 +13,11 @@
 #include <chrono>
 #include <cmath>
 #include <csignal>
+#include <cstring>
 #include <functional>
 #include <memory>
 #include <optional>
 #include <string>
-#include <string_view>
 #include <thread>
 #include <utility>
 
@@ -24,38 +25,39 @@
 
 #include "bota_ethercat_hardware/gate.hpp"
 #include "bota_ethercat_hardware/identity.hpp"
+#include "bota_ethercat_hardware/latest.hpp"
 #include "bota_ethercat_hardware/parameters.hpp"
 
 namespace bota_ethercat_hardware {
 
 enum class Level : std::uint8_t { info, warning, error };
-/// Takes a sentence for a person; called from the thread that configures and from the connector's, never from `read`.
+/// Takes a sentence for a person; called from the thread that configures and from the receiving one, never from `read`.
 using Log = std::function<void(Level, const std::string&)>;
 
-class Connector {
+class Receiver {
 public:
-    using Client = bota_ethercat::Client;
-
     /// `parameters` must outlive it.
-    Connector(const Parameters& parameters, Log log) : parameters_(parameters), log_(std::move(log)) {}
-    Connector(const Connector&) = delete;
-    Connector& operator=(const Connector&) = delete;
-    ~Connector() { stop(); }
+    Receiver(const Parameters& parameters, Log log) : parameters_(parameters), log_(std::move(log)) {}
+    Receiver(const Receiver&) = delete;
+    Receiver& operator=(const Receiver&) = delete;
+    ~Receiver() { stop(); }
 
     // -- the configuring thread
 
-    /// The first connection, which says which sensor it is; waits up to `connect_timeout` for a server. Null: `why`.
-    std::unique_ptr<Client> open(std::string& why) {
+    /// The first connection, which says which sensor it is, and begin to receive. Waits up to `connect_timeout` for a server.
+    bool open(std::string& why) {
+        stop();
         const auto end = bota_ethercat::monotonic_now_ns() + static_cast<std::int64_t>(parameters_.connect_timeout * 1e9);
         pinned_.reset();
         for (;;) {
             bool may_come = false;
             Identity found;
-            if (auto client = attempt(found, why, may_come)) {
+            if ((client_ = attempt(found, why, may_come))) {
                 pinned_ = found;
-                return client;
+                start();
+                return true;
             }
-            if (!may_come || bota_ethercat::monotonic_now_ns() >= end) return nullptr;
+            if (!may_come || bota_ethercat::monotonic_now_ns() >= end) return false;
             std::this_thread::sleep_for(std::chrono::milliseconds(100));
         }
     }
@@ -63,11 +65,33 @@ public:
     /// The sensor of `open`.
     const Identity& identity() const { return *pinned_; }
 
-    /// Begin to replace connections.
+    /// The thread ends by itself: at once, or, if it is connecting, within some seconds. Does not wait.
+    void stop_soon() noexcept { stopping_ = true; }
+
+    /// Wait for it.
+    void stop() noexcept {
+        stopping_ = true;
+        if (thread_.joinable()) thread_.join();
+        client_.reset();
+    }
+
+    // -- the control thread
+
+    /// What was received last. Waits for nobody.
+    const Received& latest() noexcept { return latest_.take(); }
+
+    /// What the controllers see, for the log.
+    void tell(int condition) noexcept { condition_.store(condition, std::memory_order_relaxed); }
+
+private:
+    using Client = bota_ethercat::Client;
+
+    static constexpr int kPaceMs = 5;  // without anything from the server: how soon it is seen that nothing comes
+    static constexpr std::int64_t kRetryNs = 100'000'000, kQuietNs = 1'000'000'000;
+    static constexpr auto kPatience = std::chrono::seconds(1);  // for one attempt, and the request before it
+
     void start() {
-        stop();
         stopping_ = false;
-        wanted_ = false;
         sigset_t all, before;
         sigfillset(&all);
         pthread_sigmask(SIG_SETMASK, &all, &before);  // signals are for the threads of the program
@@ -75,73 +99,57 @@ public:
         pthread_sigmask(SIG_SETMASK, &before, nullptr);
     }
 
-    /// The thread ends by itself: at once, or, if it is connecting, within some seconds. Does not wait.
-    void stop_soon() noexcept { stopping_ = true; }
-
-    /// Wait for it, and destroy what lies in the slots.
-    void stop() noexcept {
-        stopping_ = true;
-        if (thread_.joinable()) thread_.join();
-        delete offered_.exchange(nullptr);
-        delete returned_.exchange(nullptr);
-    }
-
-    // -- the control thread
-
-    /// The client to read from now: `current`, or the one that replaces it.
-    Client* replace(Client* current) noexcept {
-        if (offered_.load(std::memory_order_acquire) == nullptr) return current;
-        wanted_.store(false, std::memory_order_relaxed);  // before the slot is seen empty
-        Client* const next = offered_.exchange(nullptr, std::memory_order_acq_rel);
-        returned_.store(current, std::memory_order_release);  // empty: nothing is offered before it was emptied
-        return next;
-    }
-
-    /// Ask for another connection, once for each.
-    void ask(std::string_view reason) noexcept {
-        if (wanted_.load(std::memory_order_relaxed)) return;
-        reason_.clear();
-        reason_.add(reason);
-        wanted_.store(true, std::memory_order_release);
-    }
-
-    /// What the controllers see, for the log.
-    void tell(int condition) noexcept { condition_.store(condition, std::memory_order_relaxed); }
-
-private:
-    static constexpr auto kPace = std::chrono::milliseconds(10);
-    static constexpr std::int64_t kRetryNs = 100'000'000, kQuietNs = 1'000'000'000;
-    static constexpr auto kPatience = std::chrono::seconds(1);  // for one attempt, and the request before it
-
     void run() noexcept {
-        const sched_param ordinary{};
-        pthread_setschedparam(pthread_self(), SCHED_OTHER, &ordinary);  // a real-time priority may have been inherited
-        pthread_setname_np(pthread_self(), "bota_connector");
+        pthread_setname_np(pthread_self(), "bota_receiver");
+        set_priority();
         std::int64_t retry_ns = 0;
-        bool asked = false;
+        bool is_asked = false;  // for another connection
         std::string said;
-        for (; !stopping_; std::this_thread::sleep_for(kPace)) {
-            delete returned_.exchange(nullptr, std::memory_order_acq_rel);
+        while (!stopping_) {
+            const bool is_good = receive();
             const std::int64_t now = bota_ethercat::monotonic_now_ns();
             watch(now);
-            if (offered_.load(std::memory_order_acquire) || !wanted_.load(std::memory_order_acquire) || now < retry_ns) continue;
-            if (!asked) log_(Level::warning, reason_.c_str());
-            asked = true;
+            if (is_good || now < retry_ns) continue;
+            if (!is_asked) log_(Level::warning, client_->connected() ? "the sensor's settings were changed" : client_->error());
+            is_asked = true;
             retry_ns = now + kRetryNs;
             Identity found;
             std::string why;
             bool may_come = false;
             if (auto client = attempt(found, why, may_come)) {
                 log_(Level::info, "connected again to " + detail::named(found));
-                asked = false;
+                is_asked = false;
                 said.clear();
-                delete returned_.exchange(nullptr, std::memory_order_acq_rel);  // the slot must be empty when this is taken
-                offered_.store(client.release(), std::memory_order_release);
+                client_ = std::move(client);
             } else if (why != said) {
                 log_(may_come ? Level::warning : Level::error, why);
                 said = why;
             }
         }
+    }
+
+    /// Wait for something, read all of it and hand it over. False: another connection is needed.
+    bool receive() noexcept {
+        pollfd one{client_->fd(), POLLIN, 0};
+        (void)::poll(&one, one.fd < 0 ? 0 : 1, kPaceMs);
+        Received& received = latest_.next();
+        received.reading = client_->latest(parameters_.sensor);
+        received.is_checked = client_->reconfigurations() == 0;
+        received.at_ns = bota_ethercat::monotonic_now_ns();
+        received.is_connected = client_->connected();
+        const bool is_good = received.is_checked && received.is_connected;
+        latest_.publish();
+        return is_good;
+    }
+
+    /// As `receive_priority` has it.
+    void set_priority() noexcept {
+        sched_param wanted{};
+        wanted.sched_priority = parameters_.receive_priority;
+        const int failed = pthread_setschedparam(pthread_self(), wanted.sched_priority > 0 ? SCHED_FIFO : SCHED_OTHER, &wanted);
+        if (failed != 0)
+            log_(Level::warning, "the receiving thread has no real-time priority (" + std::string(std::strerror(failed)) +
+                                     "): samples come late on a busy machine; allow it (rtprio), or set receive_priority to 0");
     }
 
     /// One attempt. Null: `why`, and whether it may succeed later without anybody doing something about the sensor.
@@ -200,12 +208,10 @@ private:
     Log log_;
     std::optional<Identity> pinned_;
     std::thread thread_;
+    std::unique_ptr<Client> client_;  // the receiving thread's while there is one
+    Latest latest_;
     std::atomic<bool> stopping_{false};
-    std::atomic<Client*> offered_{nullptr};   // connector to control thread
-    std::atomic<Client*> returned_{nullptr};  // and back
-    std::atomic<bool> wanted_{false};
     std::atomic<int> condition_{0};
-    bota_ethercat::Text<320> reason_;  // the control thread's until it sets `wanted_`, then the connector's until it offers
     int logged_ = 0;
     std::int64_t quiet_until_ns_ = 0;
 };
