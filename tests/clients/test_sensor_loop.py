@@ -264,6 +264,15 @@ def test_by_default_a_sample_is_fresh_for_four_periods_or_10_ms(running: Loop) -
 # -- connections
 
 
+def test_how_long_a_sample_is_fresh_follows_the_rate(running: Loop, server: PlayedSensor) -> None:
+    assert running.new(host="127.0.0.1", port=server.port, receive_priority=0, error_after="inf") == ""
+    assert running.do("open")["ok"]
+    assert running.do("max_age") == 0.01
+    server.reconfigure(rate_hz=100)
+    running.logged("connected again")
+    wait_until(lambda: bool(running.do("max_age") == 0.04), "the new rate to count")
+
+
 def test_wrong_ports_positions_and_versions(running: Loop, server: PlayedSensor) -> None:
     assert "nobody listens there" in running.refused(free_port())
     assert "sensor 3 is not on the bus" in running.refused(server.port, sensor=3)
@@ -429,8 +438,9 @@ def test_the_two_threads_under_the_thread_sanitizer() -> None:
         loop.begin("run", 8, 1000)
         end = time.monotonic() + 1
         while time.monotonic() < end:
-            first.send(frame(int(time.monotonic() * 1e6)))
-            first.reconfigure(rate_hz=400)
+            with contextlib.suppress(ConnectionError):  # the connection of before
+                first.send(frame(int(time.monotonic() * 1e6)))
+                first.reconfigure(rate_hz=400)
     for _ in range(20):
         with played(port) as again:
             wait_until(lambda: bool(again.streams), "the next connection")

@@ -1,7 +1,7 @@
 // Runs the class behind the ros2_control plugin for tests: a command per line on standard input, for each a line of JSON.
 //
 //   new [PARAMETER=VALUE ...] [imu] [orientation]   another loop; the one before is gone
-//   open | wait MS | tare | log | stop
+//   open | wait MS | tare | log | max_age | stop
 //   read                 one cycle
 //   run SECONDS HZ       cycles at a steady pace: how many in which condition, how long they took
 //   sealed COUNT         the same at 1 kHz, in a thread to which the kernel allows nothing but sleeping
@@ -171,7 +171,7 @@ int main() {
                 else if (why.empty()) why = set_parameter(parameters, word.substr(0, at), at == std::string::npos ? "" : word.substr(at + 1));
             }
             maybe.emplace(parameters, keep);
-            gate.emplace(parameters).set_max_age(parameters.max_age.value_or(1e6));
+            gate.emplace(parameters);
             std::printf("{\"why\":%s}", quoted(why).c_str());
         } else if (command == "check") {
             Identity found;
@@ -190,6 +190,7 @@ int main() {
             if (!(words >> at >> connected)) at = now, connected = 1;
             received.at_ns = std::llround(at * 1e6);
             received.is_connected = connected != 0;
+            received.max_age_ns = std::llround(parameters.max_age.value_or(1e6) * 1e9);
             reading.condition = static_cast<bota_ethercat::Condition>(condition);
             reading.has_sample = age >= 0;
             if (age >= 0) reading.age_ns = std::llround(age * 1e6);
@@ -213,6 +214,8 @@ int main() {
         } else if (command == "read") {
             ok = watched_read(*maybe);
             print(ok, maybe->values());
+        } else if (command == "max_age") {
+            std::printf("%g", maybe->max_age());
         } else if (command == "run") {
             double seconds = 0, hz = 1000;
             words >> seconds >> hz;

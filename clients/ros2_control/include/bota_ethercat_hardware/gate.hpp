@@ -48,16 +48,13 @@ public:
         values_[kAge] = std::numeric_limits<double>::infinity();
     }
 
-    /// A sample older than this (s) is none, however it was received.
-    void set_max_age(double seconds) noexcept { max_age_ns_ = static_cast<std::int64_t>(seconds * 1e9); }
-
     /// True: the values may be used, or are what the policy has for a moment. False: it is an error.
     bool take(const Received& received, std::int64_t now_ns) noexcept {
         using bota_ethercat::Condition;
         const bota_ethercat::Reading& reading = received.reading;
         if (reading.has_sample) sampled_ns_ = reading.age_ns == kNever ? kNever : received.at_ns - reading.age_ns;
         condition_ = static_cast<int>(reading.condition);
-        if (reading.condition <= Condition::not_finite && now_ns - sampled_ns_ > max_age_ns_)  // it has grown old since
+        if (reading.condition <= Condition::not_finite && now_ns - sampled_ns_ > received.max_age_ns)  // it has grown old since
             condition_ = static_cast<int>(received.is_connected ? Condition::late : Condition::disconnected);
         else if (!received.is_checked && reading.condition <= Condition::saturated)
             condition_ = kUnchecked;
@@ -87,7 +84,7 @@ private:
     static constexpr std::int64_t kNever = std::numeric_limits<std::int64_t>::max();
 
     const Parameters& parameters_;
-    std::int64_t error_after_ns_, max_age_ns_ = kNever;
+    std::int64_t error_after_ns_;
     Values values_{};
     int condition_ = static_cast<int>(bota_ethercat::Condition::silent);
     std::int64_t sampled_ns_ = kNever;  // the instant of the newest sample, CLOCK_MONOTONIC; it outlives a connection

@@ -16,6 +16,7 @@ struct Received {
     bool is_checked = true;  ///< false: sensor or settings may be others than when they were accepted
     bool is_connected = true;
     std::int64_t at_ns = 0;  ///< CLOCK_MONOTONIC of the reading
+    std::int64_t max_age_ns = 0;
 };
 
 class Latest {

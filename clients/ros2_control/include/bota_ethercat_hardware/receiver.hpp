@@ -54,6 +54,8 @@ public:
             Identity found;
             if ((client_ = attempt(found, why, may_come))) {
                 pinned_ = found;
+                latest_.next() = Received{{}, true, true, bota_ethercat::monotonic_now_ns(), max_age_ns_};
+                latest_.publish();
                 start();
                 return true;
             }
@@ -135,6 +137,7 @@ private:
         Received& received = latest_.next();
         received.reading = client_->latest(parameters_.sensor);
         received.is_checked = client_->reconfigurations() == 0;
+        received.max_age_ns = max_age_ns_;
         received.at_ns = bota_ethercat::monotonic_now_ns();
         received.is_connected = client_->connected();
         const bool is_good = received.is_checked && received.is_connected;
@@ -169,7 +172,7 @@ private:
         // What is changed from here on is told on this connection. What was changed before that:
         const double rate_hz = found.rate_hz;
         if (!inspect(found, why, may_come)) return nullptr;
-        if (std::fabs(found.rate_hz - rate_hz) < 1e-3) return client;
+        if (std::fabs(found.rate_hz - rate_hz) < 1e-3) return max_age_ns_ = options.max_age.count(), std::move(client);
         return why = "the sensor is being reconfigured", may_come = true, nullptr;
     }
 
@@ -208,6 +211,7 @@ private:
     Log log_;
     std::optional<Identity> pinned_;
     std::thread thread_;
+    std::int64_t max_age_ns_ = 0;     // of the client's samples
     std::unique_ptr<Client> client_;  // the receiving thread's while there is one
     Latest latest_;
     std::atomic<bool> stopping_{false};

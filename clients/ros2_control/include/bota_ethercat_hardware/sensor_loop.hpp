@@ -27,14 +27,11 @@ public:
         : parameters_(std::move(parameters)), receiver_(parameters_, std::move(log)), gate_(parameters_) {}
 
     /// Connect, check the sensor, begin to receive. Waits.
-    bool open(std::string& why) {
-        if (!receiver_.open(why)) return false;
-        gate_.set_max_age(max_age());
-        return true;
-    }
+    bool open(std::string& why) { return receiver_.open(why); }
 
     const Identity& identity() const { return receiver_.identity(); }
-    double max_age() const { return bota_ethercat_hardware::max_age(parameters_, identity()); }
+    /// s up to which a sample is fresh now: another rate may make it another.
+    double max_age() noexcept { return static_cast<double>(receiver_.latest().max_age_ns) * 1e-9; }
     /// Whether the age counts from the arrival: the server is on another machine.
     bool age_is_lower_bound() noexcept { return receiver_.latest().reading.age_is_lower_bound; }
 
