@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from clients.arguments import add_address, add_imu_units, parser, seconds
+from clients.arguments import add_imu_units, add_server, parser, seconds, server_of
 from protocol.address import Address
 from protocol.pdo import ImuUnits
 
@@ -28,14 +28,16 @@ def parse(argv: Sequence[str] | None) -> Options:
         "Shows the stream of ethercat-server live in the terminal. Press ? for the keys.",
         "With --once: exit code 0 if all is good or worth a look, 1 if there is trouble, or no server.",
     )
-    add_address(made)
+    add_server(made)
     add = made.add_argument
+    add("old", nargs="?", help=argparse.SUPPRESS)  # HOST:PORT without --server
     add("--once", action="store_true", help="observe for a second, print a table and exit")
     add("--json", action="store_true", help="print one JSON object per second; with --once, just one")
     add("--seconds", type=seconds, metavar="S", help="exit after S seconds")
     add_imu_units(made)
     add("--ascii", action="store_true", help="use ASCII characters only")
     options = made.parse_args(argv, Options())
+    options.address = server_of(made, options.server, options.old)
     if options.once and options.seconds is not None:
         made.error("--seconds cannot be combined with --once")
     return options

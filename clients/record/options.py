@@ -8,7 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from clients.arguments import add_address, add_imu_units, number, parser, position, seconds
+from clients.arguments import (
+    add_imu_units,
+    add_server,
+    file_and_server,
+    number,
+    parser,
+    position,
+    seconds,
+    server_of,
+)
 from protocol.address import Address
 from protocol.pdo import ImuUnits
 
@@ -42,10 +51,11 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
         "ethercat-record",
         "Records the unmodified stream of ethercat-server into an MCAP file.",
         "Ctrl-C ends the recording. SIZE is in bytes, or such as 500k, 100M, 2G.",
+        usage="%(prog)s [options] OUT.mcap",
     )
     add = made.add_argument
-    add("path", type=Path, metavar="OUT.mcap", help="file to write")
-    add_address(made)
+    add("names", nargs="+", metavar="OUT.mcap", help="file to write")
+    add_server(made)
     add("--sensor", type=position, action="append", dest="sensors", metavar="N",
         help="record only the sensor at this position on the bus; repeatable")  # fmt: skip
     add("--seconds", type=seconds, metavar="S", help="stop after S seconds")
@@ -65,6 +75,8 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add("--until-eof", action="store_true",
         help="stop at the end of standard input, when the program at its other end exits")  # fmt: skip
     options = made.parse_intermixed_args(argv, RecordOptions())
+    options.path, old = file_and_server(made, options.names)
+    options.address = server_of(made, options.server, old)
     if options.namespaces is not None and not options.ros:
         made.error("--ros-namespace requires --ros")
     if options.sensors is not None:

@@ -244,9 +244,9 @@ def test_sensors_are_chosen_by_place_serial_or_name(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "give a recording, or --server"),
+        (["localhost:12001"], "is a server's address, no recording: write --server localhost:12001"),
         (["a.mcap", "--server", "localhost:1"], "give a recording, or --server"),
-        (["a.mcap", "--seconds", "5"], "--seconds requires --server"),
+        (["a.mcap", "--seconds", "5"], "--seconds is for listening"),
         (["--server", "localhost:x"], "HOST:PORT"),
         (["--server", "localhost", "--seconds", "0"], "from 1 to"),
         (["--server", "localhost", "--seconds", "nan"], "from 1 to"),

@@ -117,7 +117,6 @@ def test_of_lengths_with_one_rate_it_is_the_one_read_or_asked_for(
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["objects"], "either an interface"),
         (["objects", "ens5", "--server", "localhost:12001"], "either an interface"),
         (["objects", "--server", "localhost:port"], "HOST:PORT"),
         (["objects", "--server", "localhost:0"], "HOST:PORT"),
