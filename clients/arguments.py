@@ -52,6 +52,11 @@ def file_and_server(parser: argparse.ArgumentParser, names: list[str]) -> tuple[
     return Path(names[0]), names[1] if len(names) == 2 else None
 
 
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """`--force`: nothing is overwritten without it."""
+    parser.add_argument("--force", action="store_true", help="replace an existing file")
+
+
 def add_imu_units(parser: argparse.ArgumentParser, purpose: str = "") -> None:
     """Units in which the firmware sends acceleration and angular rate; `purpose` is for the help."""
     parser.add_argument(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from clients.arguments import (
+    add_force,
     add_imu_units,
     add_server,
     file_and_server,
@@ -68,7 +69,7 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add("--rotate-size", type=_size, metavar="SIZE", help="start a new file when one reaches this size")
     add("--rotate-seconds", type=number(1, 1e9, "at least 1 s"), metavar="S",
         help="start a new file every S seconds")  # fmt: skip
-    add("--force", action="store_true", help="overwrite existing files")
+    add_force(made)
     add("--wait", action="store_true", help="wait for the server to start")
     add("--no-reconnect", action="store_false", dest="reconnect",
         help="stop when the connection ends, instead of reconnecting")  # fmt: skip

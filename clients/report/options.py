@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from clients.arguments import add_imu_units, add_server, number, parser, server_of
+from clients.arguments import add_force, add_imu_units, add_server, number, parser, server_of
 from protocol.address import Address
 from protocol.pdo import ImuUnits
 from protocol.program.server_choice import is_address
@@ -26,6 +26,7 @@ class ReportOptions(argparse.Namespace):
     """None: from a recording."""
     seconds: float
     output: Path
+    force: bool
     sensor: SensorChoice | None
     imu_units: ImuUnits
     note: str
@@ -49,6 +50,7 @@ def parse_options(argv: Sequence[str] | None) -> ReportOptions:
     add("--seconds", type=longest, metavar="S", help=f"how long to listen (default {_DEFAULT_S:g})")
     add("-o", "--output", type=Path, metavar="REPORT.html",
         help="where to write the page (default: beside the recording, or report.html)")  # fmt: skip
+    add_force(made)
     add("--sensor", type=_choice, metavar="S", help=f"only this sensor: {MEANING}")
     add_imu_units(made)
     add("--note", default="", metavar="TEXT", help="a remark for the head of the page")

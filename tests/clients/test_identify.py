@@ -133,7 +133,10 @@ def test_the_yaml_is_what_the_node_takes(
     assert parameters["accelerometer.offset"] == pytest.approx(answer["accelerometer"]["offset"], abs=1e-8)
     assert parameters["accelerometer.scale"] == pytest.approx(answer["accelerometer"]["scale"], abs=1e-8)
     assert "gravity" not in parameters
-    asked(capsys, recording, "--yaml", out, "--gravity", "9.81")
+    assert "tool.yaml exists: choose another name, or use --force" in refused(
+        capsys, recording, "--yaml", out
+    )
+    asked(capsys, recording, "--yaml", out, "--force", "--gravity", "9.81")
     assert written_parameters(out)["gravity"] == [0.0, 0.0, -9.81]
     assert "cannot be written" in refused(capsys, recording, "--yaml", tmp_path / "no" / "x.yaml")
 
