@@ -6,10 +6,10 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from clients.program import VERSION
 from protocol.address import Address
 from protocol.pdo import ImuUnits
 from protocol.program import server_choice
+from protocol.program.version import VERSION
 from protocol.sensor_choice import MOST_PLACES
 
 

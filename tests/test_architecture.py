@@ -33,7 +33,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     "protocol.health": PROTOCOL,
     "protocol.client": PROTOCOL | {"protocol.client"},
     # The server: ethercat <- sensor <- acquisition <- serving <- daemon.
-    S: {S},
+    S: {S, "protocol.program"},
     f"{S}.ethercat": ETHERCAT,
     f"{S}.sensor": SENSOR,
     f"{S}.acquisition": ACQUISITION,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from clients.arguments import add_force, add_imu_units, number, parser, position
-from ft_compensation.stationary import StationaryLimits
+from ft_compensation.stationary_limits import StationaryLimits
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
 
 _LIMITS: Final = tuple(field.name for field in fields(StationaryLimits))

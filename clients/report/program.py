@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from clients.errors import RecordingError, ReportError
-from clients.program import VERSION
 from clients.report.checks.check import Level
 from clients.report.examine import Examination, examine
 from clients.report.options import ReportOptions
@@ -16,6 +15,7 @@ from clients.report.subjects import live, recorded
 from clients.report.subjects.subject import Subject
 from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
 from protocol.program.new_file import NewFile
+from protocol.program.version import VERSION
 
 EXIT_CODES = {Level.GOOD: 0, Level.NOT_POSSIBLE: 0, Level.LOOK: 0, Level.TROUBLE: 1}
 

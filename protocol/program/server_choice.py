@@ -63,7 +63,7 @@ def _in_file(path: Path) -> Address:
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise ValueError(f"{path} is not a text file: it must be TOML") from None
+        raise ValueError(f"{path} is not a text file: it must be TOML in UTF-8") from None
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path} is not valid TOML: {error}") from None
     server = content.pop("server", str(THIS_MACHINE))

@@ -18,6 +18,7 @@ import pytest
 
 from clients.identify.program import run
 from clients.identify.stationary_periods import find_stationary_periods
+from clients.program import missing
 from clients.recording.columns import columns
 from clients.recording.reader import open_recording
 from ethercat_server.virtual_sensor.measurement import scene
@@ -260,8 +261,7 @@ def test_what_is_not_installed_is_said(tmp_path: Path) -> None:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert hidden.returncode == 1
-    said = "ethercat-identify: numpy is not installed: pip install 'bota-ethercat-bridge[tools]'\n"
-    assert hidden.stderr == said
+    assert hidden.stderr == f"ethercat-identify: {missing('numpy')}\n"
 
 
 def test_a_sensor_that_was_exchanged_meanwhile_is_refused(

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from clients.program import missing
 from clients.report import cli, program
 from clients.report.subjects import live
 from clients.report.subjects.live import Received
@@ -308,7 +309,7 @@ def test_what_is_not_installed_is_said(recording: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert "is not installed: pip install 'bota-ethercat-bridge[tools]'" in done.stderr
+    assert missing("matplotlib") in done.stderr
     assert "Traceback" not in done.stderr
 
 
