@@ -19,7 +19,8 @@ FAILED: Final = 1
 
 
 def begin(program: str) -> None:
-    """What is logged appears as `PROGRAM: message`."""
+    """What is logged appears as `PROGRAM: message`. Until `run`, SIGINT ends the program at once."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     formatter = PlainFormatter()
     formatter.prefix = f"{program}: "
     handler = logging.StreamHandler(sys.stderr)
