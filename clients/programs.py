@@ -3,6 +3,11 @@
 from protocol.program.start import run
 
 
+def export() -> int:
+    """`ethercat-export`."""
+    return run("clients.export.cli")
+
+
 def identify() -> int:
     """`ethercat-identify`."""
     return run("clients.identify.cli")

@@ -52,6 +52,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     # Programs that are ordinary clients of the server.
     "clients": {"clients"} | PROTOCOL,
     "clients.recording": CLIENTS,
+    "clients.export": CLIENTS | {"clients.export"},
     "clients.record": CLIENTS | {"clients.record"},
     "clients.report": CLIENTS | {"clients.report"},
     "clients.monitor": CLIENTS | {"clients.monitor"},

@@ -25,6 +25,9 @@ from protocol.pdo import ImuUnits
 _UNITS: Final = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}
 _SIZE: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)([kMG]?)B?", re.ASCII)
 _LEAST_SIZE: Final = 100_000
+_TIMES: Final = {"": 1, "s": 1, "min": 60, "h": 3600}
+_TIME: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?(s|min|h|)", re.ASCII)
+_LONGEST_S: Final = 1e9
 
 
 class RecordOptions(argparse.Namespace):
@@ -59,7 +62,8 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add_server(made)
     add("--sensor", type=position, action="append", dest="sensors", metavar="N",
         help="record only the sensor at this position on the bus; repeatable")  # fmt: skip
-    add("--seconds", type=seconds, metavar="S", help="stop after S seconds")
+    add("--for", type=_duration, dest="seconds", metavar="TIME", help="stop after this time: 30s, 5min, 2h")
+    add("--seconds", type=seconds, metavar="S", help="the same in seconds")
     add("--ros", action="store_true",
         help="also write what the ROS 2 node would publish: WrenchStamped, Imu, Temperature")  # fmt: skip
     add("--ros-namespace", type=_namespace, action="append", dest="namespaces", metavar="NAME",
@@ -83,6 +87,15 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     if options.sensors is not None:
         options.sensors = sorted(set(options.sensors))
     return options
+
+
+def _duration(text: str) -> float:
+    """Seconds."""
+    match = _TIME.fullmatch(text)
+    found = float(match[1]) * _TIMES[match[2]] if match else 0.0
+    if 0 < found <= _LONGEST_S:
+        return found
+    raise argparse.ArgumentTypeError(f"{text!r}: it must be a time such as 30s, 5min or 2h")
 
 
 def _size(text: str) -> int:

@@ -79,7 +79,7 @@ def _record(
     source: Source, recorder: Recorder, batch: Batch, options: RecordOptions, parts: Parts, signals: Signals
 ) -> int:
     began, reason, code, refused = time.monotonic(), "asked to stop", 0, ""
-    with Progress(options.path.name) as progress:
+    with Progress(options.path.name, options.seconds) as progress:
         progress.say(f"recording {options.address} to {parts.made[0]}; Ctrl-C ends it")
         try:
             while True:
