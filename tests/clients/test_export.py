@@ -6,6 +6,7 @@ import csv
 import re
 import struct
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -34,14 +35,15 @@ def rows(path: Path) -> list[dict[str, str]]:
 def test_a_line_is_a_sample_in_si_units(tmp_path: Path) -> None:
     path, out = tmp_path / "run.mcap", tmp_path / "run.csv"
     third = struct.unpack("<f", struct.pack("<f", 1 / 3))[0]
-    values = {
+    values: dict[str, Any] = {
         "force.z": third,
         "torque.y": -1e-7,
         "acceleration.z": 1.0,
         "angular_rate.x": 180.0,
         "status": 5,
     }
-    record(path, [frame(0), frame(1, **values), frame(2, size=77, **{"orientation.w": 1.0, "warnings": 3})])
+    estimate: dict[str, Any] = {"orientation.w": 1.0, "warnings": 3}
+    record(path, [frame(0), frame(1, **values), frame(2, size=77, **estimate)])
     assert "run.csv: 3 samples\n" in export(path).err
     first, second, third_row = rows(out)
     assert tuple(first) == COLUMNS
