@@ -132,6 +132,7 @@ def test_a_wrong_file_is_named(
     file.write_bytes(content)
     with pytest.raises(ValueError, match=f"{file}.*{said}"):
         default_server({"XDG_CONFIG_HOME": str(tmp_path)})
+    monkeypatch.delenv("BOTA_SERVER")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     with pytest.raises(SystemExit, match="2"):
         monitored([])
