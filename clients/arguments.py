@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 
-from clients.program import VERSION
-from protocol.address import DEFAULT_HOST, DEFAULT_PORT, Address
+from protocol.address import Address
 from protocol.pdo import ImuUnits
+from protocol.program import server_choice
+from protocol.program.version import VERSION
 from protocol.sensor_choice import MOST_PLACES
 
 
@@ -18,13 +20,41 @@ def parser(prog: str, description: str, epilog: str, usage: str | None = None) -
     return made
 
 
-def add_address(parser: argparse.ArgumentParser) -> None:
-    """HOST:PORT of the server, optional."""
-    default = Address(DEFAULT_HOST, DEFAULT_PORT)
-    parser.add_argument(
-        "address", type=address, nargs="?", default=default, metavar="HOST:PORT",
-        help=f"the server (default {default})",
-    )  # fmt: skip
+def add_server(parser: argparse.ArgumentParser, what: str = "the server") -> None:
+    """`--server HOST:PORT`; see `server_of`."""
+    parser.add_argument("--server", type=address, metavar="HOST:PORT", help=f"{what} {server_choice.HELP}")
+
+
+def server_of(parser: argparse.ArgumentParser, given: Address | None, argument: str | None = None) -> Address:
+    """The server `given` with --server or by the old form, an `argument` without --server, or the default.
+
+    The parser ends the program if it is wrong, or given twice.
+    """
+    if given is not None and argument is not None:
+        parser.error(f"the server is given twice: leave out {argument}, or --server")
+    try:
+        return given or (server_choice.default_server() if argument is None else Address.parse(argument))
+    except ValueError as error:
+        parser.error(str(error))
+
+
+def file_and_server(parser: argparse.ArgumentParser, names: list[str]) -> tuple[Path, str | None]:
+    """The file among the arguments FILE [HOST:PORT], in either order, and the address."""
+    if len(names) > 1 and server_choice.is_address(names[0]) and not server_choice.is_address(names[1]):
+        names = [names[1], names[0], *names[2:]]
+    if server_choice.is_address(names[0]):
+        parser.error(
+            f"{names[0]} is a server's address, no file: write FILE.mcap --server {names[0]}, "
+            f"or ./{names[0]} if a file is called so"
+        )
+    if len(names) > 2:
+        parser.error(f"unexpected argument {names[2]!r}")
+    return Path(names[0]), names[1] if len(names) == 2 else None
+
+
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """`--force`: nothing is overwritten without it."""
+    parser.add_argument("--force", action="store_true", help="replace an existing file")
 
 
 def add_imu_units(parser: argparse.ArgumentParser, purpose: str = "") -> None:

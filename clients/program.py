@@ -1,19 +1,23 @@
-"""What the programs here have in common: version, messages, signals, and how they end."""
+"""What the programs here have in common: messages, signals, and how they end."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
 from types import FrameType
+from typing import Final
+from urllib.parse import unquote, urlsplit
 
-try:
-    VERSION = version("bota-ethercat-bridge")
-except PackageNotFoundError:  # run from a checkout that was never installed
-    VERSION = "0+unknown"
+_PROJECT: Final = "bota-ethercat-bridge"
+_CHECKOUT: Final = Path(__file__).parent.parent
+"""The project's folder if this runs from there."""
 
 
 def say(program: str, sentence: str) -> None:
@@ -22,14 +26,34 @@ def say(program: str, sentence: str) -> None:
     sys.stderr.flush()
 
 
-def missing(name: object) -> str:
-    """That a package or program is not installed, and how to install it."""
-    return f"{name} is not installed: pip install 'bota-ethercat-bridge[tools]'"
+def missing(name: str) -> str:
+    """That a package or program is not installed, and how to install it from where this was installed."""
+    name = name.partition(".")[0]
+    pip = [sys.executable, "-m", "pip", "install"]
+    source = _source()
+    if source is None:
+        return f"{name} is not installed: in this project's folder run {shlex.join([*pip, '.[tools]'])}"
+    return f"{name} is not installed: {shlex.join([*pip, source])}"
+
+
+def _source() -> str | None:
+    """What pip installed, with the extra: a folder, a wheel or a repository; None if that is not known."""
+    if (_CHECKOUT / "pyproject.toml").exists():
+        return f"{_CHECKOUT}[tools]"
+    try:
+        found = json.loads(distribution(_PROJECT).read_text("direct_url.json") or "")
+        url, vcs = str(found["url"]), found.get("vcs_info", {}).get("vcs")
+    except (PackageNotFoundError, ValueError, LookupError, TypeError, AttributeError):
+        return None
+    if url.startswith("file:") and vcs is None:
+        path = unquote(urlsplit(url).path)
+        return f"{path}[tools]" if Path(path).exists() else None
+    return f"{_PROJECT}[tools] @ {vcs}+{url}" if vcs else f"{_PROJECT}[tools] @ {url}"
 
 
 def not_installed(program: str, error: ImportError) -> int:
     """Say which package is not installed; returns the exit code."""
-    say(program, missing(error.name))
+    say(program, missing(error.name or str(error)))
     return 1
 
 

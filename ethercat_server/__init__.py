@@ -1,8 +1,12 @@
 """The privileged side: owns the EtherCAT bus and streams the sensor's process data over TCP."""
 
-from importlib.metadata import PackageNotFoundError, version
+__version__: str
 
-try:
-    __version__ = version("bota-ethercat-bridge")
-except PackageNotFoundError:  # run from a checkout that was never installed
-    __version__ = "0+unknown"
+
+def __getattr__(name: str) -> str:
+    if name != "__version__":
+        raise AttributeError(name)
+    # Only when it is asked for: it takes longer than all else of a start, and Ctrl-C must not wait for it.
+    from protocol.program.version import VERSION  # noqa: PLC0415
+
+    return VERSION

@@ -10,6 +10,7 @@ ProtocolError
 |   +-- UnreachableError  there is no server at that address
 |   +-- NoReplyError      a request was not answered in time
 +-- RefusedError          the server refused a request; the connection goes on
++-- FileError             a file cannot be written, or would replace another
 """
 
 from __future__ import annotations
@@ -22,6 +23,10 @@ from protocol.text.visible import printable
 
 class ProtocolError(Exception):
     """Base of all errors here; the text is one sentence for users."""
+
+
+class FileError(ProtocolError):
+    """A file cannot be written, or would replace another."""
 
 
 class PdoSizeError(ProtocolError):

@@ -29,6 +29,8 @@ def _choose_domain() -> None:
 _choose_domain()
 # The servers started here stay the user that the tests are, whose files they read.
 os.environ.pop("SUDO_UID", None)
+# Nor do they use the server that this user has chosen.
+os.environ["BOTA_SERVER"] = "localhost:12001"
 # A tenth of the time goes into looking for cycles among what was imported and collected, which all stays.
 gc.set_threshold(20_000, 10, 10)
 if "TEST_NAMESPACE" in os.environ:  # scripts/test made a network namespace, in which loopback is down

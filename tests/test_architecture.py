@@ -16,7 +16,7 @@ ROOT: Final = Path(__file__).parent.parent
 ROOTS: Final = {"bridge": ROOT / "ros2_bridge", "ft_compensation": ROOT / "ros2_bridge"}
 S: Final = "ethercat_server"
 
-PROTOCOL: Final = {"protocol", "protocol.text", "protocol.sensor", "protocol.health"}
+PROTOCOL: Final = {"protocol", "protocol.text", "protocol.sensor", "protocol.health", "protocol.program"}
 ETHERCAT: Final = {S, f"{S}.ethercat"}
 SENSOR: Final = ETHERCAT | {f"{S}.sensor"} | PROTOCOL
 ACQUISITION: Final = SENSOR | {f"{S}.acquisition"}
@@ -26,13 +26,14 @@ LINKS: Final = ACQUISITION | {f"{S}.process", f"{S}.virtual_sensor", f"{S}.links
 CLIENTS: Final = {"clients", "clients.recording", "protocol.client"} | PROTOCOL
 
 ROOMS: Final[dict[str, set[str]]] = {
-    "protocol": PROTOCOL - {"protocol.health"},
+    "protocol": PROTOCOL - {"protocol.health", "protocol.program"},
+    "protocol.program": {"protocol", "protocol.program"},
     "protocol.text": {"protocol.text", "protocol.errors"},
-    "protocol.sensor": PROTOCOL - {"protocol.health"},
+    "protocol.sensor": PROTOCOL - {"protocol.health", "protocol.program"},
     "protocol.health": PROTOCOL,
     "protocol.client": PROTOCOL | {"protocol.client"},
     # The server: ethercat <- sensor <- acquisition <- serving <- daemon.
-    S: {S},
+    S: {S, "protocol.program"},
     f"{S}.ethercat": ETHERCAT,
     f"{S}.sensor": SENSOR,
     f"{S}.acquisition": ACQUISITION,
@@ -51,6 +52,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     # Programs that are ordinary clients of the server.
     "clients": {"clients"} | PROTOCOL,
     "clients.recording": CLIENTS,
+    "clients.export": CLIENTS | {"clients.export"},
     "clients.record": CLIENTS | {"clients.record"},
     "clients.report": CLIENTS | {"clients.report"},
     "clients.monitor": CLIENTS | {"clients.monitor"},

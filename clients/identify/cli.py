@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
+from clients.identify.options import parse_options
 from clients.program import not_installed
 
 
@@ -13,6 +14,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Identify; returns the exit code."""
     # It only reads, so Ctrl-C may end it at any time.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parse_options(argv)  # --help and wrong usage need nothing of the extra
     try:
         from clients.identify.program import run  # noqa: PLC0415 - NumPy takes a while to load
     except ImportError as error:

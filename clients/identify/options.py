@@ -8,8 +8,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Final
 
-from clients.arguments import add_imu_units, number, parser, position
-from ft_compensation.stationary import StationaryLimits
+from clients.arguments import add_force, add_imu_units, number, parser, position
+from ft_compensation.stationary_limits import StationaryLimits
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
 
 _LIMITS: Final = tuple(field.name for field in fields(StationaryLimits))
@@ -28,6 +28,7 @@ class IdentifyOptions(argparse.Namespace):
     confidence: float
     one_axis: bool
     yaml: Path | None
+    force: bool
     json: bool
 
 
@@ -56,6 +57,7 @@ def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
     add("--one-axis", action="store_true",
         help="accept poses that turn about one axis only; the result along it is unchecked")  # fmt: skip
     add("--yaml", type=Path, metavar="OUT", help="write the result as parameters of the ROS 2 node")
+    add_force(made)
     add("--json", action="store_true", help="print everything as JSON instead of a table")
     options = made.parse_args(argv, IdentifyOptions())
     options.limits = replace(StationaryLimits(), **dict(options.limit))

@@ -22,7 +22,9 @@ from ft_compensation.identification.payload import Identified, identify
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
 from ft_compensation.identification.session import summary
 from ft_compensation.quantities import CompensationError
+from protocol.errors import FileError
 from protocol.pdo import STANDARD_GRAVITY
+from protocol.program.new_file import refuse_existing
 
 _say = partial(say, "ethercat-identify")
 _WIDTH: Final = 80
@@ -37,7 +39,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     """Identify; returns the exit code."""
     try:
         return _identify(parse_options(argv))
-    except (CompensationError, RecordingError) as error:
+    except (CompensationError, RecordingError, FileError) as error:
         _say(str(error))
         return 1
     except BrokenPipeError:
@@ -46,6 +48,8 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _identify(options: IdentifyOptions) -> int:
+    if options.yaml is not None:
+        refuse_existing(options.yaml, force=options.force)
     with open_recording(options.path) as recording:
         sensor = _choose(recording, options.sensor)
         if recording.cut_off is not None:

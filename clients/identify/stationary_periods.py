@@ -19,10 +19,10 @@ from clients.recording.columns import Columns
 from ft_compensation.stationary import (
     BAD_WRENCH,
     NotStationaryError,
-    StationaryLimits,
     StationaryMeans,
     stationary_means,
 )
+from ft_compensation.stationary_limits import StationaryLimits
 
 _BLOCK_S: Final = 0.1
 _BLOCK_SAMPLES: Final = 8

@@ -14,7 +14,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the monitor; returns its exit code."""
     try:
         # SIGTERM acts as Ctrl-C; the live view replaces the handler.
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)
         from clients.monitor.options import parse  # noqa: PLC0415 - Ctrl-C is heard while this loads
         from clients.monitor.program import run  # noqa: PLC0415
 

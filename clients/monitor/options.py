@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Final
 
-from clients.arguments import add_address, add_imu_units, address, parser, seconds
+from clients.arguments import add_imu_units, add_server, address, parser, seconds, server_of
 from clients.monitor.web.access import is_loopback
 from protocol.address import DEFAULT_HOST, Address
 from protocol.pdo import ImuUnits
@@ -33,8 +33,9 @@ def parse(argv: Sequence[str] | None) -> Options:
         "Shows the stream of ethercat-server live in the terminal. Press ? for the keys.",
         "With --once: exit code 0 if all is good or worth a look, 1 if there is trouble, or no server.",
     )
-    add_address(made)
+    add_server(made)
     add = made.add_argument
+    add("old", nargs="?", help=argparse.SUPPRESS)  # HOST:PORT without --server
     add("--once", action="store_true", help="observe for a second, print a table and exit")
     add("--json", action="store_true", help="print one JSON object per second; with --once, just one")
     add("--seconds", type=seconds, metavar="S", help="exit after S seconds")
@@ -45,6 +46,7 @@ def parse(argv: Sequence[str] | None) -> Options:
         help=f"show it in a browser instead, on this port of this machine (default {DEFAULT_WEB.port})",
     )  # fmt: skip
     options = made.parse_args(argv, Options())
+    options.address = server_of(made, options.server, options.old)
     if options.once and options.seconds is not None:
         made.error("--seconds cannot be combined with --once")
     if options.web is not None and (options.once or options.json):

@@ -62,7 +62,7 @@ class Recorder:
         try:
             # A session of its own: Ctrl-C is for the monitor, which then stops it.
             self._process = subprocess.Popen(
-                [*command, name, str(self._address), "--until-eof"],
+                [*command, name, "--server", str(self._address), "--until-eof"],
                 cwd=self._directory,
                 stdin=subprocess.PIPE,  # closed when the monitor ends, however it ends
                 stdout=said,

@@ -8,13 +8,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from clients.arguments import add_address, add_imu_units, number, parser, position, seconds
+from clients.arguments import (
+    add_force,
+    add_imu_units,
+    add_server,
+    file_and_server,
+    number,
+    parser,
+    position,
+    seconds,
+    server_of,
+)
 from protocol.address import Address
 from protocol.pdo import ImuUnits
 
 _UNITS: Final = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}
 _SIZE: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)([kMG]?)B?", re.ASCII)
 _LEAST_SIZE: Final = 100_000
+_TIMES: Final = {"": 1, "s": 1, "min": 60, "h": 3600}
+_TIME: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?(s|min|h|)", re.ASCII)
+_LONGEST_S: Final = 1e9
 
 
 class RecordOptions(argparse.Namespace):
@@ -42,13 +55,15 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
         "ethercat-record",
         "Records the unmodified stream of ethercat-server into an MCAP file.",
         "Ctrl-C ends the recording. SIZE is in bytes, or such as 500k, 100M, 2G.",
+        usage="%(prog)s [options] OUT.mcap",
     )
     add = made.add_argument
-    add("path", type=Path, metavar="OUT.mcap", help="file to write")
-    add_address(made)
+    add("names", nargs="+", metavar="OUT.mcap", help="file to write")
+    add_server(made)
     add("--sensor", type=position, action="append", dest="sensors", metavar="N",
         help="record only the sensor at this position on the bus; repeatable")  # fmt: skip
-    add("--seconds", type=seconds, metavar="S", help="stop after S seconds")
+    add("--for", type=_duration, dest="seconds", metavar="TIME", help="stop after this time: 30s, 5min, 2h")
+    add("--seconds", type=seconds, metavar="S", help="the same in seconds")
     add("--ros", action="store_true",
         help="also write what the ROS 2 node would publish: WrenchStamped, Imu, Temperature")  # fmt: skip
     add("--ros-namespace", type=_namespace, action="append", dest="namespaces", metavar="NAME",
@@ -58,18 +73,29 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add("--rotate-size", type=_size, metavar="SIZE", help="start a new file when one reaches this size")
     add("--rotate-seconds", type=number(1, 1e9, "at least 1 s"), metavar="S",
         help="start a new file every S seconds")  # fmt: skip
-    add("--force", action="store_true", help="overwrite existing files")
+    add_force(made)
     add("--wait", action="store_true", help="wait for the server to start")
     add("--no-reconnect", action="store_false", dest="reconnect",
         help="stop when the connection ends, instead of reconnecting")  # fmt: skip
     add("--until-eof", action="store_true",
         help="stop at the end of standard input, when the program at its other end exits")  # fmt: skip
     options = made.parse_intermixed_args(argv, RecordOptions())
+    options.path, old = file_and_server(made, options.names)
+    options.address = server_of(made, options.server, old)
     if options.namespaces is not None and not options.ros:
         made.error("--ros-namespace requires --ros")
     if options.sensors is not None:
         options.sensors = sorted(set(options.sensors))
     return options
+
+
+def _duration(text: str) -> float:
+    """Seconds."""
+    match = _TIME.fullmatch(text)
+    found = float(match[1]) * _TIMES[match[2]] if match else 0.0
+    if 0 < found <= _LONGEST_S:
+        return found
+    raise argparse.ArgumentTypeError(f"{text!r}: it must be a time such as 30s, 5min or 2h")
 
 
 def _size(text: str) -> int:

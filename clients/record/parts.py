@@ -9,6 +9,7 @@ from pathlib import Path
 
 from clients.errors import DiskError
 from clients.recording.disk import DiskFile, remove
+from protocol.program.new_file import EXISTS
 
 
 class Parts:
@@ -36,7 +37,7 @@ class Parts:
             raise DiskError(f"{self.path} is a folder: name a file in it")
         found = self._existing()
         if found and not self._overwrite:
-            raise DiskError(f"{found[0]} exists: choose another name, or use --force to replace it")
+            raise DiskError(f"{found[0]} {EXISTS}")
 
     def open(self) -> DiskFile:
         """The next file; DiskError."""

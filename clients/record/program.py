@@ -13,7 +13,7 @@ from functools import partial
 
 from clients.errors import RecordingError
 from clients.numbers import count, data_size, duration
-from clients.program import VERSION, Signals, say
+from clients.program import Signals, say
 from clients.record.options import RecordOptions, parse_options
 from clients.record.parts import Parts
 from clients.record.progress import Progress
@@ -23,6 +23,7 @@ from clients.recording.file_format import FORMAT_VERSION
 from clients.recording.reader import Event
 from clients.recording.ros_messages import RosTopics
 from protocol.errors import ConnectionFailedError, ProtocolError
+from protocol.program.version import VERSION
 from protocol.text.untrusted import rows
 from protocol.text.visible import printable
 
@@ -78,7 +79,7 @@ def _record(
     source: Source, recorder: Recorder, batch: Batch, options: RecordOptions, parts: Parts, signals: Signals
 ) -> int:
     began, reason, code, refused = time.monotonic(), "asked to stop", 0, ""
-    with Progress(options.path.name) as progress:
+    with Progress(options.path.name, options.seconds) as progress:
         progress.say(f"recording {options.address} to {parts.made[0]}; Ctrl-C ends it")
         try:
             while True:

@@ -20,8 +20,10 @@ _SHOW_EVERY_S: Final = 0.5
 class Progress:
     """The progress line."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, seconds: float | None = None) -> None:
+        """For a recording of so many seconds, if there is a limit."""
         self._name = name
+        self._of = "" if seconds is None else f" of {duration(seconds)}"
         self._console = Console(stderr=True, highlight=False)
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
         self._began = time.monotonic()
@@ -67,6 +69,5 @@ class Progress:
         self._seen_at = now
         state = f"{' + '.join(rates) or '0'} frames/s" if connected else "no server, reconnecting"
         size, lost = data_size(recorder.bytes_written), recorder.tally.brief()
-        return (
-            f"{self._name}: {duration(now - self._began)}, {recorder.saved} frames, {size}, {state}, {lost}"
-        )
+        passed = duration(now - self._began) + self._of
+        return f"{self._name}: {passed}, {recorder.saved} frames, {size}, {state}, {lost}"

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from clients.errors import DiskError
+from protocol.program.new_file import EXISTS
 
 
 def _lock(fd: int) -> None:
@@ -54,7 +55,7 @@ class DiskFile:
                 path, os.O_WRONLY | os.O_CREAT | (0 if overwrite else os.O_EXCL) | os.O_CLOEXEC, 0o666
             )
         except FileExistsError:
-            raise DiskError(f"{path} exists: choose another name, or use --force to replace it") from None
+            raise DiskError(f"{path} {EXISTS}") from None
         except OSError as error:
             raise DiskError(f"{path} cannot be created: {error.strerror}") from None
         try:

@@ -6,11 +6,13 @@ import sys
 from collections.abc import Sequence
 
 from clients.program import Signals, not_installed
+from clients.replay.options import parse_options
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
     signals = Signals()
+    parse_options(argv)  # --help and wrong usage need nothing of the extra
     try:
         from clients.replay.program import run  # noqa: PLC0415 - after the signals
     except ImportError as error:

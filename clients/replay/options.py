@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from clients.arguments import number, parser
-from protocol.address import DEFAULT_PORT
+from clients.arguments import address, number, parser
+from protocol.address import DEFAULT_HOST, Address
+from protocol.program.server_choice import is_address, own_server
 
 _HOSTS: Final = ["127.0.0.1", "::1"]
 
@@ -36,11 +37,12 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
         "ethercat-replay",
         "Serves recordings, one after the other, over the same protocol as ethercat-server.",
         "It starts with the first subscriber and ends as the server does. Ctrl-C ends it.",
-        usage="%(prog)s [options] FILE [FILE ...] [PORT]",
+        usage="%(prog)s [options] FILE [FILE ...]",
     )
     add = made.add_argument
-    add("names", nargs="+", metavar="FILE",
-        help=f"recordings; a number after them is the port (default {DEFAULT_PORT})")  # fmt: skip
+    add("names", nargs="+", metavar="FILE", help="recordings")
+    add("--server", type=address, metavar="HOST:PORT",
+        help="serve at this address of this machine (default: as the clients' --server)")  # fmt: skip
     add("--speed", type=_speed, default=1.0, metavar="X",
         help="times the recorded speed; 'max': as fast as clients read, without loss")  # fmt: skip
     add("--loop", action="store_true", help="start again at the end, until Ctrl-C")
@@ -55,12 +57,19 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
         help="group whose members may shut it down")  # fmt: skip
     options = made.parse_intermixed_args(argv, ReplayOptions())
     names: list[str] = options.names
-    options.port = DEFAULT_PORT
-    if len(names) > 1 and names[-1].isascii() and names[-1].isdecimal():
-        options.port = int(names.pop())
-        if not 1 <= options.port <= 65535:
-            made.error(f"port {options.port} is out of range: it must be from 1 to 65535")
-    options.paths, options.hosts = [Path(name) for name in names], options.hosts or _HOSTS
+    old = names.pop() if len(names) > 1 and is_address(names[-1]) else None
+    if options.server is not None and old is not None:
+        made.error(f"the address is given twice: leave out {old}, or --server")
+    try:
+        server: Address = options.server or (own_server() if old is None else Address.parse(old))
+        hosts = _HOSTS if server.host == DEFAULT_HOST else [_host(server.host)]
+    except (ValueError, argparse.ArgumentTypeError) as error:
+        made.error(str(error))
+    options.paths, options.port, options.hosts = (
+        [Path(name) for name in names],
+        server.port,
+        options.hosts or hosts,
+    )
     return options
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable, Sequence
 
@@ -14,6 +15,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Make a report; returns the exit code."""
     options = parse_options(argv)
     try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)
         # Slow to import; Ctrl-C must not end in a traceback meanwhile.
         from clients.report import program  # noqa: PLC0415
 

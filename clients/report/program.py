@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 
 from clients.errors import RecordingError, ReportError
-from clients.program import VERSION
 from clients.report.checks.check import Level
 from clients.report.examine import Examination, examine
 from clients.report.options import ReportOptions
@@ -19,6 +14,8 @@ from clients.report.page.page import as_json, render
 from clients.report.subjects import live, recorded
 from clients.report.subjects.subject import Subject
 from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
+from protocol.program.new_file import NewFile
+from protocol.program.version import VERSION
 
 EXIT_CODES = {Level.GOOD: 0, Level.NOT_POSSIBLE: 0, Level.LOOK: 0, Level.TROUBLE: 1}
 
@@ -35,7 +32,8 @@ class Outcome:
 def make(options: ReportOptions, progress: Callable[[float], None]) -> Outcome:
     """Make the report; ReportError. `progress` is called with the time listened so far, s."""
     try:
-        examinations = [examine(each) for each in _subjects(options, progress)]
+        with NewFile(options.output, force=options.force) as file:
+            return _make(options, progress, file)
     except UnreachableError as error:
         hint = "start ethercat-server, or give its HOST:PORT"
         raise ReportError(f"no server at {options.server}: {error}; {hint}") from None
@@ -43,9 +41,14 @@ def make(options: ReportOptions, progress: Callable[[float], None]) -> Outcome:
         raise ReportError(f"the server at {options.server} cannot be used: {error}") from None
     except (RecordingError, ProtocolError) as error:
         raise ReportError(str(error)) from None
+
+
+def _make(options: ReportOptions, progress: Callable[[float], None], file: NewFile) -> Outcome:
+    examinations = [examine(each) for each in _subjects(options, progress)]
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     page = render(examinations, made=now, program=f"ethercat-report {VERSION}", note=options.note)
-    _write(options.output, page)
+    file.write(page)
+    file.finish()
     words = as_json(examinations) if options.json else _summary(examinations)
     return Outcome(words, max(EXIT_CODES[each.verdict.level] for each in examinations))
 
@@ -55,28 +58,6 @@ def _subjects(options: ReportOptions, progress: Callable[[float], None]) -> list
         return recorded.subjects(options.recording, options.sensor, options.imu_units)
     assert options.server is not None
     return live.subjects(options.server, options.seconds, options.sensor, options.imu_units, progress)
-
-
-def _write(path: Path, page: str) -> None:
-    """Write atomically: an existing report stays until the new one is complete."""
-    made: str | None = None
-    try:
-        with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", dir=path.parent, prefix=f".{path.name}.", delete=False
-        ) as file:
-            made = file.name
-            file.write(page)
-        mask = os.umask(0)
-        os.umask(mask)
-        Path(made).chmod(0o666 & ~mask)
-        Path(made).replace(path)
-        made = None
-    except OSError as error:
-        raise ReportError(f"{path} cannot be written: {error.strerror or error}") from None
-    finally:
-        if made is not None:
-            with contextlib.suppress(OSError):
-                Path(made).unlink()
 
 
 def _summary(examinations: Sequence[Examination]) -> str:

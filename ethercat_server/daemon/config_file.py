@@ -33,7 +33,9 @@ def read_config(path: Path) -> ConfigFile:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UsageError(f"cannot read the configuration {path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise UsageError(f"the configuration {path} is not a text file: it must be TOML in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
         raise UsageError(f"the configuration {path} is not valid TOML: {error}") from None
     for key, value in content.items():
         if key not in {"server", "sensor"} or not isinstance(value, dict):

@@ -80,11 +80,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Missing privileges are a finding.
     logging.getLogger("ethercat_server.process.realtime").setLevel(logging.ERROR)
     args = build_parser().parse_args(argv)
+    # KeyboardInterrupt in an import may be lost in Python's own code: load all before there can be one.
+    from ethercat_server.doctor import examination, report  # noqa: F401, PLC0415
+    from ethercat_server.doctor.bus import examination as bus  # noqa: F401, PLC0415
+
     return command_line.run(_PROGRAM, lambda: _run(args), as_json=args.json)
 
 
 def _run(args: argparse.Namespace) -> int:
-    # Imported late, so that Ctrl-C works from the start.
     from ethercat_server.doctor.report import EXIT_CODES, Report, as_json, worst  # noqa: PLC0415
 
     _check(args)

@@ -8,12 +8,13 @@ from ethercat_server.links.holder import find_holder
 from ethercat_server.links.link import Link, note
 from ethercat_server.links.remote import ServerLink
 from protocol.address import Address
+from protocol.program.server_choice import default_server, is_address
 
 
 def open_link(
     ifname: str | None, server: str | None, *, any_slave: bool = False, force: bool = False
 ) -> Link:
-    """The link to the sensors on `ifname`, or behind `server`; UsageError unless exactly one is given.
+    """The link to the sensors on `ifname`, or behind `server`; UsageError if both are given.
 
     If a server uses the interface, the link goes through that server, with a note. With `any_slave`, slaves
     that are not sensors are included, for read-only commands; with `force`, a bus in use is taken over.
@@ -26,16 +27,18 @@ def open_link(
 
 
 def find_server(ifname: str | None, server: str | None) -> ServerLink | None:
-    """The named server, or the one that uses the interface; None if the interface is not in use."""
-    if (ifname is None) == (server is None):
+    """The named server, or the one that uses the interface; None if the interface is not in use.
+
+    With neither, the default server; an `ifname` such as localhost:12001 is a server too.
+    """
+    if ifname is not None and server is not None:
         raise UsageError("name either an interface, such as ens5, or a server with --server HOST:PORT")
-    if server is not None:
+    if ifname is None or (":" in ifname and is_address(ifname)):
+        text = server or ifname
         try:
-            address = Address.parse(server)
+            return ServerLink(default_server() if text is None else Address.parse(text))
         except ValueError as error:
-            raise UsageError(f"--server {error}") from None
-        return ServerLink(address)
-    assert ifname is not None
+            raise UsageError(f"--server {error}" if server else str(error)) from None
     holder = find_holder(ifname)
     if holder is None:
         return None

@@ -19,9 +19,8 @@ FAILED: Final = 1
 
 
 def begin(program: str) -> None:
-    """SIGINT and SIGTERM raise KeyboardInterrupt; what is logged appears as `PROGRAM: message`."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, _interrupt)
+    """What is logged appears as `PROGRAM: message`. Until `run`, SIGINT ends the program at once."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     formatter = PlainFormatter()
     formatter.prefix = f"{program}: "
     handler = logging.StreamHandler(sys.stderr)
@@ -32,9 +31,12 @@ def begin(program: str) -> None:
 def run(program: str, work: Callable[[], int], *, as_json: bool) -> int:
     """The exit code: what `work` returns, or that of the error it raises, which is printed as one sentence.
 
+    SIGINT and SIGTERM raise KeyboardInterrupt in `work`; before, they end the program at once.
     With `as_json` the sentence is on standard output too, as {"error": ...}.
     """
     try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, _interrupt)
         return work()
     except (ServerError, ProtocolError) as error:
         text, exit_code = str(error), getattr(error, "exit_code", FAILED)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -76,8 +75,6 @@ def build_command_parser(command: Command) -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; returns its exit code. argparse exits with 2 for what it finds."""
     command_line.begin(_PROGRAM)
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # never fail for a character the terminal lacks
     arguments = sys.argv[1:] if argv is None else list(argv)
     # The subcommand has a parser of its own, with options and arguments in any order.
     _Parser.as_json = "--json" in arguments

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 
 from ethercat_server.links.link import Link
 from ethercat_server.links.reach import open_link
+from protocol.program.server_choice import HELP
 
 DONE: Final = 0
 CHANGES: Final = 3
@@ -34,7 +35,9 @@ def add_link_arguments(
         help="interface the sensors are connected to ('virtual' for a virtual sensor); "
         "through the server that uses it, if there is one",
     )  # fmt: skip
-    parser.add_argument("--server", metavar="HOST:PORT", help="connect to this server instead of IFACE")
+    parser.add_argument(
+        "--server", metavar="HOST:PORT", help=f"connect to this server, as without IFACE {HELP}"
+    )
     if take_over:
         parser.add_argument(
             "--force", action="store_true", dest="take_over",

@@ -90,15 +90,21 @@ def options_from(args: argparse.Namespace) -> BusOptions:
     sinc_range = SETTINGS["sinc_length"].choices
     assert isinstance(sinc_range, range)
     try:
+        option = "--sensors"
         count = whole(args.sensors, 1, MOST_SLAVES) if args.sensors is not None else named
         count = count if chain is None else in_chain
+        option = "--seed"
         seed = whole(args.seed, 0, 2**63)
+        option = "--sinc"
         sinc = None if args.sinc is None else whole(args.sinc, sinc_range[0], sinc_range[-1])
+        option = "--serial"
         serial_numbers = [whole(text, 0, 0xFFFFFFFF) for text in serials]
+        option = "--eeprom-ms"
         eeprom_ms = real(args.eeprom_ms, 0, 1000)
+        option = "--ppm"
         ppms = [real(text, -PPM_LIMIT, PPM_LIMIT) for text in errors]
     except CommandError as error:
-        raise UsageError(str(error)) from None
+        raise UsageError(f"{option}: {error}") from None
     if named > count:
         raise UsageError(f"{named} sensors are named but there are to be {count}: name no more than that")
     for model in models:

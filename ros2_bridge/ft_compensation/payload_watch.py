@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from ft_compensation.quantities import ZERO, Payload, length
-from ft_compensation.stationary import StationaryLimits
+from ft_compensation.stationary_limits import StationaryLimits
 from protocol.pdo import Vector3
 
 _LOOK_S: Final = 0.05

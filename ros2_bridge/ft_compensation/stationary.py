@@ -7,13 +7,13 @@ angular rate. One bad sample spoils the window.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ft_compensation.quantities import ZERO, CompensationError, Wrench
+from ft_compensation.stationary_limits import StationaryLimits
 from protocol.framing import DataFlag
 from protocol.pdo import Sample, Vector3
 from protocol.sensor.warnings_register import WarningFlag
@@ -30,34 +30,6 @@ BAD_WRENCH: Final = (
 
 class NotStationaryError(CompensationError):
     """The sensor was not stationary: what moved, by how much, and the limit."""
-
-
-@dataclass(frozen=True, slots=True)
-class StationaryLimits:
-    """What counts as stationary.
-
-    `..._spread` is the standard deviation of any one axis, `..._wander` the drift of its mean.
-    Bota's own test allows a healthy sensor 0.6 N and 0.014 Nm at SINC 51; at SINC 32 that is 0.8 N and
-    0.02 Nm. A shorter filter or a noisy environment needs more.
-    """
-
-    force_spread: float = 0.8
-    """N"""
-    torque_spread: float = 0.02
-    """Nm"""
-    force_wander: float = 0.3
-    """N: how far the means of the quarters of the window may lie apart, beyond what noise explains."""
-    torque_wander: float = 0.01
-    """Nm, likewise."""
-    angular_rate: float = 0.05
-    """rad/s: length of the mean. A stationary gyroscope may read 0.03."""
-    angular_rate_spread: float = 0.02
-    """rad/s"""
-    acceleration_spread: float = 0.3
-    """m/s²"""
-    acceleration_wander: float = 0.05
-    """m/s²"""
-    least_samples: int = 20
 
 
 class StationaryMeans(NamedTuple):

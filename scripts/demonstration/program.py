@@ -255,10 +255,10 @@ def ignore_signals() -> None:
 
 
 def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0.5 <= value <= 1e6:
-        raise argparse.ArgumentTypeError("must be from 0.5 to 1000000")
-    return value
+    with contextlib.suppress(ValueError):
+        if 0.5 <= float(text) <= 1e6:
+            return float(text)
+    raise argparse.ArgumentTypeError(f"{text!r}: it must be a number of seconds from 0.5 to 1000000")
 
 
 def main() -> int:

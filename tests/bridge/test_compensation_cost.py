@@ -17,7 +17,7 @@ from bridge.publishing.messages import Outputs, make_stages
 from ft_compensation.attitude.tilt import GyroscopeOffset
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
-from ft_compensation.stationary import StationaryLimits
+from ft_compensation.stationary_limits import StationaryLimits
 from tests.compensation.making import BIAS, TOOL
 
 pytestmark = pytest.mark.ros

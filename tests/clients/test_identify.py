@@ -18,6 +18,7 @@ import pytest
 
 from clients.identify.program import run
 from clients.identify.stationary_periods import find_stationary_periods
+from clients.program import missing
 from clients.recording.columns import columns
 from clients.recording.reader import open_recording
 from ethercat_server.virtual_sensor.measurement import scene
@@ -133,7 +134,10 @@ def test_the_yaml_is_what_the_node_takes(
     assert parameters["accelerometer.offset"] == pytest.approx(answer["accelerometer"]["offset"], abs=1e-8)
     assert parameters["accelerometer.scale"] == pytest.approx(answer["accelerometer"]["scale"], abs=1e-8)
     assert "gravity" not in parameters
-    asked(capsys, recording, "--yaml", out, "--gravity", "9.81")
+    assert "tool.yaml exists: choose another name, or use --force" in refused(
+        capsys, recording, "--yaml", out
+    )
+    asked(capsys, recording, "--yaml", out, "--force", "--gravity", "9.81")
     assert written_parameters(out)["gravity"] == [0.0, 0.0, -9.81]
     assert "cannot be written" in refused(capsys, recording, "--yaml", tmp_path / "no" / "x.yaml")
 
@@ -257,8 +261,7 @@ def test_what_is_not_installed_is_said(tmp_path: Path) -> None:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert hidden.returncode == 1
-    said = "ethercat-identify: numpy is not installed: pip install 'bota-ethercat-bridge[tools]'\n"
-    assert hidden.stderr == said
+    assert hidden.stderr == f"ethercat-identify: {missing('numpy')}\n"
 
 
 def test_a_sensor_that_was_exchanged_meanwhile_is_refused(

@@ -22,7 +22,7 @@ from tests.server.running import free_port, wait_until
 RECORDER = """
 import signal, sys, time
 signal.signal(signal.SIGINT, lambda *_: sys.exit(print("ethercat-record: %s of %s: nothing was lost"
-    % (sys.argv[1], sys.argv[2]), file=sys.stderr) or 0))
+    % (sys.argv[1], sys.argv[3]), file=sys.stderr) or 0))
 open(sys.argv[1], "w").close()
 time.sleep(60)
 """

@@ -255,7 +255,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     ("arguments", "sentence"),
     [
         ((), "required"),
-        (("x.mcap", "99999"), "out of range"),
+        (("x.mcap", "99999"), "it must be HOST:PORT"),
         (("x.mcap", "--speed", "0"), "it must be a number"),
         (("x.mcap", "--speed", "nan"), "it must be a number"),
         (("x.mcap", "--host", "nowhere"), "an IP address of this machine"),

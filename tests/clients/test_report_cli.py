@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from clients.program import missing
 from clients.report import cli, program
 from clients.report.subjects import live
 from clients.report.subjects.live import Received
@@ -197,10 +198,10 @@ def test_a_sensor_that_was_exchanged_is_not_taken_for_the_other(
         assert words in page.read_text()
     assert f"{len(frames) - SPLIT:,} samples".replace(",", " ") in page.read_text()
     assert "The settings were changed" not in page.read_text()
-    _, out, _ = ended(capsys, path, "-o", page, "--sensor", "serial:4711")
+    _, out, _ = ended(capsys, path, "-o", page, "--force", "--sensor", "serial:4711")
     assert "serial 4711): Not conclusive" in out
     assert f"{SPLIT} samples" in page.read_text()
-    _, _, err = ended(capsys, path, "-o", page, "--sensor", "serial:7")
+    _, _, err = ended(capsys, path, "-o", page, "--force", "--sensor", "serial:7")
     assert "serial 4711), 0 (BFT-SENS-ECAT-M8, serial 99)" in err
 
 
@@ -217,7 +218,7 @@ def test_a_sensor_that_was_not_to_be_recorded_is_not_judged(
     code, out, _ = ended(capsys, path, "-o", page)
     assert (code, out.count("serial")) == (0, 1)
     assert "Not recorded, because others were chosen: sensor 1 and 2." in page.read_text()
-    code, _, err = ended(capsys, path, "-o", page, "--sensor", "1")
+    code, _, err = ended(capsys, path, "-o", page, "--force", "--sensor", "1")
     assert (code, "has no sensor 1: it has 0 (BFT-SENS-ECAT-M8, serial 100)\n" in err) == (1, True)
 
 
@@ -227,7 +228,7 @@ def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(
     made = record(tmp_path / "cut.mcap", frames, described(SINC), end=False)
     code, out, _ = ended(capsys, made)
     assert code == 0
-    for said in (out, made.with_suffix(".html").read_text(), ended(capsys, made, "--json")[1]):
+    for said in (out, made.with_suffix(".html").read_text(), ended(capsys, made, "--json", "--force")[1]):
         assert "The recording was cut off: it has no footer" in said
 
 
@@ -244,9 +245,9 @@ def test_sensors_are_chosen_by_place_serial_or_name(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "give a recording, or --server"),
+        (["localhost:12001"], "is a server's address, no recording: write --server localhost:12001"),
         (["a.mcap", "--server", "localhost:1"], "give a recording, or --server"),
-        (["a.mcap", "--seconds", "5"], "--seconds requires --server"),
+        (["a.mcap", "--seconds", "5"], "--seconds is for listening"),
         (["--server", "localhost:x"], "HOST:PORT"),
         (["--server", "localhost", "--seconds", "0"], "from 1 to"),
         (["--server", "localhost", "--seconds", "nan"], "from 1 to"),
@@ -277,7 +278,9 @@ def test_what_cannot_be_read_or_written_is_said_in_a_sentence(
     kept = tmp_path / "kept.html"
     kept.mkdir()
     assert ended(capsys, recording, "-o", kept)[0] == 1
-    assert not list(tmp_path.glob(".kept*")), "nothing half-written is left"
+    assert not list(tmp_path.glob(".*")), "nothing half-written is left"
+    assert "text.mcap exists: choose another name, or use --force" in ended(capsys, recording, "-o", text)[2]
+    assert text.read_text() == "no recording"
 
 
 def test_no_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -306,7 +309,7 @@ def test_what_is_not_installed_is_said(recording: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert "is not installed: pip install 'bota-ethercat-bridge[tools]'" in done.stderr
+    assert missing("matplotlib") in done.stderr
     assert "Traceback" not in done.stderr
 
 

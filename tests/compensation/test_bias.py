@@ -14,7 +14,8 @@ import pytest
 from ft_compensation.bias import BiasRamp, estimate_bias, gravity_of
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import NO_WRENCH, CompensationError, Wrench
-from ft_compensation.stationary import NotStationaryError, StationaryLimits, StationaryMeans, StationaryWindow
+from ft_compensation.stationary import NotStationaryError, StationaryMeans, StationaryWindow
+from ft_compensation.stationary_limits import StationaryLimits
 from protocol.framing import DataFlag
 from protocol.pdo import STANDARD_GRAVITY, Sample
 from protocol.sensor.warnings_register import WarningFlag

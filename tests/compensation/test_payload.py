@@ -14,13 +14,14 @@ import pytest
 
 from ft_compensation.bias import gravity_of
 from ft_compensation.compensator import Compensator
-from ft_compensation.identification.parameter_file import ParameterFileError, to_yaml, write_yaml
+from ft_compensation.identification.parameter_file import to_yaml, write_yaml
 from ft_compensation.identification.payload import IdentificationError, identify
 from ft_compensation.identification.poses import Pose, coverage, pose_of
 from ft_compensation.identification.session import IdentificationSession, summary
 from ft_compensation.identification.student import two_sided
 from ft_compensation.quantities import CompensationError, Payload, Wrench
 from ft_compensation.stationary import StationaryMeans
+from protocol.errors import FileError
 from tests.compensation import equations
 from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, pose, written_parameters
 
@@ -454,5 +455,5 @@ def test_ros_reads_every_number_as_a_float() -> None:
 
 
 def test_a_file_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ParameterFileError, match="cannot be written: No such file"):
+    with pytest.raises(FileError, match="cannot be written: No such file"):
         write_yaml(tmp_path / "none" / "x.yaml", identify([pose(up) for up in AXES]))

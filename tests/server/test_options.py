@@ -125,6 +125,9 @@ def test_wrong_configuration_is_refused_by_name(tmp_path: Path, text: str, compl
     file.write_text(text)
     with pytest.raises(UsageError, match=complaint):
         parse_options(["ens5", "1", "--config", str(file)])
+    file.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UsageError, match=r"c.toml is not a text file: it must be TOML in UTF-8$"):
+        parse_options(["ens5", "1", "--config", str(file)])
 
 
 def test_the_servers_own_settings_from_file_and_command_line(tmp_path: Path) -> None:

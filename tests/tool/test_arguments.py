@@ -117,7 +117,6 @@ def test_of_lengths_with_one_rate_it_is_the_one_read_or_asked_for(
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["objects"], "either an interface"),
         (["objects", "ens5", "--server", "localhost:12001"], "either an interface"),
         (["objects", "--server", "localhost:port"], "HOST:PORT"),
         (["objects", "--server", "localhost:0"], "HOST:PORT"),
@@ -132,15 +131,25 @@ def test_of_lengths_with_one_rate_it_is_the_one_read_or_asked_for(
         (["tare", "ens5", "--target", "1", "2", "3", "4", "5", "inf"], "six finite numbers"),
         (["tare", "ens5", "--target", "1e300", "0", "0", "0", "0", "0"], "larger than a REAL32 can be"),
         (["watch", "ens5", "--samples", "0"], "1 or more"),
-        (["snapshot", "ens5", "/nonexistent/a.json"], "cannot write /nonexistent/a.json: No such file"),
-        (["snapshot", "ens5", "/"], "cannot write /: Is a directory"),
-        (["snapshot", "ens5", ""], "cannot write .: Is a directory"),
-        (["snapshot", "ens5", "/tmp/" + "x" * 300], "File name too long"),
         (["restore", "ens5", "/nonexistent.json"], "/nonexistent.json"),
     ],
 )
 def test_wrong_arguments_are_one_sentence_and_exit_code_2(arguments: list[str], named: str) -> None:
     assert named in one_sentence(tool_here(*arguments, code=2))
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("/nonexistent/a.json", "/nonexistent/a.json cannot be written: No such file"),
+        ("/", "/ cannot be written: Is a directory"),
+        ("", ". cannot be written: Is a directory"),
+        ("/tmp/" + "x" * 300, "File name too long"),
+        (__file__, "exists: choose another name, or use --force"),
+    ],
+)
+def test_a_snapshot_that_cannot_be_written_is_said_before_the_sensor_is_read(file: str, said: str) -> None:
+    assert said in one_sentence(tool_here("snapshot", "ens5", file, code=1))
 
 
 @pytest.mark.parametrize(

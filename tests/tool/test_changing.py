@@ -339,9 +339,16 @@ def test_a_snapshot_follows_links_and_replaces_no_device(chain: SimulatedBus, tm
     assert link.is_symlink()
     assert json.loads(path.read_text())["serial"] == 10
     assert pipe.is_fifo()
-    failed = tool_here("snapshot", near, "/dev/full", "--sensor", 0, code=2)
-    assert "cannot write /dev/full: No space left" in one_sentence(failed)
-    tool_here("snapshot", near, path, "--sensor", 7, code=2)
+    failed = tool_here("snapshot", near, "/dev/full", "--sensor", 0, code=1)
+    assert "/dev/full cannot be written: No space left" in one_sentence(failed)
+    tool_here("snapshot", near, path, "--sensor", 7, "--force", code=2)
+    kept = path.read_text()
+    assert "a.json exists: choose another name, or use --force" in one_sentence(
+        tool_here("snapshot", near, path, "--sensor", 1, code=1)
+    )
+    assert path.read_text() == kept
+    tool_here("snapshot", near, path, "--sensor", 1, "--force")
+    assert json.loads(path.read_text())["serial"] != 10
     assert sorted(tmp_path.iterdir()) == [path, link, pipe], "nothing else is left"
 
 

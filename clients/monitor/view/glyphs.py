@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
+from protocol.program.output import SPELLED
+
 
 class Glyphs(NamedTuple):
     """The characters of bars and traces."""
@@ -38,22 +40,18 @@ BAD: Final = "bold #d55e00"
 ALARM: Final = "bold reverse #d55e00"
 NOTICE: Final = "bold reverse"
 
-_SPELLED: Final = {
-    "²": "2", "°": "deg", "µ": "u", "±": "+-", "ω": "w", "…": "...", "·": "|",
-}  # fmt: skip
-
 
 def to_ascii(text: str) -> str:
     """The text for an ASCII terminal."""
     if text.isascii():
         return text
-    return "".join(_SPELLED.get(c, c if c.isascii() else "?") for c in text)
+    return "".join(SPELLED.get(c, c if c.isascii() else "?") for c in text)
 
 
 def can_show(encoding: str | None) -> bool:
     """Whether this encoding has the UNICODE glyphs."""
     try:
-        ("".join(UNICODE) + "".join(_SPELLED)).encode(encoding or "ascii")
+        ("".join(UNICODE) + "".join(SPELLED)).encode(encoding or "ascii")
     except (UnicodeEncodeError, LookupError):
         return False
     return True

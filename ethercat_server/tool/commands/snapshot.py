@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import datetime
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,28 +23,37 @@ from ethercat_server.tool.commands.settings import (
     saving_lines,
     verify,
 )
-from ethercat_server.tool.commands.snapshot_file import RESTORABLE, Snapshot, SnapshotFile, read_snapshot
+from ethercat_server.tool.commands.snapshot_file import RESTORABLE, Snapshot, read_snapshot, text_of
 from ethercat_server.tool.show import columns, report, value_text
+from protocol.program.new_file import NewFile
 from protocol.settings import SettingValue
 
 
-def _arguments(parser: argparse.ArgumentParser, *, take_over: bool = True) -> None:
-    add_link_arguments(parser, take_over=take_over)
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add_link_arguments(parser, take_over=False)
     parser.add_argument("file", type=Path, metavar="FILE", help="JSON file")
 
 
+def _snapshot_arguments(parser: argparse.ArgumentParser) -> None:
+    _arguments(parser)
+    parser.add_argument("--force", action="store_true", help="replace an existing file")
+    parser.add_argument(
+        "--take-over", action="store_true", help="take over a bus in use, as other commands with --force"
+    )
+
+
 def _restore_arguments(parser: argparse.ArgumentParser) -> None:
-    _arguments(parser, take_over=False)
+    _arguments(parser)
     add_save(parser)
     parser.add_argument("--force", action="store_true", help="accept a file of another sensor")
 
 
 def _snapshot(args: argparse.Namespace) -> int:
-    with contextlib.closing(SnapshotFile(args.file)) as file:
+    with NewFile(args.file, force=args.force) as file:
         return _take(args, file)
 
 
-def _take(args: argparse.Namespace, file: SnapshotFile) -> int:
+def _take(args: argparse.Namespace, file: NewFile) -> int:
     with link(args) as opened:
         found = opened.choose(args.sensor)
         sensor, sdo = opened.in_force(found), opened.sdo(found.number)
@@ -60,7 +68,8 @@ def _take(args: argparse.Namespace, file: SnapshotFile) -> int:
         "settings": sensor.settings,
         "objects": [_as_json(row.address, row.name, values) for row, values in read],
     }
-    file.write(content)
+    file.write(text_of(content))
+    file.finish()
     readable = sum("hex" in values for _, values in read)
     line = f"  {readable} objects written to {args.file}, {len(read) - readable} could not be read"
     report(args.json, opened, found, {"file": str(args.file), "objects": readable}, line)
@@ -177,6 +186,6 @@ def _object_line(address: tuple[int, int], held: bytes, wanted: bytes) -> tuple[
 
 
 COMMANDS = (
-    Command("snapshot", "write all readable objects to a file", _arguments, _snapshot),
+    Command("snapshot", "write all readable objects to a file", _snapshot_arguments, _snapshot),
     Command("restore", "write back what differs from a snapshot", _restore_arguments, _restore),
 )

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -38,50 +35,10 @@ class Snapshot(NamedTuple):
     """Only those that can be restored."""
 
 
-class SnapshotFile:
-    """A file, opened before the sensor is read; UsageError if it cannot be written.
-
-    A regular file is replaced atomically; others, such as /dev/stdout, are written directly.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        try:
-            if path.exists() and not path.is_file():
-                self._target = self._beside = path
-            else:
-                self._target = Path(os.path.realpath(path))  # a symbolic link stays one
-                self._beside = self._target.with_name(f".snapshot-{secrets.token_hex(4)}")
-            self._file = self._beside.open("w" if self._is_written_to else "x", encoding="utf-8")
-        except OSError as error:
-            raise self._refusal(error) from None
-
-    @property
-    def _is_written_to(self) -> bool:
-        return self._beside == self._target
-
-    def write(self, content: Mapping[str, Any]) -> None:
-        """Write it; UsageError if that fails."""
-        text = json.dumps(
-            finite({"format": _FORMAT, "version": _VERSION, **content}), indent=1, allow_nan=False
-        )
-        try:
-            self._file.write(text + "\n")
-            self._file.close()
-            if not self._is_written_to:
-                self._beside.replace(self._target)
-        except OSError as error:
-            raise self._refusal(error) from None
-
-    def close(self) -> None:
-        """Remove the temporary file."""
-        with contextlib.suppress(OSError):
-            self._file.close()
-        if not self._is_written_to:
-            self._beside.unlink(missing_ok=True)
-
-    def _refusal(self, error: OSError) -> UsageError:
-        return UsageError(f"cannot write {self._path}: {error.strerror}")
+def text_of(content: Mapping[str, Any]) -> str:
+    """The text of a file."""
+    whole = finite({"format": _FORMAT, "version": _VERSION, **content})
+    return json.dumps(whole, indent=1, allow_nan=False) + "\n"
 
 
 def read_snapshot(path: Path) -> Snapshot:

@@ -20,7 +20,7 @@ from ft_compensation.quantities import (
     Wrench,
     length,
 )
-from ft_compensation.stationary import StationaryLimits
+from ft_compensation.stationary_limits import StationaryLimits
 from protocol.pdo import Vector3
 
 Quaternion = tuple[float, float, float, float]

@@ -17,7 +17,8 @@ from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
-from ft_compensation.stationary import StationaryLimits, StationaryMeans, StationaryWindow
+from ft_compensation.stationary import StationaryMeans, StationaryWindow
+from ft_compensation.stationary_limits import StationaryLimits
 from protocol.pdo import Sample, Vector3
 
 _BEGINS_S: Final = 1.0

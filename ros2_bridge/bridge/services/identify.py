@@ -16,6 +16,7 @@ from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified
 from ft_compensation.identification.session import IdentificationSession, accelerometer_text, summary
 from ft_compensation.quantities import CompensationError, length, wrench_text
+from protocol.errors import FileError
 
 
 class IdentifyServices:
@@ -118,7 +119,7 @@ class IdentifyServices:
             path = self._path()
             path.parent.mkdir(parents=True, exist_ok=True)
             write_yaml(path, result, "\n".join(comment), self._control.parameters.gravity)
-        except (CompensationError, OSError) as error:
+        except (CompensationError, FileError, OSError) as error:
             self._log.warning(f"the result of the identification is not written: {error}")
             return f"Not written: {error}"
         return f"Written to {path}"

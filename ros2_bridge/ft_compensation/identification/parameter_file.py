@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ft_compensation.identification.payload import Identified
-from ft_compensation.quantities import Accelerometer, CompensationError, Payload, Wrench
+from ft_compensation.quantities import Accelerometer, Payload, Wrench
 from protocol.pdo import Vector3
-
-
-class ParameterFileError(CompensationError):
-    """The file cannot be written; the text is one sentence that names it."""
+from protocol.program.new_file import NewFile
 
 
 def to_yaml(
@@ -43,13 +40,12 @@ def to_yaml(
 
 
 def write_yaml(path: Path, result: Identified, comment: str = "", gravity: Vector3 | None = None) -> None:
-    """Write what was identified; `gravity` as for `to_yaml`. ParameterFileError if that fails."""
+    """Write what was identified, or replace it; `gravity` as for `to_yaml`. FileError if that fails."""
     accelerometer = result.accelerometer.calibration if result.accelerometer else None
     text = to_yaml(result.payload, result.bias, gravity, comment, accelerometer=accelerometer)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ParameterFileError(f"{path} cannot be written: {error.strerror or error}") from None
+    with NewFile(path, force=True) as file:
+        file.write(text)
+        file.finish()
 
 
 def _number(value: float) -> str:

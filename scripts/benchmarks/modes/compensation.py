@@ -23,7 +23,7 @@ from ft_compensation.compensator import Compensator
 from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
 from ft_compensation.outputs.frames import WrenchTransform
 from ft_compensation.quantities import Payload, Wrench
-from ft_compensation.stationary import StationaryLimits
+from ft_compensation.stationary_limits import StationaryLimits
 from protocol.pdo import Sample, SampleDecoder, encode
 from scripts.benchmarks.chain import Setup
 from scripts.demonstration.program import DemoError

@@ -1,0 +1,1 @@
+"""`ethercat-export`: a recording as a table for pandas, MATLAB and spreadsheets."""

@@ -1,0 +1,1 @@
+"""What every program does alike: which server it uses, how it starts, how it writes files."""

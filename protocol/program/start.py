@@ -1,0 +1,26 @@
+"""Starts a program: Ctrl-C is never a traceback, whatever is being imported, and output never fails.
+
+Few imports, for Python's own handler raises KeyboardInterrupt in the middle of them.
+"""
+
+import signal
+
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # as early as can be: this is imported by entry points only
+
+from importlib import import_module  # noqa: E402
+
+from protocol.program.output import never_fail  # noqa: E402
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
+def run(module: str) -> int:
+    """The exit code of `main` of this module, which handles Ctrl-C itself once it can."""
+    never_fail()
+    try:
+        code: int = import_module(module).main()
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    return code

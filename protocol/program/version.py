@@ -1,0 +1,8 @@
+"""The installed version."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    VERSION = version("bota-ethercat-bridge")
+except PackageNotFoundError:  # run from a checkout that was never installed
+    VERSION = "0+unknown"

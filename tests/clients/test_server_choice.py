@@ -1,0 +1,157 @@
+"""Every program names its server alike: --server, $BOTA_SERVER, a file; the old forms keep their meaning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from clients.monitor import options as monitor
+from clients.record import options as record
+from clients.replay import options as replay
+from clients.report import options as report
+from ethercat_server.links import reach
+from protocol.program.server_choice import default_server, is_address, own_server
+
+Read = Callable[[list[str]], tuple[str, str]]
+
+
+def recorded(argv: list[str]) -> tuple[str, str]:
+    found = record.parse_options(argv)
+    return str(found.path), str(found.address)
+
+
+def monitored(argv: list[str]) -> tuple[str, str]:
+    return "", str(monitor.parse(argv).address)
+
+
+def replayed(argv: list[str]) -> tuple[str, str]:
+    found = replay.parse_options(argv)
+    return " ".join(map(str, found.paths)), f"{','.join(found.hosts)} {found.port}"
+
+
+def reported(argv: list[str]) -> tuple[str, str]:
+    found = report.parse_options(argv)
+    return str(found.recording or ""), str(found.server or "")
+
+
+@pytest.mark.parametrize(
+    ("read", "argv", "path", "server"),
+    [
+        (recorded, "a.mcap", "a.mcap", "localhost:12001"),
+        (recorded, "a.mcap --server [::1]:14101", "a.mcap", "[::1]:14101"),
+        (recorded, "a.mcap robot", "a.mcap", "robot:12001"),
+        (recorded, "a.mcap 14101", "a.mcap", "localhost:14101"),
+        (recorded, "a.mcap localhost:14101", "a.mcap", "localhost:14101"),
+        (recorded, "localhost:14101 a.mcap", "a.mcap", "localhost:14101"),
+        (recorded, "./14101", "14101", "localhost:12001"),
+        (monitored, "", "", "localhost:12001"),
+        (monitored, "--server robot", "", "robot:12001"),
+        (monitored, "[::1]:14101", "", "[::1]:14101"),
+        (monitored, "robot", "", "robot:12001"),
+        (replayed, "a.mcap b.mcap", "a.mcap b.mcap", "127.0.0.1,::1 12001"),
+        (replayed, "a.mcap 14101", "a.mcap", "127.0.0.1,::1 14101"),
+        (replayed, "a.mcap [::1]:14101", "a.mcap", "::1 14101"),
+        (replayed, "a.mcap --server 0.0.0.0:14101", "a.mcap", "0.0.0.0 14101"),
+        (replayed, "a.mcap --server localhost:14101", "a.mcap", "127.0.0.1,::1 14101"),
+        (replayed, "a.mcap --host 127.0.0.9 14101", "a.mcap", "127.0.0.9 14101"),
+        (reported, "a.mcap", "a.mcap", ""),
+        (reported, "", "", "localhost:12001"),
+        (reported, "--server :14101 --seconds 3", "", "localhost:14101"),
+    ],
+)
+def test_the_server_and_the_file(read: Read, argv: str, path: str, server: str) -> None:
+    assert read(argv.split()) == (path, server)
+
+
+@pytest.mark.parametrize(
+    ("read", "argv", "sentence"),
+    [
+        (
+            recorded,
+            "localhost:14101",
+            "is a server's address, no file: write FILE.mcap --server localhost:14",
+        ),
+        (recorded, "14101", "or ./14101 if a file is called so"),
+        (recorded, "::1", "is a server's address"),
+        (recorded, "a.mcap robot:1 --server robot:2", "the server is given twice"),
+        (recorded, "a.mcap robot:1 more", "unexpected argument 'more'"),
+        (monitored, "robot:1 --server robot:2", "the server is given twice"),
+        (monitored, "--server ::1", "in brackets"),
+        (replayed, "a.mcap 1 --server robot:2", "the address is given twice"),
+        (replayed, "a.mcap --server robot", "'robot': it must be an IP address of this machine"),
+        (reported, "localhost:14101", "write --server localhost:14101"),
+    ],
+)
+def test_what_is_ambiguous_is_said(
+    read: Read, argv: str, sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        read(argv.split())
+    assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "./12001", "folder/a:1", "robot", "a:b", "run.1", ""])
+def test_a_file_is_no_address(name: str) -> None:
+    assert not is_address(name)
+
+
+def test_the_variable_comes_before_the_file(tmp_path: Path) -> None:
+    file = tmp_path / ".config" / "bota-ethercat" / "config.toml"
+    file.parent.mkdir(parents=True)
+    file.write_text('server = "robot:14102"')
+    home = {"HOME": str(tmp_path)}
+    assert str(default_server(home)) == "robot:14102"
+    assert str(default_server({"XDG_CONFIG_HOME": str(file.parents[1])})) == "robot:14102"
+    assert str(default_server({**home, "BOTA_SERVER": "[::1]:14103"})) == "[::1]:14103"
+    assert str(default_server({"HOME": "/nowhere"})) == str(default_server({})) == "localhost:12001"
+    assert str(own_server(home)) == "localhost:12001", "nobody can serve at another machine's address"
+    assert str(own_server({"BOTA_SERVER": "14103"})) == "localhost:14103"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"\xff\xfe\x00", "is not a text file"),
+        (b"server = ", "is not valid TOML"),
+        (b"server = 1", "takes one key"),
+        (b'sever = "x"', "takes one key"),
+        (b'server = "x:y"', "it must be HOST:PORT"),
+    ],
+)
+def test_a_wrong_file_is_named(
+    content: bytes,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    file = tmp_path / "bota-ethercat" / "config.toml"
+    file.parent.mkdir()
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=f"{file}.*{said}"):
+        default_server({"XDG_CONFIG_HOME": str(tmp_path)})
+    monkeypatch.delenv("BOTA_SERVER")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    with pytest.raises(SystemExit, match="2"):
+        monitored([])
+    assert str(file) in capsys.readouterr().err
+    monkeypatch.setenv("BOTA_SERVER", "x:y")
+    with pytest.raises(ValueError, match=r"\$BOTA_SERVER: 'x:y': it must be HOST:PORT"):
+        default_server()
+
+
+@pytest.mark.parametrize(
+    ("iface", "server", "reached"),
+    [
+        (None, None, "localhost:12001"),
+        (None, "[::1]:14101", "[::1]:14101"),
+        ("robot:14101", None, "robot:14101"),
+    ],
+)
+def test_the_tool_without_an_interface_asks_the_server(
+    iface: str | None, server: str | None, reached: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reach, "ServerLink", str)
+    assert str(reach.find_server(iface, server)) == reached

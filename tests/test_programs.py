@@ -1,0 +1,160 @@
+"""What holds for every program on PATH: how it starts, what it prints where, what it needs."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Final
+
+import pytest
+
+from clients import program
+from ethercat_server.virtual_sensor.cli import main as virtual_sensor
+from protocol.program.output import never_fail
+from scripts.demonstration.program import _seconds as demo_seconds
+from tests.ended import run_here
+
+ROOT: Final = Path(__file__).parent.parent
+SCRIPTS: Final[dict[str, str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+PROGRAMS: Final = {name: entry for name, entry in SCRIPTS.items() if name != "bridge-client"}
+CLIENTS: Final = [name for name, entry in PROGRAMS.items() if entry.startswith("clients.")]
+UNKNOWN: Final = "numpy is not installed: in this project's folder run PIP '.[tools]'"
+EXTRA: Final = ("jinja2", "matplotlib", "mcap", "numpy", "rich", "textual", "zstandard")
+
+INTERRUPTED: Final = """
+import os, signal, sys
+def interrupt(event, arguments):
+    if event == "import" and arguments[0] == {module!r}:
+        os.kill(os.getpid(), signal.SIGINT)
+sys.addaudithook(interrupt)
+sys.argv = ["program", "--help"]
+from {package} import {entry}
+{entry}()
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [
+        ("ethercat-server", "ethercat_server.process.signals"),
+        ("ethercat-sensor", "argparse"),
+        ("ethercat-sensor", "ethercat_server.links.reach"),
+        ("ethercat-doctor", "ethercat_server.daemon.options"),
+        ("ethercat-virtual-sensor", "argparse"),
+        ("ethercat-identify", "clients.program"),
+        ("ethercat-record", "clients.record.options"),
+    ],
+)
+def test_ctrl_c_while_it_is_imported_is_no_traceback(name: str, module: str) -> None:
+    """A process: the signal comes where a module is imported, and a signal's default ends it."""
+    package, _, entry = PROGRAMS[name].partition(":")
+    script = INTERRUPTED.format(module=module, package=package, entry=entry)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr, done.stdout) == (-signal.SIGINT, "", "")
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_every_program_starts_so(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    package, _, entry = PROGRAMS[name].partition(":")
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        module = importlib.import_module(package)
+        started: list[str] = []
+        monkeypatch.setattr(module, "run", started.append)
+        getattr(module, entry)()
+        assert callable(importlib.import_module(started[0]).main)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_terminal_without_the_characters_gets_them_spelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, "ascii"))
+    never_fail()
+    print("9.8 m/s² ± 2 µs at 20 °C, é")
+    print(json.dumps({"name": "é😀 5 µs"}, ensure_ascii=False), flush=True)
+    text, as_json = raw.getvalue().decode().splitlines()
+    assert text == "9.8 m/s2 +- 2 us at 20 degC, \\u00e9"
+    assert json.loads(as_json) == {"name": "é😀 5 us"}
+
+
+def test_the_doctor_writes_to_an_ascii_terminal() -> None:
+    """A process, because Python makes its output at the start."""
+    package, _, entry = PROGRAMS["ethercat-doctor"].partition(":")
+    done = subprocess.run(
+        [sys.executable, "-c", f"from {package} import {entry}; {entry}()", "no-such-one", "--seconds", "0"],
+        env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, check=False,
+    )  # fmt: skip
+    assert b"Traceback" not in done.stderr
+    assert b"no-such-one" in done.stdout.decode("ascii").encode()
+
+
+def test_help_needs_nothing_of_the_extra() -> None:
+    """A process, in which none of it can be imported."""
+    script = f"""
+import importlib, sys
+sys.modules.update(dict.fromkeys({EXTRA!r}))
+for name, entry in {[(name, PROGRAMS[name]) for name in CLIENTS]!r}:
+    package, _, entry = entry.partition(":")
+    for sys.argv in ([name, "--help"], [name, "--version"]):
+        try:
+            print(getattr(importlib.import_module(package), entry)())
+        except SystemExit as ended:
+            assert ended.code == 0, name
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    for name in CLIENTS:
+        assert f"usage: {name}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("url", "what"),
+    [
+        ({"url": ROOT.as_uri(), "dir_info": {}}, f"numpy is not installed: PIP '{ROOT}[tools]'"),
+        (
+            {"url": "https://example.org/a.git", "vcs_info": {"vcs": "git"}},
+            "numpy is not installed: PIP 'bota-ethercat-bridge[tools] @ git+https://example.org/a.git'",
+        ),
+        ({"url": "file:///no/such/folder"}, UNKNOWN),
+        (None, UNKNOWN),
+    ],
+)
+def test_what_is_missing_comes_from_where_this_came_from(
+    url: object, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = None if url is None else json.dumps(url)
+    monkeypatch.setattr(program, "_CHECKOUT", Path("/no/checkout"))
+    monkeypatch.setattr(program, "distribution", lambda _: SimpleNamespace(read_text=lambda _: text))
+    assert program.missing("numpy.linalg") == what.replace("PIP", f"{sys.executable} -m pip install")
+
+
+@pytest.mark.parametrize("text", ["abc", "", "0.1", "nan", "inf"])
+def test_a_wrong_time_of_the_demo_is_said(text: str) -> None:
+    with pytest.raises(Exception, match="must be a number of seconds"):
+        demo_seconds(text)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--sensors", "99"),
+        ("--seed", "x"),
+        ("--sinc", "1"),
+        ("--serial", "x"),
+        ("--eeprom-ms", "x"),
+        ("--ppm", "x"),
+    ],
+)
+def test_the_virtual_sensor_names_the_option(option: str, value: str) -> None:
+    ended = run_here(virtual_sensor, "veth0", option, value)
+    assert ended.code == 2
+    assert ended.err.startswith(f"ethercat-virtual-sensor: {option}: ")
