@@ -14,6 +14,7 @@ from ethercat_server import __version__
 from ethercat_server.daemon.config_file import EMPTY, read_config
 from ethercat_server.daemon.server_settings import SERVER_SETTINGS, ServerSetting
 from ethercat_server.errors import UsageError
+from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
 from protocol.errors import SettingError
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
@@ -37,6 +38,8 @@ class ServerOptions:
     """The configuration file."""
     force: bool = False
     """Whether to take over a bus that is in use."""
+    allow_ip: bool = False
+    """Whether to use an interface of the machine's network."""
     server: Mapping[str, Any] = field(
         default_factory=lambda: {name: setting.default for name, setting in SERVER_SETTINGS.items()}
     )
@@ -123,6 +126,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--force", action="store_true",
         help="take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop",
     )  # fmt: skip
+    parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",
         help="set a setting of every sensor at start-up; repeatable",
@@ -168,6 +172,7 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
         sensor_name=arguments[1] if len(arguments) == 3 else None,
         config=parsed.config,
         force=parsed.force,
+        allow_ip=parsed.allow_ip,
         virtual_arguments=parsed.virtual,
         server={
             name: _first_given(getattr(parsed, name), config.server.get(name), setting)

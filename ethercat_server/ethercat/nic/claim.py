@@ -13,6 +13,7 @@ from typing import Final
 
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic.interface import look_up, trouble
+from ethercat_server.ethercat.nic.ip import ALLOW_IP, find_routes, network_trouble
 from ethercat_server.ethercat.nic.lock import in_use, locked
 
 MAX_NAME_LENGTH: Final = 15
@@ -24,12 +25,13 @@ _CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
 
 
 @contextlib.contextmanager
-def claimed(ifname: str) -> Iterator[None]:
+def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
     """Within it the bus may be opened on `ifname`, by nobody else of this project.
 
-    InterfaceError unless the interface exists, is free, can carry EtherCAT frames and may be opened.
+    InterfaceError unless the interface exists, is free, can carry EtherCAT frames, may be opened, and is not
+    one of the machine's network, which `allow_ip` permits.
     """
-    index = _check_allowed(ifname)
+    index = _check_allowed(ifname, allow_ip=allow_ip)
     # Of two that start at once neither has the bus open yet, so looking for that is not enough.
     with locked(ifname, index):
         _check_free(ifname, index)
@@ -37,7 +39,7 @@ def claimed(ifname: str) -> Iterator[None]:
         yield
 
 
-def _check_allowed(ifname: str) -> int:
+def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
     if not 0 < len(ifname.encode()) <= MAX_NAME_LENGTH or "/" in ifname:
         raise InterfaceError(
             f"{ifname!r} is no name of a network interface: it must have 1 to {MAX_NAME_LENGTH} characters; "
@@ -46,6 +48,8 @@ def _check_allowed(ifname: str) -> int:
     found = look_up(ifname)
     if found.is_loopback:
         raise InterfaceError(f"{ifname} is the loopback interface: name the one the sensor is connected to")
+    if not allow_ip:
+        _check_no_network(ifname)
     missing = _missing_capabilities()
     if missing:
         raise InterfaceError(
@@ -53,6 +57,19 @@ def _check_allowed(ifname: str) -> int:
             "give the service CAP_NET_RAW and CAP_NET_ADMIN"
         )
     return found.ifindex
+
+
+def _check_no_network(ifname: str) -> None:
+    """InterfaceError if `ifname` has the default route or an address: EtherCAT frames would go there too."""
+    try:
+        routes = find_routes(ifname)
+    except OSError as error:
+        raise InterfaceError(
+            f"the kernel does not say whether {ifname} has an IP address ({error}): {ALLOW_IP} "
+            "uses it all the same"
+        ) from None
+    if problem := network_trouble(ifname, routes):
+        raise InterfaceError(problem)
 
 
 def _check_free(ifname: str, index: int) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ethercat_server.errors import BusError
+from ethercat_server.ethercat.nic.ip import Routes, find_routes
 from ethercat_server.ethercat.slave import sii_content
 from ethercat_server.links.direct import read_images
 from ethercat_server.links.holder import find_holder
@@ -33,6 +34,7 @@ def _adapters(args: argparse.Namespace) -> int:
             info = interface.get_attr("IFLA_LINKINFO")
             name = interface.get_attr("IFLA_IFNAME")
             holder = find_holder(name)
+            routes = _routes(name)
             found.append(
                 {
                     "name": name,
@@ -42,6 +44,8 @@ def _adapters(args: argparse.Namespace) -> int:
                     "carrier": interface.get_attr("IFLA_CARRIER") == 1 and bool(interface["flags"] & 0x1),
                     "loopback": bool(interface["flags"] & 0x8),
                     "held_by": str(holder) if holder else None,
+                    "default_route": routes.default,
+                    "ip_addresses": list(routes.addresses),
                 }
             )
     if args.json:
@@ -52,9 +56,23 @@ def _adapters(args: argparse.Namespace) -> int:
         state = "down" if not row["up"] else "up" if row["carrier"] else "up, no carrier"
         what = "loopback" if row["loopback"] else row["kind"]
         held = f"in use by {row['held_by']}" if row["held_by"] else ""
-        rows.append((row["name"], state, row["address"] or "", ", ".join(filter(None, (what, held)))))
+        ip = "" if row["loopback"] else _ip_mark(row)
+        rows.append((row["name"], state, row["address"] or "", "; ".join(filter(None, (what, held, ip)))))
     say(columns(rows))
     return DONE
+
+
+def _routes(name: str) -> Routes:
+    try:
+        return find_routes(name)
+    except OSError:  # it has just gone
+        return Routes()
+
+
+def _ip_mark(row: dict[str, Any]) -> str:
+    """What makes it an interface that is refused; empty if nothing does."""
+    text = str(Routes(tuple(row["ip_addresses"]), default=row["default_route"]))
+    return f"not for a sensor: {text}" if text else ""
 
 
 def _eeprom_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,7 +89,7 @@ def _images(args: argparse.Namespace) -> dict[int, bytes | BusError]:
                 sensor.number: _image(functools.partial(link.sii, sensor.number))
                 for sensor in link.chosen(args.sensor)
             }
-        images = read_images(args.iface, cleanup, force=args.take_over)
+        images = read_images(args.iface, cleanup, force=args.take_over, allow_ip=args.allow_ip)
     if args.sensor is None:
         return images
     found = [_identified(position, image) for position, image in images.items()]
