@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ethercat_server import __version__
 from ethercat_server.daemon.config_file import EMPTY, read_config
-from ethercat_server.daemon.server_settings import SERVER_SETTINGS, ServerSetting
+from ethercat_server.daemon.server_settings import KEEP, SERVER_SETTINGS, ServerSetting
 from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
 from protocol.errors import SettingError
@@ -56,6 +56,11 @@ class ServerOptions:
         """Whether to start a virtual bus."""
         return self.ifname == VIRTUAL_INTERFACE
 
+    @property
+    def keep_unset(self) -> bool:
+        """Whether the sensors keep the settings that nobody set."""
+        return bool(self.server["unset_settings"] == KEEP)
+
     def asked_settings(self, number: int, name: str, serial: int) -> dict[str, SettingValue]:
         """The settings the user gave for the sensor `number` with this name and serial number."""
         asked: dict[str, SettingValue] = {}
@@ -64,8 +69,8 @@ class ServerOptions:
         return asked
 
     def wanted_settings(self, number: int, name: str, serial: int) -> dict[str, SettingValue]:
-        """The start-up defaults overridden by these; UsageError if the result is inconsistent."""
-        wanted = {**start_up_defaults(), **self.asked_settings(number, name, serial)}
+        """The start-up defaults, unless kept, overridden by these; UsageError if that is inconsistent."""
+        wanted = {**self._defaults, **self.asked_settings(number, name, serial)}
         try:
             check_combination(wanted)
         except SettingError as error:
@@ -75,6 +80,10 @@ class ServerOptions:
                 f"correct one of {sources}"
             ) from None
         return wanted
+
+    @property
+    def _defaults(self) -> dict[str, SettingValue]:
+        return {} if self.keep_unset else start_up_defaults()
 
     def _sources(self, number: int, name: str, serial: int) -> list[tuple[str, dict[str, SettingValue]]]:
         """Where settings for this sensor come from, and which; later ones override earlier ones."""
@@ -104,9 +113,7 @@ class ServerOptions:
     def check(self) -> None:
         """SettingError if the settings of any sensor are inconsistent."""
         for own in ({}, *self.sensor_settings.values()):
-            check_combination(
-                {**start_up_defaults(), **self.common_settings, **own, **self.assigned_settings}
-            )
+            check_combination({**self._defaults, **self.common_settings, **own, **self.assigned_settings})
 
 
 @functools.cache
@@ -142,7 +149,7 @@ def build_parser() -> argparse.ArgumentParser:
     for setting in SERVER_SETTINGS.values():
         text = setting.meaning + ("; repeatable" if setting.many else "")
         if not setting.many and setting.default is not None:
-            text += f" (default {setting.default:g})"
+            text += f" (default {setting.default if setting.text else format(setting.default, 'g')})"
         parser.add_argument(
             setting.flag, dest=setting.name, metavar=setting.metavar, help=text,
             type=_parse_with(setting), action="append" if setting.many else "store",
