@@ -12,7 +12,7 @@ from typing import Any, Final, NoReturn
 from ethercat_server import __version__
 from ethercat_server.process import command_line
 from ethercat_server.tool.command import Command
-from ethercat_server.tool.commands import bus, objects, settings, snapshot, tare, watch
+from ethercat_server.tool.commands import bus, find, objects, settings, snapshot, tare, watch
 from ethercat_server.tool.show import say_json
 
 _PROGRAM: Final = "ethercat-sensor"
@@ -22,7 +22,7 @@ _EXIT_CODES: Final = (
 
 COMMANDS: Final[Mapping[str, Command]] = {
     command.name: command
-    for module in (bus, watch, objects, settings, tare, snapshot)
+    for module in (find, bus, watch, objects, settings, tare, snapshot)
     for command in module.COMMANDS
 }
 

@@ -14,7 +14,7 @@ from ethercat_server.ethercat.slave.coe import Steps, finish
 from ethercat_server.links.holder import find_holder
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
-from ethercat_server.tool.commands.snapshot_file import RESTORABLE
+from ethercat_server.tool.snapshot_file import RESTORABLE
 from protocol.settings import sinc_length_of
 from tests.server.running import needs_bus
 from tests.tool.running import one_sentence, tool_here

@@ -16,12 +16,13 @@ from ethercat_server.doctor.bus.through_server import ServerView
 from ethercat_server.doctor.examination import examine
 from ethercat_server.doctor.finding import CannotLookError, Finding, bad, cannot_look, skipped
 from ethercat_server.doctor.machine import nic
-from ethercat_server.doctor.machine.facts import promiscuity_kept, read_counters
+from ethercat_server.doctor.machine.facts import read_counters
 from ethercat_server.doctor.machine.machine import Machine
 from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
 from ethercat_server.ethercat.nic.ip import network_trouble
 from ethercat_server.links.holder import Holder, find_holder
+from ethercat_server.links.promiscuity import promiscuity_kept
 from protocol.address import Address
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from typing import Any, Final
 from ethercat_server.doctor.finding import cannot_look
 from ethercat_server.ethercat.nic.ip import Routes, find_routes
 
-_IFF_UP, _IFF_LOOPBACK, _IFF_PROMISC = 0x1, 0x8, 0x100
+_IFF_UP, _IFF_LOOPBACK = 0x1, 0x8
 _NO_SUPPORT: Final = "the driver does not support it"
 _UNKNOWN_SPEEDS: Final = frozenset({0, 0xFFFF, 0xFFFFFFFF})
 _DUPLEX: Final = {0: "half", 1: "full"}
@@ -193,22 +193,3 @@ def read_counters(ifname: str) -> dict[str, int]:
     """The present counters of `ifname`; empty if they cannot be read."""
     link = _asked(_link, ifname)
     return dict(link.counters) if isinstance(link, Link) else {}
-
-
-@contextlib.contextmanager
-def promiscuity_kept(ifname: str) -> Iterator[None]:
-    """Restore promiscuous mode to off afterwards if it was off before: SOEM switches it on and leaves it."""
-    from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
-    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - likewise
-
-    def is_promiscuous() -> bool | None:
-        flags = {row.get_attr("IFLA_IFNAME"): row["flags"] for row in _links().values()}.get(ifname)
-        return None if flags is None else bool(flags & _IFF_PROMISC)
-
-    before = is_promiscuous()
-    try:
-        yield
-    finally:
-        if before is False and is_promiscuous():
-            with IPRoute() as route, contextlib.suppress(NetlinkError, OSError):
-                route.link("set", index=socket.if_nametoindex(ifname), flags=0, change=_IFF_PROMISC)

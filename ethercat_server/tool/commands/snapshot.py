@@ -24,8 +24,8 @@ from ethercat_server.tool.commands.settings import (
     saving_lines,
     verify,
 )
-from ethercat_server.tool.commands.snapshot_file import RESTORABLE, Snapshot, SnapshotFile, read_snapshot
 from ethercat_server.tool.show import columns, report, value_text
+from ethercat_server.tool.snapshot_file import RESTORABLE, Snapshot, SnapshotFile, read_snapshot
 from protocol.settings import SettingValue
 
 
