@@ -176,6 +176,18 @@ def test_what_every_interface_may_have_is_no_network(routes: Routes, why: str | 
 # -- who has it
 
 
+def test_a_master_of_somebody_elses_is_named_with_its_process(veth: Veth) -> None:
+    """It has no lock of ours, only the raw socket: whose that is only the kernel knows."""
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as its:
+        its.bind((veth.near, 0x88A4))
+        name = Path("/proc/self/comm").read_text().strip()
+        assert f"is in use by another EtherCAT master, process {os.getpid()} ({name}): stop" in refusal(
+            veth.near
+        )
+    with claimed(veth.near):
+        pass
+
+
 @contextlib.contextmanager
 def another(ifname: str) -> Iterator[subprocess.Popen[str]]:
     """Another process that has claimed the interface."""

@@ -15,11 +15,11 @@ from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic.interface import look_up, trouble
 from ethercat_server.ethercat.nic.ip import ALLOW_IP, find_routes, network_trouble
 from ethercat_server.ethercat.nic.lock import in_use, locked
+from ethercat_server.ethercat.nic.packet_sockets import master_sockets, users_of
 
 MAX_NAME_LENGTH: Final = 15
 """Linux's limit; a longer name would overflow SOEM's buffer."""
 
-_ETHERCAT: Final = 0x88A4
 _CARRIER_TIMEOUT_S: Final = 5.0
 _CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
 
@@ -34,7 +34,7 @@ def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
     index = _check_allowed(ifname, allow_ip=allow_ip)
     # Of two that start at once neither has the bus open yet, so looking for that is not enough.
     with locked(ifname, index):
-        _check_free(ifname, index)
+        _check_free(ifname)
         _wait_usable(ifname)
         yield
 
@@ -72,12 +72,10 @@ def _check_no_network(ifname: str) -> None:
         raise InterfaceError(problem)
 
 
-def _check_free(ifname: str, index: int) -> None:
+def _check_free(ifname: str) -> None:
     """Raise InterfaceError if another EtherCAT master has the interface open: two would wreck one another."""
-    for line in Path("/proc/self/net/packet").read_text(encoding="ascii").splitlines()[1:]:
-        _, _, _, protocol, its_index, *_ = line.split()
-        if int(protocol, 16) == _ETHERCAT and int(its_index) == index:
-            raise in_use(ifname)
+    if inodes := master_sockets(ifname):
+        raise in_use(ifname, next((process.pid for process in users_of(inodes)), 0))
 
 
 def _wait_usable(ifname: str) -> None:
