@@ -18,6 +18,7 @@ from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
 from protocol.errors import SettingError
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
+from protocol.text.did_you_mean import did_you_mean
 
 if TYPE_CHECKING:
     from ethercat_server.sensor.sensor import Identity
@@ -211,7 +212,8 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, SettingValue]:
         if not equals:
             raise UsageError(f"--set {assignment}: it must be NAME=VALUE, for example --set sinc_length=64")
         if setting is None:
-            raise UsageError(f"no setting {name.strip()!r}: available are " + ", ".join(SETTINGS))
+            name, there = name.strip(), ", ".join(SETTINGS)
+            raise UsageError(f"no setting {name!r}: available are {there}{did_you_mean(name, SETTINGS)}")
         try:
             values[setting.name] = setting.parse(text)
         except SettingError as error:

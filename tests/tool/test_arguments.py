@@ -212,3 +212,18 @@ def test_nobody_holds_an_interface_that_is_not_there() -> None:
 def test_the_notes_scripts_are_these_commands(script: str, command: str) -> None:
     text = (ROOT / "scripts" / f"{script}.py").read_text()
     assert f'main(["{command}", *sys.argv[1:]])' in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "guess"),
+    [
+        (["wach", "ens5"], "did you mean 'watch'?"),
+        (["apply", "ens5", "--set", "sinc_lenght=64"], "did you mean 'sinc_length'?"),
+        (["apply", "ens5", "--set", "FIR_filter=on"], "fast, chop"),
+        (["xyzzy"], "there are adapters, "),
+    ],
+)
+def test_a_name_that_there_is_not_is_answered_with_the_nearest(arguments: list[str], guess: str) -> None:
+    said = tool_here(*arguments, code=2).err
+    assert guess in said
+    assert ("did you mean" in said) == ("did you mean" in guess)
