@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 from protocol.errors import SettingError
 from protocol.sensor.filters import FORCE_TORQUE_FILTERS
+from protocol.text.did_you_mean import did_you_mean
 
 SettingValue = bool | int
 
@@ -142,7 +143,9 @@ def check_settings(values: Mapping[str, object]) -> dict[str, SettingValue]:
     for name, value in values.items():
         setting = SETTINGS.get(name)
         if setting is None:
-            raise SettingError(f"no setting {name!r}: the settings are " + ", ".join(SETTINGS))
+            raise SettingError(
+                f"no setting {name!r}: the settings are {', '.join(SETTINGS)}{did_you_mean(name, SETTINGS)}"
+            )
         checked[name] = setting.check(value)
     return checked
 

@@ -135,7 +135,7 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     bus = SimulatedBus(MemoryBackend(*options.slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(look, "read_image", _read_image)
-        patch.setattr(direct, "open_bus", lambda _ifname, _cleanup: Bus(bus.backend))
+        patch.setattr(direct, "open_bus", lambda _ifname, _cleanup, **_: Bus(bus.backend))
         patch.setattr(realtime, "prepare", lambda _priority, _cpu: None)
         patch.setattr(measurement, "_client", _client)
         yield bus

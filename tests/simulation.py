@@ -56,11 +56,12 @@ class Asked:
     sensor_name: str | None = None
     force = False
 
-    def __init__(self, settings: Mapping[str, SettingValue] = {}) -> None:
+    def __init__(self, settings: Mapping[str, SettingValue] = {}, *, keep_unset: bool = False) -> None:
         self._settings = dict(settings)
+        self.keep_unset = keep_unset
 
     def wanted_settings(self, _position: int, _name: str, _serial: int) -> dict[str, SettingValue]:
-        return {**start_up_defaults(), **self._settings}
+        return {**({} if self.keep_unset else start_up_defaults()), **self._settings}
 
     def asked_settings(self, _position: int, _name: str, _serial: int) -> dict[str, SettingValue]:
         return dict(self._settings)
@@ -85,6 +86,7 @@ class Simulation:
         machine: Machine | None = None,
         settings: Mapping[str, SettingValue] = {},
         backend: MemoryBackend | None = None,
+        keep_unset: bool = False,
     ) -> None:
         """`backend` is that of a simulation before, for a server that is started again."""
         self.backend = backend or MemoryBackend(*sensors, machine=machine)
@@ -93,7 +95,7 @@ class Simulation:
         self.transport = InMemoryTransport(self.clock)
         self.hub = Hub(self.listen(), self.clock.monotonic_ns)
         self.bus = Bus(self.backend)
-        self.sensors, slaves = bring_up(self.bus, Asked(settings), lambda: None)
+        self.sensors, slaves = bring_up(self.bus, Asked(settings, keep_unset=keep_unset), lambda: None)
         self.others = Others(self.bus, slaves)
         timing = ExchangeTiming(self.clock.now_ns)
         self.streams = [SensorStream(s.number, s.period_ns, timing, self.clock) for s in self.sensors]

@@ -13,7 +13,7 @@ from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.chain import Setup
 from scripts.benchmarks.modes.cards import SERVERS, Card, cards, derived, measure_cards, table
 from scripts.benchmarks.processes.relay import Delay
-from scripts.demonstration.program import DemoError
+from scripts.demonstration.child import DemoError
 
 SETUP = Setup(800, 1, 5.0, 1.0, 0, ppm=0.0)
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.chain import Setup
 from scripts.benchmarks.modes import compensation
-from scripts.demonstration.program import DemoError
+from scripts.demonstration.child import DemoError
 
 pytestmark = pytest.mark.ros
 SETUP = Setup(800, 1, 1.0, 0.0, 0, ppm=0.0)

@@ -9,7 +9,7 @@ import pytest
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.modes import cpp
 from scripts.benchmarks.modes.cpp import build, figures, run
-from scripts.demonstration.program import DemoError
+from scripts.demonstration.child import DemoError
 from tests.clients import cpp_programs
 from tests.clients.cpp_programs import needs_gxx, patient
 

@@ -14,7 +14,7 @@ from scripts.benchmarks.chain import Setup
 from scripts.benchmarks.modes import vendor
 from scripts.benchmarks.modes.vendor import first_ages, measure_vendor, rows, table
 from scripts.benchmarks.statistics import Arrivals
-from scripts.demonstration.program import DemoError
+from scripts.demonstration.child import DemoError
 
 PERIOD_NS = 1_250_000
 NO_STOPS = np.empty((0, 2), dtype=np.int64)

@@ -39,3 +39,13 @@ def test_the_files_of_the_architecture_page_exist() -> None:
         assert files, row
         for name in files:
             assert (ROOT / name).exists(), name
+
+
+def test_the_troubleshooting_page_is_one_screen_and_quotes_what_is_said() -> None:
+    text = (ROOT / "docs" / "troubleshooting.md").read_text()
+    assert len(text.split()) <= 300
+    said = "".join(path.read_text() for path in sorted((ROOT / "ethercat_server").rglob("*.py")))
+    symptoms = re.findall(r"^\| ((?:`[^`]+`(?:, )?)+) \|", text, re.MULTILINE)
+    assert len(symptoms) > 5
+    for quoted in re.findall(r"`([^`]+)`", " ".join(symptoms)):
+        assert quoted in said, quoted

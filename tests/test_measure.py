@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
+import re
+
+import numpy as np
+import pytest
 
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import SampleDecoder, encode
-from scripts.demonstration.measure import Measurement, percentile, verdict
+from scripts.demonstration.measure import Measurement, explanation, percentile, verdict
+from scripts.demonstration.show import Screen, print_summary
 
 PERIOD_NS = 1_250_000
 SECOND_NS = 1_000_000_000
@@ -93,6 +98,46 @@ def test_each_fault_is_found() -> None:
     gap = measured()
     gap.take_frame(frame(805, DataFlag.GAP), 805 * PERIOD_NS)
     assert gap.summary().lost_before == 4
+
+
+def test_what_the_machines_stops_took_is_told_apart_and_in_words() -> None:
+    measurement = measured()
+    measurement.rate_hz = 800.0
+    measurement.take_frame(frame(821, DataFlag.GAP), 821 * PERIOD_NS)  # 801 to 820 never came
+    measurement.take_frame(frame(822), 822 * PERIOD_NS)  # and these two not to the subscriber
+    measurement.take_message(values(822), 823 * PERIOD_NS)
+    stops = np.array([[799 * PERIOD_NS, 815 * PERIOD_NS], [900 * PERIOD_NS, 902 * PERIOD_NS]])
+    summary = measurement.summary(stops)
+    assert (summary.lost_before, summary.lost, summary.lost_in_stops) == (20, 1, 14)
+    assert "21 samples are missing, 14 of them made while this machine itself stopped" in str(
+        explanation(summary)
+    )
+    assert "2 times, for up to 20.0 ms" in str(explanation(summary))
+    assert "never stopped" in str(explanation(measurement.summary()))
+    assert explanation(measured().summary(stops)) is None
+
+
+def test_a_gap_without_numbers_is_as_long_as_the_rate_has_it() -> None:
+    measurement = measured()
+    measurement.rate_hz = 800.0
+    data = frame(850).process_data
+    measurement.take_frame(DataMessage(801, 0, 850 * PERIOD_NS, 0, DataFlag.GAP, 3, data), 851 * PERIOD_NS)
+    assert measurement.lost_before == 49
+    stops = np.array([[790 * PERIOD_NS, 851 * PERIOD_NS]])
+    assert measurement.summary(stops).lost_in_stops == 49
+
+
+def test_the_live_figure_of_what_is_lost_is_the_summarys(capsys: pytest.CaptureFixture[str]) -> None:
+    measurement = measured()
+    measurement.take_frame(frame(805, DataFlag.GAP), 805 * PERIOD_NS)
+    measurement.take_frame(frame(806), 806 * PERIOD_NS)
+    measurement.take_message(values(806), 806 * PERIOD_NS)
+    sensor = {"name": "BFT-SENS-ECAT-M8", "serial": 1, "rate_hz": 800}
+    Screen(sensor).show(measurement)
+    print_summary(measurement.summary(), sensor)
+    shown = capsys.readouterr().out
+    assert "lost 5 " in shown
+    assert re.search(r"Lost +│ +5 ", shown)
 
 
 def test_counting_begins_anew() -> None:

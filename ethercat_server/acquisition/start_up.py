@@ -18,10 +18,10 @@ from ethercat_server.sensor.look import Slave
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.scan import look_safely, scan, unreadable
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState, is_known_model
-from ethercat_server.sensor.set_up import identify, read_offset, set_up
-from protocol.errors import PdoSizeError
+from ethercat_server.sensor.set_up import identify, read_in_force, read_offset, set_up
+from protocol.errors import PdoSizeError, SettingError
 from protocol.pdo import layout_for
-from protocol.settings import SettingValue
+from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -41,6 +41,10 @@ class Wanted(Protocol):
     def force(self) -> bool:
         """Whether to take over a bus that is in use."""
 
+    @property
+    def keep_unset(self) -> bool:
+        """Whether settings that nobody asked for stay as the sensors have them, not the defaults."""
+
     def wanted_settings(self, number: int, name: str, serial: int, /) -> dict[str, SettingValue]:
         """The settings to be in force in a sensor."""
 
@@ -55,6 +59,7 @@ class AsFound:
     """Nothing is asked: the sensors stay set as they are."""
 
     sensor_name = None
+    keep_unset = True
 
     def __init__(self, *, force: bool = False) -> None:
         self.force = force
@@ -85,6 +90,8 @@ def bring_up(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Start
     found = find_sensors(bus, wanted, check_interrupt)
     for sensor in found.sensors:
         sdo = GuardedSdo(BlockingSdo(bus, sensor.number, check_interrupt))
+        if wanted.keep_unset:
+            _keep_unset(sdo, sensor)
         finish(set_up(sdo, sensor), clock=bus.clock)
         _tell_offset(sdo, sensor)
     check_interrupt()
@@ -159,6 +166,25 @@ def _none_of_ours(ifname: str, others: list[Slave]) -> str:
         f"on {ifname}, only {', '.join(map(str, others))}: check the sensor's cable and power, and that this "
         "is the interface it is connected to"
     )
+
+
+def _keep_unset(sdo: Sdo, sensor: Sensor) -> None:
+    """Want what the sensor has where nobody asked for anything; BusError if the two are inconsistent."""
+    asked = dict(sensor.wanted)
+    finish(read_in_force(sdo, sensor, asked), clock=sdo.clock)
+    kept = {name: value for name, value in sensor.wanted.items() if name not in asked}
+    sensor.wanted = {"sinc_length": start_up_defaults()["sinc_length"], **kept, **asked}
+    try:
+        check_combination(sensor.wanted)
+    except SettingError as error:
+        raise BusError(f"sensor {sensor.number} keeps settings that contradict those set: {error}") from None
+    sensor.asked = frozenset(sensor.wanted)
+    texts = [
+        f"{name} = {str(value).lower()}"
+        for name, value in kept.items()
+        if SETTINGS[name].default not in (None, value)
+    ]
+    log.info("sensor %d keeps what nobody set: %s", sensor.number, ", ".join(texts) or "the defaults")
 
 
 def _tell_offset(sdo: Sdo, sensor: Sensor) -> None:

@@ -11,6 +11,7 @@ from ethercat_server.errors import UsageError
 from protocol.errors import SettingError
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import SettingValue, check_settings
+from protocol.text.did_you_mean import did_you_mean
 
 
 class ConfigFile(NamedTuple):
@@ -53,7 +54,8 @@ def _server(table: dict[str, Any]) -> dict[str, Any]:
     for key, value in table.items():
         setting = SERVER_SETTINGS.get(key)
         if setting is None:
-            raise UsageError(f"[server] has no {key!r}: it takes {', '.join(SERVER_SETTINGS)}")
+            guess = did_you_mean(key, SERVER_SETTINGS)
+            raise UsageError(f"[server] has no {key!r}: it takes {', '.join(SERVER_SETTINGS)}{guess}")
         try:
             values[key] = setting.check(value)
         except ValueError as error:

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ethercat_server import __version__
 from ethercat_server.daemon.config_file import EMPTY, read_config
-from ethercat_server.daemon.server_settings import SERVER_SETTINGS, ServerSetting
+from ethercat_server.daemon.server_settings import KEEP, SERVER_SETTINGS, ServerSetting
 from ethercat_server.errors import UsageError
+from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
 from protocol.errors import SettingError
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
+from protocol.text.did_you_mean import did_you_mean
 
 if TYPE_CHECKING:
     from ethercat_server.sensor.sensor import Identity
@@ -37,6 +39,8 @@ class ServerOptions:
     """The configuration file."""
     force: bool = False
     """Whether to take over a bus that is in use."""
+    allow_ip: bool = False
+    """Whether to use an interface of the machine's network."""
     server: Mapping[str, Any] = field(
         default_factory=lambda: {name: setting.default for name, setting in SERVER_SETTINGS.items()}
     )
@@ -53,6 +57,11 @@ class ServerOptions:
         """Whether to start a virtual bus."""
         return self.ifname == VIRTUAL_INTERFACE
 
+    @property
+    def keep_unset(self) -> bool:
+        """Whether the sensors keep the settings that nobody set."""
+        return bool(self.server["unset_settings"] == KEEP)
+
     def asked_settings(self, number: int, name: str, serial: int) -> dict[str, SettingValue]:
         """The settings the user gave for the sensor `number` with this name and serial number."""
         asked: dict[str, SettingValue] = {}
@@ -61,8 +70,8 @@ class ServerOptions:
         return asked
 
     def wanted_settings(self, number: int, name: str, serial: int) -> dict[str, SettingValue]:
-        """The start-up defaults overridden by these; UsageError if the result is inconsistent."""
-        wanted = {**start_up_defaults(), **self.asked_settings(number, name, serial)}
+        """The start-up defaults, unless kept, overridden by these; UsageError if that is inconsistent."""
+        wanted = {**self._defaults, **self.asked_settings(number, name, serial)}
         try:
             check_combination(wanted)
         except SettingError as error:
@@ -72,6 +81,10 @@ class ServerOptions:
                 f"correct one of {sources}"
             ) from None
         return wanted
+
+    @property
+    def _defaults(self) -> dict[str, SettingValue]:
+        return {} if self.keep_unset else start_up_defaults()
 
     def _sources(self, number: int, name: str, serial: int) -> list[tuple[str, dict[str, SettingValue]]]:
         """Where settings for this sensor come from, and which; later ones override earlier ones."""
@@ -101,9 +114,7 @@ class ServerOptions:
     def check(self) -> None:
         """SettingError if the settings of any sensor are inconsistent."""
         for own in ({}, *self.sensor_settings.values()):
-            check_combination(
-                {**start_up_defaults(), **self.common_settings, **own, **self.assigned_settings}
-            )
+            check_combination({**self._defaults, **self.common_settings, **own, **self.assigned_settings})
 
 
 @functools.cache
@@ -123,6 +134,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--force", action="store_true",
         help="take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop",
     )  # fmt: skip
+    parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",
         help="set a setting of every sensor at start-up; repeatable",
@@ -138,7 +150,7 @@ def build_parser() -> argparse.ArgumentParser:
     for setting in SERVER_SETTINGS.values():
         text = setting.meaning + ("; repeatable" if setting.many else "")
         if not setting.many and setting.default is not None:
-            text += f" (default {setting.default:g})"
+            text += f" (default {setting.default if setting.text else format(setting.default, 'g')})"
         parser.add_argument(
             setting.flag, dest=setting.name, metavar=setting.metavar, help=text,
             type=_parse_with(setting), action="append" if setting.many else "store",
@@ -168,6 +180,7 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
         sensor_name=arguments[1] if len(arguments) == 3 else None,
         config=parsed.config,
         force=parsed.force,
+        allow_ip=parsed.allow_ip,
         virtual_arguments=parsed.virtual,
         server={
             name: _first_given(getattr(parsed, name), config.server.get(name), setting)
@@ -199,7 +212,8 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, SettingValue]:
         if not equals:
             raise UsageError(f"--set {assignment}: it must be NAME=VALUE, for example --set sinc_length=64")
         if setting is None:
-            raise UsageError(f"no setting {name.strip()!r}: available are " + ", ".join(SETTINGS))
+            name, there = name.strip(), ", ".join(SETTINGS)
+            raise UsageError(f"no setting {name!r}: available are {there}{did_you_mean(name, SETTINGS)}")
         try:
             values[setting.name] = setting.parse(text)
         except SettingError as error:

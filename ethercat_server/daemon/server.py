@@ -45,7 +45,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         ifname, priority = options.ifname, options.server["rt_priority"]
         if options.is_virtual:
             ifname = cleanup.enter_context(_virtual_bus(options)).ifname
-        cleanup.enter_context(claimed(ifname))
+        cleanup.enter_context(claimed(ifname, allow_ip=options.allow_ip))
         backend = SoemBackend(ifname)
         bus = Bus(backend)
         backend.on_emergency = bus.emergencies.note

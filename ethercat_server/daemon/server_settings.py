@@ -9,6 +9,8 @@ from typing import Any, Final, NamedTuple
 
 from ethercat_server.process import realtime
 
+DEFAULTS: Final = "defaults"
+KEEP: Final = "keep"
 DEFAULT_RT_PRIORITY: Final = realtime.DEFAULT_PRIORITY
 
 
@@ -77,6 +79,12 @@ def _address(text: str) -> str:
         raise ValueError("an IP address of this machine, such as 127.0.0.1 or 0.0.0.0") from None
 
 
+def _unset(text: str) -> str:
+    if text in (DEFAULTS, KEEP):
+        return text
+    raise ValueError(f"'{DEFAULTS}' or '{KEEP}'")
+
+
 def _name(text: str) -> str:
     if text and text.isprintable():
         return text
@@ -101,6 +109,11 @@ _ROWS: Final = (
         "user", "NAME", "user that a server started by root becomes before it serves clients (default: who "
         "ran sudo; 'root' to stay root)",
         _name, None, text=True,
+    ),
+    ServerSetting(
+        "unset_settings", "WHAT", f"what settings that nobody set become at start: '{DEFAULTS}' writes the "
+        f"server's, '{KEEP}' leaves the sensor's",
+        _unset, DEFAULTS, at_once=True, text=True,
     ),
     ServerSetting(
         "rt_priority", "N", "SCHED_FIFO priority, if permitted; 0 for ordinary scheduling",

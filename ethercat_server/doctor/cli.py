@@ -16,6 +16,7 @@ from ethercat_server.daemon.options import VIRTUAL_INTERFACE
 from ethercat_server.daemon.server_settings import SERVER_SETTINGS
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.nic.claim import MAX_NAME_LENGTH
+from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import command_line
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def build_parser() -> argparse.ArgumentParser:
             setting.flag, dest=name, type=_whole, metavar=setting.metavar, default=setting.default,
             help=f"measure like a server with this option: {setting.meaning}",
         )  # fmt: skip
+    parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
@@ -129,6 +131,7 @@ def _machine(args: argparse.Namespace, cleanup: contextlib.ExitStack) -> Machine
 
     resolution = time.clock_getres(time.CLOCK_MONOTONIC)
     own = {"asked": args.iface, "timer_resolution_s": resolution, "rt_priority": args.rt_priority}
+    own["allow_ip"] = args.allow_ip
     if args.iface != VIRTUAL_INTERFACE:
         return Machine(args.iface, facts=collect(args.iface), **own)
     machine = Machine(args.iface, **own)

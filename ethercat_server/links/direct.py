@@ -49,11 +49,11 @@ _BACK_S: Final = 10.0
 """Timeout for a sensor lost during a tare to come back for its old offset."""
 
 
-def open_bus(ifname: str, cleanup: contextlib.ExitStack) -> Bus:
+def open_bus(ifname: str, cleanup: contextlib.ExitStack, *, allow_ip: bool = False) -> Bus:
     """The open bus on `ifname`, or on a virtual bus for `virtual`; `cleanup` closes it."""
     if ifname == VIRTUAL_INTERFACE:
         ifname = cleanup.enter_context(VirtualBus()).ifname
-    cleanup.enter_context(claimed(ifname))
+    cleanup.enter_context(claimed(ifname, allow_ip=allow_ip))
     backend = SoemBackend(ifname)
     bus = Bus(backend)
     backend.on_emergency = bus.emergencies.note
@@ -62,9 +62,11 @@ def open_bus(ifname: str, cleanup: contextlib.ExitStack) -> Bus:
     return bus
 
 
-def read_images(ifname: str, cleanup: contextlib.ExitStack, *, force: bool) -> dict[int, bytes | BusError]:
+def read_images(
+    ifname: str, cleanup: contextlib.ExitStack, *, force: bool, allow_ip: bool
+) -> dict[int, bytes | BusError]:
     """The SII of every slave on the wire, of any vendor, by position; all stay in the state they are in."""
-    bus = open_bus(ifname, cleanup)
+    bus = open_bus(ifname, cleanup, allow_ip=allow_ip)
     images: dict[int, bytes | BusError] = {}
     for slave in look_safely(bus, _no_check, force=force):
         try:
@@ -77,9 +79,11 @@ def read_images(ifname: str, cleanup: contextlib.ExitStack, *, force: bool) -> d
 class DirectLink(Link):
     """All sensors in PREOP; `watch` and `tare` take them to OP with their present settings."""
 
-    def __init__(self, ifname: str, *, any_slave: bool = False, force: bool = False) -> None:
+    def __init__(
+        self, ifname: str, *, any_slave: bool = False, force: bool = False, allow_ip: bool = False
+    ) -> None:
         with contextlib.ExitStack() as cleanup:
-            self._bus = open_bus(ifname, cleanup)
+            self._bus = open_bus(ifname, cleanup, allow_ip=allow_ip)
             self.clock = self._bus.clock
             if any_slave:
                 self.sensors = _identify_all(self._bus, force=force)

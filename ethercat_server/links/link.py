@@ -7,18 +7,18 @@ import signal
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from ethercat_server.errors import BusError, UsageError
 from ethercat_server.ethercat.clock import Clock
-from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
+from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.sensor import Identity, Sensor
-from ethercat_server.sensor.set_up import read_settings, read_sinc
+from ethercat_server.sensor.set_up import NO_SETTINGS, read_in_force
 from protocol.accounting import NOT_NEW
 from protocol.framing import DataFlag, DataMessage
 from protocol.sensor_choice import SensorChoice
-from protocol.settings import SettingValue, sinc_length_of
+from protocol.settings import SettingValue
 
 
 class Found(NamedTuple):
@@ -38,7 +38,6 @@ class Found(NamedTuple):
         return {"sensor": self.number, **self.identity._asdict()}
 
 
-NO_SETTINGS: Final[Mapping[str, SettingValue]] = {}
 OnFrame = Callable[[DataMessage], bool]
 """Receives a DATA message; returns whether to continue."""
 
@@ -133,22 +132,6 @@ def choose(sensors: Sequence[Found], wanted: str | None) -> Found:
         many = "more than one sensor" if found else "no sensor"
         raise UsageError(f"--sensor {wanted}: {many} matches (available: {there})")
     return found[0]
-
-
-def read_in_force(sdo: Sdo, sensor: Sensor, asked: Mapping[str, SettingValue] = NO_SETTINGS) -> Steps[None]:
-    """Read settings and rate, and take them as wanted.
-
-    The SINC length that is `asked` for is in force if it has the rate and what is read does not.
-    """
-    length, rate, chop = yield from read_sinc(sdo)
-    sensor.rate_hz = rate or 0
-    held = sinc_length_of(length, rate, chop, asked.get("sinc_length"))
-    sensor.sinc_guessed = chop and held not in (length, asked.get("sinc_length"))
-    sensor.wanted = {"sinc_length": held or 0}
-    yield from read_settings(sdo, sensor)
-    if not held:
-        sensor.hold({name: value for name, value in sensor.settings.items() if name != "sinc_length"})
-    sensor.wanted = dict(sensor.settings)
 
 
 def note(text: str) -> None:

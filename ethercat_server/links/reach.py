@@ -12,18 +12,24 @@ from protocol.program.server_choice import default_server, is_address
 
 
 def open_link(
-    ifname: str | None, server: str | None, *, any_slave: bool = False, force: bool = False
+    ifname: str | None,
+    server: str | None,
+    *,
+    any_slave: bool = False,
+    force: bool = False,
+    allow_ip: bool = False,
 ) -> Link:
     """The link to the sensors on `ifname`, or behind `server`; UsageError if both are given.
 
     If a server uses the interface, the link goes through that server, with a note. With `any_slave`, slaves
-    that are not sensors are included, for read-only commands; with `force`, a bus in use is taken over.
+    that are not sensors are included, for read-only commands; with `force`, a bus in use is taken over, with
+    `allow_ip`, an interface of the machine's network is used.
     """
     link = find_server(ifname, server)
     if link is not None:
         return link
     assert ifname is not None
-    return DirectLink(ifname, any_slave=any_slave, force=force)
+    return DirectLink(ifname, any_slave=any_slave, force=force, allow_ip=allow_ip)
 
 
 def find_server(ifname: str | None, server: str | None) -> ServerLink | None:

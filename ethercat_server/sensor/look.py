@@ -38,6 +38,10 @@ _KNOWN: Final = ("vendor", "product", "revision", "name")
 """What `describe` says of a slave from its SII."""
 
 
+class NoSlaveError(BusError):
+    """No slave answers."""
+
+
 class Slave(NamedTuple):
     """One slave on the wire, of any vendor."""
 
@@ -90,7 +94,7 @@ def look(bus: Bus, check_interrupt: CheckInterrupt) -> list[Slave]:
     """All slaves, in their order on the wire, without their SIIs; BusError if there are none."""
     count = max(bus.count_slaves(_PROBE_BYTES, _TIMEOUT_S) for _ in range(_ATTEMPTS))
     if count <= 0:
-        raise BusError(
+        raise NoSlaveError(
             f"no EtherCAT slave answers on {bus.ifname}: check the cable, that the sensor has power and "
             "that this is the interface it is connected to"
         )

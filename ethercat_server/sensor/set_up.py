@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError
@@ -16,12 +16,14 @@ from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.sensor import SETTLING_S, Identity, Sensor
-from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor
+from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor, sinc_length_of
 from protocol.text.visible import visible
 
 _LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]
 """sinc_length."""
 _OFFSETS: Final = tuple((dictionary.FORCE_TORQUE_OFFSET, sub) for sub in range(1, 7))
+
+NO_SETTINGS: Final[Mapping[str, SettingValue]] = {}
 
 log = logging.getLogger(__name__)
 
@@ -63,10 +65,14 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     texts = [f"{name} = {text} (wanted: {_text(sensor.wanted[name])})" for name, text in held.items()]
     if rate_hz != sensor.rate_hz:
         texts.append(f"a sampling rate of {rate_hz} Hz (wanted: {sensor.rate_hz} Hz)")
+        held[_LAST] = str(rate_hz)
     if texts:
+        unset = ", ".join(name for name in held if name not in sensor.asked)
         log.info(
-            "sensor %d held %s: what is wanted was written and verified", sensor.number, ", ".join(texts)
-        )
+            "sensor %d held %s: what is wanted was written and verified%s",
+            sensor.number, ", ".join(texts),
+            unset and f"; nobody set {unset}: --unset-settings keep leaves what the sensor has",
+        )  # fmt: skip
     yield from read_settings(sdo, sensor)
     yield from _restore_offset(sdo, sensor)
     sensor.unsettled = False
@@ -198,6 +204,22 @@ def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
             log.warning("sensor %d: %s", sensor.number, error)
     held["sinc_length"] = sensor.wanted["sinc_length"]
     sensor.hold(held)
+
+
+def read_in_force(sdo: Sdo, sensor: Sensor, asked: Mapping[str, SettingValue] = NO_SETTINGS) -> Steps[None]:
+    """Read settings and rate, and take them as wanted.
+
+    The SINC length that is `asked` for is in force if it has the rate and what is read does not.
+    """
+    length, rate, chop = yield from read_sinc(sdo)
+    sensor.rate_hz = rate or 0
+    held = sinc_length_of(length, rate, chop, asked.get("sinc_length"))
+    sensor.sinc_guessed = chop and held not in (length, asked.get("sinc_length"))
+    sensor.wanted = {"sinc_length": held or 0}
+    yield from read_settings(sdo, sensor)
+    if not held:
+        sensor.hold({name: value for name, value in sensor.settings.items() if name != "sinc_length"})
+    sensor.wanted = dict(sensor.settings)
 
 
 def read_sinc(sdo: Sdo) -> Steps[tuple[int | None, int | None, bool]]:

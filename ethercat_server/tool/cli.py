@@ -11,8 +11,9 @@ from typing import Any, Final, NoReturn
 from ethercat_server import __version__
 from ethercat_server.process import command_line
 from ethercat_server.tool.command import Command
-from ethercat_server.tool.commands import bus, objects, settings, snapshot, tare, watch
+from ethercat_server.tool.commands import bus, find, objects, settings, snapshot, tare, watch
 from ethercat_server.tool.show import say_json
+from protocol.text.did_you_mean import did_you_mean
 
 _PROGRAM: Final = "ethercat-sensor"
 _EXIT_CODES: Final = (
@@ -21,7 +22,7 @@ _EXIT_CODES: Final = (
 
 COMMANDS: Final[Mapping[str, Command]] = {
     command.name: command
-    for module in (bus, watch, objects, settings, tare, snapshot)
+    for module in (find, bus, watch, objects, settings, tare, snapshot)
     for command in module.COMMANDS
 }
 
@@ -78,7 +79,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if argv is None else list(argv)
     # The subcommand has a parser of its own, with options and arguments in any order.
     _Parser.as_json = "--json" in arguments
-    command = COMMANDS[build_parser().parse_args(arguments[:1]).command]
+    parser = build_parser()
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
+        guess = did_you_mean(arguments[0], COMMANDS)
+        parser.error(f"no command {arguments[0]!r}: there are {', '.join(COMMANDS)}{guess}")
+    command = COMMANDS[parser.parse_args(arguments[:1]).command]
     args = build_command_parser(command).parse_intermixed_args(arguments[1:])
     return command_line.run(_PROGRAM, lambda: command.run(args), as_json=args.json)
 

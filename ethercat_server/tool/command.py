@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
+from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.links.link import Link
 from ethercat_server.links.reach import open_link
 from protocol.program.server_choice import HELP
@@ -44,6 +45,7 @@ def add_link_arguments(
             help="take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop",
         )  # fmt: skip
     parser.set_defaults(take_over=False)
+    parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
     default = "all" if all_if_none else "the only one"
     parser.add_argument(
         "--sensor",
@@ -55,7 +57,9 @@ def add_link_arguments(
 @contextlib.contextmanager
 def link(args: argparse.Namespace, *, any_slave: bool = False) -> Iterator[Link]:
     """The link given by the arguments (see `open_link`); closed at the end."""
-    opened = open_link(args.iface, args.server, any_slave=any_slave, force=args.take_over)
+    opened = open_link(
+        args.iface, args.server, any_slave=any_slave, force=args.take_over, allow_ip=args.allow_ip
+    )
     try:
         yield opened
     finally:

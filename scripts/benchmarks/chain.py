@@ -22,7 +22,7 @@ from protocol.errors import ProtocolError
 from scripts.benchmarks import statistics
 from scripts.benchmarks.records import began
 from scripts.benchmarks.statistics import Floats, Ints
-from scripts.demonstration.program import Child, DemoError
+from scripts.demonstration.child import Child, DemoError
 
 PORT: Final = 12001
 SERVER: Final = "ethercat_server.daemon.cli"

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from scripts.benchmarks.statistics import Floats
-from scripts.demonstration.program import DemoError
+from scripts.demonstration.child import DemoError
 
 Curves = dict[str, Floats]
 """Ages in ns, by what they are of."""

@@ -32,7 +32,8 @@ from scripts.benchmarks.modes.vendor import measure_vendor
 from scripts.benchmarks.plot import Curves, draw
 from scripts.benchmarks.records import may_be_real_time
 from scripts.benchmarks.report import print_configuration
-from scripts.demonstration.program import DemoError, Stopped, ignore_signals, loopback_up, on_signal
+from scripts.demonstration.child import DemoError
+from scripts.demonstration.program import Stopped, ignore_signals, loopback_up, on_signal
 
 MOST_CPUS: Final = 4
 """CPUs used: each of them runs a canary."""

@@ -25,7 +25,8 @@ _NUMBER_WRAP: Final = 2**24
 _INSTANT_WRAP_NS: Final = 2**20 * 1_000_000_000
 """Where the signal `clock` begins anew."""
 _QUANTILES: Final = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-_COVERED: Final = 0.5
+COVERED: Final = 0.5
+"""The part of a sample's period that must be a stop for the sample to be lost to it."""
 
 
 class Arrivals(NamedTuple):
@@ -112,7 +113,7 @@ def count(arrivals: Arrivals, period_ns: float, stopped: Ints) -> Counts:
         made=made,
         arrivals=len(arrivals.number),
         lost=len(missing),
-        lost_in_stops=int(np.count_nonzero(covered(born, period_ns, stopped) >= _COVERED)),
+        lost_in_stops=int(np.count_nonzero(covered(born, period_ns, stopped) >= COVERED)),
         repeated=len(arrivals.number) - len(numbers),
     )
 

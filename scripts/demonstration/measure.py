@@ -7,14 +7,18 @@ whether it was decoded right follow from the sample with exactly the same twelve
 from __future__ import annotations
 
 import math
+from array import array
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from protocol.accounting import FrameKind, StreamAccounting
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import Sample, SampleDecoder
+from scripts.benchmarks.statistics import COVERED, Ints, covered
 
 _REMEMBERED: Final = 8192
 """Samples that are remembered: some seconds' worth."""
@@ -24,6 +28,8 @@ FULL_RATE: Final = 0.95
 """Fewer messages than this part of the samples: something could not keep up."""
 _LEAST_RATE: Final = 0.6
 """Fewer than this part, and something is wrong."""
+
+NO_STOPS: Final[Ints] = np.empty((0, 2), dtype=np.int64)
 
 Values = tuple[float, ...]
 
@@ -42,6 +48,10 @@ class Summary(NamedTuple):
     rate_hz: float
     lost: int
     lost_before: int
+    lost_in_stops: int
+    """Of both: those made while the machine stopped."""
+    stops: int
+    longest_stop_ms: float
     repeated: int
     age_p50_ms: float
     age_p99_ms: float
@@ -66,9 +76,15 @@ class Measurement:
     """Age of the newest message when it came."""
     ages_ns: list[int] = field(default_factory=list)
     tcp_ages_ns: list[int] = field(default_factory=list)
+    rate_hz: float = 0.0
+    """The sensor's, once it is known: a gap is as long as its rate has it."""
     _samples: int = 0
     _stream: StreamAccounting = field(default_factory=StreamAccounting)
     _missing_at_begin: int = 0
+    _missing_ns: list[float] = field(default_factory=list)
+    """When the missing samples were made."""
+    _made_ns: array[int] = field(default_factory=lambda: array("q"))
+    """When each that came from the server was made, by position from 1."""
     _known: dict[Values, Known] = field(default_factory=dict)
     _order: deque[Values] = field(default_factory=deque)
     _waiting: deque[tuple[Values, int]] = field(default_factory=deque)
@@ -86,6 +102,7 @@ class Measurement:
         self._missing_at_begin = self._stream.counts.missing
         self.messages = self.repeated = self.not_finite = self.unknown = 0
         del self._positions[:-1]
+        self._missing_ns.clear()
         self.ages_ns.clear()
         self.tcp_ages_ns.clear()
         self._first_ns = self._last_ns
@@ -94,7 +111,11 @@ class Measurement:
         """A frame came from the server."""
         if frame.flags & DataFlag.GAP:
             self._gap_ns = frame.monotonic_ns
+        before, self._stream.rate_hz = self._stream.counts.missing, self.rate_hz
         kind = self._stream.take(frame.sequence, frame.monotonic_ns, frame.flags)
+        if missing := self._stream.counts.missing - before:
+            step = (frame.monotonic_ns - self._passed_ns) / (missing + 1)
+            self._missing_ns += [self._passed_ns + step * n for n in range(1, missing + 1)]
         if kind is not FrameKind.NEW:
             return
         size = len(frame.process_data)
@@ -102,6 +123,7 @@ class Measurement:
         self.latest = decoder.decode(frame.process_data)
         self._samples += 1
         self._passed_ns = frame.monotonic_ns
+        self._made_ns.append(frame.monotonic_ns)
         self.tcp_ages_ns.append(now_ns - frame.monotonic_ns)
         values = tuple(self.latest.array)
         self._known[values] = Known(self._samples, frame.monotonic_ns)
@@ -162,8 +184,17 @@ class Measurement:
             return 0
         return self._positions[-1] - self._positions[0] + 1 - len(set(self._positions))
 
-    def summary(self) -> Summary:
-        """The figures so far."""
+    def _lost_in(self, stops: Ints) -> int:
+        """How many of all that are missing were made in these stops of the machine."""
+        missing = set(range(self._positions[0], self._positions[-1])) if self._positions else set()
+        made = [*self._missing_ns, *(self._made_ns[n - 1] for n in missing.difference(self._positions))]
+        if not made or not self.rate_hz:
+            return 0
+        part = covered(np.array(made), 1e9 / self.rate_hz, stops)
+        return int(np.count_nonzero(part >= COVERED))
+
+    def summary(self, stops: Ints = NO_STOPS) -> Summary:
+        """The figures so far; `stops` of the machine, (n, 2), begin and end in CLOCK_MONOTONIC ns."""
         seconds = (self._last_ns - self._first_ns) / 1e9
         matched = len(self._positions)
         return Summary(
@@ -171,6 +202,9 @@ class Measurement:
             rate_hz=(matched - 1) / seconds if seconds > 0 else 0.0,
             lost=self.lost,
             lost_before=self.lost_before,
+            lost_in_stops=self._lost_in(stops),
+            stops=len(stops),
+            longest_stop_ms=float((stops[:, 1] - stops[:, 0]).max()) / 1e6 if len(stops) else 0.0,
             repeated=self.repeated,
             age_p50_ms=percentile(self.ages_ns, 0.5) / 1e6,
             age_p99_ms=percentile(self.ages_ns, 0.99) / 1e6,
@@ -179,6 +213,23 @@ class Measurement:
             all_finite=self.not_finite == 0,
             all_decoded_right=self.unknown == 0,
         )
+
+
+def explanation(summary: Summary) -> str | None:
+    """Why samples are missing, in words; None if none are."""
+    missing = summary.lost + summary.lost_before
+    if not missing:
+        return None
+    if not summary.stops:
+        return (
+            f"{missing} samples are missing, although this machine never stopped: clients could not keep up."
+        )
+    times = f"{summary.stops} times" if summary.stops > 1 else "once"
+    return (
+        f"{missing} samples are missing, {summary.lost_in_stops} of them made while this machine itself "
+        f"stopped, which it did {times}, for up to {summary.longest_stop_ms:.1f} ms: other programs or "
+        "a hypervisor had its processors. 'A steadier cycle' in docs/operations.md helps."
+    )
 
 
 def percentile(values: Sequence[int], share: float) -> int:

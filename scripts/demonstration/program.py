@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import ctypes
 import fcntl
 import os
 import shutil
 import signal
 import socket
 import struct
-import subprocess
 import sys
 import tempfile
 import threading
@@ -26,19 +24,15 @@ from typing import Any, Final
 
 from protocol.client import Client
 from protocol.errors import ConnectionFailedError, ProtocolError
+from scripts.demonstration.child import Child, DemoError
 from scripts.demonstration.measure import FULL_RATE, Measurement, verdict
 from scripts.demonstration.show import Screen, print_summary
+from scripts.demonstration.stops import Canaries
 
 PORT: Final = 12001
 TOPIC: Final = "/sensone_sensor_data"
 _START_TIMEOUT_S: Final = 30.0
-_STOP_TIMEOUT_S: Final = 8.0
 _SETTLING_S: Final = 0.3
-_PR_SET_PDEATHSIG: Final = 1
-
-
-class DemoError(Exception):
-    """The demo cannot go on; the text is one sentence."""
 
 
 class Stopped(Exception):  # noqa: N818 - not an error
@@ -52,59 +46,6 @@ def loopback_up() -> None:
         answer = fcntl.ioctl(any_socket, siocgifflags, struct.pack("16sh14x", b"lo", 0))
         (flags,) = struct.unpack_from("h", answer, 16)
         fcntl.ioctl(any_socket, siocsifflags, struct.pack("16sh14x", b"lo", flags | iff_up))
-
-
-class Child:
-    """A program of ours that runs beside the demo and never outlives it."""
-
-    def __init__(self, name: str, command: Sequence[str], directory: Path) -> None:
-        self.name = name
-        self._log = directory / f"{name}.log"
-        libc = ctypes.CDLL(None)
-
-        def die_with_parent() -> None:
-            libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-            signal.pthread_sigmask(signal.SIG_SETMASK, set())
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-        with self._log.open("wb") as log:
-            # A session of its own: Ctrl-C is for the demo, which then stops its children in order.
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-                preexec_fn=die_with_parent,  # noqa: PLW1509 - there are no threads yet
-            )
-
-    @property
-    def pid(self) -> int:
-        """Its process number."""
-        return self._process.pid
-
-    def check(self) -> None:
-        """DemoError, with its last words, if it has ended."""
-        code = self._process.poll()
-        if code is not None:
-            lines = self._log.read_text(errors="replace").strip().splitlines()[-8:]
-            raise DemoError(
-                "\n    ".join([f"{self.name} ended by itself with exit code {code}; it said:", *lines])
-            )
-
-    def stop(self) -> str | None:
-        """End it; what was wrong about how it ended, or None."""
-        early = self._process.poll()
-        if early is None:
-            self._process.terminate()
-        try:
-            code = self._process.wait(_STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-            return f"{self.name} did not end when told to and was killed"
-        return None if code == 0 else f"{self.name} ended with exit code {code}"
 
 
 def wait_for_server(server: Child) -> tuple[Client, dict[str, Any]]:
@@ -199,15 +140,19 @@ def run(seconds: float | None, directory: Path) -> int:
         stack.callback(client.close)
         ears = Ears(client, measurement)
         stack.callback(ears.close)
+        measurement.rate_hz = float(sensor["rate_hz"])
         wait_for_messages(children, measurement)
+        canaries = Canaries(directory, 1e9 / measurement.rate_hz)
+        stack.callback(canaries.stop)
         time.sleep(_SETTLING_S)
         with ears.lock:
             measurement.begin()
         with contextlib.suppress(Stopped), Screen(sensor) as screen:
             show(screen, ears, children, seconds)
         ignore_signals()
+        stops = canaries.stop()
         with ears.lock:
-            summary = measurement.summary()
+            summary = measurement.summary(stops)
     print_summary(summary, sensor)
     trouble = verdict(summary, float(sensor["rate_hz"])) or next(filter(None, troubles), None)
     if trouble is not None:

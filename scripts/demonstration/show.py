@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from scripts.demonstration.measure import Measurement, Summary
+from scripts.demonstration.measure import Measurement, Summary, explanation
 
 _ROWS: Final = (
     ("Force", "force", "N", 2),
@@ -71,7 +71,7 @@ class Screen:
             for _, name, unit, digits in _ROWS
         )
         return (
-            f"age {measurement.age_ns / 1e6:.2f} ms  lost {measurement.lost}  "
+            f"age {measurement.age_ns / 1e6:.2f} ms  lost {measurement.lost + measurement.lost_before}  "
             f"repeated {measurement.repeated}  {vectors}"
         )
 
@@ -87,7 +87,8 @@ class Screen:
         table.add_section()
         table.add_row("Messages a second", f"{self._rate_hz:.1f}", "", "")
         table.add_row("Age at the subscriber", f"{measurement.age_ns / 1e6:.2f} ms", "", "")
-        table.add_row("Lost, repeated", str(measurement.lost), str(measurement.repeated), "")
+        lost = measurement.lost + measurement.lost_before
+        table.add_row("Lost, repeated", str(lost), str(measurement.repeated), "")
         table.caption = "Ctrl-C ends it"
         return table
 
@@ -101,8 +102,10 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
         ("Messages", str(summary.messages)),
         ("Mean rate", f"{summary.rate_hz:.1f} Hz"),
         ("Sensor's own rate", f"{sensor['rate_hz']} Hz"),
-        ("Lost between server and subscriber", str(summary.lost)),
-        ("Lost before or withheld (GAP)", str(summary.lost_before)),
+        ("Lost", str(summary.lost + summary.lost_before)),
+        ("  before or withheld (GAP)", str(summary.lost_before)),
+        ("  between server and subscriber", str(summary.lost)),
+        ("  of both, while the machine stopped", str(summary.lost_in_stops)),
         ("Repeated", str(summary.repeated)),
         ("Age at the subscriber, p50", f"{summary.age_p50_ms:.2f} ms"),
         ("Age at the subscriber, p99", f"{summary.age_p99_ms:.2f} ms"),
@@ -113,6 +116,8 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
     ):
         table.add_row(name, value)
     Console().print(table)
+    if (why := explanation(summary)) is not None:
+        print(why)
 
 
 def _yes(fact: bool) -> str:

@@ -10,7 +10,8 @@ import pytest
 from ethercat_server.doctor.examination import examine_machine
 from ethercat_server.doctor.finding import CannotLookError, Level
 from ethercat_server.doctor.machine import nic
-from ethercat_server.doctor.machine.facts import InterfaceFacts, Routes
+from ethercat_server.doctor.machine.facts import InterfaceFacts
+from ethercat_server.ethercat.nic.ip import Routes
 from tests.doctor.made_up import CPUS, but, machine, only
 
 NAMED = "ens5"
@@ -246,7 +247,7 @@ def test_managers_that_leave_it_alone(tmp_path: Path, files: dict[str, str]) -> 
     ("routes", "level"),
     [
         (Routes(("10.0.0.2/24",), (), True), Level.BAD),
-        (Routes(("10.0.0.2/24",)), Level.WARNING),
+        (Routes(("10.0.0.2/24",)), Level.BAD),
         (Routes(others=("10.1.0.0/16",)), Level.WARNING),
         (Routes(link_local=("fe80::1/64",)), Level.NOTE),
         (Routes(), Level.OK),

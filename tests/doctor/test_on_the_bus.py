@@ -10,7 +10,7 @@ import pytest
 
 from ethercat_server.doctor.bus import examination
 from ethercat_server.doctor.finding import Level
-from ethercat_server.doctor.machine.facts import Routes
+from ethercat_server.ethercat.nic.ip import Routes
 from ethercat_server.links.holder import Holder
 from tests.doctor.made_up import but
 from tests.doctor.running import examined
@@ -138,8 +138,8 @@ def test_a_sensor_that_goes_away_while_it_measures(single: SimulatedBus, tmp_pat
         ({"link": {"loopback": True}}, "it is the loopback interface"),
         ({"link": {"master": "br0"}}, "part of a bridge"),
         ({"link": {"upper": ("ens5.7",)}}, "part of a bridge, bond or VLAN"),
-        ({"routes": Routes(addresses=("192.0.2.77/32",))}, "it carries IP"),
-        ({"routes": Routes(default=True)}, "it carries IP"),
+        ({"routes": Routes(addresses=("192.0.2.77/32",))}, "has the IP address 192.0.2.77/32"),
+        ({"routes": Routes(default=True)}, "has the machine's default route"),
         ({"routes": "Permission denied"}, "its IP configuration is unknown (Permission denied)"),
     ],
 )

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from ethercat_server.doctor.cli import main
-from ethercat_server.doctor.machine.facts import Link, Routes, collect
+from ethercat_server.doctor.machine.facts import Link, collect
+from ethercat_server.ethercat.nic.ip import Routes
 from ethercat_server.links.holder import find_holder
 from tests.doctor.running import ATTEMPTS, MODULE, STARVED, doctor, doctor_here, doctor_of_nobody, levels
 from tests.server import readable

@@ -22,8 +22,8 @@ def error(reply: dict[str, Any]) -> dict[str, Any]:
 class Bench:
     """The two clients; `client` has subscribed."""
 
-    def __init__(self, *sensors: SensorOptions, backend: MemoryBackend | None = None) -> None:
-        self.simulation = Simulation(*(sensors or (AT_REST,)), backend=backend)
+    def __init__(self, *sensors: SensorOptions, backend: MemoryBackend | None = None, **asked: Any) -> None:
+        self.simulation = Simulation(*(sensors or (AT_REST,)), backend=backend, **asked)
         self.client, self.asking = self.simulation.connect(), self.simulation.connect()
         self.client.ask("subscribe")
         self.client.fresh(50)
@@ -33,7 +33,7 @@ class Bench:
         """See `Client`."""
         return self.client.wait_event(name)
 
-    def start_again(self) -> Bench:
-        """End this server and start another one on the same sensors."""
+    def start_again(self, **asked: Any) -> Bench:
+        """End this server and start another one on the same sensors; see `Simulation` for `asked`."""
         self.simulation.close()
-        return Bench(backend=self.simulation.backend)
+        return Bench(backend=self.simulation.backend, **asked)

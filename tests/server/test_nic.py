@@ -15,13 +15,18 @@ from pathlib import Path
 
 import pytest
 
+from ethercat_server.daemon.server import serve
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import lock
 from ethercat_server.ethercat.nic.claim import claimed
 from ethercat_server.ethercat.nic.interface import look_up, why_silent
+from ethercat_server.ethercat.nic.ip import Routes, network_trouble
+from ethercat_server.process.signals import Signals
+from tests.doctor.running import doctor_here
 from tests.server import readable
 from tests.server.as_another_user import NO_OTHER_USER, NOBODY
 from tests.server.running import Veth, needs_bus, wait_until
+from tests.tool.running import tool_here
 
 pytestmark = [pytest.mark.bus, needs_bus]
 AS_NOBODY = pytest.mark.skipif(NO_OTHER_USER is not None, reason=NO_OTHER_USER or "")
@@ -91,7 +96,96 @@ def test_an_interface_that_is_down_or_gone_is_why_nothing_comes_back(veth: Veth)
     assert "no network interface 'nothing0'" in why_silent("nothing0")
 
 
+# -- an interface of the machine's network
+
+IN_A_NETWORK = """
+set -e
+ip link add near0 type veth peer name far0
+ip link set far0 up
+ip link set near0 up
+ip address add 192.0.2.7/24 dev near0
+ip route add default via 192.0.2.1
+exec "$@"
+"""
+"""In a network namespace, where a default route hurts nobody."""
+REFUSE = """
+import sys
+from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.nic.claim import claimed
+try:
+    with claimed("near0"):
+        pass
+except InterfaceError as error:
+    print(error)
+with claimed("near0", allow_ip=True):
+    print("allowed")
+"""
+
+
+def test_the_default_route_is_refused_unless_it_is_allowed() -> None:
+    """Only in a network namespace of its own may a test have one, so this is a process."""
+    done = subprocess.run(
+        ["unshare", "--net", "bash", "-c", IN_A_NETWORK, "bash", sys.executable, "-c", REFUSE],
+        check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    refused, allowed = done.stdout.splitlines()
+    assert "near0 has the machine's default route" in refused, done.stderr
+    assert "'ethercat-sensor adapters' lists them" in refused
+    assert "--allow-ip" in refused
+    assert allowed == "allowed"
+
+
+def test_an_address_is_refused_by_server_tool_and_doctor_and_marked(veth: Veth) -> None:
+    veth.ip("address", "add", "192.0.2.77/32", "dev", veth.near)
+    why = f"{veth.near} has the IP address 192.0.2.77/32"
+    try:
+        assert refusal(veth.near).startswith(why)
+        assert f"'sudo ip address flush dev {veth.near}'" in refusal(veth.near)
+        assert why in tool_here("watch", veth.near, code=1).err
+        with pytest.raises(InterfaceError, match="has the IP address"):
+            serve([veth.near, "14999", "--user", "root"], Signals())
+        found = doctor_here(veth.near, "--seconds", 0, "--json")
+        assert why in found.findings("bus")["slaves"]["found"]
+        assert (found.code, found.findings("other software")["addresses"]["level"]) == (1, "bad")
+        line = next(
+            line for line in tool_here("adapters").out.splitlines() if line.startswith(f"{veth.near} ")
+        )
+        assert "not for a sensor: 192.0.2.77/32" in line
+        with claimed(veth.near, allow_ip=True):
+            pass
+    finally:
+        veth.ip("address", "flush", "dev", veth.near)
+    with claimed(veth.near):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("routes", "why"),
+    [
+        (Routes(("10.0.0.2/24",), (), True), "default route"),
+        (Routes(("2001:db8::2/64",)), "address 2001:db8::2/64"),
+        (Routes((), ("fe80::1/64",), others=("10.1.0.0/16",)), None),
+        (Routes(), None),
+    ],
+)
+def test_what_every_interface_may_have_is_no_network(routes: Routes, why: str | None) -> None:
+    problem = network_trouble("ens5", routes)
+    assert problem is None if why is None else problem is not None and why in problem
+
+
 # -- who has it
+
+
+def test_a_master_of_somebody_elses_is_named_with_its_process(veth: Veth) -> None:
+    """It has no lock of ours, only the raw socket: whose that is only the kernel knows."""
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as its:
+        its.bind((veth.near, 0x88A4))
+        name = Path("/proc/self/comm").read_text().strip()
+        assert f"is in use by another EtherCAT master, process {os.getpid()} ({name}): stop" in refusal(
+            veth.near
+        )
+    with claimed(veth.near):
+        pass
 
 
 @contextlib.contextmanager

@@ -147,6 +147,20 @@ def test_the_servers_own_settings_from_file_and_command_line(tmp_path: Path) -> 
     )
 
 
+def test_unset_settings_are_the_defaults_or_the_sensors(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text('[server]\nunset_settings = "keep"\n[sensor]\nfast = true\n')
+    kept = parse_options(["ens5", "1", "--config", str(file)])
+    assert kept.keep_unset
+    assert kept.wanted_settings(0, "BFT-SENS-ECAT-M8", 1) == {"fast": True}, "fir is the sensor's"
+    assert not parse_options(["ens5", "1"]).keep_unset
+    with pytest.raises(UsageError, match="fast is true but fir is false"):
+        parse_options(["ens5", "1", "--config", str(file), "--unset-settings", "defaults"])
+    file.write_text('[server]\nunset_settings = "perhaps"\n')
+    with pytest.raises(UsageError, match="must be 'defaults' or 'keep'"):
+        parse_options(["ens5", "1", "--config", str(file)])
+
+
 def test_every_server_setting_is_on_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         parse_options(["--help"])

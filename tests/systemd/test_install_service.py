@@ -102,6 +102,24 @@ def test_another_port_and_a_second_interface_and_the_end_of_all(copied: Stage) -
     assert "nothing is installed" in copied.run("--uninstall")
 
 
+def test_a_dry_run_says_what_would_be_done_and_does_nothing(copied: Stage, tmp_path: Path) -> None:
+    fresh = Stage(tmp_path / "fresh")
+    said = fresh.run("--dry-run", "--keep-environment", "--bridge", "ens5")
+    assert fresh.files() == {}
+    assert "would write /etc/systemd/system/ethercat-bridge.service\n" in said
+    before = copied.files()
+    (copied.prefix / "pyvenv.cfg").touch()
+    edited = copied.path / CONFIGURATION[1:]
+    edited.write_text(before[CONFIGURATION] + "# mine\n")
+    before = copied.files()
+    said = copied.run("--dry-run", "--uninstall")
+    assert copied.files() == before
+    assert copied.prefix.exists()
+    assert f"kept {CONFIGURATION}, which was edited" in said
+    assert "would remove /etc/ethercat-server/ens5.env\n" in said
+    assert "would remove /opt/ethercat-server\n" in said
+
+
 def test_edited_configuration_is_kept_and_an_old_unit_is_not(copied: Stage) -> None:
     edited = copied.path / CONFIGURATION[1:]
     edited.write_text("[sensor]\nfir = true\n")
@@ -117,7 +135,9 @@ def test_uninstall_leaves_nothing_that_was_not_edited_and_touches_no_folder_of_o
     (copied.prefix / "precious").touch()
     copied.run("--uninstall")
     assert not copied.files()
-    assert not (copied.path / "etc/ethercat-server").exists()
+    assert [str(path.relative_to(copied.path)) for path in copied.path.iterdir()] == ["opt"], (
+        "no empty folders"
+    )
     assert (copied.prefix / "precious").exists()
 
 
@@ -176,12 +196,20 @@ mkdir -p /opt/ethercat-server/bin
 cp /bin/true /opt/ethercat-server/bin/ethercat-server
 touch /opt/ethercat-server/pyvenv.cfg
 cd "$2"
-scripts/install-service --keep-environment virtual
+refused=0
+scripts/install-service --keep-environment virtual || refused=$?
+scripts/install-service --no-start --dry-run --keep-environment virtual
+echo "refused with $refused, files $(find /etc/ethercat-server /var/lib -type f 2>/dev/null | wc -l)"
+before=$(find /etc /opt /var/lib -type d | sort)
+rm -rf /etc/systemd
+scripts/install-service --no-start --keep-environment virtual
 getent passwd ethercat ethercat-bridge
 echo "installed $(find /etc/ethercat-server /opt /var/lib -type f | wc -l)"
 echo "network managers told $(find /etc -path '*etwork*ethercat*' | wc -l)"
 scripts/install-service --uninstall
 echo "left $(find /etc/ethercat-server /opt /var/lib -type f 2>/dev/null | wc -l)"
+echo "folders $(comm -13 <(echo "$before") <(find /etc /opt /var/lib -type d | sort) | wc -l)"
+[ ! -e /etc/systemd ]
 """
 """The real thing, without --root: in a mount namespace with an /etc, /opt, /var/lib and /run of its own."""
 
@@ -197,11 +225,15 @@ def test_without_a_staging_root_it_makes_users_and_cleans_up(tmp_path: Path) -> 
         check=False, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    users, files = done.stdout.splitlines()[:2], done.stdout.splitlines()[2:]
+    refused, *users = done.stdout.splitlines()[:3]
+    files = done.stdout.splitlines()[3:]
+    assert refused == "refused with 1, files 0"
+    assert "systemd does not run here, so no service could start: " in done.stderr
+    assert "would write /etc/systemd/system/ethercat-server@.service" in done.stderr
     assert [line.split(":")[0] for line in users] == ["ethercat", "ethercat-bridge"]
     assert all(line.endswith("nologin") for line in users)
-    assert files == ["installed 5", "network managers told 0", "left 0"]
-    assert "next: systemctl enable --now 'ethercat-server@virtual'" in done.stderr
+    assert files == ["installed 5", "network managers told 0", "left 0", "folders 0"]
+    assert "systemd does not run here: nothing starts it" in done.stderr
 
 
 def test_every_package_is_in_the_copy_that_is_built() -> None:

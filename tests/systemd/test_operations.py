@@ -13,7 +13,7 @@ ROOMS = ("ethercat", "sensor", "acquisition", "serving", "process", "daemon")
 """What runs in the server; programs beside it have pages of their own."""
 SERVER = [path for room in ROOMS for path in sorted((ROOT / "ethercat_server" / room).rglob("*.py"))]
 SERVER.append(ROOT / "ethercat_server/virtual_sensor/virtual_bus.py")
-ERRORS = {"ServerError", "InterfaceError", "BusError", "SdoAbortError"}
+ERRORS = {"ServerError", "InterfaceError", "BusError", "NoSlaveError", "SdoAbortError"}
 """UsageError is not one of them: it answers what was just typed, and has one line for all."""
 GENERAL = {"check cable and power", "power it off and on", "power the sensor off and on", "then start again"}
 """Advice that many messages end with."""

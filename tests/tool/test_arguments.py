@@ -14,7 +14,7 @@ from ethercat_server.ethercat.slave.coe import Steps, finish
 from ethercat_server.links.holder import find_holder
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
-from ethercat_server.tool.commands.snapshot_file import RESTORABLE
+from ethercat_server.tool.snapshot_file import RESTORABLE
 from protocol.settings import sinc_length_of
 from tests.server.running import needs_bus
 from tests.tool.running import one_sentence, tool_here
@@ -221,3 +221,18 @@ def test_nobody_holds_an_interface_that_is_not_there() -> None:
 def test_the_notes_scripts_are_these_commands(script: str, command: str) -> None:
     text = (ROOT / "scripts" / f"{script}.py").read_text()
     assert f'main(["{command}", *sys.argv[1:]])' in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "guess"),
+    [
+        (["wach", "ens5"], "did you mean 'watch'?"),
+        (["apply", "ens5", "--set", "sinc_lenght=64"], "did you mean 'sinc_length'?"),
+        (["apply", "ens5", "--set", "FIR_filter=on"], "fast, chop"),
+        (["xyzzy"], "there are adapters, "),
+    ],
+)
+def test_a_name_that_there_is_not_is_answered_with_the_nearest(arguments: list[str], guess: str) -> None:
+    said = tool_here(*arguments, code=2).err
+    assert guess in said
+    assert ("did you mean" in said) == ("did you mean" in guess)

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from ethercat_server.links.survey import adapters
+from ethercat_server.tool.commands import find
 from tests.server.commands import stats, written
 from tests.server.running import (
     ATTEMPTS,
@@ -50,6 +52,17 @@ def test_adapters_say_what_state_they_are_in(bench: Bench) -> None:
     assert found["lo"]["loopback"]
     line = next(line for line in tool_here("adapters").out.splitlines() if line.startswith(veth.near))
     assert "up" in line
+
+
+def test_find_looks_where_it_may(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The states are the kernel's, the frames pysoem's; of this machine's interfaces only the test's own."""
+    veth, sensor = bench
+    own = (veth.near, veth.far)
+    monkeypatch.setattr(find, "adapters", lambda: [row for row in adapters() if row.name in own])
+    found = {row["name"]: row for row in tool_here("find", "--json").json["interfaces"]}
+    assert [row["serial"] for row in found[veth.near]["sensors"]] == [10, 20]
+    assert f"process {sensor.process.pid}" in found[veth.far]["found"]
+    assert "PROMISC" not in veth.ip("link", "show", veth.near)
 
 
 def test_a_master_that_is_no_server_is_named(bench: Bench) -> None:

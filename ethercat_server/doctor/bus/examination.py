@@ -16,11 +16,13 @@ from ethercat_server.doctor.bus.through_server import ServerView
 from ethercat_server.doctor.examination import examine
 from ethercat_server.doctor.finding import CannotLookError, Finding, bad, cannot_look, skipped
 from ethercat_server.doctor.machine import nic
-from ethercat_server.doctor.machine.facts import promiscuity_kept, read_counters
+from ethercat_server.doctor.machine.facts import read_counters
 from ethercat_server.doctor.machine.machine import Machine
 from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
+from ethercat_server.ethercat.nic.ip import network_trouble
 from ethercat_server.links.holder import Holder, find_holder
+from ethercat_server.links.promiscuity import promiscuity_kept
 from protocol.address import Address
 
 if TYPE_CHECKING:
@@ -77,10 +79,13 @@ def _check_may_look(machine: Machine, holder: Holder | None) -> None:
     if there.loopback:
         cannot_look("it is the loopback interface")
     routes = machine.facts.routes
-    if isinstance(routes, str):
-        cannot_look(f"its IP configuration is unknown ({routes}), so no frame is sent there")
-    if routes.default or routes.addresses or there.master or there.upper:
-        cannot_look("it carries IP, or is part of a bridge, bond or VLAN, so no frame is sent there")
+    if not machine.allow_ip:
+        if isinstance(routes, str):
+            cannot_look(f"its IP configuration is unknown ({routes}), so no frame is sent there")
+        if problem := network_trouble(machine.shown, routes):
+            cannot_look(problem)
+    if there.master or there.upper:
+        cannot_look("it is part of a bridge, bond or VLAN, so no frame is sent there")
     if not there.up or not there.carrier:
         cannot_look("it is down" if not there.up else "it has no carrier")
 
@@ -115,7 +120,7 @@ def _on_bus(machine: Machine, request: Request) -> Iterator[Finding]:
     with contextlib.ExitStack() as cleanup:
         cleanup.enter_context(promiscuity_kept(machine.ifname))
         try:
-            bus = open_bus(machine.ifname, cleanup)
+            bus = open_bus(machine.ifname, cleanup, allow_ip=machine.allow_ip)
         except ServerError as error:
             yield replace(bad(str(error), ""), subject="bus", check="slaves")
             return

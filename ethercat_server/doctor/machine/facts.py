@@ -15,11 +15,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from ethercat_server.doctor.finding import cannot_look
+from ethercat_server.ethercat.nic.ip import Routes, find_routes
 
-_IFF_UP, _IFF_LOOPBACK, _IFF_PROMISC = 0x1, 0x8, 0x100
-_MAIN_TABLE: Final = 254
-_MADE_BY_KERNEL: Final = 2
-_LINK_LOCAL_SCOPE: Final = 253
+_IFF_UP, _IFF_LOOPBACK = 0x1, 0x8
 _NO_SUPPORT: Final = "the driver does not support it"
 _UNKNOWN_SPEEDS: Final = frozenset({0, 0xFFFF, 0xFFFFFFFF})
 _DUPLEX: Final = {0: "half", 1: "full"}
@@ -48,19 +46,6 @@ class Link:
     """Device behind it, by the kernel's name, such as 0000:00:1f.6 or virtio2."""
     counters: dict[str, int] = field(default_factory=dict)
     carrier_changes: int | None = None
-
-
-@dataclass(frozen=True)
-class Routes:
-    """Addresses and routes on it."""
-
-    addresses: tuple[str, ...] = ()
-    """With the length of their prefix; link-local ones of IPv6 are not among them."""
-    link_local: tuple[str, ...] = ()
-    default: bool = False
-    """The machine's default route goes here."""
-    others: tuple[str, ...] = ()
-    """Destinations of the routes that somebody made."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +88,7 @@ def collect(ifname: str) -> InterfaceFacts:
     return InterfaceFacts(
         link=_asked(_link, ifname),
         names=names,
-        routes=_asked(_routes, ifname),
+        routes=_asked(find_routes, ifname),
         settings=_asked(_settings, ifname),
         driver=_asked(_driver, ifname),
         coalescing=_asked(_coalescing, ifname),
@@ -208,50 +193,3 @@ def read_counters(ifname: str) -> dict[str, int]:
     """The present counters of `ifname`; empty if they cannot be read."""
     link = _asked(_link, ifname)
     return dict(link.counters) if isinstance(link, Link) else {}
-
-
-@contextlib.contextmanager
-def promiscuity_kept(ifname: str) -> Iterator[None]:
-    """Restore promiscuous mode to off afterwards if it was off before: SOEM switches it on and leaves it."""
-    from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
-    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - likewise
-
-    def is_promiscuous() -> bool | None:
-        flags = {row.get_attr("IFLA_IFNAME"): row["flags"] for row in _links().values()}.get(ifname)
-        return None if flags is None else bool(flags & _IFF_PROMISC)
-
-    before = is_promiscuous()
-    try:
-        yield
-    finally:
-        if before is False and is_promiscuous():
-            with IPRoute() as route, contextlib.suppress(NetlinkError, OSError):
-                route.link("set", index=socket.if_nametoindex(ifname), flags=0, change=_IFF_PROMISC)
-
-
-def _routes(ifname: str) -> Routes:
-    from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
-
-    index = socket.if_nametoindex(ifname)
-    with IPRoute() as route:
-        addresses = [row for row in route.get_addr(index=index) if row["index"] == index]
-        routes = [
-            row
-            for family in (socket.AF_INET, socket.AF_INET6)
-            for row in route.get_routes(oif=index, family=family)
-            if row.get_attr("RTA_OIF") == index and row.get_attr("RTA_TABLE") == _MAIN_TABLE
-        ]
-    texts = [
-        (f"{row.get_attr('IFA_LOCAL') or row.get_attr('IFA_ADDRESS')}/{row['prefixlen']}", row)
-        for row in addresses
-    ]
-    local = {
-        text for text, row in texts if row["family"] == socket.AF_INET6 and row["scope"] == _LINK_LOCAL_SCOPE
-    }
-    made = [row for row in routes if row["proto"] != _MADE_BY_KERNEL and row["dst_len"]]
-    return Routes(
-        addresses=tuple(text for text, _ in texts if text not in local),
-        link_local=tuple(sorted(local)),
-        default=any(row["dst_len"] == 0 for row in routes),
-        others=tuple(f"{row.get_attr('RTA_DST')}/{row['dst_len']}" for row in made),
-    )

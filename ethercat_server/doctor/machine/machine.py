@@ -36,6 +36,8 @@ class Machine:
     release: str = field(default_factory=lambda: os.uname().release)
     rt_priority: int = 80
     """The server's real-time priority."""
+    allow_ip: bool = False
+    """Whether an interface of the machine's network may be used."""
 
     @property
     def shown(self) -> str:

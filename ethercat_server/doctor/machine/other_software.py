@@ -7,9 +7,11 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, warning
-from ethercat_server.doctor.machine.facts import Routes, known
+from ethercat_server.doctor.machine.facts import known
 from ethercat_server.doctor.machine.machine import Machine
-from ethercat_server.links.holder import Holder, Listener, owners, packet_sockets
+from ethercat_server.ethercat.nic.ip import ALLOW_IP, network_trouble
+from ethercat_server.ethercat.nic.packet_sockets import Listener, packet_sockets
+from ethercat_server.links.holder import Holder, owners
 
 _ETHERCAT: Final = 0x88A4
 _EVERYTHING: Final = 3
@@ -56,7 +58,7 @@ def _ifupdown(machine: Machine) -> str:
 def addresses(machine: Machine) -> Iterator[Finding]:
     """IP on the interface."""
     machine.facts.there  # noqa: B018 - there must be one
-    found: Routes = known(machine.facts.routes)
+    found = known(machine.facts.routes)
     name = machine.shown
     values: dict[str, Any] = {
         "addresses": [*found.addresses, *found.link_local],
@@ -64,14 +66,15 @@ def addresses(machine: Machine) -> Iterator[Finding]:
         "default_route": found.default,
     }
     why = "IP traffic delays the sensor's frames"
-    if found.default:
-        yield bad(
-            f"the machine's default route ({', '.join(found.addresses) or 'no address'})",
-            "this is the machine's network: use another interface", "ethercat-sensor adapters",
-            **values,
-        )  # fmt: skip
-    elif found.addresses or found.others:
-        text = ", ".join([*found.addresses, *(f"route to {route}" for route in found.others)])
+    text = ", ".join([*found.addresses, *(f"route to {route}" for route in found.others)])
+    if not machine.allow_ip and network_trouble(name, found):
+        text = f"the machine's default route ({text or 'no address'})" if found.default else text
+        command = "ethercat-sensor adapters" if found.default else f"sudo ip address flush dev {name}"
+        why = f"the server refuses it (without {ALLOW_IP}): use another interface"
+        yield bad(text, why + ("" if found.default else ", or remove its addresses"), command, **values)
+    elif found.default:
+        yield warning(f"the machine's default route ({text or 'no address'})", why, **values)
+    elif text:
         yield warning(text, why, f"sudo ip address flush dev {name}", **values)
     elif found.link_local:
         yield note(

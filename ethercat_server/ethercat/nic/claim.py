@@ -13,31 +13,33 @@ from typing import Final
 
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic.interface import look_up, trouble
+from ethercat_server.ethercat.nic.ip import ALLOW_IP, find_routes, network_trouble
 from ethercat_server.ethercat.nic.lock import in_use, locked
+from ethercat_server.ethercat.nic.packet_sockets import master_sockets, users_of
 
 MAX_NAME_LENGTH: Final = 15
 """Linux's limit; a longer name would overflow SOEM's buffer."""
 
-_ETHERCAT: Final = 0x88A4
 _CARRIER_TIMEOUT_S: Final = 5.0
 _CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
 
 
 @contextlib.contextmanager
-def claimed(ifname: str) -> Iterator[None]:
+def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
     """Within it the bus may be opened on `ifname`, by nobody else of this project.
 
-    InterfaceError unless the interface exists, is free, can carry EtherCAT frames and may be opened.
+    InterfaceError unless the interface exists, is free, can carry EtherCAT frames, may be opened, and is not
+    one of the machine's network, which `allow_ip` permits.
     """
-    index = _check_allowed(ifname)
+    index = _check_allowed(ifname, allow_ip=allow_ip)
     # Of two that start at once neither has the bus open yet, so looking for that is not enough.
     with locked(ifname, index):
-        _check_free(ifname, index)
+        _check_free(ifname)
         _wait_usable(ifname)
         yield
 
 
-def _check_allowed(ifname: str) -> int:
+def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
     if not 0 < len(ifname.encode()) <= MAX_NAME_LENGTH or "/" in ifname:
         raise InterfaceError(
             f"{ifname!r} is no name of a network interface: it must have 1 to {MAX_NAME_LENGTH} characters; "
@@ -46,6 +48,8 @@ def _check_allowed(ifname: str) -> int:
     found = look_up(ifname)
     if found.is_loopback:
         raise InterfaceError(f"{ifname} is the loopback interface: name the one the sensor is connected to")
+    if not allow_ip:
+        _check_no_network(ifname)
     missing = _missing_capabilities()
     if missing:
         raise InterfaceError(
@@ -55,12 +59,23 @@ def _check_allowed(ifname: str) -> int:
     return found.ifindex
 
 
-def _check_free(ifname: str, index: int) -> None:
+def _check_no_network(ifname: str) -> None:
+    """InterfaceError if `ifname` has the default route or an address: EtherCAT frames would go there too."""
+    try:
+        routes = find_routes(ifname)
+    except OSError as error:
+        raise InterfaceError(
+            f"the kernel does not say whether {ifname} has an IP address ({error}): {ALLOW_IP} "
+            "uses it all the same"
+        ) from None
+    if problem := network_trouble(ifname, routes):
+        raise InterfaceError(problem)
+
+
+def _check_free(ifname: str) -> None:
     """Raise InterfaceError if another EtherCAT master has the interface open: two would wreck one another."""
-    for line in Path("/proc/self/net/packet").read_text(encoding="ascii").splitlines()[1:]:
-        _, _, _, protocol, its_index, *_ = line.split()
-        if int(protocol, 16) == _ETHERCAT and int(its_index) == index:
-            raise in_use(ifname)
+    if inodes := master_sockets(ifname):
+        raise in_use(ifname, next((process.pid for process in users_of(inodes)), 0))
 
 
 def _wait_usable(ifname: str) -> None:

@@ -11,19 +11,15 @@ import sys
 from typing import Final, NamedTuple
 
 from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.nic.netlink import GET_LINK, ask
 
 LEAST_MTU: Final = 1500
 """Bytes: an EtherCAT frame may be as long as any Ethernet frame."""
 CHECK_CABLE: Final = "check cable and power"
 
-_RTM_NEWLINK, _RTM_GETLINK, _NLM_F_REQUEST = 16, 18, 1
 _IFLA_MTU, _IFLA_MASTER, _IFLA_CARRIER = 4, 10, 33
-_HEADER: Final = struct.Struct("=IHHII")
-"""Length, type, flags, sequence number, port."""
 _LINK: Final = struct.Struct("=BxHiII")
 """Family, type, index, flags, change mask."""
-_ATTRIBUTE: Final = struct.Struct("=HH")
-_BUFFER: Final = 65536
 _IFF_UP, _IFF_LOOPBACK, _IFF_RUNNING = 0x1, 0x8, 0x40
 
 
@@ -106,20 +102,9 @@ def _name(index: int) -> str:
 
 def _answer(index: int) -> Interface:
     """What the kernel answers about the interface `index`; OSError or struct.error if it does not."""
-    request = _HEADER.pack(_HEADER.size + _LINK.size, _RTM_GETLINK, _NLM_F_REQUEST, 0, 0)
-    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as asked:
-        asked.setblocking(False)  # the kernel answers before send returns
-        asked.send(request + _LINK.pack(0, 0, index, 0, 0))
-        answer = asked.recv(_BUFFER)
-    size, kind, *_ = _HEADER.unpack_from(answer)
-    if kind != _RTM_NEWLINK:
-        raise OSError("no such interface")
-    _, _, index, flags, _ = _LINK.unpack_from(answer, _HEADER.size)
-    values = {_IFLA_MTU: 0, _IFLA_MASTER: 0, _IFLA_CARRIER: 0}
-    at, end = _HEADER.size + _LINK.size, min(size, len(answer))
-    while at + _ATTRIBUTE.size <= end:
-        length, attribute = _ATTRIBUTE.unpack_from(answer, at)
-        if attribute in values:
-            values[attribute] = int.from_bytes(answer[at + _ATTRIBUTE.size : at + length], sys.byteorder)
-        at += max(_ATTRIBUTE.size, length + 3 & ~3)
-    return Interface(index, flags, values[_IFLA_MTU], values[_IFLA_MASTER], bool(values[_IFLA_CARRIER]))
+    (_, _, index, flags, _), found = next(ask(GET_LINK, _LINK, 0, 0, index, 0, 0))
+    mtu, master, carrier = (
+        int.from_bytes(found.get(name, b""), sys.byteorder)
+        for name in (_IFLA_MTU, _IFLA_MASTER, _IFLA_CARRIER)
+    )
+    return Interface(index, flags, mtu, master, bool(carrier))

@@ -1,4 +1,4 @@
-"""`adapters` and `eeprom`: network adapters, and the EEPROMs (SII) of the slaves."""
+"""`eeprom`: the EEPROMs (SII) of the slaves."""
 
 from __future__ import annotations
 
@@ -11,50 +11,12 @@ from typing import Any
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.slave import sii_content
 from ethercat_server.links.direct import read_images
-from ethercat_server.links.holder import find_holder
 from ethercat_server.links.link import Found, choose, note
 from ethercat_server.links.reach import find_server
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.sensor import Identity
 from ethercat_server.tool.command import DONE, Command, add_link_arguments
 from ethercat_server.tool.show import columns, say, say_json
-
-
-def _no_arguments(_: argparse.ArgumentParser) -> None:
-    """`adapters` has none."""
-
-
-def _adapters(args: argparse.Namespace) -> int:
-    from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment, and only this needs it
-
-    found = []
-    with IPRoute() as route:
-        for interface in route.get_links():
-            info = interface.get_attr("IFLA_LINKINFO")
-            name = interface.get_attr("IFLA_IFNAME")
-            holder = find_holder(name)
-            found.append(
-                {
-                    "name": name,
-                    "kind": (info.get_attr("IFLA_INFO_KIND") if info else None) or "",
-                    "address": interface.get_attr("IFLA_ADDRESS"),
-                    "up": bool(interface["flags"] & 0x1),
-                    "carrier": interface.get_attr("IFLA_CARRIER") == 1 and bool(interface["flags"] & 0x1),
-                    "loopback": bool(interface["flags"] & 0x8),
-                    "held_by": str(holder) if holder else None,
-                }
-            )
-    if args.json:
-        say_json({"adapters": found})
-        return DONE
-    rows = [("adapter", "state", "address", "")]
-    for row in found:
-        state = "down" if not row["up"] else "up" if row["carrier"] else "up, no carrier"
-        what = "loopback" if row["loopback"] else row["kind"]
-        held = f"in use by {row['held_by']}" if row["held_by"] else ""
-        rows.append((row["name"], state, row["address"] or "", ", ".join(filter(None, (what, held)))))
-    say(columns(rows))
-    return DONE
 
 
 def _eeprom_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,7 +33,7 @@ def _images(args: argparse.Namespace) -> dict[int, bytes | BusError]:
                 sensor.number: _image(functools.partial(link.sii, sensor.number))
                 for sensor in link.chosen(args.sensor)
             }
-        images = read_images(args.iface, cleanup, force=args.take_over)
+        images = read_images(args.iface, cleanup, force=args.take_over, allow_ip=args.allow_ip)
     if args.sensor is None:
         return images
     found = [_identified(position, image) for position, image in images.items()]
@@ -137,6 +99,5 @@ def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 COMMANDS = (
-    Command("adapters", "list the network adapters of this machine", _no_arguments, _adapters),
     Command("eeprom", "read the slaves' SII (EEPROM): raw words, and decoded", _eeprom_arguments, _eeprom),
 )

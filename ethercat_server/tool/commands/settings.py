@@ -22,7 +22,10 @@ from protocol.sensor.meaning import meaning, value_meaning
 from protocol.settings import SETTINGS, SettingValue
 
 UNSAVED = "in force until the sensor is powered off: use --save, or the command save, to keep it"
-SAVED = "saved to the sensor's flash"
+SAVED = (
+    "saved to the sensor's flash; a server writes its own settings at start: set the same there, or "
+    "--unset-settings keep"
+)
 
 
 def changes(sensor: Sensor, settings: Mapping[str, SettingValue]) -> list[dict[str, Any]]:

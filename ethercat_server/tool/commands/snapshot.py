@@ -23,8 +23,8 @@ from ethercat_server.tool.commands.settings import (
     saving_lines,
     verify,
 )
-from ethercat_server.tool.commands.snapshot_file import RESTORABLE, Snapshot, read_snapshot, text_of
 from ethercat_server.tool.show import columns, report, value_text
+from ethercat_server.tool.snapshot_file import RESTORABLE, Snapshot, read_snapshot, text_of
 from protocol.program.new_file import NewFile
 from protocol.settings import SettingValue
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from scripts.benchmarks.chain import PORT, SERVER, Chain, Setup, chain, recording, start_server, virtual_bus
-from scripts.demonstration.program import DemoError
+from scripts.demonstration.child import DemoError
 
 
 class Card(NamedTuple):

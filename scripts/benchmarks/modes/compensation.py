@@ -26,7 +26,7 @@ from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.stationary_limits import StationaryLimits
 from protocol.pdo import Sample, SampleDecoder, encode
 from scripts.benchmarks.chain import Setup
-from scripts.demonstration.program import DemoError
+from scripts.demonstration.child import DemoError
 
 SAMPLES: Final = 20_000
 SIZE: Final = 61

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from scripts.benchmarks.chain import PORT, Setup, chain, start_server, virtual_bus
 from scripts.benchmarks.statistics import spread_us
-from scripts.demonstration.program import DemoError
+from scripts.demonstration.child import DemoError
 
 _ROOT: Final = Path(__file__).parents[3]
 _WAYS: Final = ("waiting", "polling")

@@ -21,7 +21,7 @@ from scripts.benchmarks.chain import PORT, Chain, CpuUse, Setup, chain, start_se
 from scripts.benchmarks.processes.node_client import COLUMNS
 from scripts.benchmarks.records import began
 from scripts.benchmarks.statistics import Ints, read_numbers
-from scripts.demonstration.program import Child
+from scripts.demonstration.child import Child
 
 _STAMP, _INSTANT, _VALUES, _ARRIVAL = range(COLUMNS)
 RATES: Final = (800, 1600)

@@ -19,7 +19,7 @@ from rich.table import Table
 from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import PORT, Chain, Setup, chain, recording, start_server, virtual_bus
 from scripts.benchmarks.statistics import Arrivals, Floats
-from scripts.demonstration.program import Child, DemoError
+from scripts.demonstration.child import Child, DemoError
 
 VERSION: Final = "1.1.16"
 _REQUIREMENT: Final = f"bota-driver=={VERSION}"

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from scripts.benchmarks.records import connect, sleep_until, steady, write
-from scripts.demonstration.program import DemoError
+from scripts.demonstration.child import DemoError
 
 _WARM_UP_S: Final = 0.3
 _SIZE: Final = 94
