@@ -18,10 +18,11 @@ _KEYWORDS: Final = {
 }  # fmt: skip
 
 
-def problems(name: str, value: object) -> list[str]:
-    """What is wrong about `value` by the schema docs/schemas/NAME.json."""
+def problems(name: str, value: object, part: str | None = None) -> list[str]:
+    """What is wrong about `value` by the schema docs/schemas/NAME.json, or a part of it."""
     schema = json.loads((SCHEMAS / f"{name}.json").read_text())
-    return list(_check(value, schema, schema.get("$defs", {}), "$"))
+    names = schema.get("$defs", {})
+    return list(_check(value, names[part] if part else schema, names, "$"))
 
 
 def _check(value: Any, schema: Mapping[str, Any], names: Mapping[str, Any], where: str) -> Iterator[str]:

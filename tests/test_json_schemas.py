@@ -13,11 +13,14 @@ from clients.monitor.model.state import State
 from clients.monitor.view.json_line import json_line
 from clients.report.cli import main as report
 from ethercat_server.doctor.cli import main as doctor
+from ethercat_server.tool.cli import COMMANDS
 from tests.clients.monitor_states import gone, healthy, troubled
 from tests.clients.recordings import frame, record
 from tests.clients.test_identify import posed
 from tests.ended import run_here
 from tests.json_schema import SCHEMAS, problems
+from tests.simulated_links import simulated_bus
+from tests.tool.running import tool_here
 
 
 @pytest.mark.parametrize("state", [healthy, troubled, gone])
@@ -49,6 +52,31 @@ def test_the_checks_of_a_report(tmp_path: Path) -> None:
     found = run_here(report, path, "--json").json
     assert found
     assert not problems("report", found)
+
+
+@pytest.mark.parametrize("size", [61, 77])
+def test_every_command_of_the_tool(size: int, tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    asked = [
+        ("eeprom",), ("objects",), ("read", "sinc_length", "0x1018:4"), ("snapshot", file), ("save",),
+        ("watch", "--samples", 50), ("plan", "--set", "chop=on"), ("apply", "--set", "sinc_length=128"),
+        ("restore", file, "--save"), ("restore", file),
+    ]  # fmt: skip
+    with simulated_bus("--pdo", str(size)) as bus:
+        for command, *arguments in asked:
+            ended = tool_here(command, bus.near, *arguments, "--json", code=None)
+            for line in ended.out.splitlines() if command == "watch" else [ended.out]:
+                assert not problems("sensor", json.loads(line), str(command))
+        assert problems("sensor", tool_here("read", bus.near, "0x8000", "--json").json, "plan")
+    with simulated_bus("--pdo", str(size), "--signal", "rest") as bus:
+        assert not problems("sensor", tool_here("tare", bus.near, "--json").json, "tare")
+    refused = tool_here("objects", "--server", "localhost:0", "--json", code=2)
+    assert not problems("sensor", refused.json, "error")
+
+
+def test_every_command_has_a_schema() -> None:
+    parts = json.loads((SCHEMAS / "sensor.json").read_text())["$defs"]
+    assert not COMMANDS.keys() - parts.keys()
 
 
 @pytest.mark.parametrize("path", sorted(SCHEMAS.glob("*.json")), ids=lambda path: path.stem)

@@ -215,5 +215,7 @@ def test_a_drive_at_work_is_not_touched_by(command: str, tmp_path: Path) -> None
         before = registers(bus.backend)
         result = tool_here(command, bus.near, *further.get(command, []), code=1)
         assert "has slaves at work that are no Bota sensors (position 1 in OP)" in one_sentence(result)
+        option = "--take-over" if command in {"snapshot", "restore"} else "--force"
+        assert f"; {option} takes them to PREOP" in one_sentence(result)
         assert registers(bus.backend) == before
         assert bus.stats_of_foreign(1)["write_count"] == 0

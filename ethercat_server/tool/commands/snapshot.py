@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import datetime
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ethercat_server.errors import BusError, SdoAbortError, ServerError
 from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
@@ -28,18 +29,19 @@ from ethercat_server.tool.snapshot_file import RESTORABLE, Snapshot, read_snapsh
 from protocol.program.new_file import NewFile
 from protocol.settings import SettingValue
 
+_TAKE_OVER: Final = "--take-over"
+"""Not `--force`, which is for the file: replacing one must not stop a machine."""
+
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add_link_arguments(parser, take_over=False)
     parser.add_argument("file", type=Path, metavar="FILE", help="JSON file")
+    parser.add_argument(_TAKE_OVER, action="store_true", help="take over a bus in use, as --force elsewhere")
 
 
 def _snapshot_arguments(parser: argparse.ArgumentParser) -> None:
     _arguments(parser)
     parser.add_argument("--force", action="store_true", help="replace an existing file")
-    parser.add_argument(
-        "--take-over", action="store_true", help="take over a bus in use, as other commands with --force"
-    )
 
 
 def _restore_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,13 +50,25 @@ def _restore_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="accept a file of another sensor")
 
 
+@contextlib.contextmanager
+def _link(args: argparse.Namespace) -> Iterator[Link]:
+    """The link; an error advises the option that these commands have."""
+    try:
+        with link(args) as opened:
+            yield opened
+    except BusError as error:
+        if "; --force " not in str(error):
+            raise
+        raise BusError(str(error).replace("; --force ", f"; {_TAKE_OVER} ")) from None
+
+
 def _snapshot(args: argparse.Namespace) -> int:
     with NewFile(args.file, force=args.force) as file:
         return _take(args, file)
 
 
 def _take(args: argparse.Namespace, file: NewFile) -> int:
-    with link(args) as opened:
+    with _link(args) as opened:
         found = opened.choose(args.sensor)
         sensor, sdo = opened.in_force(found), opened.sdo(found.number)
         read = [(row, finish(read_object(sdo, row))) for row in KNOWN_OBJECTS]
@@ -82,7 +96,7 @@ def _as_json(address: tuple[int, int], name: str, values: dict[str, Any]) -> dic
 
 def _restore(args: argparse.Namespace) -> int:
     snapshot = read_snapshot(args.file)
-    with link(args) as opened:
+    with _link(args) as opened:
         found = opened.choose(args.sensor)
         _check_whose(found.identity, snapshot.identity, args)
         sensor = opened.in_force(found, snapshot.settings)
