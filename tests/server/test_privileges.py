@@ -106,7 +106,7 @@ def test_what_needs_root_is_done_first_and_all_before_a_frame_is_read(
     def prepare(_priority: int, _cpu: int | None, *, becomes_user: bool) -> None:
         done.append(f"prepared, becomes user: {becomes_user}")
 
-    monkeypatch.setattr(daemon, "claimed", contextlib.nullcontext)
+    monkeypatch.setattr(daemon, "claimed", lambda *_, **__: contextlib.nullcontext())
     monkeypatch.setattr(daemon, "SoemBackend", Backend)
     monkeypatch.setattr(daemon, "Bus", lambda _: MagicMock())
     monkeypatch.setattr(daemon, "bring_up", bring_up)

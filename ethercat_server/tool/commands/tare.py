@@ -1,19 +1,24 @@
-"""`tare`: set the sensor's force/torque offset so that its mean reading becomes a given wrench."""
+"""`tare`: set the sensor's force/torque offset so that its mean reading becomes a wrench, or back."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
 from typing import Final
 
-from ethercat_server.errors import UsageError
-from ethercat_server.sensor.set_up import pack_offset
+from ethercat_server.errors import BusError, UsageError
+from ethercat_server.ethercat.slave.coe import finish
+from ethercat_server.links.link import Found, note, signals_held_back
+from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.commands.settings import UNSAVED
 from ethercat_server.tool.show import columns, report
+from ethercat_server.tool.tare_memory import Tared, recall, remember
 from protocol.control import ACTIONS, MAX_TARE_SAMPLES
 
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+_UNSAVED: Final = UNSAVED.replace("--save, or the command save,", "the command save")
 _DEFAULT_SAMPLES: Final = ACTIONS["tare"].parameters["samples"].default
 
 
@@ -27,6 +32,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--target", type=float, nargs=6, default=[0.0] * 6, metavar=_AXES,
         help="wrench the sensor is to read, in N and Nm (default: zeros)",
     )  # fmt: skip
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument("--undo", action="store_true", help="restore the offset of before the last tare")
+    instead.add_argument("--clear", action="store_true", help="set the offset to zero")
 
 
 def _tare(args: argparse.Namespace) -> int:
@@ -38,16 +46,59 @@ def _tare(args: argparse.Namespace) -> int:
         pack_offset(args.target)
     except ValueError as error:
         raise UsageError(f"--target: {error}") from None
+    if args.undo or args.clear:
+        return _take_back(args)
     with link(args) as opened:
         found = opened.choose(args.sensor)
         tared = opened.tare(found.number, args.samples, args.target)
+    _remember(found, tared["old_offset"], tared["new_offset"])
     keys = ("old_offset", "new_offset", "residual", "deviation")
     rows: list[tuple[str, ...]] = [("", "old offset", "new offset", "residual", "deviation", "")]
     for n, axis in enumerate(_AXES):
         rows.append((axis, *(f"{tared[key][n]:.4f}" for key in keys), "N" if n < 3 else "Nm"))
-    unsaved = UNSAVED.replace("--save, or the command save,", "the command save")
-    report(args.json, opened, found, {key: tared[key] for key in keys}, columns(rows, indent=2), unsaved)
+    report(args.json, opened, found, {key: tared[key] for key in keys}, columns(rows, indent=2), _UNSAVED)
     return DONE
+
+
+def _take_back(args: argparse.Namespace) -> int:
+    """Write the offset of before the last tare, or zeros, and verify it."""
+    with link(args) as opened:
+        found = opened.choose(args.sensor)
+        sdo = opened.sdo(found.number)
+        before = finish(read_offset(sdo), clock=opened.clock)
+        after = _former(found, before) if args.undo else [0.0] * 6
+        with signals_held_back():
+            try:
+                finish(write_offset(sdo, after), clock=opened.clock)
+            except BusError as error:
+                finish(write_offset(sdo, before), clock=opened.clock)
+                raise BusError(f"{error}; the old offset is in force") from None
+    _remember(found, before, after)
+    rows: list[tuple[str, ...]] = [("", "old offset", "new offset", "")]
+    for n, axis in enumerate(_AXES):
+        rows.append((axis, f"{before[n]:.4f}", f"{after[n]:.4f}", "N" if n < 3 else "Nm"))
+    values = {"old_offset": list(before), "new_offset": list(after)}
+    report(args.json, opened, found, values, columns(rows, indent=2), _UNSAVED)
+    return DONE
+
+
+def _former(found: Found, now: Sequence[float]) -> list[float]:
+    """The offset of before the last tare; BusError unless what is in force is of that tare."""
+    last = recall(found.identity.serial)
+    if last is None:
+        raise BusError(f"no tare of {found} by this user is known: use --clear, or tare again")
+    if pack_offset(last.after) != pack_offset(now):
+        raise BusError(
+            f"the offset of {found} has changed since its last tare here: use --clear, or tare again"
+        )
+    return last.before
+
+
+def _remember(found: Found, before: Sequence[float], after: Sequence[float]) -> None:
+    try:
+        remember(found.identity.serial, Tared(list(before), list(after)))
+    except OSError as error:
+        note(f"--undo will not know this tare: {error.strerror or error}")
 
 
 COMMANDS = (
