@@ -70,6 +70,7 @@ def test_every_command_of_the_tool(size: int, tmp_path: Path) -> None:
         assert problems("sensor", tool_here("read", bus.near, "0x8000", "--json").json, "plan")
     with simulated_bus("--pdo", str(size), "--signal", "rest") as bus:
         assert not problems("sensor", tool_here("tare", bus.near, "--json").json, "tare")
+    assert not problems("sensor", tool_here("adapters", "--json").json, "adapters")
     refused = tool_here("objects", "--server", "localhost:0", "--json", code=2)
     assert not problems("sensor", refused.json, "error")
 

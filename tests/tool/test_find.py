@@ -16,6 +16,7 @@ from ethercat_server.links.survey import Adapter
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.tool.commands import find
 from protocol.address import Address
+from tests.json_schema import problems
 from tests.simulated_links import SimulatedBus, chain, registers, simulated_bus, simulated_server
 from tests.tool.running import tool_here
 
@@ -31,7 +32,9 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedBus]:
 def found(patch: pytest.MonkeyPatch, *adapters: Adapter, code: int = 0) -> dict[str, dict[str, object]]:
     """What `find --json` says on a machine with these interfaces, by name."""
     patch.setattr(find, "adapters", lambda: list(adapters))
-    rows = tool_here("find", "--json", code=code).json["interfaces"]
+    said = tool_here("find", "--json", code=code).json
+    assert not problems("sensor", said, "find")
+    rows = said["interfaces"]
     return {row["name"]: row for row in rows}
 
 
