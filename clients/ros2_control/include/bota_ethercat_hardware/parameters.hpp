@@ -44,7 +44,7 @@ struct Parameters {
     double error_after = 0.5;                ///< s of nan or hold until read() fails; infinity: never
     double connect_timeout = 5.0;            ///< s that on_configure waits for the server
     bool on_activate_tare = false;
-    int receive_priority = 50;               ///< SCHED_FIFO, of the receiving thread; 0: none
+    int receive_priority = 51;               ///< SCHED_FIFO, of the receiving thread, above a controller manager's 50; 0: none
     bota_ethercat::ImuUnits imu_raw_units = bota_ethercat::ImuUnits::g_dps;
     // From the <sensor> tag:
     bool wants_imu = false, wants_orientation = false;
