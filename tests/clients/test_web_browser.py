@@ -36,13 +36,15 @@ def web() -> Iterator[Web]:
 
 
 @pytest.fixture
-def page(chromium: Page, web: Web) -> Page:
+def page(chromium: Page, web: Web) -> Iterator[Page]:
     """It shows the sensor; nothing was sent yet."""
     chromium.complaints.clear()
     chromium.size(1280, 900)
     chromium.open(f"{web.origin}/#token={web.token.text}")
     wait_for_text(chromium, "#identity", "BFT-SENS-ECAT-M8")
-    return chromium
+    yield chromium
+    chromium.open("about:blank")  # else the page goes on trying to reconnect, and complains in the next test
+    chromium.wait_for("location.href === 'about:blank'")
 
 
 def wait_for_text(page: Page, selector: str, text: str) -> None:
@@ -161,6 +163,7 @@ def test_a_page_with_the_token_tares_after_a_question(page: Page, web: Web) -> N
 @pytest.mark.parametrize("token", ["", "#token=of-another-run"])
 def test_a_page_without_the_token_only_shows(chromium: Page, web: Web, token: str) -> None:
     chromium.open("about:blank")
+    chromium.wait_for("location.href === 'about:blank'")
     chromium.open(web.origin + "/" + token)
     wait_for_text(chromium, "#identity", "BFT-SENS-ECAT-M8")
     feed(web, 160)

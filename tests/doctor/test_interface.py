@@ -247,7 +247,8 @@ def test_managers_that_leave_it_alone(tmp_path: Path, files: dict[str, str]) -> 
     ("routes", "level"),
     [
         (Routes(("10.0.0.2/24",), (), True), Level.BAD),
-        (Routes(("10.0.0.2/24",)), Level.BAD),
+        (Routes(("10.0.0.2/24",), leased=("10.0.0.2/24",)), Level.BAD),
+        (Routes(("10.0.0.2/24",)), Level.WARNING),
         (Routes(others=("10.1.0.0/16",)), Level.WARNING),
         (Routes(link_local=("fe80::1/64",)), Level.NOTE),
         (Routes(), Level.OK),

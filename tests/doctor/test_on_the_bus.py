@@ -138,7 +138,7 @@ def test_a_sensor_that_goes_away_while_it_measures(single: SimulatedBus, tmp_pat
         ({"link": {"loopback": True}}, "it is the loopback interface"),
         ({"link": {"master": "br0"}}, "part of a bridge"),
         ({"link": {"upper": ("ens5.7",)}}, "part of a bridge, bond or VLAN"),
-        ({"routes": Routes(addresses=("192.0.2.77/32",))}, "has the IP address 192.0.2.77/32"),
+        ({"routes": Routes(leased=("192.0.2.77/32",))}, "has the IP address 192.0.2.77/32 by DHCP"),
         ({"routes": Routes(default=True)}, "has the machine's default route"),
         ({"routes": "Permission denied"}, "its IP configuration is unknown (Permission denied)"),
     ],

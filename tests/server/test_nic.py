@@ -135,9 +135,10 @@ def test_the_default_route_is_refused_unless_it_is_allowed() -> None:
     assert allowed == "allowed"
 
 
-def test_an_address_is_refused_by_server_tool_and_doctor_and_marked(veth: Veth) -> None:
-    veth.ip("address", "add", "192.0.2.77/32", "dev", veth.near)
-    why = f"{veth.near} has the IP address 192.0.2.77/32"
+def test_an_address_for_some_time_is_refused_by_server_tool_and_doctor_and_marked(veth: Veth) -> None:
+    """So does a DHCP client add it."""
+    veth.ip("address", "add", "192.0.2.77/32", "dev", veth.near, "valid_lft", "600", "preferred_lft", "600")
+    why = f"{veth.near} has the IP address 192.0.2.77/32 by DHCP"
     try:
         assert refusal(veth.near).startswith(why)
         assert f"'sudo ip address flush dev {veth.near}'" in refusal(veth.near)
@@ -159,11 +160,25 @@ def test_an_address_is_refused_by_server_tool_and_doctor_and_marked(veth: Veth) 
         pass
 
 
+def test_an_address_that_somebody_gave_it_is_allowed(veth: Veth) -> None:
+    """The doctor warns of it: IP traffic delays the sensor's frames."""
+    veth.ip("address", "add", "192.0.2.77/32", "dev", veth.near)
+    try:
+        with claimed(veth.near):
+            pass
+        assert f"{veth.near} " in (listed := tool_here("adapters").out)
+        assert "192.0.2.77/32" in listed
+        assert "not for a sensor: 192.0.2.77/32" not in listed
+    finally:
+        veth.ip("address", "flush", "dev", veth.near)
+
+
 @pytest.mark.parametrize(
     ("routes", "why"),
     [
         (Routes(("10.0.0.2/24",), (), True), "default route"),
-        (Routes(("2001:db8::2/64",)), "address 2001:db8::2/64"),
+        (Routes(leased=("2001:db8::2/64",)), "address 2001:db8::2/64 by DHCP"),
+        (Routes(("10.0.0.2/24",)), None),
         (Routes((), ("fe80::1/64",), others=("10.1.0.0/16",)), None),
         (Routes(), None),
     ],

@@ -93,9 +93,10 @@ def test_other_interfaces_without_a_sensor_are_told_apart(
             raise InterfaceError("not allowed to open denied: CAP_NET_RAW missing; run with sudo")
         return Bus(buses[ifname])
 
-    monkeypatch.setattr(direct, "open_bus", open_bus)
     before = registers(at_work)
-    rows = found(monkeypatch, *(Adapter(name) for name in (*buses, "denied")))
+    with monkeypatch.context() as patch:  # undone before that of the bench
+        patch.setattr(direct, "open_bus", open_bus)
+        rows = found(monkeypatch, *(Adapter(name) for name in (*buses, "denied")))
     assert rows["empty"]["found"] == "no EtherCAT slave answers"
     assert rows["foreign"]["found"] == "another EtherCAT slave"
     assert "has slaves at work that are no Bota sensors (position 1 in OP)" in str(rows["at_work"]["found"])

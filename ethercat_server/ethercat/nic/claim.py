@@ -60,7 +60,7 @@ def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
 
 
 def _check_no_network(ifname: str) -> None:
-    """InterfaceError if `ifname` has the default route or an address: EtherCAT frames would go there too."""
+    """InterfaceError if `ifname` is part of a network: EtherCAT frames would go there too."""
     try:
         routes = find_routes(ifname)
     except OSError as error:

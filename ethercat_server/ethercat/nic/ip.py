@@ -16,7 +16,7 @@ from ethercat_server.ethercat.nic.netlink import GET_ADDRESS, GET_ROUTE, ask
 
 ALLOW_IP: Final = "--allow-ip"
 """The option that has the server or a program use such an interface all the same."""
-ALLOW_IP_HELP: Final = "use IFACE although it has the machine's default route or an IP address"
+ALLOW_IP_HELP: Final = "use IFACE although it has the machine's default route or an IP address by DHCP"
 
 _ADDRESS: Final = struct.Struct("=BBBBI")
 """Family, length of the prefix, flags, scope, interface."""
@@ -24,6 +24,7 @@ _IFA_ADDRESS, _IFA_LOCAL = 1, 2
 _ROUTE: Final = struct.Struct("=BBBBBBBBI")
 """Family, length of the destination, of the source, TOS, table, who made it, scope, kind, flags."""
 _RTA_DST, _RTA_OIF = 1, 4
+_IFA_F_PERMANENT: Final = 0x80
 _MAIN_TABLE: Final = 254
 _MADE_BY_KERNEL: Final = 2
 _LINK_SCOPE: Final = 253
@@ -42,6 +43,8 @@ class Routes:
     """The machine's default route goes here."""
     others: tuple[str, ...] = ()
     """Destinations of the routes that somebody made."""
+    leased: tuple[str, ...] = ()
+    """Those of the addresses that a network gave for some time: DHCP, or an IPv6 router."""
 
     def __str__(self) -> str:
         """What makes it part of a network; empty if nothing does."""
@@ -60,11 +63,16 @@ def _find_routes(ifname: str) -> Routes:
     index = socket.if_nametoindex(ifname)
     addresses: list[str] = []
     link_local: list[str] = []
-    for (family, length, _, scope, its), found in ask(GET_ADDRESS, _ADDRESS, 0, 0, 0, 0, 0, all_of_them=True):
+    leased: list[str] = []
+    for (family, length, flags, scope, its), found in ask(
+        GET_ADDRESS, _ADDRESS, 0, 0, 0, 0, 0, all_of_them=True
+    ):
         if its == index and family in _FAMILIES:
             raw = found.get(_IFA_LOCAL) or found[_IFA_ADDRESS]
             there = link_local if scope == _LINK_SCOPE else addresses
             there.append(f"{ipaddress.ip_address(raw)}/{length}")
+            if there is addresses and not flags & _IFA_F_PERMANENT:
+                leased.append(addresses[-1])
     default, others = False, []
     for row, found in ask(GET_ROUTE, _ROUTE, *(0,) * 9, all_of_them=True):
         family, length, _, _, table, made_by, *_ = row
@@ -74,7 +82,7 @@ def _find_routes(ifname: str) -> Routes:
         default = default or not length
         if length and made_by != _MADE_BY_KERNEL:
             others.append(f"{ipaddress.ip_address(found[_RTA_DST])}/{length}")
-    return Routes(tuple(addresses), tuple(sorted(link_local)), default, tuple(others))
+    return Routes(tuple(addresses), tuple(sorted(link_local)), default, tuple(others), tuple(leased))
 
 
 def network_trouble(ifname: str, routes: Routes) -> str | None:
@@ -85,9 +93,9 @@ def network_trouble(ifname: str, routes: Routes) -> str | None:
         return (
             f"{ifname} has the machine's default route, so it is no interface for a sensor: {other}; {anyway}"
         )
-    if routes.addresses:
+    if routes.leased:
         return (
-            f"{ifname} has the IP address {routes.addresses[0]}, so other machines may be on it: {other}, "
+            f"{ifname} has the IP address {routes.leased[0]} by DHCP, so it is part of a network: {other}, "
             f"or, if only the sensor is on it, 'sudo ip address flush dev {ifname}'; {anyway}"
         )
     return None

@@ -6,6 +6,7 @@ import argparse
 from typing import Any, NamedTuple
 
 from ethercat_server.errors import ServerError
+from ethercat_server.ethercat.nic.ip import network_trouble
 from ethercat_server.links.remote import ServerLink
 from ethercat_server.links.survey import Adapter, adapters, look_on
 from ethercat_server.process.command_line import FAILED
@@ -39,7 +40,9 @@ def _adapters(args: argparse.Namespace) -> int:
     for row in found:
         what = "loopback" if row.loopback else row.kind
         held = f"in use by {row.holder}" if row.holder else ""
-        ip = f"not for a sensor: {row.routes}" if str(row.routes) and not row.loopback else ""
+        ip = str(row.routes) if not row.loopback else ""
+        if network_trouble(row.name, row.routes):
+            ip = f"not for a sensor: {ip}"
         rows.append((row.name, row.state, row.address or "", "; ".join(filter(None, (what, held, ip)))))
     say(columns(rows))
     return DONE
