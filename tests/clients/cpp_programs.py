@@ -60,7 +60,9 @@ def _folder() -> Path:
 def build(source: Path, flags: Sequence[str], others: Sequence[Path] = (), compiler: str = "g++") -> Path:
     """The program made of `source` and `others`, built once for their contents; every warning is an error."""
     digest = hashlib.sha256(repr((compiler, STRICT, flags)).encode())
-    for path in (*HEADERS, source, *others, *sorted(source.parent.glob("*.hpp"))):
+    folders = (INCLUDE, source.parent, *(Path(flag[2:]) for flag in flags if flag.startswith("-I")))
+    headers = (header for folder in folders for header in sorted(folder.rglob("*.hpp")))
+    for path in (source, *others, *headers):
         digest.update(path.read_bytes())
     program = _folder() / f"{source.stem}-{digest.hexdigest()[:16]}"
     with (_folder() / "lock").open("w") as lock:
@@ -89,12 +91,10 @@ _idle: list[subprocess.Popen[str]] = []
 """Drivers that wait for the next test."""
 
 
-class Driver:
-    """A C++ client that a test commands: tests/clients/cpp/driver.cpp, a process for many tests."""
+class Commanded:
+    """A program that a test commands: a line in for each command, and a line of JSON out."""
 
-    def __init__(self, port: int, process: subprocess.Popen[str] | None = None, **options: object) -> None:
-        self.process = process or (_idle.pop() if _idle else start_driver())
-        self.begin("new", "host=127.0.0.1", f"port={port}", *(f"{k}={v}" for k, v in options.items()))
+    process: subprocess.Popen[str]
 
     def begin(self, *words: object) -> None:
         """Give a command; `answer` has what comes of it."""
@@ -111,6 +111,14 @@ class Driver:
     def do(self, *words: object) -> Any:
         self.begin(*words)
         return self.answer()
+
+
+class Driver(Commanded):
+    """A C++ client that a test commands: tests/clients/cpp/driver.cpp, a process for many tests."""
+
+    def __init__(self, port: int, process: subprocess.Popen[str] | None = None, **options: object) -> None:
+        self.process = process or (_idle.pop() if _idle else start_driver())
+        self.begin("new", "host=127.0.0.1", f"port={port}", *(f"{k}={v}" for k, v in options.items()))
 
     def connect(self) -> Driver:
         told = self.do("connect", int(PATIENCE_S * 1000))

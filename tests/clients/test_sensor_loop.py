@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import math
 import select
@@ -17,7 +16,16 @@ import pytest
 
 from protocol.control import Event, event
 from protocol.framing import DataFlag
-from tests.clients.cpp_programs import ROOT, SANITIZED, SOURCES, build, end_driver, needs_gxx, patient
+from tests.clients.cpp_programs import (
+    ROOT,
+    SANITIZED,
+    SOURCES,
+    Commanded,
+    build,
+    end_driver,
+    needs_gxx,
+    patient,
+)
 from tests.clients.played_sensor import PlayedSensor, described, frame, played
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port, wait_until
@@ -25,7 +33,6 @@ from tests.server.running import PATIENCE_S, free_port, wait_until
 pytestmark = [needs_gxx, patient]
 
 PACKAGE = ROOT / "clients" / "ros2_control"
-HEADERS = sorted((PACKAGE / "include" / "bota_ethercat_hardware").glob("*.hpp"))
 THREADS = ("-g", "-O1", "-fsanitize=thread", "-fno-sanitize-recover=all")
 FRESH, SATURATED, NOT_FINITE, LATE, BAD_CLOCK, REPEATED, INVALID, SILENT, LOST, DISCONNECTED = range(10)
 UNCHECKED = 100
@@ -36,31 +43,14 @@ Seen = dict[str, Any]
 
 
 def program(sanitized: tuple[str, ...] = SANITIZED) -> Path:
-    contents = hashlib.sha256(b"".join(path.read_bytes() for path in HEADERS)).hexdigest()
-    flags = (*sanitized, "-pthread", f"-I{PACKAGE / 'include'}", f"-DHEADERS=0x{contents[:15]}")
-    return build(SOURCES / "sensor_loop.cpp", flags)
+    return build(SOURCES / "sensor_loop.cpp", (*sanitized, "-pthread", f"-I{PACKAGE / 'include'}"))
 
 
-class Loop:
+class Loop(Commanded):
     """tests/clients/cpp/sensor_loop.cpp, a process for many tests."""
 
     def __init__(self, path: Path) -> None:
         self.process = subprocess.Popen([path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-    def begin(self, *words: object) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(" ".join(map(str, words)) + "\n")
-        self.process.stdin.flush()
-
-    def answer(self) -> Any:
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line, f"the program ended with {self.process.wait(10)}"
-        return json.loads(line)
-
-    def do(self, *words: object) -> Any:
-        self.begin(*words)
-        return self.answer()
 
     def has_answered(self) -> bool:
         assert self.process.stdout is not None

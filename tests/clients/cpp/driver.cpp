@@ -15,6 +15,7 @@
 #include <sstream>
 
 #include "decode.hpp"
+#include "json_text.hpp"
 
 static std::size_t allocations = 0;
 
@@ -51,17 +52,6 @@ Reading watched(Call&& call) {
     received += receives - receives_before;
     called += other_calls - calls_before;
     return reading;
-}
-
-const char* yes(bool value) { return value ? "true" : "false"; }
-
-std::string quoted(std::string_view text) {
-    std::string result = "\"";
-    for (const char c : text) {
-        if (c == '"' || c == '\\') result += '\\';
-        result += c;
-    }
-    return result + "\"";
 }
 
 const char* name(Condition condition) {

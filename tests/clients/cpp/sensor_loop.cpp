@@ -27,6 +27,8 @@
 #include <optional>
 #include <sstream>
 
+#include "json_text.hpp"
+
 static thread_local std::size_t allocations = 0;
 
 extern "C" int __sanitizer_install_malloc_and_free_hooks(void (*)(const volatile void*, std::size_t), void (*)(const volatile void*));
@@ -34,17 +36,6 @@ extern "C" int __sanitizer_install_malloc_and_free_hooks(void (*)(const volatile
 namespace {
 
 using namespace bota_ethercat_hardware;
-
-const char* yes(bool value) { return value ? "true" : "false"; }
-
-std::string quoted(std::string_view text) {
-    std::string result = "\"";
-    for (const char c : text) {
-        if (c == '"' || c == '\\') result += '\\';
-        result += c;
-    }
-    return result + "\"";
-}
 
 std::mutex lines_lock;
 std::vector<std::string> lines;
