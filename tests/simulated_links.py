@@ -22,7 +22,7 @@ from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
-from ethercat_server.acquisition.stream import Made, SensorStream
+from ethercat_server.acquisition.stream import Made, make_streams
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.doctor.bus import measurement
 from ethercat_server.doctor.bus.receiver import MESSAGE
@@ -156,9 +156,7 @@ class SimulatedServer:
         ethercat = Bus(bus.backend)
         sensors = bring_up(ethercat, Asked({"sinc_length": SINC_LENGTH}), lambda: None).sensors
         timing = ExchangeTiming(bus.clock.now_ns)
-        self.streams = [
-            SensorStream(sensor.number, sensor.period_ns, timing, bus.clock) for sensor in sensors
-        ]
+        self.streams = make_streams(ethercat, sensors, timing)
         self.transport = InMemoryTransport(bus.clock)
         self.hub = Hub(self.transport, bus.clock.monotonic_ns)
         self.recovery = Recovery(ethercat, sensors, self.streams, self._announce, Others(ethercat, ()))

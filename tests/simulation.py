@@ -24,7 +24,7 @@ from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
-from ethercat_server.acquisition.stream import Made, SensorStream
+from ethercat_server.acquisition.stream import Made, make_streams
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.others import Others
@@ -98,7 +98,7 @@ class Simulation:
         self.sensors, slaves = bring_up(self.bus, Asked(settings, keep_unset=keep_unset), lambda: None)
         self.others = Others(self.bus, slaves)
         timing = ExchangeTiming(self.clock.now_ns)
-        self.streams = [SensorStream(s.number, s.period_ns, timing, self.clock) for s in self.sensors]
+        self.streams = make_streams(self.bus, self.sensors, timing)
         self.events: list[JsonObject] = []
         self.recovery = Recovery(self.bus, self.sensors, self.streams, self._announce, self.others)
         self.jobs = Jobs(self.bus, self.sensors)

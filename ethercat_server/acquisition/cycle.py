@@ -19,6 +19,7 @@ from ethercat_server.acquisition.stream import Made, SensorStream
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.timing.schedule import Schedule
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.exchange.distributed_clock import LATCHED
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
 _SERVE_EVERY_NS: Final = 10_000_000
@@ -219,14 +220,14 @@ class Cycle:
         self._answered = True
         self._complete = complete = wkc >= self._recovery.alive_wkc[which]
         new: list[Made] = []
-        for number, start, end, untouched, sensor, stream in self._carried[which]:
+        for number, start, end, untouched, at, sensor, stream in self._carried[which]:
             if back < stream.clock.quiet_until_ns:
                 continue  # the poll was for another sensor
             data = frame[start:end]
             # One that is out may be counted in place of one that is not there any more.
             if not complete or sensor.state is not SensorState.STREAMING or data == untouched:
                 stream.invalid(wkc)
-            elif made := stream.take(data, wkc, sent, back):
+            elif made := stream.take(data, wkc, sent, back, LATCHED.unpack_from(frame, at) if at else None):
                 new.append((made[0], number, made[1]))
         if new:
             self._hub.publish(new, back)
@@ -243,6 +244,8 @@ class Cycle:
         for stream in self._streams:
             stream.age.roll()
             stream.check()
+            if stream.clock.events is None:
+                self._bus.process_data.read_latched(stream.number, reads=False)
         self.every_second()
 
     def status(self) -> dict[str, Any]:

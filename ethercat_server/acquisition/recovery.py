@@ -258,7 +258,10 @@ class Recovery:
         if left_op:
             sensor.settle(self._clock)
         self._count_alive()
-        stream.recover(sensor.period_ns if left_op else None, lost=number in self._lost_at_ns)
+        latching = self._bus.read_clock(number) if left_op else None
+        stream.recover(
+            sensor.period_ns if left_op else None, lost=number in self._lost_at_ns, latching=latching
+        )
         if (change := self._changing.pop(number, None)) is not None:
             if change.failed is None:
                 self._announce(event(Event.RECONFIGURED, sensor=number, **sensor.in_force()))

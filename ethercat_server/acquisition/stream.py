@@ -8,13 +8,19 @@ that was overtaken by a later one is no news.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
+from ethercat_server.acquisition.hardware.event_times import EventTimes
+from ethercat_server.acquisition.hardware.trust import Verdict
 from ethercat_server.acquisition.health.samples import SampleHealth
 from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.timing.sample_clock import SILENT_PERIODS, SampleClock
+from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
+from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
+from ethercat_server.sensor.sensor import Sensor
 from protocol.framing import DataFlag, encode_data
 from protocol.pdo import is_finite
 
@@ -31,12 +37,18 @@ class SensorStream:
     """Numbers, stamps and marks the frames of the sensor `number`, which samples every `period_ns`."""
 
     def __init__(
-        self, number: int, period_ns: float, timing: ExchangeTiming, clock: Clock = SYSTEM_CLOCK
+        self,
+        number: int,
+        period_ns: float,
+        timing: ExchangeTiming,
+        clock: Clock = SYSTEM_CLOCK,
+        latching: DistributedClock | None = None,
     ) -> None:
+        """`latching` is the clock of the slave controller, if that latches when samples come to be."""
         self.number = number
         self._monotonic_ns, self._time_ns = clock.monotonic_ns, clock.time_ns
         self._timing = timing
-        self.clock = SampleClock(period_ns, timing)
+        self.clock = SampleClock(period_ns, timing, latching and EventTimes(latching, timing))
         self.process_data = b""
         """The newest valid process data."""
         self._handed_out = b""
@@ -65,11 +77,13 @@ class SensorStream:
         self.idle_at_ns = 0.0
         """`idle` is to be called from then on."""
 
-    def take(self, data: bytes, wkc: int, sent_ns: int, back_ns: int) -> tuple[bytes, int] | None:
+    def take(
+        self, data: bytes, wkc: int, sent_ns: int, back_ns: int, latched: Latched | None = None
+    ) -> tuple[bytes, int] | None:
         """The frame that a valid exchange gives, and its flags; None if it gives none.
 
         `learn` must follow if `learns`. `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the
-        exchange.
+        exchange; `latched` is what the slave controller has latched.
         """
         clock = self.clock
         if sent_ns < self._seen[0]:  # overtaken
@@ -78,6 +92,8 @@ class SensorStream:
         self._seen = sent_ns, back_ns, fresh
         self._wkc, self._valid_ns = wkc, back_ns
         self.learns = True
+        if latched is not None and clock.events is not None:
+            clock.events.took(latched, sent_ns, back_ns, fresh)
         if not fresh:
             return None
         self.process_data = data
@@ -89,7 +105,7 @@ class SensorStream:
         self._handed_out = data
         flags = self._new_sample()
         # After a stall in the exchange its end says nothing of when the sample came to be.
-        moment_ns = int(clock.instant_ns if clock.locked else min(back_ns, sent_ns + clock.period_ns))
+        moment_ns = int(clock.instant_ns if clock.is_dated else min(back_ns, sent_ns + clock.period_ns))
         if moment_ns <= self._moment_ns:  # the one before was dated too young
             moment_ns = self._moment_ns + 1
         self._moment_ns = moment_ns
@@ -147,12 +163,18 @@ class SensorStream:
     def check(self) -> None:
         """To be called once a second: log what the samples show of the sensor."""
         self.health.check(self.fresh, self.repeated, self.clock)
+        events = self.clock.events
+        if events is not None and events.trust.verdict is Verdict.REFUSED:
+            self.clock.events = None
 
-    def recover(self, period_ns: float | None, *, lost: bool = True) -> None:
+    def recover(
+        self, period_ns: float | None, *, lost: bool = True, latching: DistributedClock | None = None
+    ) -> None:
         """The sensor is back after it was out; `period_ns` if it entered OP anew, None if it never left."""
         self.recoveries += lost
         if period_ns is not None:
-            self.clock = SampleClock(period_ns, self._timing)
+            events = latching and EventTimes(latching, self._timing)
+            self.clock = SampleClock(period_ns, self._timing, events)
             self._discard = DISCARDED_AT_START
             self._gap = True
 
@@ -168,3 +190,11 @@ class SensorStream:
             "recoveries": self.recoveries,
             "clock": self.clock.describe(),
         }
+
+
+def make_streams(bus: Bus, sensors: Sequence[Sensor], timing: ExchangeTiming) -> list[SensorStream]:
+    """Those of the sensors on a bus in OP."""
+    return [
+        SensorStream(sensor.number, sensor.period_ns, timing, bus.clock, bus.read_clock(sensor.number))
+        for sensor in sensors
+    ]

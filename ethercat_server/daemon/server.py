@@ -12,7 +12,7 @@ from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import bring_up
-from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.acquisition.stream import make_streams
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.daemon.options import ServerOptions, parse_options
 from ethercat_server.daemon.service import Policy, Service
@@ -56,7 +56,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         policy.apply(hub)
         sensors, slaves = bring_up(bus, options, signals.check)
         timing = ExchangeTiming(bus.clock.monotonic_ns())
-        streams = [SensorStream(sensor.number, sensor.period_ns, timing) for sensor in sensors]
+        streams = make_streams(bus, sensors, timing)
         others = Others(bus, slaves)
         recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast, others), Jobs(bus, sensors)
         cycle = Cycle(bus, sensors, streams, timing, hub, recovery, jobs, notifier)

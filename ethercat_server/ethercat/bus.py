@@ -12,14 +12,15 @@ from typing import Final
 from ethercat_server.errors import SetUpError
 from ethercat_server.ethercat.backend import Backend, CheckInterrupt, Master
 from ethercat_server.ethercat.datagrams import Datagrams
+from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, latch_events, read_clock
+from ethercat_server.ethercat.exchange.frames import Area, fit_a_frame
+from ethercat_server.ethercat.exchange.process_data import ProcessData
 from ethercat_server.ethercat.mailbox.emergencies import Emergencies
-from ethercat_server.ethercat.process_data import Area, ProcessData, fit_a_frame
 from ethercat_server.ethercat.slave import registers as reg
 
 _U16: Final = struct.Struct("<H")
 _SYNC_MANAGER: Final = struct.Struct("<2xHBxBx")
 """Length, control, activation."""
-_SM_WRITE, _SM_MAILBOX = 0x04, 0x02
 
 
 class Bus(Datagrams):
@@ -38,6 +39,8 @@ class Bus(Datagrams):
         """Where the sensors are on the wire: by number, as everything below."""
         self.fmmus: list[bytes] = []
         """FMMU registers as they must be in OP."""
+        self._latching: list[int | None] = []
+        """Stations of the sensors whose controllers latch when samples are written, None for others."""
         self.process_data = ProcessData((), backend)
         """The exchange, once the sensors are mapped."""
 
@@ -72,37 +75,44 @@ class Bus(Datagrams):
             self.master.release()
         self.backend.close()
 
+    def read_clock(self, number: int) -> DistributedClock | None:
+        """The clock of a sensor's controller, from now on read with its process data; None if it has none."""
+        if self._latching[number] is None or (clock := read_clock(self, number)) is None:
+            return None
+        self.process_data.read_latched(number, reads=True)
+        return clock
+
     def _lay_out_exchange(self) -> None:
         """Read from the FMMUs which logical addresses are whose process data."""
         areas: list[list[Area]] = []
         self.fmmus = []
-        lrw = not any(self._features(number) & reg.NO_LRW for number in range(len(self.stations)))
+        features = [self._features(number) for number in range(len(self.stations))]
+        lrw = not any(each & reg.NO_LRW for each in features)
+        self._latching = []
         for number in range(len(self.stations)):
             count = min(self.read_surely(number, reg.FMMU_AND_SM_COUNT, 2)[0], reg.MOST_FMMUS)
             self.fmmus.append(self.read_surely(number, reg.FMMU, count * reg.FMMU_SIZE))
             rows = (reg.FMMU_LAYOUT.unpack_from(self.fmmus[-1], at * reg.FMMU_SIZE) for at in range(count))
             areas.append([Area(row[0], row[0] + row[1], row[6]) for row in rows if row[7] & 1])
-            kinds = {area.kind for area in areas[-1]}
-            if (
-                kinds != self._kinds(number)
-                or reg.FMMU_READ not in kinds
-                or not fit_a_frame(areas[-1], lrw=lrw)
-            ):
+            kinds, managers = {area.kind for area in areas[-1]}, self._sync_managers(number)
+            if kinds != managers.keys() or reg.FMMU_READ not in kinds or not fit_a_frame(areas[-1], lrw=lrw):
                 # SOEM writes them once, and does not look whether that worked.
                 raise SetUpError(f"sensor {number} did not answer when it was mapped: check cable and power")
-        self.process_data = ProcessData(areas, self.backend, lrw=lrw)
+            latches = features[number] & reg.HAS_DC and latch_events(self, number, managers[reg.FMMU_READ])
+            self._latching.append(self.stations[number] if latches else None)
+        self.process_data = ProcessData(areas, self.backend, lrw=lrw, stations=self._latching)
 
     def _features(self, number: int) -> int:
         """What the slave controller of a sensor can do."""
         return int(_U16.unpack(self.read_surely(number, reg.FEATURES, 2))[0])
 
-    def _kinds(self, number: int) -> set[int]:
-        """What a sensor has according to its sync managers: inputs, outputs, or both."""
+    def _sync_managers(self, number: int) -> dict[int, int]:
+        """Which sync manager of a sensor has its inputs, its outputs: by the kind of their FMMUs."""
         count = min(self.read_surely(number, reg.FMMU_AND_SM_COUNT, 2)[1], reg.MOST_SYNC_MANAGERS)
         data = self.read_surely(number, reg.SYNC_MANAGER, count * reg.SYNC_MANAGER_SIZE)
         rows = [_SYNC_MANAGER.unpack_from(data, at * reg.SYNC_MANAGER_SIZE) for at in range(count)]
         return {
-            reg.FMMU_WRITE if control & _SM_WRITE else reg.FMMU_READ
-            for length, control, active in rows
-            if length and active & 1 and not control & _SM_MAILBOX
+            reg.FMMU_WRITE if control & reg.SM_WRITE else reg.FMMU_READ: at
+            for at, (length, control, active) in enumerate(rows)
+            if length and active & 1 and not control & reg.SM_MAILBOX
         }

@@ -10,7 +10,7 @@ from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import AsFound, enter_op, find_sensors
-from ethercat_server.acquisition.stream import Made, SensorStream
+from ethercat_server.acquisition.stream import Made, make_streams
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.errors import BusError, ServerError, UsageError
 from ethercat_server.ethercat.bus import Bus
@@ -154,9 +154,7 @@ class _Running:
         self.sensors = sensors
         self._clock = bus.clock
         timing = ExchangeTiming(bus.clock.monotonic_ns())
-        self.streams = [
-            SensorStream(sensor.number, sensor.period_ns, timing, bus.clock) for sensor in sensors
-        ]
+        self.streams = make_streams(bus, sensors, timing)
         self.recovery = Recovery(bus, sensors, self.streams, lambda _: None, Others(bus, ()))
         self.on_idle: Callable[[], bool] = lambda: True
         self._jobs = Jobs(bus, sensors)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from typing import Final
 
+from ethercat_server.acquisition.hardware.trust import Verdict
 from ethercat_server.acquisition.timing.sample_clock import PLAUSIBLE_PULL, SampleClock
 
 _DEVIATING_SECONDS: Final = 10
@@ -30,6 +31,9 @@ class SampleHealth:
         self._silent_s = 0
         self._finite_s = _FINITE_SECONDS
         self._rate_reported = False
+        self._trusted = False
+        """Whether it was reported that event times date the samples."""
+        self._distrust_reported = False
         self._deviating_s = 0
 
     def check(self, fresh: int, repeated: int, clock: SampleClock) -> None:
@@ -40,6 +44,7 @@ class SampleHealth:
         self._check_silence(new, repeats)
         self._check_numbers(new, not_finite)
         self._check_rate(clock)
+        self._check_events(clock)
 
     def _check_silence(self, new: int, repeats: int) -> None:
         if new:
@@ -81,4 +86,22 @@ class SampleHealth:
             log.warning(
                 "sensor %d samples every %.1f µs, %+.1f %% off what it is set to: check its settings",
                 self._number, clock.period_ns / 1000, 100 * pull,
+            )  # fmt: skip
+
+    def _check_events(self, clock: SampleClock) -> None:
+        """Say once that the slave controller dates the samples, and once that it does not, or no longer."""
+        if clock.events is None:
+            return
+        trust = clock.events.trust
+        if trust.verdict is Verdict.TRUSTED:
+            if not self._trusted:
+                log.info("sensor %d: the clock of its slave controller dates the samples", self._number)
+            self._trusted = True
+        elif trust.why and not self._distrust_reported:
+            self._distrust_reported = True
+            log.log(
+                logging.WARNING if self._trusted else logging.INFO,
+                "sensor %d: its samples are dated by polling, for its slave controller's event times are "
+                "unusable: %s",
+                self._number, trust.why,
             )  # fmt: skip

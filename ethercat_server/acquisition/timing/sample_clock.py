@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from ethercat_server.acquisition.timing.estimate import CERTAIN, CONTRADICTS, ROOT_2_PI, Estimate
+from ethercat_server.acquisition.hardware.event_times import EventTimes
+from ethercat_server.acquisition.timing.estimate import CERTAIN, CONTRADICTS, Estimate
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.timing.margin import event_margin_ns, has_no_time_for_two, margin_ns
 
 _LOCKED: Final = 0.125
 """The clock is followed while the phase is known to this part of a period (standard deviation)."""
@@ -25,13 +27,6 @@ PLAUSIBLE_PULL: Final = 0.002
 """A real sensor's period differs from the nominal one by less than this part."""
 SILENT_PERIODS: Final = 3
 """A sensor that has given nothing new for so long counts as silent, not just late."""
-_PRICE_NS: Final = 15_000.0
-"""Age that is given up to save an exchange."""
-_LOSS_PERIODS: Final = 10.0
-"""Age that is given up to lose no sample, in periods, where there is no time for a second poll."""
-_NO_TIME: Final = 0.5
-"""There is none if a round trip takes more than this part of a period."""
-_LARGEST_MARGIN: Final = 0.4
 _EARLY_POLLS: Final = 0.11
 """Part of the samples whose first poll is to be early."""
 _CAUTION_GAIN: Final = 0.05
@@ -58,14 +53,15 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_absent", "_aim_ns", "_begun", "_caution", "_doubtful", "_estimate", "_hits", "_least_variance",
-        "_looked_ns", "_margin_ns", "_most_variance", "_newest", "_nominal_ns", "_overdue", "_probed_above",
-        "_probing", "_single", "_timing", "_turn", "_usual_margin_ns", "instant_ns", "locked",
-        "quiet_until_ns", "steps", "uncertain",
+        "_absent", "_aim_ns", "_begun", "_by_event", "_caution", "_doubtful", "_estimate", "_hits",
+        "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_newest", "_nominal_ns", "_overdue",
+        "_probed_above", "_probing", "_single", "_timing", "_turn", "_usual_margin_ns", "events",
+        "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
     )  # fmt: skip
 
-    def __init__(self, period_ns: float, timing: ExchangeTiming) -> None:
+    def __init__(self, period_ns: float, timing: ExchangeTiming, events: EventTimes | None = None) -> None:
         """`period_ns` is the nominal sample period; `timing` that of the bus."""
+        self.events = events
         self._nominal_ns = period_ns
         self._estimate = Estimate(period_ns)
         """Its phase is the next sample's instant less the outward part of the shortest round trip."""
@@ -81,6 +77,8 @@ class SampleClock:
         it right."""
         self.quiet_until_ns = 0.0
         """An exchange that is back before this has certainly nothing new."""
+        self._by_event = 0.0
+        """Instant of the newest sample as its event has it, less the outward part; 0: it says nothing."""
         self._looked_ns = 0
         """When the last valid exchange was sent."""
         self._newest = 1
@@ -116,7 +114,19 @@ class SampleClock:
     @property
     def uncertainty_ns(self) -> float:
         """How far `instant_ns` may be off: two standard deviations, and where the slave is on the way."""
-        return 2 * math.sqrt(self._estimate.variance) + self._timing.least_ns / 2
+        events = self.events
+        variance = events.variance if events is not None and events.are_trusted else self._estimate.variance
+        return 2 * math.sqrt(variance) + self._timing.least_ns / 2
+
+    @property
+    def is_dated(self) -> bool:
+        """Whether `instant_ns` is known better than from when the exchange was sent and back."""
+        return self.locked or self._by_event != 0.0
+
+    @property
+    def by_events(self) -> bool:
+        """Whether samples are dated by the slave controller."""
+        return self.events is not None and self.events.are_trusted
 
     @property
     def one_by_one(self) -> bool:
@@ -132,6 +142,7 @@ class SampleClock:
         """What `status` says of it."""
         return {
             "mode": "locked" if self.locked else "oversampling",
+            "stamps": "hardware" if self.by_events else "polling",
             "period_us": self.period_ns / 1000,
             "offset_ppm": round((self._nominal_ns / self.period_ns - 1) * 1e6, 1),
             "uncertainty_us": round(self.uncertainty_ns / 1000, 1) if self.locked else None,
@@ -171,12 +182,17 @@ class SampleClock:
         if self._turn < 0 or not self._least_variance < variance < self._most_variance:
             self._turn = _TURNS
             self._least_variance, self._most_variance = variance / _CHANGED, variance * _CHANGED
-            self._single = _has_time_for_one(timing, period_ns)
-            self._usual_margin_ns = margin_ns(timing, period_ns, variance)
+            self._single = has_no_time_for_two(timing, period_ns)
+            margin = event_margin_ns if self.by_events and not self._single else margin_ns
+            self._usual_margin_ns = margin(timing, period_ns, variance)
             self._probed_above = (timing.look_variance + _PROBE_BELOW) / 4
-        self._margin_ns = self._usual_margin_ns if self._single else self._usual_margin_ns * self._caution
-        self._aim_ns = estimate.phase_ns + self._margin_ns - timing.look_ns
+        self._margin_ns = self._usual_margin_ns
+        if not (self._single or self.by_events):
+            self._margin_ns *= self._caution
         self._probing = self._hits > _UNPROBED or variance > self._probed_above
+        self._aim_ns = estimate.phase_ns + self._margin_ns - timing.look_ns
+        if self._probing and not self._single and self.by_events:
+            self._aim_ns -= 2 * self._margin_ns
         self.quiet_until_ns = estimate.phase_ns - CERTAIN * deviation_ns if self.locked else 0.0
 
     # -- what an exchange says
@@ -196,6 +212,16 @@ class SampleClock:
             self.uncertain = unwatched_ns >= period_ns
             self.instant_ns = min(back_ns, sent_ns + period_ns) - min(unwatched_ns, period_ns) / 2
             return
+        self.uncertain = False
+        events, self._by_event = self.events, 0.0
+        if events is not None and events.are_trusted:
+            at_ns = events.instant_ns - least_ns / 2 if events.instant_ns else phase_ns
+            late = (at_ns - phase_ns) / period_ns
+            if events.judge((late - round(late)) * period_ns, self._estimate.variance, back_ns):
+                self._by_event = at_ns
+                self._count(1 + round(late), late)
+                self.instant_ns = min(events.instant_ns, back_ns)
+                return
         excess_ns = back_ns - sent_ns - least_ns
         if excess_ns < 0:
             excess_ns = 0.0
@@ -203,7 +229,6 @@ class SampleClock:
         # dated from before, never as younger than it may be.
         looked_at_ns = sent_ns + (excess_ns / 2 if excess_ns < _LONGEST_LOOK * period_ns else 0.0)
         late = (looked_at_ns - phase_ns) / period_ns
-        self.uncertain = False
         if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
             # It was seen coming: whichever it was expected next to.
             newest = 1 + round(((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns)
@@ -215,6 +240,16 @@ class SampleClock:
             least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
             self.uncertain = self._doubtful or (most > 0 and least < most)
+        self._count(newest, late)
+        instant_ns = phase_ns + (self._newest - 1) * period_ns
+        instant_ns = max(instant_ns, looked_ns)
+        instant_ns += least_ns / 2
+        self.instant_ns = instant_ns if instant_ns < back_ns else back_ns
+        if events is not None and self.locked and not (events.are_trusted or self.uncertain):
+            events.judge(events.instant_ns - instant_ns, self._estimate.variance, back_ns)
+
+    def _count(self, newest: int, late: float) -> None:
+        """The new sample is this one by the estimate, and so late there, in periods."""
         if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
             newest = 0 if self._doubtful and late < -0.5 else 1
         self._newest = self.steps = newest
@@ -222,10 +257,6 @@ class SampleClock:
             self.steps = 1  # a silent sensor is told as such
         elif late > _EARLY:
             self.steps += self._absent  # those that did not come are missing, too
-        instant_ns = phase_ns + (newest - 1) * period_ns
-        instant_ns = max(instant_ns, looked_ns)
-        instant_ns += least_ns / 2
-        self.instant_ns = instant_ns if instant_ns < back_ns else back_ns
 
     def _is_late(self, look_ns: float, variance: float) -> bool:
         """Whether the sample that is expected should have been there at a look."""
@@ -247,6 +278,8 @@ class SampleClock:
                 estimate.advance(self._newest - 1)
             if self.uncertain:
                 pass  # it may be another sample's
+            elif self._by_event and self.events is not None:
+                estimate.learn_bracket(self._by_event, self._by_event, self.events.variance)
             elif self.locked and not (looked_ns > estimate.phase_ns and self._is_late(looked_ns, variance)):
                 estimate.learn_bit(look_ns, variance, 1)
             elif look_ns - looked_ns < estimate.period_ns:
@@ -266,30 +299,11 @@ class SampleClock:
             self._overdue = look_ns > estimate.phase_ns + _OVERDUE * math.sqrt(estimate.variance + variance)
             # One in doubt may have been seen already; one that is late may be missing. The next one tells.
             if self.locked and not (self._doubtful or self._is_late(look_ns, variance)):
-                estimate.learn_bit(look_ns, variance, -1)
+                if not self.by_events:
+                    estimate.learn_bit(look_ns, variance, -1)
                 if look_ns > estimate.phase_ns - doubt_ns - self._margin_ns:
                     if self._hits:
                         self._caution += _CAUTION_GAIN * self._caution
                         self._caution = min(self._caution, 1.0)
                     self._hits = 0
         self._settle()
-
-
-def _has_time_for_one(timing: ExchangeTiming, period_ns: float) -> bool:
-    """Whether there is no time for a second poll of a sample."""
-    return timing.usual_ns > _NO_TIME * period_ns
-
-
-def margin_ns(timing: ExchangeTiming, period_ns: float, phase_variance: float) -> float:
-    """How long after the expected instant a poll should look, so that samples are youngest on the whole.
-
-    An early look costs a second exchange, or the sample where there is no time for one. The margin is where
-    a little more of it costs as much as it saves: where the density of the look's instant is 1 / cost.
-    """
-    single = _has_time_for_one(timing, period_ns)
-    cost_ns = _LOSS_PERIODS * period_ns if single else timing.usual_ns + _PRICE_NS
-    deviation_ns = math.sqrt(phase_variance + timing.variance)
-    ratio = cost_ns / (deviation_ns * ROOT_2_PI)
-    if ratio <= 1:
-        return 0.0
-    return min(deviation_ns * math.sqrt(2 * math.log(ratio)), _LARGEST_MARGIN * period_ns)

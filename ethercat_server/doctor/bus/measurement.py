@@ -19,7 +19,7 @@ from typing import Final
 
 from ethercat_server.acquisition.histogram import Distribution
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.timing.sample_clock import margin_ns
+from ethercat_server.acquisition.timing.margin import margin_ns
 from ethercat_server.doctor.bus.receiver import MESSAGE
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
 from ethercat_server.process import realtime

@@ -10,10 +10,12 @@ from typing import Final
 
 DL_INFORMATION: Final = 0x0000
 FMMU_AND_SM_COUNT: Final = 0x0004
+"""Two bytes: the number of FMMUs, the number of sync managers."""
 FEATURES: Final = 0x0008
+HAS_DC: Final = 1 << 2
+"""In FEATURES: there are distributed clocks."""
 NO_LRW: Final = 1 << 9
 """In FEATURES: logical memory can be read (LRD) and written (LWR), but not both at once."""
-"""Two bytes: the number of FMMUs, the number of sync managers."""
 STATION_ADDRESS: Final = 0x0010
 STATION_ALIAS: Final = 0x0012
 DL_CONTROL: Final = 0x0100
@@ -51,10 +53,15 @@ FMMU: Final = 0x0600
 FMMU_SIZE: Final = 16
 SYNC_MANAGER: Final = 0x0800
 SYNC_MANAGER_SIZE: Final = 8
+SM_CONTROL: Final = 4
+"""Offsets within a sync manager."""
 SM_STATUS: Final = 5
-"""Offset within a sync manager."""
 SM_ACTIVATE: Final = 6
 SM_PDI_CONTROL: Final = 7
+SM_MAILBOX, SM_WRITE = 0x02, 0x04
+"""Bits of the control byte: it is a mailbox (else buffered), the master writes."""
+SM_LATCH_PDI_EVENT: Final = 0x80
+"""Bit of the activate byte: the events of the slave's processor, the PDI, are latched with their times."""
 MAILBOX_FULL: Final = 0x08
 """Bit of a mailbox sync manager's status."""
 MAILBOX_IN_STATUS: Final = SYNC_MANAGER + SYNC_MANAGER_SIZE + SM_STATUS
@@ -71,6 +78,10 @@ DC_SPEED_START: Final = 0x0930
 DC_FILTERS: Final = 0x0934
 DC_ACTIVATION: Final = 0x0980
 """Two bytes: who controls the SYNC signals, which are active."""
+DC_PDI_START_EVENT: Final = 0x09F8
+"""Local time, 32 bits: the slave's processor began to write or read a buffer."""
+DC_PDI_CHANGE_EVENT: Final = 0x09FC
+"""The same: it had written or read it."""
 USER_RAM: Final = 0x0F80
 REGISTERS_END: Final = 0x1000
 """Process data memory begins here."""

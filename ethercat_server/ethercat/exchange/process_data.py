@@ -1,0 +1,131 @@
+"""The exchange of process data: frames of our own, several at a time, each matched by its index."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Final
+
+from ethercat_server.ethercat.backend import Backend
+from ethercat_server.ethercat.exchange.distributed_clock import switch_latched
+from ethercat_server.ethercat.exchange.frames import Area, make_frames
+from ethercat_server.ethercat.wire import DATAGRAM_INDEX, FRAME_HEADER, Command
+
+FIRST_INDEX: Final = 0x90
+"""Single datagrams and SOEM use the indices below."""
+_INDICES: Final = 0x100 - FIRST_INDEX
+MOST_IN_FLIGHT = 100
+"""Frames on the wire; a limit for a bus that does not answer."""
+_LOST_NS: Final = 100_000_000
+"""A frame that is not back after this time counts as lost: its index is used again."""
+_TAG: Final = struct.Struct("<I")
+_NOTHING: Final = (0, 0, 0)
+
+
+class ProcessData:
+    """The frames of an exchange, and those that are on the wire."""
+
+    def __init__(
+        self,
+        areas: Sequence[Sequence[Area]],
+        backend: Backend,
+        *,
+        lrw: bool = True,
+        stations: Sequence[int | None] = (),
+    ) -> None:
+        """See `make_frames`."""
+        self._send, self._monotonic_ns = backend.send, backend.clock.monotonic_ns
+        frames = make_frames(areas, stations or [None] * len(areas), lrw=lrw)
+        self._lrw, self._command = lrw, int(Command.LRW if lrw else Command.LRD)
+        self._frames = [frame.content for frame in frames]
+        self._ends = [frame.end for frame in frames]
+        self._written = [frame.written for frame in frames]
+        self._tags = [frame.tag for frame in frames]
+        self.inputs = [frame.inputs for frame in frames]
+        """By frame: the sensors whose inputs it carries."""
+        self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
+        """What each sensor adds to the working counter of each frame."""
+        self._index = self._number = 0
+        self._sent = [_NOTHING] * _INDICES
+        """By index less the first: when a frame was sent that is not back, else 0; which it was; its tag."""
+        self.in_flight = 0
+        """Frames in flight: not back, and not known to be lost."""
+        self._lost = 0
+        self.blocked_until_ns = 0
+        """Nothing can be sent before, as long as nothing comes back."""
+        self.frame = b""
+        """The answer that `take` took last."""
+        self.wkc = 0
+        """Its working counter."""
+        self.which = 0
+        """Which frame of the exchange it is."""
+
+    def read_latched(self, number: int, *, reads: bool) -> None:
+        """Read what the controller of a sensor latches, or no longer."""
+        for content, inputs in zip(self._frames, self.inputs, strict=True):
+            for each in inputs:
+                if each.number == number and each.latched:
+                    switch_latched(content, each.latched, reads=reads)
+
+    def send(self) -> int:
+        """Send an exchange, unless too many are on the wire. Returns when."""
+        now_ns = 0
+        for which, frame in enumerate(self._frames):
+            index = self._index
+            if self.in_flight >= MOST_IN_FLIGHT or self._sent[index][0]:
+                now_ns = self._monotonic_ns()
+                self._forget(now_ns)
+                if self.in_flight >= MOST_IN_FLIGHT:
+                    self.blocked_until_ns = min(sent[0] for sent in self._sent if sent[0]) + _LOST_NS
+                    return now_ns
+                while self._sent[index][0]:
+                    index = (index + 1) % _INDICES
+            self._index = (index + 1) % _INDICES
+            self._number = number = (self._number + 1) & 0xFFFFFFFF
+            frame[DATAGRAM_INDEX] = index + FIRST_INDEX
+            _TAG.pack_into(frame, self._tags[which], number)
+            self.in_flight += 1
+            now_ns = self._monotonic_ns()
+            self._send(frame)
+            self._sent[index] = now_ns, which, number
+        return now_ns
+
+    def take(self, frame: bytes) -> int:
+        """Take a frame that has arrived: returns when it was sent; 0 if it is no answer that is awaited."""
+        if (
+            len(frame) <= DATAGRAM_INDEX
+            or frame[DATAGRAM_INDEX] < FIRST_INDEX
+            or frame[FRAME_HEADER] != self._command
+        ):
+            return 0
+        index = frame[DATAGRAM_INDEX] - FIRST_INDEX
+        sent_ns, which, number = self._sent[index]
+        if not sent_ns:
+            return 0
+        at = self._tags[which]
+        if len(frame) < at + _TAG.size or _TAG.unpack_from(frame, at)[0] != number:  # an older one
+            return 0
+        self._sent[index] = _NOTHING
+        self.blocked_until_ns = 0
+        self.in_flight -= 1
+        self.frame, self.which = frame, which
+        end = self._ends[which]
+        self.wkc = frame[end] | frame[end + 1] << 8
+        if not self._lrw:  # an LRW would have counted 2
+            end = self._written[which]
+            self.wkc += 2 * (frame[end] | frame[end + 1] << 8)
+        return sent_ns
+
+    @property
+    def lost(self) -> int:
+        """Frames that did not come back."""
+        self._forget(self._monotonic_ns())
+        return self._lost
+
+    def _forget(self, now_ns: int) -> None:
+        """Give up the frames that have been away for too long."""
+        for index, (sent_ns, _, _) in enumerate(self._sent):
+            if sent_ns and now_ns - sent_ns >= _LOST_NS:
+                self._sent[index] = _NOTHING
+                self.in_flight -= 1
+                self._lost += 1
