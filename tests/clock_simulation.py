@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
+from ethercat_server.acquisition.hardware.event_times import EventTimes
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.timing.sample_clock import SampleClock
+from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
 
 SECOND: Final = 1e9
 _SEND_NS: Final = 8_000.0
@@ -96,6 +98,59 @@ class Sensor:
                 at, restart = restart + chance.random() * first_ns, math.inf
 
 
+@dataclass(frozen=True)
+class Controller:
+    """A slave controller with a distributed clock. Times in ns, `_s`: from the start, where nothing else is said."""
+
+    ppm: float = 35.0
+    """How much faster its crystal is,"""
+    step_ppm: float = 0.0
+    """and by how much more, later."""
+    start: int = 2**32 - 2_000_000_000
+    """Local time at the start: it wraps after 2 s."""
+    jump_ns: float = 0.0
+    """By so much the local time jumps."""
+    stops: bool = False
+    """The local time stands still."""
+    stuck: bool = False
+    """The event time stands still."""
+    late_ns: float = 0.0
+    """The event time is late; early if negative: that of the buffer's start."""
+    jitter_ns: float = 0.0
+    """It is off by so much at random (standard deviation)."""
+    lags: int = 0
+    """It is that of a sample so many before."""
+    counter: int = 1
+    """Working counter of its registers."""
+    lies_from_s: float = 0.0
+    """When all this begins."""
+
+    def local(self, at_ns: float) -> int:
+        """The local time then."""
+        since_ns = at_ns - self.lies_from_s * SECOND
+        lies = since_ns >= 0
+        if lies and self.stops:
+            at_ns -= since_ns
+        local = self.start + at_ns * (1 + self.ppm * 1e-6)
+        if lies:
+            local += since_ns * self.step_ppm * 1e-6 + self.jump_ns
+        return round(local)
+
+    def latched(self, instants_ns: Sequence[float], number: int, look_ns: float) -> Latched:
+        """What a frame reads that is at the slave at `look_ns`, when the sample `number` is the newest."""
+        change = 0
+        if number >= 0:
+            if look_ns < self.lies_from_s * SECOND:
+                change = self.local(instants_ns[number])
+            else:
+                event_ns = instants_ns[max(0, number - self.lags)] + self.late_ns
+                if self.jitter_ns:
+                    event_ns += random.Random(number).gauss(0, self.jitter_ns)
+                change = 0 if self.stuck else self.local(event_ns)
+        wrap = 1 << 32
+        return self.local(look_ns) % wrap, self.counter, change % wrap, change % wrap, self.counter
+
+
 class Sample(NamedTuple):
     """One that was handed out. Times in ns."""
 
@@ -157,16 +212,22 @@ class Exchange(NamedTuple):
     back_ns: float
     number: int
     """Of the newest sample when the sensor looked."""
+    latched: Latched | None
+    """By its controller."""
 
 
 class ClockSimulation:
     """One sensor, one card, one machine. Times in ns from the start."""
 
-    def __init__(self, sensor: Sensor, card: Card, machine: Machine, seed: int) -> None:
+    def __init__(
+        self, sensor: Sensor, card: Card, machine: Machine, seed: int, controller: Controller | None = None
+    ) -> None:
         self.card = card
         self.machine = machine
+        self.controller = controller
         self.timing = ExchangeTiming()
-        self.clock = SampleClock(SECOND / sensor.rate_hz, self.timing)
+        events = controller and EventTimes(DistributedClock(0, 0), self.timing)
+        self.clock = SampleClock(SECOND / sensor.rate_hz, self.timing, events)
         self.now_ns = 1.0
         self.polls_ns: list[float] = []
         """When they were sent."""
@@ -216,15 +277,19 @@ class ClockSimulation:
             return
         self._last_look_ns = max(sent_ns + out_ns, self._last_look_ns)
         self._last_back_ns = max(sent_ns + took_ns, self._last_look_ns, self._last_back_ns)
-        self._flying.append(Exchange(sent_ns, self._last_back_ns, self._newest(self._last_look_ns)))
+        look_ns, number = self._last_look_ns, self._newest(self._last_look_ns)
+        latched = self.controller and self.controller.latched(self.instants_ns, number, look_ns)
+        self._flying.append(Exchange(sent_ns, self._last_back_ns, number, latched))
 
     def _take(self, exchange: Exchange) -> None:
         clock, sent, back, number = self.clock, int(exchange.sent_ns), int(self.now_ns), exchange.number
         self.timing.took(sent, back)
         fresh = number > (self.samples[-1].number if self.samples else -1)
+        if clock.events is not None and exchange.latched is not None:
+            clock.events.took(exchange.latched, sent, back, fresh)
         if fresh:
             clock.predict(sent, back)
-            stamp_ns = clock.instant_ns if clock.locked else min(back, sent + clock.period_ns)
+            stamp_ns = clock.instant_ns if clock.is_dated else min(back, sent + clock.period_ns)
             told = clock.uncertainty_ns, clock.locked, clock.steps, clock.uncertain
             self.samples.append(Sample(number, self.instants_ns[number], back, stamp_ns, *told))
         clock.observe(sent, back, fresh)

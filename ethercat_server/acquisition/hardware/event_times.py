@@ -10,30 +10,29 @@ from __future__ import annotations
 from typing import Final
 
 from ethercat_server.acquisition.hardware.local_clock import LocalClock
-from ethercat_server.acquisition.hardware.trust import Trust, Verdict
+from ethercat_server.acquisition.hardware.trust import Evidence, Trust, Verdict
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
 
 _WRAP: Final = 1 << 32
 _HALF: Final = 1 << 31
+_LONG_AGO: Final = -(1 << 63)
 _FRAME_NS: Final = 150_000
 """An event may come while the frame passes; the longest one takes less."""
+_PASSING: Final = 0.5
+"""What that counts as a contradiction."""
+_LEAST_VARIANCE: Final = 2_000.0**2
+_ASYMMETRY: Final = 1 / 24
+"""Standard deviation of the outward part of a round trip, as part of the shortest one."""
 
 
 class EventTimes:
     """Of one sensor. `took` follows every exchange; after one that brought a new sample, `judge`."""
 
     __slots__ = (
-        "_event",
-        "_half_behind_ns",
-        "_local",
-        "_offset",
-        "fits",
-        "instant_ns",
-        "local_clock",
-        "moved",
-        "trust",
-    )
+        "_answers", "_event", "_half_behind_ns", "_is_passing", "_local", "_moved", "_offset", "_timing",
+        "_took_ns", "instant_ns", "local_clock", "trust",
+    )  # fmt: skip
 
     def __init__(self, clock: DistributedClock, timing: ExchangeTiming) -> None:
         """`clock` is the slave controller's; `timing` that of the bus."""
@@ -41,24 +40,23 @@ class EventTimes:
         self.trust = Trust()
         self.instant_ns = 0.0
         """CLOCK_MONOTONIC of the new sample of the newest exchange; 0 if its event does not say."""
-        self.fits = False
-        """Whether that event can be this sample's."""
-        self.moved = 0
-        """Number of samples with an event of their own."""
+        self._timing = timing
         self._offset = clock.offset
         self._half_behind_ns = clock.behind_ns / 2
-        self._local = self._event = 0
+        self._local = self._event = _LONG_AGO
         """Local times of the newest exchange and of the newest sample's event."""
+        self._took_ns = 0
+        """By the newest exchange."""
+        self._is_passing = False
+        """Whether that event came while the frame passed: it may be this sample's or the next one's."""
+        self._moved = 0
+        self._answers = False
+        """Whether the controller knows the registers."""
 
     @property
     def variance(self) -> float:
-        """Of `instant_ns` about the instants of a clock that runs evenly, in ns²."""
-        return self.trust.spread + self.local_clock.variance
-
-    @property
-    def restarts(self) -> int:
-        """How often the local clock was found to be another."""
-        return self.local_clock.restarts
+        """Of `instant_ns`, in ns², but for where on its way a round trip takes its time."""
+        return self.local_clock.variance + _LEAST_VARIANCE
 
     @property
     def are_trusted(self) -> bool:
@@ -70,32 +68,48 @@ class EventTimes:
 
         `fresh`: it brought a new sample. Exchanges come in the order in which they were sent.
         """
-        self.instant_ns, self.fits = 0.0, False
+        self.instant_ns, self._is_passing = 0.0, False
         system, counted, _, change, counted_too = latched
-        if counted != 1 or counted_too != 1:
+        self._answers = counted == counted_too == 1
+        if not self._answers:
             return
         clock = self.local_clock
         clock.saw((system - self._offset) % _WRAP, sent_ns, back_ns)
-        before, self._local = self._local, local = self._local, clock.local
+        before, local = self._local, clock.local
+        self._local = local
         if not fresh:
             return
         event = local - ((local - change + _HALF) % _WRAP - _HALF)
-        self.moved += event != self._event
+        self._moved += event != self._event
         self._event = event
-        self.fits = before < event < local + _FRAME_NS
-        # One that came while the frame passed may be this sample's or the next one's.
-        if self.fits and event <= local and clock.is_known and clock.fits(sent_ns, back_ns):
+        if before < event <= local and clock.is_known and clock.fits(sent_ns, back_ns):
             self.instant_ns = clock.time(event) - self._half_behind_ns
+            self._took_ns = back_ns - sent_ns
+        self._is_passing = local < event < local + _FRAME_NS
 
     def judge(self, difference_ns: float, variance: float, back_ns: int) -> bool:
         """Whether the new sample is dated by `instant_ns`.
 
-        That is so much later than the estimate by polling expects, with this variance; the exchange was back
-        at `back_ns`.
+        That is so much later than the estimate expects, which has this variance; the exchange was back at
+        `back_ns`.
         """
-        trust = self.trust
+        trust, variance = self.trust, variance + self.variance
         if trust.verdict is Verdict.TRUSTED:
-            return trust.keeps(self, difference_ns, variance + self.local_clock.variance, back_ns)
-        if trust.verdict is Verdict.TRIAL:
-            trust.tries(self, difference_ns, variance + self.local_clock.variance, back_ns)
+            if self.instant_ns and trust.keeps(difference_ns, variance, self._took_ns / 2):
+                return True
+            if not self.instant_ns:
+                trust.contradicted(_PASSING if self._is_passing else 1.0)
+            trust.reconsider(self._evidence, back_ns)
+        elif trust.verdict is Verdict.TRIAL:
+            if self.instant_ns:
+                trust.compare(difference_ns)
+            elif not (self._is_passing or (self._answers and not self.local_clock.is_known)):
+                trust.unfit()
+            # Polling does not tell where on its way a round trip takes its time.
+            asymmetry_ns = _ASYMMETRY * self._timing.least_ns
+            trust.end(self._evidence, variance + asymmetry_ns * asymmetry_ns, back_ns)
         return False
+
+    @property
+    def _evidence(self) -> Evidence:
+        return Evidence(self.local_clock.restarts, self._moved)

@@ -35,8 +35,10 @@ _PULLED: Final = 1.0
 _RATE_STEP: Final = 20e-6
 """If the errors have a mean of so many standard deviations, the rate has changed: by about so much."""
 _KNOWN_NS: Final = 10_000.0
+_KNOWN: Final = 1 / 32
 _KNOWN_BLOCKS: Final = 12
-"""It is known once its standard deviation is less, after so many blocks."""
+"""It is known once its standard deviation is less than this, or than this part of the shortest round trip, after
+so many blocks."""
 
 
 class LocalClock:
@@ -132,4 +134,5 @@ class LocalClock:
             self._restart()
         else:
             self._doubt_ns = _CONTRADICTS * math.sqrt(self.variance)
-            self.is_known = self._blocks >= _KNOWN_BLOCKS and self.variance < _KNOWN_NS**2
+            enough_ns = max(_KNOWN_NS, _KNOWN * self._timing.least_ns)
+            self.is_known = self._blocks >= _KNOWN_BLOCKS and self.variance < enough_ns * enough_ns

@@ -6,20 +6,19 @@ that contradict the frames or the sensor's clock suffice for another trial.
 
 from __future__ import annotations
 
+import math
 from enum import Enum
-from typing import Final, Protocol
+from typing import Final, NamedTuple
 
 _SAMPLES: Final = 100
 _TRIAL_NS: Final = 500_000_000
 """A trial takes so many samples and so long."""
-_AGREEING: Final = 0.95
-"""Part of them that must agree with polling."""
+_FITTING: Final = 0.95
+"""Part of them whose events must lie between the frames around the sample."""
 _CONTRADICTS: Final = 3.0
-"""One that is off by more than so many standard deviations does not."""
+"""Off by more than so many standard deviations in the mean, they are wrong."""
 _OUTLIER: Final = 5.0
-"""Once trusted, one that is off by so many is not used."""
-_LEAST_SPREAD: Final = 2_000.0**2
-_SPREAD_GAIN: Final = 1 / 64
+"""Once they are trusted, one that is off by so many is not used."""
 _MOST_FAILURES: Final = 5
 """After so many event times are not used any more."""
 _PROVEN_NS: Final = 60_000_000_000
@@ -27,7 +26,7 @@ _PROVEN_NS: Final = 60_000_000_000
 _RESTARTS: Final = 3
 """A local clock that starts anew so often in a trial is none."""
 _MOST_CONTRADICTIONS: Final = 4.0
-_FORGET: Final = 1 / 64
+_FORGET: Final = 1 / 32
 """The trust ends with so many, of which each sample that fits takes back this part of one."""
 
 
@@ -39,91 +38,100 @@ class Verdict(Enum):
     REFUSED = "refused"
 
 
-class Evidence(Protocol):
-    """What the newest sample's event says: see `EventTimes`."""
+class Evidence(NamedTuple):
+    """What is known of the local clock, and of the events, when a trial begins or ends."""
 
-    instant_ns: float
-    fits: bool
+    restarts: int
+    """How often the clock was found to be another."""
     moved: int
-
-    @property
-    def restarts(self) -> int:
-        """How often the local clock was found to be another."""
+    """Number of samples with an event of their own."""
 
 
 class Trust:
     """In the event times of one sensor. Times in ns, variances in ns²."""
 
     __slots__ = (
-        "_agreed", "_compared", "_contradictions", "_differences_ns", "_failures", "_moved", "_restarts",
-        "_since_ns", "spread", "verdict", "why",
+        "_began", "_compared", "_contradictions", "_failures", "_since_ns", "_squares", "_sum_ns", "_unfit",
+        "spread", "verdict", "why",
     )  # fmt: skip
 
     def __init__(self) -> None:
         self.verdict = Verdict.TRIAL
         self.why = ""
         """What was wrong with them last: part of a sentence."""
-        self.spread = _LEAST_SPREAD
-        """Variance of the instants about those of a clock that runs evenly."""
+        self.spread = 0.0
+        """Variance of the differences from polling in the last trial."""
         self._failures = 0
         self._contradictions = 0.0
         self._since_ns = 0
-        self._compared = self._agreed = self._moved = self._restarts = 0
-        self._differences_ns = 0.0
+        self._began = Evidence(0, 0)
+        self._compared = self._unfit = 0
+        self._sum_ns = self._squares = 0.0
 
-    def keeps(self, event: Evidence, difference_ns: float, variance: float, back_ns: int) -> bool:
-        """Whether a sample is dated by its event, which is so far from the estimate of this variance."""
-        if event.instant_ns:
-            square, most = difference_ns * difference_ns, _OUTLIER * _OUTLIER * (variance + self.spread)
-            fits = square < most
-            self.spread += _SPREAD_GAIN * ((square if fits else most) - self.spread)
-            self.spread = max(self.spread, _LEAST_SPREAD)
-            if fits:
-                if self._contradictions > 0:
-                    self._contradictions -= _FORGET
-                return True
-        elif event.fits:  # its local clock is not known
-            return False
+    def keeps(self, difference_ns: float, variance: float, jump_ns: float) -> bool:
+        """Whether a sample is dated by its event, so far from the estimate, which has this variance.
+
+        If it is further than `jump_ns` the sensor's own clock has changed: so far a jump of the local clock
+        would show in the round trip.
+        """
+        if not _OUTLIER * math.sqrt(variance) < abs(difference_ns) < jump_ns:
+            if self._contradictions > 0:
+                self._contradictions -= _FORGET
+            return True
         self._contradictions += 1
-        if self._contradictions > _MOST_CONTRADICTIONS:
-            if back_ns - self._since_ns > _PROVEN_NS:
-                self._failures = 0
-            self._fail("they contradict the frames and the sensor's clock")
-            self._begin(event, back_ns)
         return False
 
-    def tries(self, event: Evidence, difference_ns: float, variance: float, back_ns: int) -> None:
-        """Compare a sample's event with the estimate by polling."""
+    def contradicted(self, weight: float) -> None:
+        """A sample has no event that can be its own."""
+        self._contradictions += weight
+
+    def reconsider(self, evidence: Evidence, now_ns: int) -> None:
+        """End the trust if there were too many contradictions."""
+        if self._contradictions > _MOST_CONTRADICTIONS:
+            if now_ns - self._since_ns > _PROVEN_NS:
+                self._failures = 0
+            self._fail("they contradict the frames or the sensor's own clock")
+            self.begin(evidence, now_ns)
+
+    def begin(self, evidence: Evidence, now_ns: int) -> None:
+        """Begin a trial."""
+        self._since_ns, self._began = now_ns, evidence
+        self._compared = self._unfit = 0
+        self._sum_ns = self._squares = 0.0
+
+    def compare(self, difference_ns: float) -> None:
+        """An event is so much later than what polling says."""
+        self._compared += 1
+        self._sum_ns += difference_ns
+        self._squares += difference_ns * difference_ns
+
+    def unfit(self) -> None:
+        """An event that cannot be the sample's."""
+        self._unfit += 1
+
+    def end(self, evidence: Evidence, variance: float, now_ns: int) -> None:
+        """End the trial if it was long enough; `variance` is that of both estimates."""
         if not self._since_ns:
-            self._begin(event, back_ns)
-        if event.instant_ns or not event.fits:
-            self._compared += 1
-            if event.instant_ns:
-                self._differences_ns += difference_ns
-                most = _CONTRADICTS * _CONTRADICTS * (variance + self.spread)
-                self._agreed += difference_ns * difference_ns < most
-        if back_ns - self._since_ns > _TRIAL_NS:
-            if event.restarts - self._restarts > _RESTARTS:
-                self._refuse("its local clock does not run")
-            elif self._compared >= _SAMPLES:
-                self._end(event, back_ns)
-
-    def _begin(self, event: Evidence, now_ns: int) -> None:
-        self._since_ns = now_ns
-        self._compared = self._agreed = 0
-        self._differences_ns = 0.0
-        self._moved, self._restarts = event.moved, event.restarts
-
-    def _end(self, event: Evidence, back_ns: int) -> None:
-        if self._agreed >= _AGREEING * self._compared:
-            self.verdict, self._since_ns = Verdict.TRUSTED, back_ns
-            self._contradictions = 0.0
-        elif event.moved == self._moved:
+            self.begin(evidence, now_ns)
+        if now_ns - self._since_ns < _TRIAL_NS:
+            return
+        count = self._compared + self._unfit
+        if evidence.restarts - self._began.restarts > _RESTARTS:
+            self._refuse("its local clock does not run")
+        elif count < _SAMPLES:
+            pass
+        elif evidence.moved == self._began.moved:
             self._refuse("they stand still")
+        elif self._compared < _FITTING * count:
+            self._fail("they contradict the frames")
+            self.begin(evidence, now_ns)
+        elif abs(mean_ns := self._sum_ns / self._compared) > _CONTRADICTS * math.sqrt(variance):
+            self._fail(f"they differ from what polling shows by {mean_ns / 1000:+.0f} µs")
+            self.begin(evidence, now_ns)
         else:
-            off_us = self._differences_ns / self._compared / 1000
-            self._fail(f"they differ from what polling shows by {off_us:+.0f} µs")
-            self._begin(event, back_ns)
+            self.spread = self._squares / self._compared
+            self.verdict, self._since_ns = Verdict.TRUSTED, now_ns
+            self._contradictions = 0.0
 
     def _fail(self, why: str) -> None:
         self._failures += 1

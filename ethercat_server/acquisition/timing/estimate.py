@@ -138,7 +138,27 @@ class Estimate:
         else:
             self._run = 0.0
             self._narrow(slope * slope + slope * late / deviation_ns)
-        excess = (1 - chance) * (surprise + math.log(1 - chance))
+        self._stir((1 - chance) * (surprise + math.log(1 - chance)))
+
+    def learn_instant(self, instant_ns: float, variance: float) -> None:
+        """The sample came to be then."""
+        error_ns, total = instant_ns - self.phase_ns, self.variance + variance
+        surprise = error_ns * error_ns / total
+        if surprise > CONTRADICTS * CONTRADICTS:
+            if self._is_contradicted():
+                self._move(error_ns / self.variance)
+            return
+        self._contradictions = 0
+        self._move(error_ns / total)
+        self._narrow(1 / total)
+        self._stir((surprise - 1) / 2)
+
+    def expect(self, variance: float) -> None:
+        """Instants are about so far from those of a crystal."""
+        self._stir(math.log(max(variance, _JITTER_NS**2) / _JITTER_NS**2) / _RESTLESS_GAIN)
+
+    def _stir(self, excess: float) -> None:
+        """Something was more surprising than the model has it, by so much."""
         restless = self._restless + _RESTLESS_GAIN * excess
         if restless > 0 or self._restless > 0:
             self._restless = min(max(restless, 0.0), _MOST_RESTLESS)

@@ -15,7 +15,7 @@ _LOSS_PERIODS: Final = 10.0
 _NO_TIME: Final = 0.5
 """There is none if a round trip takes more than this part of a period."""
 _LARGEST_MARGIN: Final = 0.4
-_EVENT_MARGIN: Final = 2.0
+_EVENT_MARGIN: Final = 1.3
 """Standard deviations, where events date the samples and to look early teaches nothing."""
 
 

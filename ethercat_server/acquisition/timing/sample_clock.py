@@ -189,7 +189,7 @@ class SampleClock:
         self._margin_ns = self._usual_margin_ns
         if not (self._single or self.by_events):
             self._margin_ns *= self._caution
-        self._probing = self._hits > _UNPROBED or variance > self._probed_above
+        self._probing = self._hits > _UNPROBED or (variance > self._probed_above and not self.by_events)
         self._aim_ns = estimate.phase_ns + self._margin_ns - timing.look_ns
         if self._probing and not self._single and self.by_events:
             self._aim_ns -= 2 * self._margin_ns
@@ -217,7 +217,8 @@ class SampleClock:
         if events is not None and events.are_trusted:
             at_ns = events.instant_ns - least_ns / 2 if events.instant_ns else phase_ns
             late = (at_ns - phase_ns) / period_ns
-            if events.judge((late - round(late)) * period_ns, self._estimate.variance, back_ns):
+            off = late - round(late) if late > -0.5 else late
+            if events.judge(off * period_ns, self._estimate.variance, back_ns):
                 self._by_event = at_ns
                 self._count(1 + round(late), late)
                 self.instant_ns = min(events.instant_ns, back_ns)
@@ -247,6 +248,8 @@ class SampleClock:
         self.instant_ns = instant_ns if instant_ns < back_ns else back_ns
         if events is not None and self.locked and not (events.are_trusted or self.uncertain):
             events.judge(events.instant_ns - instant_ns, self._estimate.variance, back_ns)
+            if events.are_trusted:
+                self._estimate.expect(events.trust.spread)
 
     def _count(self, newest: int, late: float) -> None:
         """The new sample is this one by the estimate, and so late there, in periods."""
@@ -279,14 +282,14 @@ class SampleClock:
             if self.uncertain:
                 pass  # it may be another sample's
             elif self._by_event and self.events is not None:
-                estimate.learn_bracket(self._by_event, self._by_event, self.events.variance)
+                estimate.learn_instant(self._by_event, self.events.variance)
             elif self.locked and not (looked_ns > estimate.phase_ns and self._is_late(looked_ns, variance)):
                 estimate.learn_bit(look_ns, variance, 1)
             elif look_ns - looked_ns < estimate.period_ns:
                 estimate.learn_bracket(looked_ns, look_ns, variance)
             estimate.advance(1)
             self._doubtful = self.uncertain
-            if self._hits:
+            if self._hits and not self._by_event:
                 self._caution -= _CAUTION_GAIN * _EARLY_POLLS * self._caution
             self._hits += 1
             self._absent = 0
@@ -301,8 +304,8 @@ class SampleClock:
             if self.locked and not (self._doubtful or self._is_late(look_ns, variance)):
                 if not self.by_events:
                     estimate.learn_bit(look_ns, variance, -1)
-                if look_ns > estimate.phase_ns - doubt_ns - self._margin_ns:
-                    if self._hits:
+                if look_ns > estimate.phase_ns - doubt_ns - 2 * self._margin_ns:
+                    if self._hits and not self.by_events:
                         self._caution += _CAUTION_GAIN * self._caution
                         self._caution = min(self._caution, 1.0)
                     self._hits = 0
