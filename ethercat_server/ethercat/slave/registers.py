@@ -10,10 +10,14 @@ from typing import Final
 
 DL_INFORMATION: Final = 0x0000
 FMMU_AND_SM_COUNT: Final = 0x0004
+"""Two bytes: the number of FMMUs, the number of sync managers."""
 FEATURES: Final = 0x0008
+DC_AVAILABLE: Final = 1 << 2
+"""In FEATURES: it has a distributed clock."""
+DC_64_BIT: Final = 1 << 3
+"""In FEATURES: of 64 bits, not 32."""
 NO_LRW: Final = 1 << 9
 """In FEATURES: logical memory can be read (LRD) and written (LWR), but not both at once."""
-"""Two bytes: the number of FMMUs, the number of sync managers."""
 STATION_ADDRESS: Final = 0x0010
 STATION_ALIAS: Final = 0x0012
 DL_CONTROL: Final = 0x0100
@@ -54,6 +58,10 @@ SYNC_MANAGER_SIZE: Final = 8
 SM_STATUS: Final = 5
 """Offset within a sync manager."""
 SM_ACTIVATE: Final = 6
+SM_LATCH_ECAT: Final = 0x40
+"""In a sync manager's activate register: a frame that exchanges its buffer is a DC event."""
+SM_LATCH_PDI: Final = 0x80
+"""Likewise the firmware that begins or ends an access to its buffer."""
 SM_PDI_CONTROL: Final = 7
 MAILBOX_FULL: Final = 0x08
 """Bit of a mailbox sync manager's status."""
@@ -68,9 +76,18 @@ DC_OFFSET: Final = 0x0920
 DC_DELAY: Final = 0x0928
 DC_DIFFERENCE: Final = 0x092C
 DC_SPEED_START: Final = 0x0930
+DC_SPEED_DIFFERENCE: Final = 0x0932
 DC_FILTERS: Final = 0x0934
+"""Two bytes: filter depths of the differences of the system time, and of the speed."""
 DC_ACTIVATION: Final = 0x0980
 """Two bytes: who controls the SYNC signals, which are active."""
+DC_ECAT_EVENT: Final = 0x09F0
+"""Four bytes, local time: the frame came that exchanged the buffer of a sync manager."""
+DC_PDI_START_EVENT: Final = 0x09F8
+"""Likewise the firmware began to access a buffer."""
+DC_PDI_CHANGE_EVENT: Final = 0x09FC
+"""Likewise it exchanged one: new inputs."""
+DC_END: Final = 0x0A00
 USER_RAM: Final = 0x0F80
 REGISTERS_END: Final = 0x1000
 """Process data memory begins here."""

@@ -10,8 +10,8 @@ import struct
 from collections.abc import Callable
 from typing import Protocol
 
+from ethercat_server.virtual_sensor.dc.unit import DistributedClock
 from ethercat_server.virtual_sensor.esc import registers as reg
-from ethercat_server.virtual_sensor.esc.distributed_clock import DistributedClock
 from ethercat_server.virtual_sensor.esc.fmmu import Fmmu
 from ethercat_server.virtual_sensor.esc.sii import SiiInterface
 from ethercat_server.virtual_sensor.esc.sync_manager import SyncManager
@@ -67,7 +67,8 @@ class Esc:
         self.sync_managers = [SyncManager(self.memory, n) for n in range(reg.SYNC_MANAGER_COUNT)]
         self.fmmus: list[Fmmu] = []
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
-        self.has_lrw = True
+        self.has_lrw = self.has_dc = True
+        self._write_mask = reg.WRITE_MASK
         self._events = 0
 
     def take_lrw_away(self) -> None:
@@ -75,6 +76,26 @@ class Esc:
         self.has_lrw = False
         features = _U16.unpack_from(self.memory, reg.FEATURES)[0]
         _U16.pack_into(self.memory, reg.FEATURES, features | reg.NO_LRW)
+
+    def take_dc_away(self) -> None:
+        """Be a controller without a distributed clock."""
+        self.has_dc = False
+        self.clock.events.take_away()
+        self._miss(reg.DC_AVAILABLE | reg.DC_64_BIT, range(reg.DC_RECEIVE_TIMES, reg.DC_END))
+
+    def narrow_dc(self) -> None:
+        """Be a controller whose distributed clock has 32 bits."""
+        self.clock.time_mask = 2**32 - 1
+        for time in (reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME, reg.DC_OFFSET):
+            self._miss(reg.DC_64_BIT, range(time + 4, time + 8))
+
+    def _miss(self, feature: int, registers: range) -> None:
+        features = _U16.unpack_from(self.memory, reg.FEATURES)[0]
+        _U16.pack_into(self.memory, reg.FEATURES, features & ~feature)
+        mask = bytearray(self._write_mask)
+        for memory in (self.memory, mask):
+            memory[registers.start : registers.stop] = bytes(len(registers))
+        self._write_mask = bytes(mask)
 
     def count(self, counter: int) -> None:
         """Add one to the error counter at this register; it stays at 255."""
@@ -182,8 +203,11 @@ class Esc:
         if manager.mailbox:
             data = manager.take(offset, length)
             if data is not None and not manager.full:
+                self._exchanged(manager)
                 self._pdi.mailbox_read()
             return data
+        if manager.latches_ecat and offset + length == manager.length:
+            self._exchanged(manager)
         if offset == 0:  # three buffers: the newest is handed over when the first byte is read
             newest = self._pdi.inputs()[: manager.length].ljust(manager.length, b"\0")
             self.memory[manager.start : manager.end] = newest
@@ -197,20 +221,29 @@ class Esc:
             if not manager.put(offset, data):
                 return False
             if manager.full:
+                self._exchanged(manager)
                 self._pdi.mailbox_written()
             return True
         self.memory[manager.start + offset : manager.start + offset + len(data)] = data
         if offset + len(data) == manager.length:  # handed over when the last byte is written
+            self._exchanged(manager)
             self._pdi.outputs(bytes(self.memory[manager.start : manager.end]))
         return True
+
+    def _exchanged(self, manager: SyncManager) -> None:
+        if manager.latches_ecat and self.has_dc:
+            self.clock.exchanged()
 
     def _read_registers(self, start: int, end: int) -> bytes:
         if start <= reg.EVENT_REQUEST + 1 and end > reg.EVENT_REQUEST:
             _U16.pack_into(self.memory, reg.EVENT_REQUEST, self.events)
         if start < reg.SII_DATA and end > reg.SII_CONTROL:
             self.sii.advance()
-        if start < reg.DC_RECEIVE_TIME and end > reg.DC_SYSTEM_TIME:
-            self.clock.show()
+        if end > reg.DC_SYSTEM_TIME and start < reg.DC_END and self.has_dc:
+            if start < reg.DC_RECEIVE_TIME:
+                self.clock.show_system_time()
+            if end > reg.DC_ECAT_EVENT:
+                self.clock.show_events()
         data = bytes(self.memory[start:end])
         if start <= reg.AL_STATUS < end:
             self._events &= ~reg.EVENT_AL_STATUS
@@ -221,12 +254,12 @@ class Esc:
     def _write_registers(self, address: int, data: bytes) -> bool:
         end = address + len(data)
         memory = self.memory
-        if not any(reg.WRITE_MASK[address:end]):
+        if not any(self._write_mask[address:end]):
             return False
         locked = [m.registers for m in self.sync_managers if m.enabled]
         repeat_before = self.sync_managers[1].repeat_request
         for at, value in zip(range(address, end), data, strict=True):
-            mask = reg.WRITE_MASK[at]
+            mask = self._write_mask[at]
             if not mask or any(first <= at < first + reg.SM_STATUS for first in locked):
                 continue  # a sync manager's area can be changed only while it is disabled
             memory[at] = memory[at] & ~mask | value & mask
@@ -254,9 +287,12 @@ class Esc:
             self._pdi.sync_managers_changed()
             if self.sync_managers[1].repeat_request != repeat_before:
                 self._pdi.repeat_requested()
-        if touched(reg.DC_RECEIVE_TIMES, 4):
-            self.clock.latch()
-        if touched(reg.DC_SYSTEM_TIME, 4):
-            self.clock.compare()
+        if self.has_dc and end > reg.DC_RECEIVE_TIMES and start < reg.DC_END:
+            if touched(reg.DC_RECEIVE_TIMES, 4):
+                self.clock.latch()
+            if touched(reg.DC_SPEED_START, 2):
+                self.clock.reset_loop()
+            if touched(reg.DC_SYSTEM_TIME, 1):
+                self.clock.compare()
         if touched(reg.AL_CONTROL, 2):
             self._pdi.al_control(_U16.unpack_from(self.memory, reg.AL_CONTROL)[0])
