@@ -286,6 +286,12 @@ def test_faults_of_the_event_times() -> None:
     assert look(master)[2:] == (0, 0, 0)
 
 
+def test_a_register_that_stands_still_from_power_on_has_the_first_event() -> None:
+    frames = list(looks(prepared("stuck"), 10, PERIOD))
+    assert len({change for *_, change in frames[1:]} - {0}) == 1
+    assert len({start for *_, start, _ in frames}) == 10
+
+
 def test_faults_of_the_local_clock() -> None:
     master = prepared()
     master.wait(3 * MS)

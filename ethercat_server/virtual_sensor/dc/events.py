@@ -36,7 +36,7 @@ class EventTimes:
 
     Attributes:
         none: there are no such registers.
-        stuck: the end of a write is no longer shown.
+        stuck: no further end of a write is shown.
         shows_start: instead of the end of a write its start is shown.
         previous: the write before the newest one is shown.
         shift: added to the times of writes.
@@ -50,6 +50,7 @@ class EventTimes:
         self._write_ns = 0
         self._since: int | None = None
         self._begun = self._completed = _NEVER
+        self._any_shown = False
         self.none = False
         self.repair()
 
@@ -85,10 +86,11 @@ class EventTimes:
         if since is None or writes is None or self.none:
             return
         number = writes.number_at(now)
-        if number != self._completed and not self.stuck:
+        if number != self._completed and not (self.stuck and self._any_shown):
             self._completed = number
             end = self._end(writes, number)
             if end >= since:
+                self._any_shown = True
                 shown = end - self._write_ns if self.shows_start else end
                 self._show(reg.DC_PDI_CHANGE_EVENT, shown, number)
         number = writes.number_at(now + self._write_ns)

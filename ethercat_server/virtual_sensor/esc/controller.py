@@ -17,6 +17,8 @@ from ethercat_server.virtual_sensor.esc.sii import SiiInterface
 from ethercat_server.virtual_sensor.esc.sync_manager import SyncManager
 
 _U16 = struct.Struct("<H")
+_REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_TIMES, reg.DC_END
+_DC_SYSTEM_TIME, _DC_RECEIVE_TIME, _DC_ECAT_EVENT = reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME, reg.DC_ECAT_EVENT
 _LINE_GOES_ON, _LINE_ENDS = 0x5A33, 0x5613
 """DL status: ports 0 and 1 have a link, or only port 0."""
 
@@ -68,7 +70,7 @@ class Esc:
         self.fmmus: list[Fmmu] = []
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
         self.has_lrw = self.has_dc = True
-        self._write_mask = reg.WRITE_MASK
+        self._write_mask: bytes | bytearray = reg.WRITE_MASK
         self._events = 0
 
     def take_lrw_away(self) -> None:
@@ -90,12 +92,10 @@ class Esc:
             self._miss(reg.DC_64_BIT, range(time + 4, time + 8))
 
     def _miss(self, feature: int, registers: range) -> None:
-        features = _U16.unpack_from(self.memory, reg.FEATURES)[0]
-        _U16.pack_into(self.memory, reg.FEATURES, features & ~feature)
-        mask = bytearray(self._write_mask)
-        for memory in (self.memory, mask):
+        self.memory[reg.FEATURES] &= ~feature
+        self._write_mask = bytearray(self._write_mask)
+        for memory in (self.memory, self._write_mask):
             memory[registers.start : registers.stop] = bytes(len(registers))
-        self._write_mask = bytes(mask)
 
     def count(self, counter: int) -> None:
         """Add one to the error counter at this register; it stays at 255."""
@@ -134,15 +134,15 @@ class Esc:
         Bytes that may not be read stay as they are in `current`.
         """
         length = len(current)
-        end = min(address + length, reg.MEMORY_END)
+        end = address + length
+        if end <= _REGISTERS_END:
+            return self._read_registers(address, end) if length else None
+        end = min(end, reg.MEMORY_END)
         for manager in self.sync_managers:
             if manager.active and manager.start == address and manager.length == length:
                 return self._read_manager(manager, 0, length)
         if address >= end:
             return None
-        if end <= reg.REGISTERS_END:
-            data = self._read_registers(address, end)
-            return data if len(data) == length else data + current[len(data) :]
         result = bytearray(current)
         any_read = False
         if address < reg.REGISTERS_END:
@@ -235,15 +235,17 @@ class Esc:
             self.clock.exchanged()
 
     def _read_registers(self, start: int, end: int) -> bytes:
+        if end > _DC_SYSTEM_TIME and start < _DC_END and self.has_dc:
+            if start < _DC_RECEIVE_TIME:
+                self.clock.show_system_time()
+            if end > _DC_ECAT_EVENT:
+                self.clock.show_events()
+        if start > _DC_RECEIVE_TIMES:
+            return bytes(self.memory[start:end])
         if start <= reg.EVENT_REQUEST + 1 and end > reg.EVENT_REQUEST:
             _U16.pack_into(self.memory, reg.EVENT_REQUEST, self.events)
         if start < reg.SII_DATA and end > reg.SII_CONTROL:
             self.sii.advance()
-        if end > reg.DC_SYSTEM_TIME and start < reg.DC_END and self.has_dc:
-            if start < reg.DC_RECEIVE_TIME:
-                self.clock.show_system_time()
-            if end > reg.DC_ECAT_EVENT:
-                self.clock.show_events()
         data = bytes(self.memory[start:end])
         if start <= reg.AL_STATUS < end:
             self._events &= ~reg.EVENT_AL_STATUS
