@@ -24,7 +24,9 @@ class LocalClock:
 
     def at(self, instant: int) -> int:
         """Local time at an instant."""
-        return self._scaled(instant) // RATE_SCALE
+        if self._ramp or self._stopped:
+            return self._scaled(instant) // RATE_SCALE
+        return (self._local + (instant - self._anchor) * (RATE_SCALE + self._rate)) // RATE_SCALE
 
     def _scaled(self, instant: int) -> int:
         if self._stopped:

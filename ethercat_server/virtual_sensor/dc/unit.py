@@ -19,7 +19,8 @@ HOP_NS: Final = 700
 """From slave to slave, cable included."""
 _U64 = 2**64 - 1
 _U32 = 2**32 - 1
-_OFFSET_AND_DELAY = struct.Struct("<QI")
+_offset_and_delay = struct.Struct("<QI").unpack_from
+_DC_OFFSET: Final = reg.DC_OFFSET
 _TIME = struct.Struct("<Q")
 
 
@@ -51,8 +52,9 @@ class DistributedClock:
 
     def _system(self) -> int:
         """The system time when this frame passed the reference clock, as this clock has it."""
-        offset, delay = _OFFSET_AND_DELAY.unpack_from(self._memory, reg.DC_OFFSET)
-        return (self.local.at(self._arrival) + int(offset) - int(delay)) & self.time_mask
+        offset, delay = _offset_and_delay(self._memory, _DC_OFFSET)
+        arrival = self.frame_start + self.before * HOP_NS  # in line: it is read in every frame
+        return int(self.local.at(arrival) + offset - delay) & self.time_mask
 
     def latch(self) -> None:
         """The master wrote to the receive times: keep when its frame came, and came back."""

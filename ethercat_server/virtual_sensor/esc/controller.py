@@ -234,14 +234,14 @@ class Esc:
         if manager.latches_ecat and self.has_dc:
             self.clock.exchanged()
 
-    def _read_registers(self, start: int, end: int) -> bytes:
+    def _read_registers(self, start: int, end: int) -> bytes | bytearray:
         if end > _DC_SYSTEM_TIME and start < _DC_END and self.has_dc:
             if start < _DC_RECEIVE_TIME:
                 self.clock.show_system_time()
             if end > _DC_ECAT_EVENT:
                 self.clock.show_events()
         if start > _DC_RECEIVE_TIMES:
-            return bytes(self.memory[start:end])
+            return self.memory[start:end]
         if start <= reg.EVENT_REQUEST + 1 and end > reg.EVENT_REQUEST:
             _U16.pack_into(self.memory, reg.EVENT_REQUEST, self.events)
         if start < reg.SII_DATA and end > reg.SII_CONTROL:
