@@ -98,7 +98,9 @@ class Bus(Datagrams):
             if kinds != managers.keys() or reg.FMMU_READ not in kinds or not fit_a_frame(areas[-1], lrw=lrw):
                 # SOEM writes them once, and does not look whether that worked.
                 raise SetUpError(f"sensor {number} did not answer when it was mapped: check cable and power")
-            latches = features[number] & reg.HAS_DC and latch_events(self, number, managers[reg.FMMU_READ])
+            latches = features[number] & reg.DC_AVAILABLE and latch_events(
+                self, number, managers[reg.FMMU_READ]
+            )
             self._latching.append(self.stations[number] if latches else None)
         self.process_data = ProcessData(areas, self.backend, lrw=lrw, stations=self._latching)
 

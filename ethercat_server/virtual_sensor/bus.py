@@ -33,6 +33,8 @@ from ethercat_server.virtual_sensor.slave.application import Application
 Slave = VirtualSensor | ForeignSlave
 
 _LONGEST_PERIOD_NS = 50_000_000
+_BYTE_NS = 80
+"""At 100 Mbit/s: what a datagram reads is of the moment at which it passes, not of the start of its frame."""
 _FIRST_STATION = 0x1001
 """Where another master begins."""
 
@@ -52,7 +54,7 @@ class Bus:
     """Slaves in the order in which frames reach them. All times are in ns, on the caller's clock.
 
     Attributes:
-        now: time of the latest call.
+        now: time of the latest call, or at which the latest datagram passed.
         lose: number of the next frames that are lost.
         deaf_until: no frame comes back before this time; None if the bus answers.
         deaf_after: number of frames after which the bus stops answering; None for never.
@@ -111,6 +113,7 @@ class Bus:
 
     def set_time(self, now: int) -> None:
         """Let time pass up to `now`, with what is due meanwhile but the watchdogs: frames may be waiting."""
+        now = max(now, self.now)  # a frame lasts some µs
         while self._power_events and self._power_events[0][0] <= now:
             self.now, slave = self._power_events.pop(0)
             slave.power(True)
@@ -158,8 +161,12 @@ class Bus:
             return False
         position = self._damaged_at()
         intact = self._escs[:position]
+        start = self.now
+        for esc in intact:
+            esc.clock.frame_start = start
         for datagram in datagrams:
             if datagram.command:  # a NOP passes unchanged
+                self.now = start + (datagram.header - wire.FRAME_HEADER) * _BYTE_NS
                 pass_through(intact, frame, datagram)
         if position is not None:  # the network card of the master throws it away
             self.frames_lost += 1

@@ -12,6 +12,7 @@ from ethercat_server import __version__
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor import link
 from ethercat_server.virtual_sensor.control import ControlError
+from ethercat_server.virtual_sensor.dc.kinds import CLOCK_WORDS, ClockWordError, parse_clock
 from ethercat_server.virtual_sensor.faults.command import CommandError, real, whole
 from ethercat_server.virtual_sensor.faults.measurement import PPM_LIMIT
 from ethercat_server.virtual_sensor.faults.table import COMMANDS
@@ -24,7 +25,13 @@ from ethercat_server.virtual_sensor.foreign.chain import (
 )
 from ethercat_server.virtual_sensor.foreign.kinds import KINDS
 from ethercat_server.virtual_sensor.measurement.signals import SIGNALS
-from ethercat_server.virtual_sensor.options import EEPROM_MS, BusOptions, ForeignOptions, SensorOptions
+from ethercat_server.virtual_sensor.options import (
+    EEPROM_MS,
+    WRITE_US,
+    BusOptions,
+    ForeignOptions,
+    SensorOptions,
+)
 from protocol.pdo import LAYOUTS
 from protocol.settings import SETTINGS
 
@@ -36,11 +43,13 @@ class UsageError(Exception):
 def build_parser() -> argparse.ArgumentParser:
     """The command line."""
     commands = "\n".join(f"  {c.usage:34} {c.meaning}" for c in COMMANDS)
+    words = "\n".join(f"  {f'{w.name} {w.values}':34} {w.meaning}" for w in CLOCK_WORDS)
     parser = argparse.ArgumentParser(
         prog="ethercat-virtual-sensor",
         description="Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
         "and other slaves beside them.",
-        epilog=f"commands, one per line on stdin or on the --control socket:\n{commands}",
+        epilog=f"commands, one per line on stdin or on the --control socket:\n{commands}\n\n"
+        f"of a distributed clock, in --dc or as a command:\n{words}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     several = "; several, comma separated or repeated, for a chain"
@@ -57,6 +66,13 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--sinc", metavar="N", help="SINC length after power-on (default 64)")
     parser.add_argument("--ppm", action="append", metavar="X", help=f"clock error{several}")
+    parser.add_argument(
+        "--dc", action="append", metavar="WORD[=VALUE][+...]", help=f"distributed clock, see below{several}"
+    )
+    parser.add_argument(
+        "--write-us", default=str(WRITE_US), metavar="X",
+        help=f"time of the firmware's write of a sample to the controller (default {WRITE_US:g})",
+    )  # fmt: skip
     parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
     parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of the scene")
     parser.add_argument("--seed", default="0", metavar="N", help="seed of the noise")
@@ -86,7 +102,8 @@ def options_from(args: argparse.Namespace) -> BusOptions:
     if chain is not None and args.sensors is not None:
         raise UsageError("--chain names the sensors too: leave --sensors out")
     models, serials, errors = _list(args.model), _list(args.serial), _list(args.ppm)
-    named = max(len(models), len(serials), len(errors), chain is None)
+    clocks = _list(args.dc)
+    named = max(len(models), len(serials), len(errors), len(clocks), chain is None)
     sinc_range = SETTINGS["sinc_length"].choices
     assert isinstance(sinc_range, range)
     try:
@@ -101,9 +118,14 @@ def options_from(args: argparse.Namespace) -> BusOptions:
         serial_numbers = [whole(text, 0, 0xFFFFFFFF) for text in serials]
         option = "--eeprom-ms"
         eeprom_ms = real(args.eeprom_ms, 0, 1000)
+        option = "--write-us"
+        write_us = real(args.write_us, 0, 1000)
+        option = "--dc"
+        for text in clocks:
+            parse_clock(text)
         option = "--ppm"
         ppms = [real(text, -PPM_LIMIT, PPM_LIMIT) for text in errors]
-    except CommandError as error:
+    except (CommandError, ClockWordError) as error:
         raise UsageError(f"{option}: {error}") from None
     if named > count:
         raise UsageError(f"{named} sensors are named but there are to be {count}: name no more than that")
@@ -124,6 +146,8 @@ def options_from(args: argparse.Namespace) -> BusOptions:
                 pdo_size=int(args.pdo),
                 sinc_length=sinc,
                 ppm=ppms[min(position, len(ppms) - 1)] if ppms else 0.0,
+                dc=clocks[min(position, len(clocks) - 1)] if clocks else "",
+                write_us=write_us,
                 signal=args.signal,
                 noise=args.noise == "on",
                 seed=seed + position,

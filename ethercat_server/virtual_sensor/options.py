@@ -8,6 +8,8 @@ from typing import Final
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor.slave.al import AlState
 
+WRITE_US: Final = 12.0
+"""About what 61 bytes take over SPI at 40 MHz."""
 EEPROM_MS: Final = 2.0
 """About what a real EEPROM needs for the eight bytes of a read command."""
 
@@ -25,6 +27,10 @@ class SensorOptions:
     """By what CHOP divides its sampling rate."""
     ppm: float = 0.0
     """Error of its clock: positive is fast."""
+    dc: str = ""
+    """What its distributed clock is like, in the words of `dc.kinds`: `32-bit+ppm=20+late=50`."""
+    write_us: float = WRITE_US
+    """Time that its firmware takes to write a sample to the controller, before the sample's instant."""
     signal: str = "scene"
     noise: bool = True
     seed: int = 0

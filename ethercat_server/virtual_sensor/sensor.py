@@ -94,6 +94,7 @@ class VirtualSensor:
         """Set the error of its clock, now and after a power cycle."""
         self._options = replace(self._options, ppm=ppm)
         if self.life is not None:
+            self.life.esc.clock.settle()
             self.life.sampler.set_ppm(ppm)
 
     def set_signal(self, signal: str) -> None:

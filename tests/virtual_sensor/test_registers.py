@@ -198,7 +198,7 @@ def test_the_system_time_runs_with_its_offset() -> None:
     master.wait(1_000_000)
     assert system_time() - before == 1_001_000, "with the exchange"
     assert master.write(0x0920, struct.pack("<QI", 10**18, 350)) == 1
-    assert system_time() - before == 10**18 + 350 + 1_003_000
+    assert system_time() - before == 10**18 - 350 + 1_003_000
     assert master.read(0x0920, 12) == struct.pack("<QI", 10**18, 350)
     assert master.write(0x0910, struct.pack("<I", (system_time() + 1500) & 0xFFFFFFFF)) == 1
     assert master.read(0x092C, 4) == struct.pack("<I", 500), "behind that one"

@@ -58,7 +58,7 @@ def latch_events(bus: Datagrams, number: int, sync_manager: int) -> bool:
     """Have a sensor's controller latch when it writes samples, to this sync manager; False if it does not."""
     address = reg.SYNC_MANAGER + sync_manager * reg.SYNC_MANAGER_SIZE + reg.SM_ACTIVATE
     active = bus.read_surely(number, address, 1)[0]
-    return bus.write_register(number, address, bytes([active | reg.SM_LATCH_PDI_EVENT]))
+    return bus.write_register(number, address, bytes([active | reg.SM_LATCH_PDI]))
 
 
 def read_clock(bus: Datagrams, number: int) -> DistributedClock | None:

@@ -12,8 +12,10 @@ DL_INFORMATION: Final = 0x0000
 FMMU_AND_SM_COUNT: Final = 0x0004
 """Two bytes: the number of FMMUs, the number of sync managers."""
 FEATURES: Final = 0x0008
-HAS_DC: Final = 1 << 2
-"""In FEATURES: there are distributed clocks."""
+DC_AVAILABLE: Final = 1 << 2
+"""In FEATURES: it has a distributed clock."""
+DC_64_BIT: Final = 1 << 3
+"""In FEATURES: of 64 bits, not 32."""
 NO_LRW: Final = 1 << 9
 """In FEATURES: logical memory can be read (LRD) and written (LWR), but not both at once."""
 STATION_ADDRESS: Final = 0x0010
@@ -57,11 +59,13 @@ SM_CONTROL: Final = 4
 """Offsets within a sync manager."""
 SM_STATUS: Final = 5
 SM_ACTIVATE: Final = 6
+SM_LATCH_ECAT: Final = 0x40
+"""In a sync manager's activate register: a frame that exchanges its buffer is a DC event."""
+SM_LATCH_PDI: Final = 0x80
+"""Likewise the firmware that begins or ends an access to its buffer."""
 SM_PDI_CONTROL: Final = 7
 SM_MAILBOX, SM_WRITE = 0x02, 0x04
 """Bits of the control byte: it is a mailbox (else buffered), the master writes."""
-SM_LATCH_PDI_EVENT: Final = 0x80
-"""Bit of the activate byte: the events of the slave's processor, the PDI, are latched with their times."""
 MAILBOX_FULL: Final = 0x08
 """Bit of a mailbox sync manager's status."""
 MAILBOX_IN_STATUS: Final = SYNC_MANAGER + SYNC_MANAGER_SIZE + SM_STATUS
@@ -75,13 +79,18 @@ DC_OFFSET: Final = 0x0920
 DC_DELAY: Final = 0x0928
 DC_DIFFERENCE: Final = 0x092C
 DC_SPEED_START: Final = 0x0930
+DC_SPEED_DIFFERENCE: Final = 0x0932
 DC_FILTERS: Final = 0x0934
+"""Two bytes: filter depths of the differences of the system time, and of the speed."""
 DC_ACTIVATION: Final = 0x0980
 """Two bytes: who controls the SYNC signals, which are active."""
+DC_ECAT_EVENT: Final = 0x09F0
+"""Four bytes, local time: the frame came that exchanged the buffer of a sync manager."""
 DC_PDI_START_EVENT: Final = 0x09F8
-"""Local time, 32 bits: the slave's processor began to write or read a buffer."""
+"""Likewise the firmware began to access a buffer."""
 DC_PDI_CHANGE_EVENT: Final = 0x09FC
-"""The same: it had written or read it."""
+"""Likewise it exchanged one: new inputs."""
+DC_END: Final = 0x0A00
 USER_RAM: Final = 0x0F80
 REGISTERS_END: Final = 0x1000
 """Process data memory begins here."""

@@ -24,6 +24,9 @@ _ONE_BY_STATION = frozenset({Command.FPRD, Command.FPWR, Command.FPRW})
 _READ_MULTIPLE_WRITE = frozenset({Command.ARMW, Command.FRMW})
 _KNOWN = frozenset(Command) - {Command.NOP}
 _PLANS_KEPT: Final = 64
+_FPRD: Final = int(Command.FPRD)
+_STATION_ADDRESS: Final = reg.STATION_ADDRESS
+_EVENT_MASK: Final = reg.EVENT_MASK
 
 
 def pass_through(escs: Sequence[Esc], frame: bytearray, datagram: Datagram) -> None:
@@ -36,8 +39,13 @@ def pass_through(escs: Sequence[Esc], frame: bytearray, datagram: Datagram) -> N
         low = frame[at]  # which suffices to pass nearly all others
         for esc in escs:
             memory = esc.memory
-            if memory[reg.STATION_ADDRESS] == low or memory[reg.EVENT_MASK] or memory[reg.EVENT_MASK + 1]:
+            if memory[_EVENT_MASK] or memory[_EVENT_MASK + 1]:
                 execute(esc, frame, datagram)
+            elif memory[_STATION_ADDRESS] == low and memory[_STATION_ADDRESS + 1] == frame[at + 1]:
+                if command == _FPRD:
+                    _read(esc, frame, datagram)
+                else:
+                    execute(esc, frame, datagram)
     elif command in _ONE_BY_POSITION:
         first = datagram.adp
         for number, esc in enumerate(escs, first):
@@ -49,6 +57,15 @@ def pass_through(escs: Sequence[Esc], frame: bytearray, datagram: Datagram) -> N
     else:
         for esc in escs:
             execute(esc, frame, datagram)
+
+
+def _read(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
+    """Process an FPRD for this slave, which shows no events: the same as `execute`, in less time."""
+    start, end = datagram.data, datagram.end
+    read = esc.read(datagram.ado, frame[start:end])
+    if read is not None:
+        frame[start:end] = read
+        _U16.pack_into(frame, end, (_U16.unpack_from(frame, end)[0] + 1) & 0xFFFF)
 
 
 def execute(esc: Esc, frame: bytearray, datagram: Datagram) -> None:

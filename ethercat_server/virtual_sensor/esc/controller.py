@@ -10,13 +10,15 @@ import struct
 from collections.abc import Callable
 from typing import Protocol
 
+from ethercat_server.virtual_sensor.dc.unit import DistributedClock
 from ethercat_server.virtual_sensor.esc import registers as reg
-from ethercat_server.virtual_sensor.esc.distributed_clock import DistributedClock
 from ethercat_server.virtual_sensor.esc.fmmu import Fmmu
 from ethercat_server.virtual_sensor.esc.sii import SiiInterface
 from ethercat_server.virtual_sensor.esc.sync_manager import SyncManager
 
 _U16 = struct.Struct("<H")
+_REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_TIMES, reg.DC_END
+_DC_SYSTEM_TIME, _DC_RECEIVE_TIME, _DC_ECAT_EVENT = reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME, reg.DC_ECAT_EVENT
 _LINE_GOES_ON, _LINE_ENDS = 0x5A33, 0x5613
 """DL status: ports 0 and 1 have a link, or only port 0."""
 
@@ -67,7 +69,8 @@ class Esc:
         self.sync_managers = [SyncManager(self.memory, n) for n in range(reg.SYNC_MANAGER_COUNT)]
         self.fmmus: list[Fmmu] = []
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
-        self.has_lrw = True
+        self.has_lrw = self.has_dc = True
+        self._write_mask: bytes | bytearray = reg.WRITE_MASK
         self._events = 0
 
     def take_lrw_away(self) -> None:
@@ -75,6 +78,24 @@ class Esc:
         self.has_lrw = False
         features = _U16.unpack_from(self.memory, reg.FEATURES)[0]
         _U16.pack_into(self.memory, reg.FEATURES, features | reg.NO_LRW)
+
+    def take_dc_away(self) -> None:
+        """Be a controller without a distributed clock."""
+        self.has_dc = False
+        self.clock.events.take_away()
+        self._miss(reg.DC_AVAILABLE | reg.DC_64_BIT, range(reg.DC_RECEIVE_TIMES, reg.DC_END))
+
+    def narrow_dc(self) -> None:
+        """Be a controller whose distributed clock has 32 bits."""
+        self.clock.time_mask = 2**32 - 1
+        for time in (reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME, reg.DC_OFFSET):
+            self._miss(reg.DC_64_BIT, range(time + 4, time + 8))
+
+    def _miss(self, feature: int, registers: range) -> None:
+        self.memory[reg.FEATURES] &= ~feature
+        self._write_mask = bytearray(self._write_mask)
+        for memory in (self.memory, self._write_mask):
+            memory[registers.start : registers.stop] = bytes(len(registers))
 
     def count(self, counter: int) -> None:
         """Add one to the error counter at this register; it stays at 255."""
@@ -113,15 +134,15 @@ class Esc:
         Bytes that may not be read stay as they are in `current`.
         """
         length = len(current)
-        end = min(address + length, reg.MEMORY_END)
+        end = address + length
+        if end <= _REGISTERS_END:
+            return self._read_registers(address, end) if length else None
+        end = min(end, reg.MEMORY_END)
         for manager in self.sync_managers:
             if manager.active and manager.start == address and manager.length == length:
                 return self._read_manager(manager, 0, length)
         if address >= end:
             return None
-        if end <= reg.REGISTERS_END:
-            data = self._read_registers(address, end)
-            return data if len(data) == length else data + current[len(data) :]
         result = bytearray(current)
         any_read = False
         if address < reg.REGISTERS_END:
@@ -182,8 +203,11 @@ class Esc:
         if manager.mailbox:
             data = manager.take(offset, length)
             if data is not None and not manager.full:
+                self._exchanged(manager)
                 self._pdi.mailbox_read()
             return data
+        if manager.latches_ecat and offset + length == manager.length:
+            self._exchanged(manager)
         if offset == 0:  # three buffers: the newest is handed over when the first byte is read
             newest = self._pdi.inputs()[: manager.length].ljust(manager.length, b"\0")
             self.memory[manager.start : manager.end] = newest
@@ -197,20 +221,31 @@ class Esc:
             if not manager.put(offset, data):
                 return False
             if manager.full:
+                self._exchanged(manager)
                 self._pdi.mailbox_written()
             return True
         self.memory[manager.start + offset : manager.start + offset + len(data)] = data
         if offset + len(data) == manager.length:  # handed over when the last byte is written
+            self._exchanged(manager)
             self._pdi.outputs(bytes(self.memory[manager.start : manager.end]))
         return True
 
-    def _read_registers(self, start: int, end: int) -> bytes:
+    def _exchanged(self, manager: SyncManager) -> None:
+        if manager.latches_ecat and self.has_dc:
+            self.clock.exchanged()
+
+    def _read_registers(self, start: int, end: int) -> bytes | bytearray:
+        if end > _DC_SYSTEM_TIME and start < _DC_END and self.has_dc:
+            if start < _DC_RECEIVE_TIME:
+                self.clock.show_system_time()
+            if end > _DC_ECAT_EVENT:
+                self.clock.show_events()
+        if start > _DC_RECEIVE_TIMES:
+            return self.memory[start:end]
         if start <= reg.EVENT_REQUEST + 1 and end > reg.EVENT_REQUEST:
             _U16.pack_into(self.memory, reg.EVENT_REQUEST, self.events)
         if start < reg.SII_DATA and end > reg.SII_CONTROL:
             self.sii.advance()
-        if start < reg.DC_RECEIVE_TIME and end > reg.DC_SYSTEM_TIME:
-            self.clock.show()
         data = bytes(self.memory[start:end])
         if start <= reg.AL_STATUS < end:
             self._events &= ~reg.EVENT_AL_STATUS
@@ -221,12 +256,12 @@ class Esc:
     def _write_registers(self, address: int, data: bytes) -> bool:
         end = address + len(data)
         memory = self.memory
-        if not any(reg.WRITE_MASK[address:end]):
+        if not any(self._write_mask[address:end]):
             return False
         locked = [m.registers for m in self.sync_managers if m.enabled]
         repeat_before = self.sync_managers[1].repeat_request
         for at, value in zip(range(address, end), data, strict=True):
-            mask = reg.WRITE_MASK[at]
+            mask = self._write_mask[at]
             if not mask or any(first <= at < first + reg.SM_STATUS for first in locked):
                 continue  # a sync manager's area can be changed only while it is disabled
             memory[at] = memory[at] & ~mask | value & mask
@@ -254,9 +289,12 @@ class Esc:
             self._pdi.sync_managers_changed()
             if self.sync_managers[1].repeat_request != repeat_before:
                 self._pdi.repeat_requested()
-        if touched(reg.DC_RECEIVE_TIMES, 4):
-            self.clock.latch()
-        if touched(reg.DC_SYSTEM_TIME, 4):
-            self.clock.compare()
+        if self.has_dc and end > reg.DC_RECEIVE_TIMES and start < reg.DC_END:
+            if touched(reg.DC_RECEIVE_TIMES, 4):
+                self.clock.latch()
+            if touched(reg.DC_SPEED_START, 2):
+                self.clock.reset_loop()
+            if touched(reg.DC_SYSTEM_TIME, 1):
+                self.clock.compare()
         if touched(reg.AL_CONTROL, 2):
             self._pdi.al_control(_U16.unpack_from(self.memory, reg.AL_CONTROL)[0])

@@ -21,6 +21,7 @@ class SyncManager:
         self.start = self.length = self.end = self.control = 0
         self.enabled = self.active = self.locked = False
         self.mailbox = self.master_writes = False
+        self.latches_ecat = self.latches_pdi = False
         self._open = False
         self.reload()
 
@@ -30,7 +31,10 @@ class SyncManager:
         self.end = self.start + self.length
         self.mailbox = self.control & 0x03 == 0x02
         self.master_writes = self.control & 0x0C == 0x04
-        self.enabled = bool(self._memory[self.registers + reg.SM_ACTIVATE] & 1)
+        activate = self._memory[self.registers + reg.SM_ACTIVATE]
+        self.enabled = bool(activate & 1)
+        self.latches_ecat = bool(activate & reg.SM_LATCH_ECAT)
+        self.latches_pdi = bool(activate & reg.SM_LATCH_PDI)
         self._refresh()
         if not self.enabled:
             self.full = self._open = False

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from ethercat_server.virtual_sensor.bus import Bus, Slave
-from ethercat_server.virtual_sensor.faults import bus, firmware, measurement
+from ethercat_server.virtual_sensor.faults import bus, distributed_clock, firmware, measurement
 from ethercat_server.virtual_sensor.faults.command import Action, Call, CommandError, FaultCommand, whole
 
 LONGEST_LINE: Final = 1000
@@ -38,6 +38,7 @@ COMMANDS: Final[tuple[FaultCommand, ...]] = (
     *bus.COMMANDS,
     *firmware.COMMANDS,
     *measurement.COMMANDS,
+    *distributed_clock.COMMANDS,
     FaultCommand("stats", "stats", (0,), "counters and states, as JSON", _stats),
     FaultCommand("help", "help", (0,), "this list", _help),
     FaultCommand("quit", "quit", (0,), "end the program", _quit),

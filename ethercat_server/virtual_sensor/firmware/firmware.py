@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from ethercat_server.virtual_sensor.dc.kinds import parse_clock
 from ethercat_server.virtual_sensor.faults.aborts import AbortFaults
 from ethercat_server.virtual_sensor.firmware.dictionary import OBJECT_NAMES, Dictionary
 from ethercat_server.virtual_sensor.firmware.flash import Flash
@@ -41,6 +42,9 @@ class Firmware(Application):
         device = sensor_device(options.model, options.serial, options.pdo_size)
         information = SdoInformation(self.dictionary, device, OBJECT_NAMES)
         super().__init__(device, clock, information, options.eeprom_ms)
+        self.esc.clock.events.follow(self.sampler, round(options.write_us * 1000))
+        for apply in parse_clock(options.dc):
+            apply(self.esc)
 
     def mailbox_written(self) -> None:
         """A request has arrived."""

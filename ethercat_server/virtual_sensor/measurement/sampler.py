@@ -50,11 +50,19 @@ class Sampler:
         self._prepared_number, self._prepared = -1, b""
         self.settings_changed()
 
+    def number_at(self, instant: int) -> int:
+        """Number of the newest sample at an instant that is not skipped."""
+        return self.disturbances.newest_given(self.clock.number_at(instant))
+
+    def completed(self, number: int) -> int:
+        """Instant of a sample: it is in the controller's buffer."""
+        return self.clock.instant(number)
+
     def newest(self) -> bytes:
         """The newest process data."""
         if self._stuck:
             return self._stuck
-        number = self.disturbances.newest_given(self.clock.number_at(self._now()))
+        number = self.number_at(self._now())
         if number != self._number:
             if number == self._prepared_number:
                 self._data = self._prepared
@@ -65,7 +73,7 @@ class Sampler:
 
     def prepare(self, expected: int) -> None:
         """Compute the sample that a frame at the time `expected` will read, while there is time."""
-        number = self.disturbances.newest_given(self.clock.number_at(expected))
+        number = self.number_at(expected)
         if number not in (self._number, self._prepared_number) and not self._stuck:
             self._prepared = self._make(number)
             self._prepared_number = number

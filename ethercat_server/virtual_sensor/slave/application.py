@@ -73,6 +73,8 @@ class Application(ABC):
         self.esc.memory[reg.WATCHDOG_STATUS] = 1
         if self.al.state is AlState.OP:
             self.take_outputs(data)
+            if self.esc.sync_managers[_OUTPUTS].latches_pdi:
+                self.esc.clock.events.outputs_taken(self.clock())
 
     # Application layer.
 
@@ -106,6 +108,7 @@ class Application(ABC):
         for manager, on in zip(managers, wanted, strict=True):
             if on == manager.locked:
                 manager.allow(on)
+        self.esc.clock.events.sync_managers_changed(managers, self.clock())
         shown, _, code = struct.unpack_from("<HHH", self.esc.memory, reg.AL_STATUS)
         if (shown, code) != (self.al.status, self.al.code):
             self.esc.set_al_status(self.al.status, self.al.code)

@@ -1,0 +1,1 @@
+"""The distributed clock (DC) unit of a slave controller, and what may be wrong with it."""

@@ -1,0 +1,346 @@
+"""The distributed clock: local and system time, the control loop, event times, and their faults."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+import pytest
+
+from ethercat_server.ethercat.wire import Command
+from ethercat_server.virtual_sensor.cli import UsageError, build_parser, options_from
+from ethercat_server.virtual_sensor.dc.control_loop import _counter, _deviation
+from ethercat_server.virtual_sensor.dc.local_clock import LocalClock
+from ethercat_server.virtual_sensor.faults.table import obey
+from ethercat_server.virtual_sensor.options import ForeignOptions, SensorOptions
+from tests.virtual_sensor.raw_master import OP, PREOP, SAFEOP, RawMaster, chain
+
+MS = 1_000_000
+PERIOD = 1_250_000
+WRITE = 12_000
+START = 5_000_000_123
+LATCH = 0xC1
+"""Activate register: enabled, with both kinds of events."""
+
+
+def prepared(dc: str = "", state: int = OP, **options: object) -> RawMaster:
+    """A sensor with the signal `clock`, whose SM3 latches events."""
+    sensor = SensorOptions(signal="clock", dc=dc, **options)  # type: ignore[arg-type]
+    master = RawMaster(sensor, start=START).go(state)
+    assert master.write(0x081E, bytes([LATCH])) == 1
+    return master
+
+
+def look(master: RawMaster) -> tuple[int, int, int, int, int]:
+    """One frame: instant of the sample in its data, system time, the three event times."""
+    answer = master.frame(
+        (Command.LRW, 0, 0, bytes(1 + master.pdo_size)),
+        (Command.APRD, 0, 0x0910, bytes(4)),
+        (Command.APRD, 0, 0x09F0, bytes(16)),
+    )
+    assert answer is not None
+    (data, _), (system, _), (events, counter) = answer
+    assert counter == 1
+    seconds, us, ns = struct.unpack_from("<fff", data, 1 + 5 + 4)
+    instant = int(seconds) * 10**9 + int(us) * 1000 + int(ns)
+    ecat, start, change = struct.unpack("<I4xII", events)
+    return instant, int.from_bytes(system, "little"), ecat, start, change
+
+
+def looks(master: RawMaster, count: int, step: int = 777_777) -> Iterator[tuple[int, int, int, int, int]]:
+    for _ in range(count):
+        master.wait(step)
+        yield look(master)
+
+
+def obeyed(master: RawMaster, line: str) -> None:
+    assert obey(master.bus, line) == "ok"
+
+
+# Local and system time.
+
+
+def test_a_frame_has_one_time() -> None:
+    master = prepared()
+    answer = master.frame(*((Command.APRD, 0, 0x0910, bytes(8)) for _ in range(3)))
+    assert answer is not None
+    assert {data for data, _ in answer} == {struct.pack("<Q", master.now - START)}
+
+
+def test_the_rate_changes_without_a_jump_of_the_time() -> None:
+    clock = LocalClock(1000)
+    clock.jump(1000, 2**32 - 10)
+    clock.set_ppm(1000, 100.0)
+    assert clock.at(1000 + 10 * MS) == 2**32 - 10 + 10 * MS + 1000
+    clock.set_ppm(1000 + 10 * MS, -50.0, ramp_ns=10 * MS)
+    before = clock.at(1000 + 10 * MS)
+    assert before == 2**32 - 10 + 10 * MS + 1000
+    assert clock.at(1000 + 20 * MS) == before + 10 * MS + 250, "25 ppm in the mean"
+    assert clock.at(1000 + 30 * MS) == before + 20 * MS + 250 - 500
+    clock.steer(1000 + 15 * MS, 10**6)
+    assert clock.at(1000 + 20 * MS) == before + 10 * MS + 250 + 5
+    clock.stop(1000 + 20 * MS, True)
+    assert clock.at(10**12) == before + 10 * MS + 255
+    clock.stop(10**12, False)
+    assert clock.at(10**12 + MS) == before + 11 * MS + 255 - 50 + 1
+
+
+def test_changing_the_rate_often_accumulates_no_error() -> None:
+    clock = LocalClock(0)
+    for number in range(1000):
+        clock.steer(number * 1000, 333_333)
+    assert clock.at(10**9) - 10**9 in range(333, 334)
+
+
+def test_32_bits() -> None:
+    master = RawMaster(SensorOptions(dc="32-bit+at=4294967295"), start=START)
+    assert master.read16(0x0008) & 0x0C == 0x04
+    assert master.write(0x0920, b"\xff" * 8) == 1
+    assert master.read(0x0920, 8) == b"\xff" * 4 + bytes(4)
+    assert struct.unpack("<Q", master.read(0x0910, 8))[0] < MS, "it has wrapped"
+    assert master.write(0x0924, bytes(4)) == 0
+
+
+def test_no_distributed_clock() -> None:
+    master = prepared("none")
+    assert master.read16(0x0008) & 0x0C == 0
+    assert master.write(0x0900, bytes(4)) == master.write(0x0910, bytes(4)) == master.write(0x0920, b"1") == 0
+    master.wait(10 * MS)
+    look(master)
+    assert master.read(0x0900, 0x100) == bytes(0x100)
+    assert obey(master.bus, "dc late 5").startswith("error: that slave has no distributed clock")
+
+
+def test_the_delay_is_that_of_the_reference_clock_to_the_slave() -> None:
+    master = RawMaster(*chain(3), start=START)
+    for position in range(3):
+        master.write(0x0928, struct.pack("<I", 700 * position), position)
+    answer = master.frame(*((Command.APRD, -position, 0x0910, bytes(8)) for position in range(3)))
+    assert answer is not None
+    assert len({data for data, _ in answer}) == 1
+
+
+# The control loop.
+
+
+def test_speed_counter_differences_and_rates() -> None:
+    for start, counter in ((0x1000, 0), (0x1000, 1), (0x1000, -3969), (0x80, 1), (0x3FFF, 12345)):
+        assert _counter(_deviation(counter, start), start) == counter
+    assert _deviation(3969, 0x1000) == pytest.approx(763e-6, rel=0.01)
+
+
+@pytest.mark.parametrize(("step", "frames", "close"), [(PERIOD, 1600, 50), (20 * MS, 1000, 1000)])
+def test_drift_compensation_steers_the_local_clock(step: int, frames: int, close: int) -> None:
+    """The first slave is the reference; the second is 70 ppm off, and 30 µs behind."""
+    master = RawMaster(SensorOptions(dc="ppm=20"), SensorOptions(serial=2, dc="ppm=-50+at=0"), start=START)
+    master.write(0x0920, struct.pack("<QI", 2**64 - 30_000, 700), 1)
+    assert master.write(0x0930, struct.pack("<H", 0x1000), 1) == 1
+    local = [slave.life.esc.clock.local for slave in master.bus.sensors if slave.life]
+    apart: list[int] = []
+    for _ in range(frames):
+        master.wait(step)
+        assert master.one(Command.ARMW, 0, 0x0910, bytes(4))[1] == 2
+        apart.append(local[1].at(master.now) - local[0].at(master.now) - 30_000)
+    assert apart[0] < -29_000
+    assert all(abs(ns) < close for ns in apart[-10:])
+    counter = struct.unpack("<h", master.read(0x0932, 2, 1))[0]
+    assert _deviation(counter, 0x1000) == pytest.approx(70e-6, abs=1e-6)
+    master.write(0x0930, struct.pack("<H", 0x1000), 1)
+    assert master.read(0x092C, 4, 1) + master.read(0x0932, 2, 1) == bytes(6)
+    now = master.now
+    assert local[1].at(now + 10**9) - local[1].at(now) == 10**9 - 50_000, "its own rate again"
+
+
+# Event times.
+
+
+@pytest.mark.parametrize("ppm", [0.0, 180.0, -250.0])
+@pytest.mark.parametrize("dc", ["", "ppm=-30+at=4294000000"])
+def test_event_times_are_those_of_the_sample_in_the_data(dc: str, ppm: float) -> None:
+    """Also across the wrap of the 32 bits, and when several samples came between two frames."""
+    master = prepared(dc, ppm=ppm)
+    life = master.bus.sensors[0].life
+    assert life is not None
+    local = life.esc.clock.local
+    master.wait(4 * MS)
+    made = life.sampler.made
+    samples = set()
+    for step in (777_777, 100_001, 5 * PERIOD + 333):
+        for _ in range(40):
+            master.wait(step)
+            began = master.now + 1000
+            instant, system, ecat, start, change = look(master)
+            samples.add(instant)
+            assert system == ecat == local.at(began) & 0xFFFFFFFF
+            following = life.sampler.completed(life.sampler.number_at(instant) + 1)
+            if began < following < master.bus.now:  # it came within the frame, behind the data
+                instant, following = following, following + PERIOD
+            assert change == local.at(instant) & 0xFFFFFFFF
+            assert start in {local.at(i - WRITE) & 0xFFFFFFFF for i in (instant, following)}
+    assert life.sampler.made - made == len(samples), "no sample was computed twice"
+
+
+def test_the_next_sample_may_come_within_the_frame() -> None:
+    """The events are read some µs after the data."""
+    master = prepared()
+    instant = look(master)[0]
+    after = 4 * PERIOD - 11_500  # its write has begun
+    master.wait(instant + after - master.now)
+    assert look(master)[3:] == (instant + 4 * PERIOD - WRITE - START, instant + 3 * PERIOD - START)
+    master.wait(instant + 4 * PERIOD - 3000 - master.now)
+    shown, _, ecat, _, change = look(master)
+    assert (shown, change) == (instant + 3 * PERIOD, instant + 4 * PERIOD - START)
+    assert ecat < change
+
+
+def test_only_what_the_activate_register_says_is_latched() -> None:
+    master = RawMaster(SensorOptions(signal="clock"), start=START).go(OP)
+    master.wait(3 * MS)
+    assert look(master)[2:] == (0, 0, 0)
+    assert master.write(0x081E, b"\x41") == 1
+    master.wait(3 * MS)
+    _, system, *events = look(master)
+    assert events == [system, 0, 0]
+    assert master.write(0x081E, b"\x81") == 1
+    since = master.now - START
+    instant = look(master)[0]
+    assert look(master)[3:] == (0, 0), "the sample came before"
+    master.wait(PERIOD)
+    assert look(master)[2:] == (system, *(instant + PERIOD - START - ns for ns in (WRITE, 0)))
+    assert instant + PERIOD - START > since
+    assert master.write(0x081E, b"\x01") == 1
+    events = list(look(master)[2:])
+    master.wait(5 * MS)
+    assert list(look(master)[2:]) == events
+
+
+def test_there_are_no_events_before_safeop() -> None:
+    master = RawMaster(SensorOptions(signal="clock"), start=START).go(PREOP)
+    master.set_up_process_data()
+    assert master.write(0x081E, bytes([LATCH])) == 1
+    master.wait(10 * MS)
+    assert master.read(0x09F0, 16) == bytes(16)
+    assert master.request(SAFEOP) == (SAFEOP, 0)
+    began = master.now - START
+    master.wait(10 * MS)
+    assert look(master)[4] > began
+    assert master.request(PREOP) == (PREOP, 0)
+    before = master.read(0x09F0, 16)
+    master.wait(10 * MS)
+    assert master.read(0x09F0, 16) == before
+
+
+def test_outputs_and_mailboxes_latch_too() -> None:
+    master = RawMaster(start=START).go(OP)
+    for manager in range(2):
+        assert master.write(0x0806 + 8 * manager, bytes([LATCH])) == 1
+    assert master.upload(0x1000, 0)
+    assert 0 < struct.unpack("<I", master.read(0x09F0, 4))[0] < master.now - START
+    assert master.write(0x0816, bytes([LATCH])) == 1
+    frame = look(master)
+    assert frame[2:] == (frame[1],) * 3, "all is of the frame that brought the outputs"
+
+
+def test_a_skipped_sample_is_no_event_and_a_repeated_one_is() -> None:
+    master = prepared()
+    obeyed(master, "skip 60")
+    assert all(change == instant - START for instant, _, _, _, change in looks(master, 50, PERIOD))
+    obeyed(master, "skip 0")
+    obeyed(master, "stick")
+    assert len({change for *_, change in looks(master, 10, PERIOD)}) == 10
+
+
+# Faults.
+
+
+def test_faults_of_the_event_times() -> None:
+    master = prepared()
+    number = 0
+
+    def off(line: str) -> tuple[int, int]:
+        """What is added to the times of start and end, in a frame in the middle between two samples."""
+        nonlocal number
+        obeyed(master, line)
+        number += 2
+        master.wait(START + 10 * MS + number * PERIOD + PERIOD // 2 - master.now)
+        instant, _, _, start, change = look(master)
+        return start + WRITE - (instant - START), change - (instant - START)
+
+    assert off("dc ok") == (0, 0)
+    assert off("dc late 50.5") == (50_500, 50_500)
+    assert off("dc early 7") == (-7000, -7000)
+    assert off("dc ok") == (0, 0)
+    assert off("dc start") == (0, -WRITE)
+    assert off("dc ok") == (0, 0)
+    assert off("dc previous") == (-PERIOD, -PERIOD)
+    assert off("dc ok") == (0, 0)
+    found = {off("dc jitter 20") for _ in range(10)}
+    assert all(start == end and abs(end) <= 20_000 for start, end in found)
+    assert len(found) == 10
+    assert off("dc ok") == (0, 0)
+    assert off("dc stuck") == (0, -2 * PERIOD)
+    assert off("dc stuck") == (0, -4 * PERIOD)
+    assert off("dc ok") == (0, 0)
+    obeyed(master, "dc no-events")
+    master.wait(10 * MS)
+    assert look(master)[2:] == (0, 0, 0)
+
+
+def test_a_register_that_stands_still_from_power_on_has_the_first_event() -> None:
+    frames = list(looks(prepared("stuck"), 10, PERIOD))
+    assert len({change for *_, change in frames[1:]} - {0}) == 1
+    assert len({start for *_, start, _ in frames}) == 10
+
+
+def test_faults_of_the_local_clock() -> None:
+    master = prepared()
+    master.wait(3 * MS)
+    _, system, _, _, change = look(master)
+    obeyed(master, "dc jump 123456")
+    later = look(master)
+    assert later[3:] == (change - WRITE, change), "of the time before the jump"
+    assert later[1] - system - 123_456 in range(1000, 10_000)
+    master.wait(PERIOD)
+    assert look(master)[4] == change + PERIOD + 123_456
+    obeyed(master, "dc time-stuck")
+    stuck = [(frame[1], frame[4]) for frame in looks(master, 3, PERIOD)]
+    assert len({system for system, _ in stuck}) == 1
+    assert len({change for _, change in stuck}) == 3
+    obeyed(master, "dc ok")
+    obeyed(master, "dc stopped")
+    assert len({frame[1:3] for frame in looks(master, 3, PERIOD)}) == 1
+    obeyed(master, "dc ok")
+    obeyed(master, "dc at 5000000000")
+    assert 0 <= look(master)[1] - (5_000_000_000 & 0xFFFFFFFF) < 10_000
+    obeyed(master, "dc ppm 100")
+    first, second = looks(master, 2, 10 * MS - 1000)
+    assert second[1] - first[1] in range(10 * MS + 1000, 10 * MS + 12_000)
+    obeyed(master, "dc ramp 0 1.5")
+    obeyed(master, "power cycle 0")
+    master.wait(1)
+    assert not any(look(master)[2:]), "all is as in the options again"
+
+
+def test_words_that_are_wrong() -> None:
+    master = RawMaster(SensorOptions(), ForeignOptions("EK1100"))
+    for line, sentence in {
+        "dc lat 5": "no 'lat' of a distributed clock: available: ok, no-events, stuck,",
+        "dc none": "no 'none' of a distributed clock: available: ok, no-events, stuck,",
+        "dc late": "late takes US",
+        "dc stuck 5": "stuck takes no value",
+        "dc ppm fast": "'fast' must be a number from -100000 to 100000",
+    }.items():
+        assert obey(master.bus, line).startswith(f"error: {sentence}")
+    obeyed(master, "dc ppm 5 #1")
+
+
+def test_clocks_along_the_chain_on_the_command_line() -> None:
+    def options(*words: str) -> list[tuple[str, float]]:
+        parsed = options_from(build_parser().parse_args(["x", *words]))
+        return [(sensor.dc, sensor.write_us) for sensor in parsed.sensors]
+
+    words = ("--dc", "none,32-bit+late=5", "--write-us", "8.5", "--chain")
+    assert options(*words, "BOTA,EK1100,BOTA") == [("none", 8.5), ("32-bit+late=5", 8.5)]
+    assert options("--sensors", "2") == [("", 12.0)] * 2
+    with pytest.raises(UsageError, match="--dc: late takes US"):
+        options("--dc", "late")
