@@ -100,7 +100,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Controller:
-    """A slave controller with a distributed clock. Times in ns, `_s`: from the start, where nothing else is said."""
+    """A slave controller with a distributed clock, that may lie. Times in ns."""
 
     ppm: float = 35.0
     """How much faster its crystal is,"""
@@ -123,7 +123,7 @@ class Controller:
     counter: int = 1
     """Working counter of its registers."""
     lies_from_s: float = 0.0
-    """When all this begins."""
+    """When all this begins, in s from the start."""
 
     def local(self, at_ns: float) -> int:
         """The local time then."""
@@ -226,7 +226,7 @@ class ClockSimulation:
         self.machine = machine
         self.controller = controller
         self.timing = ExchangeTiming()
-        events = controller and EventTimes(DistributedClock(0, 0), self.timing)
+        events = EventTimes(DistributedClock(0, 0), self.timing) if controller else None
         self.clock = SampleClock(SECOND / sensor.rate_hz, self.timing, events)
         self.now_ns = 1.0
         self.polls_ns: list[float] = []
@@ -278,7 +278,7 @@ class ClockSimulation:
         self._last_look_ns = max(sent_ns + out_ns, self._last_look_ns)
         self._last_back_ns = max(sent_ns + took_ns, self._last_look_ns, self._last_back_ns)
         look_ns, number = self._last_look_ns, self._newest(self._last_look_ns)
-        latched = self.controller and self.controller.latched(self.instants_ns, number, look_ns)
+        latched = self.controller.latched(self.instants_ns, number, look_ns) if self.controller else None
         self._flying.append(Exchange(sent_ns, self._last_back_ns, number, latched))
 
     def _take(self, exchange: Exchange) -> None:
@@ -289,9 +289,8 @@ class ClockSimulation:
             clock.events.took(exchange.latched, sent, back, fresh)
         if fresh:
             clock.predict(sent, back)
-            stamp_ns = clock.instant_ns if clock.is_dated else min(back, sent + clock.period_ns)
             told = clock.uncertainty_ns, clock.locked, clock.steps, clock.uncertain
-            self.samples.append(Sample(number, self.instants_ns[number], back, stamp_ns, *told))
+            self.samples.append(Sample(number, self.instants_ns[number], back, clock.instant_ns, *told))
         clock.observe(sent, back, fresh)
         if not clock.locked:
             self.unlocked_ns.append(back)

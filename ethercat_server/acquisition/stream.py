@@ -104,8 +104,7 @@ class SensorStream:
             return None
         self._handed_out = data
         flags = self._new_sample()
-        # After a stall in the exchange its end says nothing of when the sample came to be.
-        moment_ns = int(clock.instant_ns if clock.is_dated else min(back_ns, sent_ns + clock.period_ns))
+        moment_ns = int(clock.instant_ns)
         if moment_ns <= self._moment_ns:  # the one before was dated too young
             moment_ns = self._moment_ns + 1
         self._moment_ns = moment_ns

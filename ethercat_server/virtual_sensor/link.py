@@ -26,6 +26,9 @@ LONGEST_NAME: Final = 15
 _BUFFER = 2048
 _IDLE_MS = 10
 _FRAMES_PER_TURN = 64
+_FIRST_HALF_NS: Final = 10_000.0
+_FORGET: Final = 1.005
+"""By this factor the shortest time is taken to be longer with each frame."""
 
 
 class LinkError(Exception):
@@ -105,7 +108,7 @@ def _serve(
     exit_on_eof: bool,
 ) -> None:
     descriptor = raw.fileno()
-    buffer = bytearray(_BUFFER)
+    answers = _Answers(raw, bus, ifname)
     index = _index(ifname)
     up = True
     while not stop():
@@ -122,28 +125,43 @@ def _serve(
                 bus.set_time(time.monotonic_ns())
                 channel.handle(ready, event)
         if any(ready == descriptor for ready, _ in events):
-            up = _answer_waiting(raw, bus, buffer, ifname)
+            up = answers.waiting()
 
 
-def _answer_waiting(raw: socket.socket, bus: Bus, buffer: bytearray, ifname: str) -> bool:
-    """Answer a bounded number of waiting frames; False if the interface is down."""
-    view = memoryview(buffer)
-    for _ in range(_FRAMES_PER_TURN):
-        try:
-            size = raw.recv_into(buffer)
-            now = time.monotonic_ns()
-            if bus.process(buffer, size, now):
-                raw.send(view[:size])
-        except BlockingIOError:
-            bus.prepare()
-            return True
-        except OSError as error:
-            if error.errno in (errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR):
-                continue  # the frame is lost, as on a cable
-            if error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
-                return False
-            raise LinkError(f"interface {ifname} failed: {error.strerror}") from None
-    return True
+class _Answers:
+    """Answers the frames that arrive.
+
+    A frame passes the slaves halfway between its arrival and its answer, as far as answers take the shortest
+    time: as on a wire, where slaves take no time, the way out is then as long as the way back.
+    """
+
+    def __init__(self, raw: socket.socket, bus: Bus, ifname: str) -> None:
+        self._raw, self._bus, self._ifname = raw, bus, ifname
+        self._buffer = bytearray(_BUFFER)
+        self._half_ns = _FIRST_HALF_NS
+
+    def waiting(self) -> bool:
+        """Answer a bounded number of waiting frames; False if the interface is down."""
+        raw, bus, buffer = self._raw, self._bus, self._buffer
+        view = memoryview(buffer)
+        for _ in range(_FRAMES_PER_TURN):
+            try:
+                size = raw.recv_into(buffer)
+                arrived = time.monotonic_ns()
+                if bus.process(buffer, size, arrived + int(self._half_ns)):
+                    half_ns = (time.monotonic_ns() - arrived) / 2
+                    raw.send(view[:size])
+                    self._half_ns = min(half_ns, _FORGET * self._half_ns)
+            except BlockingIOError:
+                bus.prepare()
+                return True
+            except OSError as error:
+                if error.errno in (errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR):
+                    continue  # the frame is lost, as on a cable
+                if error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
+                    return False
+                raise LinkError(f"interface {self._ifname} failed: {error.strerror}") from None
+        return True
 
 
 def _check_there(ifname: str, index: int) -> None:

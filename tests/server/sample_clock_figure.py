@@ -55,7 +55,7 @@ def phases() -> list[Phase]:
         time_s = step / _STEPS
         if not STOP_S <= time_s < STOP_S + STOP_LENGTH_S:
             simulation.run(time_s)
-        estimate = copy(simulation.clock._estimate)
+        estimate = copy(simulation.clock.estimate)
         # Nothing is observed in the stop: the estimate is carried on, as it is when the machine is back.
         estimate.advance(max(0, math.ceil((time_s * SECOND - estimate.phase_ns) / estimate.period_ns)))
         least_ns = simulation.timing.least_ns

@@ -155,7 +155,7 @@ def test_follows_a_simulated_sensor_that_sleeps_between_its_samples(sleep_ns: fl
         assert simulation.outcome(1).lost == 0
         assert whole.counted <= 1, "while the rate is not known"
         assert simulation.outcome(1).unlocked == 0
-        assert simulation.clock.pull == pytest.approx(sleep_ns / 1.25e6, rel=0.1)
+        assert simulation.clock.estimate.pull == pytest.approx(sleep_ns / 1.25e6, rel=0.1)
 
 
 def test_a_sensor_that_is_not_periodic_is_not_taken_for_one_for_long() -> None:

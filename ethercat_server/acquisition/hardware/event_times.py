@@ -27,7 +27,7 @@ _ASYMMETRY: Final = 1 / 24
 
 
 class EventTimes:
-    """Of one sensor. `took` follows every exchange; after one that brought a new sample, `judge`."""
+    """Of one sensor. `took` follows every exchange; one that brought a new sample, `judge` or `compare`."""
 
     __slots__ = (
         "_answers", "_event", "_half_behind_ns", "_is_passing", "_local", "_moved", "_offset", "_timing",
@@ -88,27 +88,34 @@ class EventTimes:
         self._is_passing = local < event < local + _FRAME_NS
 
     def judge(self, difference_ns: float, variance: float, back_ns: int) -> bool:
-        """Whether the new sample is dated by `instant_ns`.
+        """Whether the new sample is dated by `instant_ns`: to be asked for each, while they are trusted.
 
         That is so much later than the estimate expects, which has this variance; the exchange was back at
         `back_ns`.
         """
-        trust, variance = self.trust, variance + self.variance
-        if trust.verdict is Verdict.TRUSTED:
-            if self.instant_ns and trust.keeps(difference_ns, variance, self._took_ns / 2):
-                return True
-            if not self.instant_ns:
-                trust.contradicted(_PASSING if self._is_passing else 1.0)
-            trust.reconsider(self._evidence, back_ns)
-        elif trust.verdict is Verdict.TRIAL:
-            if self.instant_ns:
-                trust.compare(difference_ns)
-            elif not (self._is_passing or (self._answers and not self.local_clock.is_known)):
-                trust.unfit()
-            # Polling does not tell where on its way a round trip takes its time.
-            asymmetry_ns = _ASYMMETRY * self._timing.least_ns
-            trust.end(self._evidence, variance + asymmetry_ns * asymmetry_ns, back_ns)
+        trust = self.trust
+        if self.instant_ns and trust.keeps(difference_ns, variance + self.variance, self._took_ns / 2):
+            return True
+        if not self.instant_ns:
+            trust.contradicted(_PASSING if self._is_passing else 1.0)
+        trust.reconsider(self._evidence, back_ns)
         return False
+
+    def compare(self, difference_ns: float, variance: float, back_ns: int) -> float:
+        """Try them on the new sample: as `judge`, while they are not trusted.
+
+        Returns the variance of the differences once they are trusted from here on, else 0.
+        """
+        trust = self.trust
+        if trust.verdict is Verdict.REFUSED:
+            return 0.0
+        if self.instant_ns:
+            trust.compare(difference_ns)
+        elif not (self._is_passing or (self._answers and not self.local_clock.is_known)):
+            trust.unfit()
+        # Polling does not tell where on its way a round trip takes its time.
+        asymmetry_ns = _ASYMMETRY * self._timing.least_ns
+        return trust.end(self._evidence, variance + self.variance + asymmetry_ns * asymmetry_ns, back_ns)
 
     @property
     def _evidence(self) -> Evidence:

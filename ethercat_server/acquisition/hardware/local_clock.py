@@ -37,8 +37,8 @@ _RATE_STEP: Final = 20e-6
 _KNOWN_NS: Final = 10_000.0
 _KNOWN: Final = 1 / 32
 _KNOWN_BLOCKS: Final = 12
-"""It is known once its standard deviation is less than this, or than this part of the shortest round trip, after
-so many blocks."""
+"""It is known once its standard deviation is less than one of these, the second as part of the shortest round
+trip, after so many blocks."""
 
 
 class LocalClock:

@@ -52,15 +52,13 @@ class Trust:
 
     __slots__ = (
         "_began", "_compared", "_contradictions", "_failures", "_since_ns", "_squares", "_sum_ns", "_unfit",
-        "spread", "verdict", "why",
+        "verdict", "why",
     )  # fmt: skip
 
     def __init__(self) -> None:
         self.verdict = Verdict.TRIAL
         self.why = ""
         """What was wrong with them last: part of a sentence."""
-        self.spread = 0.0
-        """Variance of the differences from polling in the last trial."""
         self._failures = 0
         self._contradictions = 0.0
         self._since_ns = 0
@@ -109,12 +107,15 @@ class Trust:
         """An event that cannot be the sample's."""
         self._unfit += 1
 
-    def end(self, evidence: Evidence, variance: float, now_ns: int) -> None:
-        """End the trial if it was long enough; `variance` is that of both estimates."""
+    def end(self, evidence: Evidence, variance: float, now_ns: int) -> float:
+        """End the trial if it was long enough; `variance` is that of both estimates.
+
+        Returns the variance of the differences between them if they are trusted now, else 0.
+        """
         if not self._since_ns:
             self.begin(evidence, now_ns)
         if now_ns - self._since_ns < _TRIAL_NS:
-            return
+            return 0.0
         count = self._compared + self._unfit
         if evidence.restarts - self._began.restarts > _RESTARTS:
             self._refuse("its local clock does not run")
@@ -129,9 +130,10 @@ class Trust:
             self._fail(f"they differ from what polling shows by {mean_ns / 1000:+.0f} µs")
             self.begin(evidence, now_ns)
         else:
-            self.spread = self._squares / self._compared
             self.verdict, self._since_ns = Verdict.TRUSTED, now_ns
             self._contradictions = 0.0
+            return self._squares / self._compared
+        return 0.0
 
     def _fail(self, why: str) -> None:
         self._failures += 1

@@ -78,7 +78,7 @@ class SampleHealth:
 
     def _check_rate(self, clock: SampleClock) -> None:
         """Say once if the sensor samples at another rate than it is set to."""
-        pull = clock.pull
+        pull = clock.estimate.pull
         deviates = clock.locked and abs(pull) > PLAUSIBLE_PULL
         self._deviating_s = self._deviating_s + 1 if deviates else 0
         if self._deviating_s == _DEVIATING_SECONDS and not self._rate_reported:

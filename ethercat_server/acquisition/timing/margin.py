@@ -15,8 +15,8 @@ _LOSS_PERIODS: Final = 10.0
 _NO_TIME: Final = 0.5
 """There is none if a round trip takes more than this part of a period."""
 _LARGEST_MARGIN: Final = 0.4
-_EVENT_MARGIN: Final = 1.3
-"""Standard deviations, where events date the samples and to look early teaches nothing."""
+_LESSON: Final = 1.5
+"""By this factor an early look costs more where it teaches nothing, for events date the samples."""
 
 
 def has_no_time_for_two(timing: ExchangeTiming, period_ns: float) -> bool:
@@ -24,13 +24,9 @@ def has_no_time_for_two(timing: ExchangeTiming, period_ns: float) -> bool:
     return timing.usual_ns > _NO_TIME * period_ns
 
 
-def event_margin_ns(timing: ExchangeTiming, period_ns: float, phase_variance: float) -> float:
-    """The same where events date the samples: one exchange a sample."""
-    deviation_ns = math.sqrt(phase_variance + timing.variance)
-    return min(_EVENT_MARGIN * deviation_ns, _LARGEST_MARGIN * period_ns)
-
-
-def margin_ns(timing: ExchangeTiming, period_ns: float, phase_variance: float) -> float:
+def margin_ns(
+    timing: ExchangeTiming, period_ns: float, phase_variance: float, *, by_events: bool = False
+) -> float:
     """How long after the expected instant a poll should look, so that samples are youngest on the whole.
 
     An early look costs a second exchange, or the sample where there is no time for one. The margin is where
@@ -38,6 +34,8 @@ def margin_ns(timing: ExchangeTiming, period_ns: float, phase_variance: float) -
     """
     single = has_no_time_for_two(timing, period_ns)
     cost_ns = _LOSS_PERIODS * period_ns if single else timing.usual_ns + _PRICE_NS
+    if by_events:
+        cost_ns *= _LESSON
     deviation_ns = math.sqrt(phase_variance + timing.variance)
     ratio = cost_ns / (deviation_ns * ROOT_2_PI)
     if ratio <= 1:

@@ -13,7 +13,7 @@ from typing import Any, Final
 from ethercat_server.acquisition.hardware.event_times import EventTimes
 from ethercat_server.acquisition.timing.estimate import CERTAIN, CONTRADICTS, Estimate
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.timing.margin import event_margin_ns, has_no_time_for_two, margin_ns
+from ethercat_server.acquisition.timing.margin import has_no_time_for_two, margin_ns
 
 _LOCKED: Final = 0.125
 """The clock is followed while the phase is known to this part of a period (standard deviation)."""
@@ -53,9 +53,9 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_absent", "_aim_ns", "_begun", "_by_event", "_caution", "_doubtful", "_estimate", "_hits",
+        "_absent", "_aim_ns", "_begun", "_by_event", "_caution", "_doubtful", "_hits",
         "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_newest", "_nominal_ns", "_overdue",
-        "_probed_above", "_probing", "_single", "_timing", "_turn", "_usual_margin_ns", "events",
+        "_probed_above", "_probing", "_single", "_timing", "_turn", "_usual_margin_ns", "estimate", "events",
         "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
     )  # fmt: skip
 
@@ -63,7 +63,7 @@ class SampleClock:
         """`period_ns` is the nominal sample period; `timing` that of the bus."""
         self.events = events
         self._nominal_ns = period_ns
-        self._estimate = Estimate(period_ns)
+        self.estimate = Estimate(period_ns)
         """Its phase is the next sample's instant less the outward part of the shortest round trip."""
         self._timing = timing
         self.locked = False
@@ -109,19 +109,14 @@ class SampleClock:
     @property
     def period_ns(self) -> float:
         """Estimated period."""
-        return self._estimate.period_ns
+        return self.estimate.period_ns
 
     @property
     def uncertainty_ns(self) -> float:
         """How far `instant_ns` may be off: two standard deviations, and where the slave is on the way."""
         events = self.events
-        variance = events.variance if events is not None and events.are_trusted else self._estimate.variance
+        variance = events.variance if events is not None and events.are_trusted else self.estimate.variance
         return 2 * math.sqrt(variance) + self._timing.least_ns / 2
-
-    @property
-    def is_dated(self) -> bool:
-        """Whether `instant_ns` is known better than from when the exchange was sent and back."""
-        return self.locked or self._by_event != 0.0
 
     @property
     def by_events(self) -> bool:
@@ -132,11 +127,6 @@ class SampleClock:
     def one_by_one(self) -> bool:
         """Whether it is followed, and an exchange is back before the next one is wanted."""
         return self.locked and not self._single
-
-    @property
-    def pull(self) -> float:
-        """By what part the period differs from the nominal one."""
-        return self._estimate.pull
 
     def describe(self) -> dict[str, Any]:
         """What `status` says of it."""
@@ -152,7 +142,7 @@ class SampleClock:
 
     def next_poll_ns(self) -> float:
         """When the next exchange should be sent, as far as this sensor is concerned."""
-        timing, aim_ns, period_ns = self._timing, self._aim_ns, self._estimate.period_ns
+        timing, aim_ns, period_ns = self._timing, self._aim_ns, self.estimate.period_ns
         sent_ns = timing.sent_ns
         if not self.locked:
             return sent_ns + period_ns / _POLLS_UNLOCKED
@@ -160,7 +150,7 @@ class SampleClock:
             # The polls that are on their way are for the samples before: the first that has none is next.
             guard_ns = self._margin_ns / 2
             ahead_ns = max(0, int((sent_ns - aim_ns + guard_ns) // period_ns) + 1) * period_ns
-            probe_ns = self._estimate.phase_ns - timing.look_ns + ahead_ns
+            probe_ns = self.estimate.phase_ns - timing.look_ns + ahead_ns
             if self._probing and probe_ns > sent_ns + guard_ns:
                 return probe_ns
             return aim_ns + ahead_ns
@@ -174,7 +164,7 @@ class SampleClock:
 
     def _settle(self) -> None:
         """Derive from the estimate what the next poll needs."""
-        timing, estimate = self._timing, self._estimate
+        timing, estimate = self._timing, self.estimate
         variance, period_ns = estimate.variance, estimate.period_ns
         deviation_ns = math.sqrt(variance)
         self.locked = self._begun and deviation_ns < _LOCKED * period_ns
@@ -183,12 +173,10 @@ class SampleClock:
             self._turn = _TURNS
             self._least_variance, self._most_variance = variance / _CHANGED, variance * _CHANGED
             self._single = has_no_time_for_two(timing, period_ns)
-            margin = event_margin_ns if self.by_events and not self._single else margin_ns
-            self._usual_margin_ns = margin(timing, period_ns, variance)
+            self._usual_margin_ns = margin_ns(timing, period_ns, variance, by_events=self.by_events)
             self._probed_above = (timing.look_variance + _PROBE_BELOW) / 4
-        self._margin_ns = self._usual_margin_ns
-        if not (self._single or self.by_events):
-            self._margin_ns *= self._caution
+        steady = self._single or self.by_events
+        self._margin_ns = self._usual_margin_ns if steady else self._usual_margin_ns * self._caution
         self._probing = self._hits > _UNPROBED or (variance > self._probed_above and not self.by_events)
         self._aim_ns = estimate.phase_ns + self._margin_ns - timing.look_ns
         if self._probing and not self._single and self.by_events:
@@ -202,7 +190,7 @@ class SampleClock:
 
         Sets `steps`, `uncertain` and `instant_ns`.
         """
-        phase_ns, period_ns = self._estimate.phase_ns, self._estimate.period_ns
+        phase_ns, period_ns = self.estimate.phase_ns, self.estimate.period_ns
         looked_ns, least_ns = self._looked_ns, self._timing.least_ns
         unwatched_ns = back_ns - looked_ns
         if not self._begun:
@@ -210,7 +198,7 @@ class SampleClock:
             # Only what fell into the time the sensor was not watched can have been lost.
             self.steps = 1 + int(unwatched_ns // period_ns)
             self.uncertain = unwatched_ns >= period_ns
-            self.instant_ns = min(back_ns, sent_ns + period_ns) - min(unwatched_ns, period_ns) / 2
+            self.instant_ns = min(back_ns, sent_ns + period_ns)
             return
         self.uncertain = False
         events, self._by_event = self.events, 0.0
@@ -218,7 +206,7 @@ class SampleClock:
             at_ns = events.instant_ns - least_ns / 2 if events.instant_ns else phase_ns
             late = (at_ns - phase_ns) / period_ns
             off = late - round(late) if late > -0.5 else late
-            if events.judge(off * period_ns, self._estimate.variance, back_ns):
+            if events.judge(off * period_ns, self.estimate.variance, back_ns):
                 self._by_event = at_ns
                 self._count(1 + round(late), late)
                 self.instant_ns = min(events.instant_ns, back_ns)
@@ -235,21 +223,20 @@ class SampleClock:
             newest = 1 + round(((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns)
         else:
             newest = 1 + math.floor(late)
-            doubt_ns = CERTAIN * math.sqrt(self._estimate.variance)
+            doubt_ns = CERTAIN * math.sqrt(self.estimate.variance)
             if not self._single:
                 doubt_ns += least_ns / 4  # the outward part of a short round trip varies, too
             least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
             self.uncertain = self._doubtful or (most > 0 and least < most)
         self._count(newest, late)
-        instant_ns = phase_ns + (self._newest - 1) * period_ns
-        instant_ns = max(instant_ns, looked_ns)
-        instant_ns += least_ns / 2
-        self.instant_ns = instant_ns if instant_ns < back_ns else back_ns
+        instant_ns = max(phase_ns + (self._newest - 1) * period_ns, looked_ns) + least_ns / 2
+        # After a stall in the exchange its end says nothing of when the sample came to be.
+        self.instant_ns = min(instant_ns if self.locked else sent_ns + period_ns, back_ns)
         if events is not None and self.locked and not (events.are_trusted or self.uncertain):
-            events.judge(events.instant_ns - instant_ns, self._estimate.variance, back_ns)
-            if events.are_trusted:
-                self._estimate.expect(events.trust.spread)
+            difference_ns = events.instant_ns - instant_ns
+            if variance := events.compare(difference_ns, self.estimate.variance, back_ns):
+                self.estimate.expect(variance)
 
     def _count(self, newest: int, late: float) -> None:
         """The new sample is this one by the estimate, and so late there, in periods."""
@@ -263,12 +250,12 @@ class SampleClock:
 
     def _is_late(self, look_ns: float, variance: float) -> bool:
         """Whether the sample that is expected should have been there at a look."""
-        estimate = self._estimate
+        estimate = self.estimate
         return look_ns > estimate.phase_ns + CONTRADICTS * math.sqrt(estimate.variance + variance)
 
     def observe(self, sent_ns: int, back_ns: int, fresh: bool) -> None:
         """Learn from one valid exchange whether it brought a new sample (`fresh`: after `predict`)."""
-        estimate = self._estimate
+        estimate = self.estimate
         look_ns, variance = self._timing.look(sent_ns, back_ns)
         looked_ns, self._looked_ns = self._looked_ns, sent_ns
         if not self._begun:
@@ -304,7 +291,7 @@ class SampleClock:
             if self.locked and not (self._doubtful or self._is_late(look_ns, variance)):
                 if not self.by_events:
                     estimate.learn_bit(look_ns, variance, -1)
-                if look_ns > estimate.phase_ns - doubt_ns - 2 * self._margin_ns:
+                if look_ns > estimate.phase_ns - doubt_ns - self._margin_ns * (1 + self.by_events):
                     if self._hits and not self.by_events:
                         self._caution += _CAUTION_GAIN * self._caution
                         self._caution = min(self._caution, 1.0)
