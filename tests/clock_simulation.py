@@ -226,7 +226,7 @@ class ClockSimulation:
         self.machine = machine
         self.controller = controller
         self.timing = ExchangeTiming()
-        events = EventTimes(DistributedClock(0, 0), self.timing) if controller else None
+        events = EventTimes(DistributedClock(0, 0, 20_000), self.timing) if controller else None
         self.clock = SampleClock(SECOND / sensor.rate_hz, self.timing, events)
         self.now_ns = 1.0
         self.polls_ns: list[float] = []

@@ -39,8 +39,6 @@ class Bus(Datagrams):
         """Where the sensors are on the wire: by number, as everything below."""
         self.fmmus: list[bytes] = []
         """FMMU registers as they must be in OP."""
-        self._latching: list[int | None] = []
-        """Stations of the sensors whose controllers latch when samples are written, None for others."""
         self.process_data = ProcessData((), backend)
         """The exchange, once the sensors are mapped."""
 
@@ -77,10 +75,9 @@ class Bus(Datagrams):
 
     def read_clock(self, number: int) -> DistributedClock | None:
         """The clock of a sensor's controller, from now on read with its process data; None if it has none."""
-        if self._latching[number] is None or (clock := read_clock(self, number)) is None:
+        if (at := self.process_data.read_latched(number, reads=True)) is None:
             return None
-        self.process_data.read_latched(number, reads=True)
-        return clock
+        return read_clock(self, number, at)
 
     def _lay_out_exchange(self) -> None:
         """Read from the FMMUs which logical addresses are whose process data."""
@@ -88,7 +85,7 @@ class Bus(Datagrams):
         self.fmmus = []
         features = [self._features(number) for number in range(len(self.stations))]
         lrw = not any(each & reg.NO_LRW for each in features)
-        self._latching = []
+        latching: list[int | None] = []
         for number in range(len(self.stations)):
             count = min(self.read_surely(number, reg.FMMU_AND_SM_COUNT, 2)[0], reg.MOST_FMMUS)
             self.fmmus.append(self.read_surely(number, reg.FMMU, count * reg.FMMU_SIZE))
@@ -101,8 +98,8 @@ class Bus(Datagrams):
             latches = features[number] & reg.DC_AVAILABLE and latch_events(
                 self, number, managers[reg.FMMU_READ]
             )
-            self._latching.append(self.stations[number] if latches else None)
-        self.process_data = ProcessData(areas, self.backend, lrw=lrw, stations=self._latching)
+            latching.append(self.stations[number] if latches else None)
+        self.process_data = ProcessData(areas, self.backend, lrw=lrw, stations=latching)
 
     def _features(self, number: int) -> int:
         """What the slave controller of a sensor can do."""

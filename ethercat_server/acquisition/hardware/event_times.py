@@ -17,8 +17,8 @@ from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock
 _WRAP: Final = 1 << 32
 _HALF: Final = 1 << 31
 _LONG_AGO: Final = -(1 << 63)
-_FRAME_NS: Final = 150_000
-"""An event may come while the frame passes; the longest one takes less."""
+_SLACK_NS: Final = 5_000
+"""A controller may note the two by so much differently."""
 _PASSING: Final = 0.5
 """What that counts as a contradiction."""
 _LEAST_VARIANCE: Final = 2_000.0**2
@@ -30,8 +30,8 @@ class EventTimes:
     """Of one sensor. `took` follows every exchange; one that brought a new sample, `judge` or `compare`."""
 
     __slots__ = (
-        "_answers", "_event", "_half_behind_ns", "_is_passing", "_local", "_moved", "_offset", "_timing",
-        "_took_ns", "instant_ns", "local_clock", "trust",
+        "_answers", "_event", "_half_behind_ns", "_is_passing", "_local", "_moved", "_offset", "_reading_ns",
+        "_timing", "_took_ns", "instant_ns", "local_clock", "trust",
     )  # fmt: skip
 
     def __init__(self, clock: DistributedClock, timing: ExchangeTiming) -> None:
@@ -43,6 +43,7 @@ class EventTimes:
         self._timing = timing
         self._offset = clock.offset
         self._half_behind_ns = clock.behind_ns / 2
+        self._reading_ns = clock.reading_ns
         self._local = self._event = _LONG_AGO
         """Local times of the newest exchange and of the newest sample's event."""
         self._took_ns = 0
@@ -82,10 +83,10 @@ class EventTimes:
         event = local - ((local - change + _HALF) % _WRAP - _HALF)
         self._moved += event != self._event
         self._event = event
-        if before < event <= local and clock.is_known and clock.fits(sent_ns, back_ns):
+        if before - _SLACK_NS < event <= local and clock.is_known and clock.fits(sent_ns, back_ns):
             self.instant_ns = clock.time(event) - self._half_behind_ns
             self._took_ns = back_ns - sent_ns
-        self._is_passing = local < event < local + _FRAME_NS
+        self._is_passing = local < event < local + self._reading_ns
 
     def judge(self, difference_ns: float, variance: float, back_ns: int) -> bool:
         """Whether the new sample is dated by `instant_ns`: to be asked for each, while they are trusted.

@@ -22,6 +22,9 @@ _LINKS: Final = 4
 _MOST_BEHIND_NS: Final = 1_000_000
 _WRAP: Final = 1 << 32
 _EVENTS_SIZE: Final = 8
+_BYTE_NS: Final = 80
+"""At 100 Mbit/s."""
+_SLACK_NS: Final = 10_000
 
 Latched = tuple[int, int, int, int, int]
 """System time when the frame arrived, a working counter; times of the events PDI buffer start and PDI buffer
@@ -38,6 +41,8 @@ class DistributedClock(NamedTuple):
     """System time less local time, modulo 2**32 ns."""
     behind_ns: int
     """Time from when a frame arrives at the slave until it is there again on its way back."""
+    reading_ns: int
+    """Time from when a frame arrives until it has read what is latched, at most."""
 
 
 def latched_datagrams(station: int) -> tuple[tuple[int, int, int, bytes], ...]:
@@ -61,13 +66,16 @@ def latch_events(bus: Datagrams, number: int, sync_manager: int) -> bool:
     return bus.write_register(number, address, bytes([active | reg.SM_LATCH_PDI]))
 
 
-def read_clock(bus: Datagrams, number: int) -> DistributedClock | None:
-    """What another master has left in a sensor's controller; None if it does not answer."""
+def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
+    """What another master has left in a sensor's controller; None if it does not answer.
+
+    `at` is where frames read what is latched.
+    """
     data = bus.read_register(number, reg.DC_OFFSET, _U64_U32.size)
     if data is None:
         return None
     offset, delay = _U64_U32.unpack(data)
-    return DistributedClock((offset - delay) % _WRAP, _behind_ns(bus, number))
+    return DistributedClock((offset - delay) % _WRAP, _behind_ns(bus, number), at * _BYTE_NS + _SLACK_NS)
 
 
 def _behind_ns(bus: Datagrams, number: int) -> int:

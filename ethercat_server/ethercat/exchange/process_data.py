@@ -60,12 +60,14 @@ class ProcessData:
         self.which = 0
         """Which frame of the exchange it is."""
 
-    def read_latched(self, number: int, *, reads: bool) -> None:
-        """Read what the controller of a sensor latches, or no longer."""
+    def read_latched(self, number: int, *, reads: bool) -> int | None:
+        """Read what a sensor's controller latches, or no longer; where, or None if it latches nothing."""
         for content, inputs in zip(self._frames, self.inputs, strict=True):
             for each in inputs:
                 if each.number == number and each.latched:
                     switch_latched(content, each.latched, reads=reads)
+                    return each.latched
+        return None
 
     def send(self) -> int:
         """Send an exchange, unless too many are on the wire. Returns when."""

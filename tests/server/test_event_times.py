@@ -1,0 +1,154 @@
+"""Samples dated by a slave controller's event times, and every way in which these can be wrong.
+
+All in simulated time: the machine, the network card, the sensor, the controller's clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from ethercat_server.acquisition.hardware.trust import Verdict
+from tests.clock_simulation import Card, ClockSimulation, Controller, Machine, Outcome, Sensor
+
+QUIET, CARD = Machine(), Card()
+SENSOR = Sensor(400.0, ppm=150.0)
+HONEST = Controller()
+LIES_FROM_S = 3.0
+
+
+def run(
+    controller: Controller | None,
+    sensor: Sensor = SENSOR,
+    card: Card = CARD,
+    machine: Machine = QUIET,
+    seconds: float = 6.0,
+) -> ClockSimulation:
+    return ClockSimulation(sensor, card, machine, 1, controller).run(seconds)
+
+
+def verdict(simulation: ClockSimulation) -> Verdict:
+    assert simulation.clock.events is not None
+    return simulation.clock.events.trust.verdict
+
+
+def why(simulation: ClockSimulation) -> str:
+    assert simulation.clock.events is not None
+    return simulation.clock.events.trust.why
+
+
+def percentile(values: list[float], percent: float) -> float:
+    return values[int(len(values) * percent / 100)]
+
+
+def assert_right(outcome: Outcome) -> None:
+    assert percentile(outcome.errors_ns, 50) < 3e3
+    assert percentile(outcome.errors_ns, 99) < 10e3
+    assert outcome.lost == outcome.counted
+    assert outcome.unflagged == 0
+    assert outcome.outside == 0
+
+
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(1600.0, 3.0), (150.0, 12.0), (25.0, 40.0)])
+def test_events_date_samples_with_one_exchange_each(rate_hz: float, seconds: float) -> None:
+    simulation = run(HONEST, Sensor(rate_hz, ppm=-300.0), seconds=seconds)
+    assert verdict(simulation) is Verdict.TRUSTED
+    outcome = simulation.outcome(seconds / 2)
+    assert_right(outcome)
+    assert outcome.lost == 0
+    assert outcome.exchanges < 1.05
+    by_polling = run(None, Sensor(rate_hz, ppm=-300.0), seconds=seconds).outcome(seconds / 2)
+    assert outcome.exchanges < by_polling.exchanges - 0.05
+    assert percentile(outcome.ages_ns, 99) < percentile(by_polling.ages_ns, 99)
+    assert by_polling.unlocked == outcome.unlocked == 0
+
+
+@pytest.mark.parametrize(
+    ("card", "machine"),
+    [
+        pytest.param(Card(2e6, spread=0, jitter_ns=4e5), QUIET, id="slow card"),
+        pytest.param(Card(lost=0.01), QUIET, id="lost frames"),
+        pytest.param(Card(), Machine(stolen=0.2), id="stolen time"),
+        pytest.param(Card(), Machine(stops=((3.5, 3e8), (4.5, 2e7), (5.0, 7e8))), id="stops"),
+    ],
+)
+def test_events_date_samples_where_polling_hardly_can(card: Card, machine: Machine) -> None:
+    simulation = run(HONEST, card=card, machine=machine)
+    assert verdict(simulation) is Verdict.TRUSTED
+    assert_right(simulation.outcome(3.0))
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        pytest.param(replace(SENSOR, white_ns=2e4), id="jitter"),
+        pytest.param(replace(SENSOR, restart_s=4.5), id="restart"),
+        pytest.param(replace(SENSOR, silent_s=(3.5, 4.5)), id="silence"),
+    ],
+)
+def test_events_follow_a_sensor_that_is_no_good_clock(sensor: Sensor) -> None:
+    simulation = run(HONEST, sensor)
+    assert verdict(simulation) is Verdict.TRUSTED
+    outcome = simulation.outcome(3.0)
+    assert percentile(outcome.errors_ns, 50) < 3e3
+    assert percentile(outcome.errors_ns, 99) < 10e3
+
+
+WRONG = {
+    "late": Controller(late_ns=100e3),
+    "late within the margin": Controller(late_ns=40e3),
+    "start of the buffer": Controller(late_ns=-100e3),
+    "start of a short buffer": Controller(late_ns=-12e3),
+    "of the sample before": Controller(lags=1),
+    "at random": Controller(jitter_ns=50e3),
+    "stands still": Controller(stuck=True),
+    "time stands still": Controller(stops=True),
+    "time runs wrong": Controller(step_ppm=-5000.0),
+}
+REASONS = {
+    "stands still": "they stand still",
+    "time stands still": "its local clock does not run",
+    "time runs wrong": "its local clock does not run",
+}
+
+
+@pytest.mark.parametrize("since_s", [0.0, LIES_FROM_S])
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_event_times_are_refused_and_polling_goes_on(name: str, since_s: float) -> None:
+    simulation = run(replace(WRONG[name], lies_from_s=since_s), seconds=8.0)
+    assert verdict(simulation) is Verdict.REFUSED
+    assert REASONS.get(name, "they ") in why(simulation)
+    outcome = simulation.outcome(1.0)
+    assert outcome.lost == outcome.counted == outcome.unflagged == 0
+    # Those until it is noticed: an early event that fits between two polls is dated by it.
+    assert outcome.outside < 100
+    after = simulation.outcome(6.0)
+    assert after.outside == after.unlocked == 0
+    assert percentile(after.errors_ns, 99) < 20e3
+
+
+def test_registers_that_nobody_has_are_refused_within_a_second() -> None:
+    for controller in (Controller(counter=0), Controller(stuck=True)):
+        assert verdict(run(controller, seconds=1.0)) is Verdict.REFUSED
+
+
+@pytest.mark.parametrize("jump_ns", [3e6, 30e3, -30e3, -1e9])
+def test_a_clock_that_jumps_is_not_believed_until_it_has_proved_right_again(jump_ns: float) -> None:
+    simulation = run(Controller(jump_ns=jump_ns, lies_from_s=LIES_FROM_S), seconds=9.0)
+    outcome = simulation.outcome(1.0)
+    assert outcome.outside == outcome.lost == outcome.counted == 0
+    assert verdict(simulation) is Verdict.TRUSTED
+    assert_right(simulation.outcome(8.0))
+
+
+def test_a_change_of_the_clocks_rate_is_followed() -> None:
+    simulation = run(Controller(step_ppm=50.0, lies_from_s=LIES_FROM_S), seconds=8.0)
+    assert verdict(simulation) is Verdict.TRUSTED
+    assert simulation.outcome(1.0).outside == 0
+    assert_right(simulation.outcome(6.0))
+
+
+def test_the_uncertainty_covers_the_stamps_of_a_lopsided_round_trip() -> None:
+    simulation = run(Controller(late_ns=-4e3))
+    assert simulation.outcome(1.0).outside == 0

@@ -1,0 +1,144 @@
+"""The whole server on sensors with distributed clocks: what it reads and writes, and what it says of them.
+
+How event times are judged is in test_event_times.py.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+
+import pytest
+
+from ethercat_server.errors import SetUpError
+from ethercat_server.ethercat.exchange.distributed_clock import LATCHED, latched_datagrams
+from ethercat_server.ethercat.exchange.frames import Area, fit_a_frame, make_frames
+from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.wire import Command, Datagram, parse
+from ethercat_server.virtual_sensor.options import SensorOptions
+from tests.simulation import Simulation, fresh, reading
+
+SETTLED_S = 3.0
+
+
+def simulation(*dc: str) -> Simulation:
+    return Simulation(
+        *(SensorOptions(serial=n, signal="clock", ppm=150.0, dc=each) for n, each in enumerate(dc, 1))
+    )
+
+
+def stamps(running: Simulation, number: int = 0) -> str:
+    stamped: str = running.status()["sensors"][number]["clock"]["stamps"]
+    return stamped
+
+
+def errors_ns(running: Simulation) -> list[int]:
+    return [frame.monotonic_ns - reading(frame).instant_ns for frame in fresh(running.frames)]
+
+
+def test_samples_are_dated_by_the_slave_controller(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    running = simulation("ppm=40+at=4294000000")
+    running.run(SETTLED_S)
+    assert stamps(running) == "hardware"
+    assert caplog.text.count("the clock of its slave controller dates the samples") == 1
+    cycles, count = running.status()["cycles"], len(running.frames)
+    running.run(1.0)
+    errors = errors_ns(running)[count:]
+    assert max(errors) - min(errors) < 10_000
+    assert running.status()["cycles"] - cycles < 1.06 * len(errors)
+    assert running.status()["sensors"][0]["lost_samples"] == 0
+
+
+@pytest.mark.parametrize("dc", ["none", "no-events"])
+def test_a_controller_without_it_is_polled_as_before(dc: str, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    running = simulation(dc)
+    running.run(SETTLED_S)
+    assert stamps(running) == "polling"
+    assert ("stand still" in caplog.text) is (dc == "no-events")
+    read = {datagram.ado for datagram in sent(running) if datagram.command == Command.FPRD}
+    assert reg.DC_SYSTEM_TIME not in read, "what is of no use is not asked for"
+
+
+def sent(running: Simulation) -> list[Datagram]:
+    content = bytes(running.bus.process_data._frames[0])
+    return parse(content, len(content))
+
+
+def test_registers_that_stop_in_operation_cost_no_sample(caplog: pytest.LogCaptureFixture) -> None:
+    running = simulation("")
+    running.run(SETTLED_S)
+    assert stamps(running) == "hardware"
+    running.command("dc stuck")
+    running.run(SETTLED_S)
+    assert stamps(running) == "polling"
+    assert caplog.text.count("its samples are dated by polling") == 1
+    status = running.status()["sensors"][0]
+    assert (status["lost_samples"], status["invalid"], status["recoveries"]) == (0, 0, 0)
+
+
+def test_a_sensor_that_lost_its_power_is_dated_by_its_new_clock() -> None:
+    running = simulation("at=3000000000")
+    running.run(SETTLED_S)
+    running.command("power cycle 0.3")
+    running.run(SETTLED_S + 2)
+    assert running.status()["sensors"][0]["recoveries"] == 1
+    assert stamps(running) == "hardware"
+    errors = errors_ns(running)[-400:]
+    assert max(errors) - min(errors) < 10_000
+
+
+def test_each_sensor_of_a_bus_has_its_own_clock() -> None:
+    running = simulation("ppm=40", "none", "ppm=-40+at=4000000000")
+    running.run(SETTLED_S)
+    assert [stamps(running, number) for number in range(3)] == ["hardware", "polling", "hardware"]
+
+
+def test_what_another_master_has_written_to_the_clock_is_taken_into_account() -> None:
+    before = simulation("")
+    before.run(0.1)
+    before.close()
+    life = before.backend.sensors.sensors[0].life
+    assert life is not None
+    assert life.esc.write(reg.DC_OFFSET, struct.pack("<QI", 10**18 + 2**31, 350))
+    running = Simulation(backend=before.backend)
+    running.run(SETTLED_S)
+    assert stamps(running) == "hardware"
+    assert max(map(abs, errors_ns(running)[-400:])) < 10_000
+
+
+def areas(count: int, size: int = 61) -> list[list[Area]]:
+    inputs = [(n * size, (n + 1) * size) for n in range(count)]
+    return [[Area(*each, reg.FMMU_READ)] for each in inputs]
+
+
+@pytest.mark.parametrize("lrw", [True, False])
+@pytest.mark.parametrize("count", [1, 8, 15, 16, 40])
+def test_frames_carry_the_latched_times_of_the_sensors_in_them(count: int, lrw: bool) -> None:
+    stations = [None if number % 5 == 4 else 0x1001 + number for number in range(count)]
+    frames = make_frames(areas(count), stations, lrw=lrw)
+    assert sorted(each.number for frame in frames for each in frame.inputs) == list(range(count))
+    for frame in frames:
+        assert len(frame.content) <= 1514
+        datagrams = {datagram.data: datagram for datagram in parse(frame.content, len(frame.content))}
+        assert datagrams[frame.tag].command == Command.NOP
+        for inputs in frame.inputs:
+            station = stations[inputs.number]
+            if station is None:
+                assert inputs.latched == 0
+                continue
+            first = datagrams[inputs.latched]
+            second = datagrams[inputs.latched + LATCHED.size - 10]
+            assert (first.adp, first.ado, first.length) == (station, reg.DC_SYSTEM_TIME, 4)
+            assert (second.adp, second.ado, second.length) == (station, reg.DC_PDI_START_EVENT, 8)
+            assert len(latched_datagrams(station)) == 2
+
+
+def test_process_data_that_no_frame_can_carry_is_an_error() -> None:
+    whole = [Area(0, 1400, reg.FMMU_READ)]
+    assert fit_a_frame(whole, lrw=True)
+    assert not fit_a_frame(whole, lrw=False)
+    torn = [[Area(0, 61, reg.FMMU_READ), Area(2000, 2010, reg.FMMU_READ)]]
+    with pytest.raises(SetUpError, match="lies among that of others"):
+        make_frames(torn, [None], lrw=True)
