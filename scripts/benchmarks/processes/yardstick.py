@@ -1,32 +1,37 @@
-"""The floor of this machine: a bare pysoem exchange, a bare message over loopback TCP. Nothing else.
-
-Both loops wake at absolute deadlines and do the one thing.
-"""
+"""The yardstick's master: brings the sensors to OP, then becomes the C program of yardstick.c."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import shutil
 import socket
-import struct
-import time
-from array import array
-from collections.abc import Callable
+import subprocess
 from pathlib import Path
 from typing import Any, Final
 
-from scripts.benchmarks.records import connect, sleep_until, steady, write
+from ethercat_server.ethercat.raw_socket import packet_sockets
 from scripts.demonstration.child import DemoError
 
-_WARM_UP_S: Final = 0.3
-_SIZE: Final = 94
-"""A DATA message with 61 bytes of process data."""
-_MESSAGE: Final = struct.Struct(f">Q{_SIZE - 8}x")
+_SOURCE: Final = Path(__file__).with_suffix(".c")
 _OP_ATTEMPTS: Final = 500
+
+
+def build(folder: Path) -> Path:
+    """The C program, optimized. DemoError if it cannot be built."""
+    if shutil.which("gcc") is None:
+        raise DemoError("there is no C compiler (sudo apt install gcc)")
+    program = folder / "yardstick"
+    command = ["gcc", "-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror", str(_SOURCE), "-o", str(program)]
+    made = subprocess.run(command, check=False, capture_output=True, text=True)
+    if made.returncode:
+        raise DemoError(f"gcc could not build {_SOURCE.name}:\n{made.stderr}")
+    return program
 
 
 def operational_master(ifname: str) -> Any:
     """The least that pysoem needs to bring the virtual sensors to OP."""
-    import pysoem  # noqa: PLC0415 - the message programs do without
+    import pysoem  # noqa: PLC0415 - whoever builds the program does without
 
     master = pysoem.Master()
     master.open(ifname)
@@ -44,80 +49,27 @@ def operational_master(ifname: str) -> Any:
     raise DemoError(f"the sensor on {ifname} does not reach OP")
 
 
-def exchange(arguments: argparse.Namespace) -> None:
-    """Writes (wake-up lateness, send and receive) pairs in ns."""
-    master = operational_master(arguments.ifname)
-    steady(arguments.priority)
-    period_ns = int(1e9 / arguments.rate)
-    figures = array("q")
-    due = time.monotonic_ns()
-    warm, end = due + int(_WARM_UP_S * 1e9), due + int((_WARM_UP_S + arguments.seconds) * 1e9)
-    while due < end:
-        woke = sleep_until(due)
-        master.send_processdata()
-        master.receive_processdata(period_ns // 1000)
-        back = time.monotonic_ns()
-        if due > warm:
-            figures.extend((woke - due, back - woke))
-        due += period_ns * (1 + max(0, back - due) // period_ns)
-    master.close()
-    write(arguments.path, figures)
-
-
-def send(arguments: argparse.Namespace) -> None:
-    """Sends a message with the time in it, `sensors` of them at each deadline."""
-    with socket.create_server(("127.0.0.1", arguments.port)) as listener:
-        receiver, _ = listener.accept()
-    receiver.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    steady(arguments.priority)
-    period_ns = int(1e9 / arguments.rate)
-    due = time.monotonic_ns()
-    end = due + int((_WARM_UP_S + arguments.seconds) * 1e9)
-    with receiver:
-        while due < end:
-            sleep_until(due)
-            for _ in range(arguments.sensors):
-                receiver.send(_MESSAGE.pack(time.monotonic_ns()))
-            due += period_ns
-    write(arguments.path, array("q"))
-
-
-def receive(arguments: argparse.Namespace) -> None:
-    """Writes how long each message took, in ns. Scheduled as any client is."""
-    figures = array("q")
-    first = 0
-    with connect(arguments.port) as connection:
-        rest = b""
-        while data := connection.recv(65536):
-            now = time.monotonic_ns()
-            first = first or now
-            data = rest + data
-            whole = len(data) // _SIZE * _SIZE
-            rest = data[whole:]
-            if now - first > _WARM_UP_S * 1e9:
-                figures.extend(now - sent for (sent,) in _MESSAGE.iter_unpack(data[:whole]))
-    write(arguments.path, figures)
-
-
 def main() -> None:
-    """Run one of the parts."""
+    """Wait for the client, bring the sensors to OP, and hand both sockets over."""
     parser = argparse.ArgumentParser()
-    programs = parser.add_subparsers(required=True)
-    parts: tuple[Callable[[argparse.Namespace], None], ...] = (exchange, send, receive)
-    for part in parts:
-        program = programs.add_parser(part.__name__)
-        program.set_defaults(run=part)
-        program.add_argument("path", type=Path)
-        if part is not exchange:
-            program.add_argument("--port", type=int, required=True)
-        if part is not receive:
-            program.add_argument("--rate", type=float, required=True)
-            program.add_argument("--seconds", type=float, required=True)
-            program.add_argument("--priority", type=int, default=0)
-    programs.choices["exchange"].add_argument("--ifname", required=True)
-    programs.choices["send"].add_argument("--sensors", type=int, default=1)
+    parser.add_argument("program", type=Path)
+    parser.add_argument("path", type=Path)
+    parser.add_argument("--ifname", required=True)
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--rate", type=float, required=True)
+    parser.add_argument("--priority", type=int, default=0)
     arguments = parser.parse_args()
-    arguments.run(arguments)
+    with socket.create_server(("127.0.0.1", arguments.port)) as listener:
+        client, _ = listener.accept()
+    master = operational_master(arguments.ifname)
+    (raw,) = packet_sockets()
+    for descriptor in (raw, client.fileno()):
+        os.set_inheritable(descriptor, True)
+    outputs = sum(len(slave.output) for slave in master.slaves)
+    numbers = (raw, client.fileno(), arguments.rate, arguments.priority, outputs, len(master.slaves))
+    os.execv(  # noqa: S606 - built here
+        arguments.program, [str(arguments.program), "master", *map(str, numbers), str(arguments.path)]
+    )
 
 
 if __name__ == "__main__":

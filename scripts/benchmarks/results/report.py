@@ -1,4 +1,4 @@
-"""The benchmark's table: a row for each figure, this project beside the polling design and the floor."""
+"""The benchmark's table: a row for each figure, a column for each program."""
 
 from __future__ import annotations
 
@@ -9,34 +9,37 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from scripts.benchmarks.comparison import RATIOS
+
+COLUMNS: Final = {"project": "this", "yardstick": "bare C", "driver": "Bota's driver", "polling": "polling"}
+BY_C: Final = "this / C"
 _POINTS: Final = {"p50": "p50", "p99": "p99", "p999": "p99.9"}
-_NONE: Final = "-"
+NONE: Final = "-"
 
 
 class Row(NamedTuple):
-    """A line of the table; one with a name only is a heading."""
+    """A line of the table; one without cells is a heading."""
 
     name: str
-    project: str = ""
-    polling: str = ""
-    floor: str = ""
-    project_by_floor: str = ""
-    polling_by_project: str = ""
+    cells: tuple[str, ...] = ()
 
 
 def print_configuration(result: Mapping[str, Any], console: Console) -> None:
-    """One configuration as a table."""
+    """One configuration as a table, and why a column is not there."""
     table = Table(title=title(result), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    table.collapse_padding = True
     table.add_column("", no_wrap=True)
-    for name in ("this", "polling", "floor", "this/floor", "polling/this"):
+    for name in headings(result):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows(result):
-        if len(list(filter(None, row))) == 1:
+        if row.cells:
+            table.add_row(f"  {row.name}", *row.cells)
+        else:
             table.add_section()
             table.add_row(f"[bold]{row.name}[/bold]")
-        else:
-            table.add_row(f"  {row.name}", *row[1:])
     console.print(table)
+    for name, why in result.get("missing", {}).items():
+        console.print(f"no column '{COLUMNS[name]}': {why}", soft_wrap=True)
 
 
 def title(configuration: Mapping[str, Any]) -> str:
@@ -45,40 +48,52 @@ def title(configuration: Mapping[str, Any]) -> str:
     return f"{configuration['rate_hz']} Hz, {sensors} virtual sensor{'s' * (sensors > 1)}"
 
 
+def programs(result: Mapping[str, Any]) -> list[str]:
+    """What was measured, in the order of the columns."""
+    return [name for name in COLUMNS if result.get(name)]
+
+
+def headings(result: Mapping[str, Any]) -> list[str]:
+    """The columns' names; the ratio is behind the two that it is of."""
+    found = [COLUMNS[name] for name in programs(result)]
+    if "ratio" in result:
+        found.insert(2, BY_C)
+    return found
+
+
 def rows(result: Mapping[str, Any]) -> list[Row]:
     """The table's rows, headings and all."""
-    found = [Row("Up to a TCP client"), *_counts(result, "tcp")]
-    found += _points("age", result, ("tcp", "age_us"), ("age_us",))
+    found = [Row("Up to a TCP client"), *_counts(result, "tcp"), *_points("age", result, "tcp", "age_us")]
+    if get(result, "project", "c") is not None:
+        found += _points("age at the C client", result, "c", "age_us")
     found += [
-        _figure("stamp error, p50, µs", result, ("tcp", "stamp_error_us", "p50")),
-        _figure("absolute stamp error, p99, µs", result, ("tcp", "stamp_error_us", "p99_absolute")),
-        _figure(
-            "hand-out to client, p50, µs", result, ("tcp", "hand_out_to_client_us"), ("loopback_us", "p50")
-        ),
+        figure("stamp error, p50, µs", result, "tcp", "stamp_error_us", "p50"),
+        figure("absolute stamp error, p99, µs", result, "tcp", "stamp_error_us", "p99_absolute"),
+        figure("hand-out to client, p50, µs", result, "tcp", "hand_out_to_client_us"),
     ]
-    if get(result, "project", "ros") is not None:
+    with_ros = get(result, "project", "ros") is not None
+    if with_ros:
         found += [Row("Up to a ROS subscriber"), *_counts(result, "ros")]
-        found += _points("age", result, ("ros", "age_us"))
-    found.append(Row("The server's loop"))
-    found += _points("wake-up lateness", result, ("tcp", "server", "wake_us"), ("wake_us",))
-    found += _points("exchange", result, ("tcp", "server", "exchange_us"), ("exchange_us",))
+        found += _points("age", result, "ros", "age_us")
+    found.append(Row("The loop"))
+    found += _points("wake-up lateness", result, "tcp", "server", "wake_us")
+    found += _points("exchange", result, "tcp", "server", "exchange_us")
     found += [
         Row("Resources"),
-        _figure("CPU of the server, %", result, ("tcp", "cpu_percent", "server")),
-        _figure("memory of the server, MB", result, ("tcp", "rss_mb", "server")),
+        figure("CPU, %", result, "tcp", "cpu_percent", "server"),
+        figure("memory, MB", result, "tcp", "rss_mb", "server"),
+        figure("CPU of the TCP client, %", result, "tcp", "cpu_percent", "client"),
     ]
-    for name in sorted(get(result, "project", "ros", "cpu_percent") or {}):
-        if name.startswith("node"):
-            found.append(_figure(f"CPU of the {name}, %", result, ("ros", "cpu_percent", name)))
-            found.append(_figure(f"memory of the {name}, MB", result, ("ros", "rss_mb", name)))
-    found.append(_figure("CPU of the TCP client, %", result, ("tcp", "cpu_percent", "client")))
-    if get(result, "project", "ros") is not None:
-        found.append(_figure("CPU of the subscriber, %", result, ("ros", "cpu_percent", "subscriber")))
-    found.append(_figure("CPU of the virtual sensor, %", result, ("tcp", "cpu_percent", "sensor")))
-    found.append(_figure("CPU of all else (TCP), %", result, ("tcp", "cpu_percent", "everything else")))
-    if get(result, "project", "ros") is not None:
-        others = ("ros", "cpu_percent", "everything else")
-        found.append(_figure("CPU of all else (ROS), %", result, others))
+    if with_ros:
+        for name in sorted(name for name in result["project"]["ros"]["cpu_percent"] if name[:4] == "node"):
+            found.append(figure(f"CPU of the {name}, %", result, "ros", "cpu_percent", name))
+            found.append(figure(f"memory of the {name}, MB", result, "ros", "rss_mb", name))
+        found.append(figure("CPU of the subscriber, %", result, "ros", "cpu_percent", "subscriber"))
+    found += [
+        figure("CPU of the virtual sensor, %", result, "tcp", "cpu_percent", "sensor"),
+        figure("CPU of all else, %", result, "tcp", "cpu_percent", "everything else"),
+        figure("stolen by a hypervisor, %", result, "tcp", "stolen_percent"),
+    ]
     return found
 
 
@@ -91,51 +106,45 @@ def get(content: Any, *path: str) -> Any:
     return content
 
 
+def figure(name: str, result: Mapping[str, Any], *path: str) -> Row:
+    """A row of one figure of each program."""
+    values = [get(result, program, *path) for program in programs(result)]
+    return _row(
+        name,
+        result,
+        [NONE if value is None else f"{value:.{1 if value < 100 else 0}f}" for value in values],
+        path,
+    )
+
+
+def _row(name: str, result: Mapping[str, Any], cells: list[str], path: tuple[str, ...] = ()) -> Row:
+    if "ratio" in result:
+        ratios = result["ratio"].get(path[0] if path else None, {})
+        found = [f"{ratios[name]['median']:.2f}" for name, of in RATIOS.items() if ratios and path[1:] == of]
+        cells[2:2] = found or [""]
+    return Row(name, tuple(cells))
+
+
+def _points(name: str, result: Mapping[str, Any], *path: str) -> list[Row]:
+    return [figure(f"{name}, {text}, µs", result, *path, point) for point, text in _POINTS.items()]
+
+
 def _counts(result: Mapping[str, Any], chain: str) -> list[Row]:
-    found = []
-    for key, name in (
-        ("made", "samples made"),
-        ("lost", "lost"),
-        ("lost_in_stops", "  during stalls of the machine"),
-        ("repeated", "repeated"),
-        ("machine_stops", "stalls of the machine"),
-    ):
-        texts = []
-        for program in ("project", "polling"):
-            value, made = get(result, program, chain, key), get(result, program, chain, "made")
-            if value is None:
-                texts.append(_NONE)
-            elif key in {"lost", "repeated"} and value:
-                texts.append(f"{value} ({value / made:.2%})")
-            else:
-                texts.append(str(value))
-        found.append(Row(name, *texts))
-    return found
-
-
-def _points(
-    name: str, result: Mapping[str, Any], path: tuple[str, ...], floor: tuple[str, ...] | None = None
-) -> list[Row]:
     return [
-        _figure(f"{name}, {text}, µs", result, (*path, point), (*floor, point) if floor else None)
-        for point, text in _POINTS.items()
+        _row(name, result, [count(get(result, program, chain), key) for program in programs(result)])
+        for key, name in (
+            ("made", "samples made"),
+            ("lost", "lost"),
+            ("lost_in_stops", "  during stalls of the machine"),
+            ("repeated", "repeated"),
+            ("machine_stops", "stalls of the machine"),
+        )
     ]
 
 
-def _figure(
-    name: str, result: Mapping[str, Any], path: tuple[str, ...], floor: tuple[str, ...] | None = None
-) -> Row:
-    project, polling = get(result, "project", *path), get(result, "polling", *path)
-    least = get(result, "floor", *floor) if floor else None
-    return Row(
-        name, _text(project), _text(polling), _text(least) if floor else "",
-        _ratio(project, least), _ratio(polling, project) if "error" not in name else "",
-    )  # fmt: skip
-
-
-def _text(value: float | None) -> str:
-    return _NONE if value is None else f"{value:.1f}"
-
-
-def _ratio(value: float | None, unit: float | None) -> str:
-    return f"{value / unit:.1f}" if value is not None and unit is not None and unit > 0 else ""
+def count(figures: Mapping[str, Any] | None, key: str) -> str:
+    """A number of samples, of those made."""
+    if figures is None or key not in figures:
+        return NONE
+    value = figures[key]
+    return f"{value} ({value / figures['made']:.1%})" if key in {"lost", "repeated"} and value else str(value)
