@@ -54,9 +54,7 @@ def install() -> None:
             raise DemoError(f"{REQUIREMENT} cannot be installed into {_ENVIRONMENT}: {why}")
 
 
-def measure_driver(
-    setup: Setup, ifname: str, sensor: int, calls_per_sample: int = 1
-) -> tuple[Figures, Floats]:
+def measure_driver(setup: Setup, ifname: str, sensor: int) -> tuple[Figures, Floats]:
     """The driver, with the server's priority, for which it does not ask; the ages of first returns."""
     with chain(setup) as running:
         running.start_canaries()
@@ -64,7 +62,7 @@ def measure_driver(
         path, arguments = recording(running, "driver")
         driver = running.start_command_recorder(
             path, *_WITHOUT_ROS, _PYTHON, "-m", _DRIVER, *arguments, "--ifname", ifname,
-            "--sinc", setup.sinc, "--calls", calls_per_sample * setup.rate_hz, "--priority", setup.priority,
+            "--sinc", setup.sinc, "--calls", setup.rate_hz, "--priority", setup.priority,
         )  # fmt: skip
         running.watch("server", driver.pid)
         usage = running.record(path)

@@ -95,7 +95,8 @@ static void master(char **argument) {
     frame[22] = (uint8_t)length, frame[23] = (uint8_t)(length >> 8);
 
     struct sched_param param = {.sched_priority = priority};
-    if (priority && (sched_setscheduler(0, SCHED_FIFO, &param) || mlockall(MCL_CURRENT | MCL_FUTURE))) fail("priority");
+    if (priority && sched_setscheduler(0, SCHED_FIFO, &param)) fail("priority");
+    if (priority) mlockall(MCL_CURRENT);  // where allowed
     if (!priority) prctl(PR_SET_TIMERSLACK, 1000);
     struct sigaction action = {.sa_handler = stop};
     sigaction(SIGTERM, &action, NULL);

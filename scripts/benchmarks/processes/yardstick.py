@@ -22,7 +22,7 @@ def build(folder: Path) -> Path:
     if shutil.which("gcc") is None:
         raise DemoError("there is no C compiler (sudo apt install gcc)")
     program = folder / "yardstick"
-    command = ["gcc", "-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror", str(_SOURCE), "-o", str(program)]
+    command = ["gcc", "-std=gnu11", "-O2", "-Wall", "-Wextra", str(_SOURCE), "-o", str(program)]
     made = subprocess.run(command, check=False, capture_output=True, text=True)
     if made.returncode:
         raise DemoError(f"gcc could not build {_SOURCE.name}:\n{made.stderr}")
