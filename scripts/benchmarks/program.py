@@ -36,7 +36,7 @@ from scripts.demonstration.program import Stopped, ignore_signals, loopback_up, 
 
 MOST_CPUS: Final = 4
 """CPUs used: each of them runs a canary."""
-_WIDTH: Final = 100
+_WIDTH: Final = 108
 """Minimum width of the tables."""
 _SECONDS: Final = 6.0
 _QUICK_SECONDS: Final = 3.0
