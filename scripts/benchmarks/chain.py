@@ -77,7 +77,10 @@ class CpuUse:
         return round(100 * (self._used_s() - self._had_s) / (time.monotonic() - self._began_s), 1)
 
     def _used_s(self) -> float:
-        times = self._process.cpu_times()
+        threads = Path(f"/proc/{self._process.pid}/task").glob("*/schedstat")
+        if ran_ns := [int(thread.read_text().split()[0]) for thread in threads]:
+            return sum(ran_ns) * 1e-9
+        times = self._process.cpu_times()  # in whole ticks: coarse for a short turn
         return float(times.user + times.system)
 
 
@@ -95,13 +98,20 @@ class Chain:
 
     def start(self, name: str, module: str, *arguments: object) -> Child:
         """Start a program of ours."""
-        command = [sys.executable, "-m", module, *map(str, arguments)]
-        self.children.append(Child(name, command, self.directory))
+        return self.start_command(name, sys.executable, "-m", module, *arguments)
+
+    def start_command(self, name: str, *command: object) -> Child:
+        """Start any program."""
+        self.children.append(Child(name, list(map(str, command)), self.directory))
         return self.children[-1]
 
     def start_recorder(self, path: Path, module: str, *arguments: object) -> Child:
-        """Start a program that may end by itself once it has written `path`."""
-        child = self.start(path.name, module, *arguments)
+        """Start a program of ours that may end by itself once it has written `path`."""
+        return self.start_command_recorder(path, sys.executable, "-m", module, *arguments)
+
+    def start_command_recorder(self, path: Path, *command: object) -> Child:
+        """Start any program that may end by itself once it has written `path`."""
+        child = self.start_command(path.name, *command)
         self.results[child] = path
         return child
 
@@ -144,7 +154,7 @@ class Chain:
         """Wait for a recording, which has been started, to be whole; CPU and memory meanwhile."""
         self.wait(lambda: began(path).exists() or path.exists(), "nothing was received")
         uses = {name: CpuUse(process) for name, process in self.watched.items()}
-        others = cpu_of_others()
+        others, machine = cpu_of_others(), cpu_of_machine()
         started = time.monotonic()
         ending = started + self.setup.seconds - 0.1
         self.wait(lambda: time.monotonic() > ending or path.exists(), "", self.setup.seconds + 5)
@@ -155,6 +165,7 @@ class Chain:
             usage["rss_mb"][name] = round(process.memory_info().rss / _MEGABYTE, 1)
         since = sum(taken - others.get(pid, 0.0) for pid, taken in cpu_of_others().items())
         usage["cpu_percent"]["everything else"] = round(100 * since / wall, 1)
+        usage["stolen_percent"] = stolen_percent(machine)
         self.wait(path.exists, "the recording did not end")
         return usage
 
@@ -187,6 +198,18 @@ def cpu_of_others() -> dict[int, float]:
                 times = process.cpu_times()
                 taken[process.pid] = times.user + times.system
     return taken
+
+
+def cpu_of_machine() -> tuple[float, float]:
+    """CPU seconds that a hypervisor has given to others, and all that have gone by."""
+    times = psutil.cpu_times()
+    return times.steal, sum(times) - times.guest - times.guest_nice
+
+
+def stolen_percent(before: tuple[float, float]) -> float:
+    """What a hypervisor took of all CPUs since then."""
+    stolen, passed = (now - then for now, then in zip(cpu_of_machine(), before, strict=True))
+    return round(100 * stolen / passed, 1) if passed else 0.0
 
 
 @contextlib.contextmanager

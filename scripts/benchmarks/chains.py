@@ -1,58 +1,68 @@
 """What is compared: this project and the polling design, each up to a TCP client and to a ROS subscriber, and
-the floor of the machine. Each function runs one and returns its figures, and the distributions for the plot.
+a bare C program. Each function runs one and returns its figures, and the ages for the plot.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Final
 
 from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import PORT, Chain, Setup, chain, recording, start_server
 from scripts.benchmarks.processes.polling import TOPIC as POLLING_TOPIC
 from scripts.benchmarks.statistics import Floats
+from scripts.demonstration.child import Child
 
 Figures = dict[str, Any]
-_FLOOR: Final = "scripts.benchmarks.processes.floor"
+_CLIENT: Final = "scripts.benchmarks.processes.client"
+_YARDSTICK: Final = "scripts.benchmarks.processes.yardstick"
 _POLLING: Final = "scripts.benchmarks.processes.polling"
 _PORTS_BESIDE: Final = 1
 """The other programs' port is the server's and this."""
 
 
-def floor(setup: Setup, ifname: str, seconds: float, priority: int) -> tuple[Figures, Floats]:
-    """Bare exchange, then bare loopback TCP; the ages are what they and waking add up to."""
+def yardstick(setup: Setup, ifname: str, sensor: int, program: Path) -> tuple[Figures, Floats]:
+    """The C program, and its C client."""
     port = PORT + _PORTS_BESIDE
-    paced = ("--rate", setup.rate_hz, "--seconds", seconds, "--priority", priority)
     with chain(setup) as running:
-        running.start_canaries()  # they keep the CPUs awake here as they do in the other chains
-        exchanges = running.directory / "exchange"
-        running.start_recorder(exchanges, _FLOOR, "exchange", exchanges, "--ifname", ifname, *paced)
-        running.wait(exchanges.exists, "the bare exchange did not end", seconds + 30)
-        sender, receiver = running.directory / "send", running.directory / "receive"
-        sensors = ("--sensors", setup.sensors)
-        running.start_recorder(sender, _FLOOR, "send", sender, "--port", port, *paced, *sensors)
-        running.start_recorder(receiver, _FLOOR, "receive", receiver, "--port", port)
-        running.wait(receiver.exists, "the bare messages did not end", seconds + 30)
-        wake, exchange = statistics.read_numbers(exchanges, 2).astype(float).T
-        loopback = statistics.read_numbers(receiver, 1)[:, 0].astype(float)
-    age = statistics.floor_of_age(wake, exchange, loopback)
-    return {
-        "real_time": priority > 0,
-        "wake_us": statistics.spread_us(wake),
-        "exchange_us": statistics.spread_us(exchange),
-        "loopback_us": statistics.spread_us(loopback),
-        "age_us": statistics.spread_us(age),
-    }, age
+        running.start_canaries()
+        own = running.directory / "yardstick"
+        how = ("--port", port, "--rate", setup.rate_hz, "--priority", setup.priority)
+        master = running.start_recorder(own, _YARDSTICK, program, own, "--ifname", ifname, *how)
+        running.watch("server", master.pid)
+        running.watch("sensor", sensor)
+        path = running.directory / "client"
+        running.watch("client", _start_c_client(running, program, port, path).pid)
+        usage = running.record(path)
+        running.stop()
+        figures, ages = running.figures(path)
+        return {**figures, **usage, "server": _loop(own)}, ages
 
 
-def project_tcp(setup: Setup, ifname: str, sensor: int) -> tuple[Figures, Floats]:
-    """Server and a TCP client."""
+def _start_c_client(running: Chain, program: Path, port: int, path: Path) -> Child:
+    times = (running.setup.warm_up_s, running.setup.seconds)
+    return running.start_command_recorder(path, program, "client", port, path, *times)
+
+
+def _loop(path: Path) -> Figures:
+    """How late a loop woke, and how long its exchanges took."""
+    late, exchange = statistics.read_numbers(path, 2).astype(float).T
+    return {"wake_us": statistics.spread_us(late), "exchange_us": statistics.spread_us(exchange)}
+
+
+def project_tcp(
+    setup: Setup, ifname: str, sensor: int, program: Path | None = None
+) -> tuple[Figures, Floats]:
+    """Server and a TCP client: Python's, or the C program's."""
     with chain(setup) as running:
         running.start_canaries()
         running.watch("sensor", sensor)
         link = start_server(running, ifname)
         path, arguments = recording(running, "client")
-        client = running.start_recorder(
-            path, "scripts.benchmarks.processes.client", *arguments, "--port", PORT
+        client = (
+            _start_c_client(running, program, PORT, path)
+            if program
+            else running.start_recorder(path, _CLIENT, *arguments, "--port", PORT)
         )
         running.watch("client", client.pid)
         usage = running.record(path)
@@ -102,9 +112,7 @@ def polling_tcp(setup: Setup, ifname: str, sensor: int) -> tuple[Figures, Floats
         usage = running.record(path)
         running.stop()
         figures, ages = running.figures(path)
-        late, exchange = statistics.read_numbers(own, 2).astype(float).T
-    server = {"wake_us": statistics.spread_us(late), "exchange_us": statistics.spread_us(exchange)}
-    return {**figures, **usage, "server": server}, ages
+        return {**figures, **usage, "server": _loop(own)}, ages
 
 
 def polling_ros(setup: Setup, ifname: str, sensor: int) -> tuple[Figures, Floats]:

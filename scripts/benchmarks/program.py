@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import datetime
 import json
 import os
@@ -13,8 +12,8 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -22,22 +21,22 @@ from typing import Any, Final, NamedTuple
 from rich.console import Console
 
 from ethercat_server.errors import ServerError
-from scripts.benchmarks import chains
-from scripts.benchmarks.chain import OVERSAMPLING_HZ, Setup, virtual_bus
+from scripts.benchmarks.chain import OVERSAMPLING_HZ, Setup, cpu_of_machine, stolen_percent
+from scripts.benchmarks.comparison import Compared, Progress, measure
 from scripts.benchmarks.modes import cards
 from scripts.benchmarks.modes.cpp import measure_cpp
 from scripts.benchmarks.modes.node import measure_node
 from scripts.benchmarks.modes.soak import soak
-from scripts.benchmarks.modes.vendor import measure_vendor
-from scripts.benchmarks.plot import Curves, draw
 from scripts.benchmarks.records import may_be_real_time
-from scripts.benchmarks.report import print_configuration
+from scripts.benchmarks.results.page import renew
+from scripts.benchmarks.results.plot import draw
+from scripts.benchmarks.results.report import print_configuration
 from scripts.demonstration.child import DemoError
 from scripts.demonstration.program import Stopped, ignore_signals, loopback_up, on_signal
 
 MOST_CPUS: Final = 4
 """CPUs used: each of them runs a canary."""
-_WIDTH: Final = 100
+_WIDTH: Final = 108
 """Minimum width of the tables."""
 _SECONDS: Final = 6.0
 _QUICK_SECONDS: Final = 3.0
@@ -67,59 +66,7 @@ MODES: Final[dict[str, Mode]] = {
     "node": Mode(
         measure_node, "only the ROS 2 node: ages beside a TCP client, CPU, first message after a stop", 15.0
     ),
-    "vendor": Mode(measure_vendor, "only the server and a TCP client, beside Bota's own Python driver", 12.0),
 }
-
-
-@dataclass
-class Progress:
-    """Shows what is being measured."""
-
-    console: Console
-    total: int
-    done: int = 0
-
-    @contextlib.contextmanager
-    def part(self, what: str) -> Iterator[None]:
-        """One chain."""
-        self.done += 1
-        text = f"[{self.done}/{self.total}] {what}"
-        if self.console.is_terminal:
-            with self.console.status(text):
-                yield
-        else:
-            print(text, flush=True)
-            yield
-
-
-def measure(setup: Setup, with_ros: bool, progress: Progress) -> tuple[dict[str, Any], Curves]:
-    """One configuration: everything side by side on the same virtual sensors."""
-    name = f"{setup.rate_hz} Hz, {setup.sensors} sensor{'s' * (setup.sensors > 1)}"
-    result: dict[str, Any] = {
-        "rate_hz": setup.rate_hz,
-        "sensors": setup.sensors,
-        "project": {},
-        "polling": None,
-    }
-    curves: Curves = {}
-    floor_s = setup.seconds / 2
-    with virtual_bus(setup) as (ifname, sensor):
-        with progress.part(f"{name}: floor"):
-            result["floor"], curves["floor"] = chains.floor(setup, ifname, floor_s, setup.priority)
-            if setup.priority and setup.sensors == 1:
-                result["floor_ordinary"], _ = chains.floor(setup, ifname, floor_s, 0)
-        programs = {"project": (chains.project_tcp, chains.project_ros)}
-        if setup.sensors == 1:  # the polling programs know one sensor only
-            programs["polling"] = (chains.polling_tcp, chains.polling_ros)
-        for program, (to_client, to_subscriber) in programs.items():
-            with progress.part(f"{name}: {program}, TCP"):
-                figures, curves[f"{program}, TCP"] = to_client(setup, ifname, sensor)
-                result[program] = {"tcp": figures, "ros": None}
-            if with_ros:
-                with progress.part(f"{name}: {program}, ROS"):
-                    figures, curves[f"{program}, ROS"] = to_subscriber(setup, ifname, sensor)
-                    result[program]["ros"] = figures
-    return result, curves
 
 
 def run(options: argparse.Namespace, console: Console) -> None:
@@ -160,26 +107,33 @@ def run(options: argparse.Namespace, console: Console) -> None:
             print(f"written: {options.json}")
             return
     wanted = [setup(rate, sensors) for rate in options.rates for sensors in options.sensors]
-    ways = 2 if options.ros else 1
-    progress = Progress(console, sum(1 + ways * (2 if one.sensors == 1 else 1) for one in wanted))
-    began = time.monotonic()
+    compared = Compared.find(options)
+    alone, beside = 1 + compared.ros, 1 + compared.ros + compared.driver
+    progress = Progress(console, sum(alone + beside * (one.sensors == 1) for one in wanted))
+    began, machine = time.monotonic(), cpu_of_machine()
     results, curves = [], {}
     for one in wanted:
-        result, curves[one.rate_hz, one.sensors] = measure(one, options.ros, progress)
+        result, curves[one.rate_hz, one.sensors] = measure(one, compared, progress)
         results.append(result)
     for result in results:
         print_configuration(result, console)
-    write_json(options.json, options, priority, seconds=seconds, configurations=results)
+    stolen = stolen_percent(machine)
+    content = write_json(
+        options.json, options, priority, seconds=seconds, stolen_percent=stolen, configurations=results
+    )
     written = str(options.json)
     try:
         draw(curves, options.plot)
         written += f" and {options.plot}"
     except DemoError as error:
         console.print(str(error))
-    print(f"{time.monotonic() - began:.0f} s; written: {written}")
+    if options.page:
+        renew(options.page, content)
+        written += f" and {options.page}"
+    print(f"{time.monotonic() - began:.0f} s, of which a hypervisor took {stolen} %; written: {written}")
 
 
-def write_json(path: Path, options: argparse.Namespace, priority: int, **results: Any) -> None:
+def write_json(path: Path, options: argparse.Namespace, priority: int, **results: Any) -> dict[str, Any]:
     """Everything that was measured, and where and how."""
     content = {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -196,20 +150,24 @@ def write_json(path: Path, options: argparse.Namespace, priority: int, **results
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return content
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """The command line; argparse exits with 2 for what is wrong with it."""
     parser = argparse.ArgumentParser(
         prog="scripts/benchmark",
-        description="Measure this project beside the floor of this machine and a polling design.",
+        description="Measure this project beside a bare C program and a polling design.",
     )
     here = Path(os.environ.get("CALLED_FROM") or Path.cwd())
     folder = here / "benchmark-results"
     parser.add_argument("--quick", action="store_true", help="one configuration only, in half a minute")
     parser.add_argument("--seconds", type=_seconds, help=f"how long each chain is measured ({_SECONDS:g})")
     parser.add_argument("--json", type=Path, default=folder / "benchmark.json", metavar="FILE")
-    parser.add_argument("--plot", type=Path, default=folder / "benchmark.png", metavar="FILE.png")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png")
+    parser.add_argument("--page", type=Path, metavar="FILE.md",
+                        help="renew figures and plot of this page (docs/benchmark.md)")  # fmt: skip
+    parser.add_argument("--vendor", action="store_true", help="Bota's own Python driver, too")
     parser.add_argument("--rates", type=_rates, metavar="HZ,...", help="sample rates (800,1600)")
     parser.add_argument("--sensors", type=_counts, metavar="N,...", help="sensors on the bus (1,2)")
     parser.add_argument("--ppm", type=float, default=150.0, help="the sensors' clock error (%(default)g)")
@@ -222,7 +180,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
                         help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip
     options = parser.parse_args(argv)
-    options.json, options.plot = here / options.json, here / options.plot
+    options.page = options.page and here / options.page
+    plot = options.page.with_suffix(".png") if options.page else folder / "benchmark.png"
+    options.json, options.plot = here / options.json, here / (options.plot or plot)
     only_one = options.quick or options.soak or any(getattr(options, name) for name in MODES)
     options.rates = options.rates or ([800] if only_one else [800, 1600])
     options.sensors = options.sensors or ([1] if only_one or options.cards is not None else [1, 2])

@@ -139,15 +139,6 @@ def stamp_errors(arrivals: Arrivals) -> Floats:
     return errors
 
 
-def floor_of_age(wake: Floats, exchange: Floats, loopback: Floats) -> Floats:
-    """Waking, exchange and message, drawn independently: the age that this machine cannot be rid of."""
-    draw = np.random.default_rng(0)
-    size = 4 * max(len(wake), len(loopback))
-    return np.asarray(
-        draw.choice(np.clip(wake, 0, None), size) + draw.choice(exchange, size) + draw.choice(loopback, size)
-    )
-
-
 def spread_us(values_ns: Floats) -> dict[str, float] | None:
     """p50, p99, p999, min and max in microseconds; None if there are no values."""
     if not len(values_ns):

@@ -32,7 +32,6 @@ from scripts.demonstration.stops import Canaries
 PORT: Final = 12001
 TOPIC: Final = "/sensone_sensor_data"
 _START_TIMEOUT_S: Final = 30.0
-_SETTLING_S: Final = 0.3
 
 
 class Stopped(Exception):  # noqa: N818 - not an error
@@ -138,21 +137,21 @@ def run(seconds: float | None, directory: Path) -> int:
         start("bridge-client", "--ros-args", "-p", f"server_port:={PORT}")
         client, sensor = wait_for_server(server)
         stack.callback(client.close)
-        ears = Ears(client, measurement)
-        stack.callback(ears.close)
         measurement.rate_hz = float(sensor["rate_hz"])
-        wait_for_messages(children, measurement)
+        # Before the threads that listen: each fork would keep them from reading.
         canaries = Canaries(directory, 1e9 / measurement.rate_hz)
         stack.callback(canaries.stop)
-        time.sleep(_SETTLING_S)
+        ears = Ears(client, measurement)
+        stack.callback(ears.close)
+        wait_for_messages(children, measurement)
+        canaries.wait()
         with ears.lock:
             measurement.begin()
         with contextlib.suppress(Stopped), Screen(sensor) as screen:
             show(screen, ears, children, seconds)
         ignore_signals()
-        stops = canaries.stop()
-        with ears.lock:
-            summary = measurement.summary(stops)
+        with ears.lock:  # what comes while they end is none of the figures
+            summary = measurement.summary(canaries.stop())
     print_summary(summary, sensor)
     trouble = verdict(summary, float(sensor["rate_hz"])) or next(filter(None, troubles), None)
     if trouble is not None:

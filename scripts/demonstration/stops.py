@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from pathlib import Path
+from typing import Final
 
 from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from scripts.benchmarks import statistics
-from scripts.benchmarks.records import may_be_real_time
+from scripts.benchmarks.records import began, may_be_real_time
 from scripts.benchmarks.statistics import Ints
-from scripts.demonstration.child import Child
+from scripts.demonstration.child import Child, DemoError
+
+_START_TIMEOUT_S: Final = 30.0
 
 
 class Canaries:
@@ -28,6 +32,16 @@ class Canaries:
             module = "scripts.benchmarks.processes.canary"
             command = [sys.executable, "-m", module, str(path), "--cpu", str(cpu), *how]
             self._running.append((Child(path.name, command, directory), path))
+
+    def wait(self) -> None:
+        """Until all of them watch."""
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        for child, path in self._running:
+            while not began(path).exists():
+                child.check()
+                if time.monotonic() > deadline:
+                    raise DemoError(f"{child.name} did not begin within {_START_TIMEOUT_S:g} s")
+                time.sleep(0.02)
 
     def stop(self) -> Ints:
         """End them; the stops of the machine, each with its beginning and end (CLOCK_MONOTONIC ns)."""

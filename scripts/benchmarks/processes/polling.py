@@ -26,7 +26,7 @@ _VALUES: Final = struct.Struct("<5x6f2x3fx3f5x")
 
 def server(arguments: argparse.Namespace) -> None:
     """Exchange, send, sleep; writes (wake-up lateness, exchange) pairs in ns on SIGTERM."""
-    from scripts.benchmarks.processes.floor import operational_master  # noqa: PLC0415 - only the server needs it
+    from scripts.benchmarks.processes.yardstick import operational_master  # noqa: PLC0415 - only the server needs it
 
     stopping: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _frame: stopping.append(number))

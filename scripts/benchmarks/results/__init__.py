@@ -1,0 +1,1 @@
+"""What becomes of the figures: tables, the plot, the page docs/benchmark.md."""
