@@ -26,6 +26,7 @@ from scripts.benchmarks import chains
 from scripts.benchmarks.chain import OVERSAMPLING_HZ, Setup, virtual_bus
 from scripts.benchmarks.modes import cards
 from scripts.benchmarks.modes.cpp import measure_cpp
+from scripts.benchmarks.modes.load import measure_load
 from scripts.benchmarks.modes.node import measure_node
 from scripts.benchmarks.modes.soak import soak
 from scripts.benchmarks.modes.vendor import measure_vendor
@@ -150,6 +151,11 @@ def run(options: argparse.Namespace, console: Console) -> None:
         write_json(options.json, options, priority, seconds=length, cards=measured)
         print(f"written: {options.json}")
         return
+    if options.load:
+        result = measure_load(setup(options.rates[0], 1), options.load, options.ros, console)
+        write_json(options.json, options, priority, seconds=seconds, load=result)
+        print(f"written: {options.json}")
+        return
     for name, mode in MODES.items():
         if getattr(options, name):
             one = replace(
@@ -218,12 +224,14 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         parser.add_argument(f"--{name}", action="store_true", help=mode.help)
     parser.add_argument("--cards", type=_round_trips, nargs="?", const=(), metavar="MS,...",
                         help="only slow network cards, of these round trips (all)")  # fmt: skip
+    parser.add_argument("--load", type=int, choices=range(1, 65), metavar="N",
+                        help="only ages beside N endless loops, ordinary and real-time")  # fmt: skip
     parser.add_argument("--no-ros", dest="ros", action="store_false", help="TCP only")
     parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
                         help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip
     options = parser.parse_args(argv)
     options.json, options.plot = here / options.json, here / options.plot
-    only_one = options.quick or options.soak or any(getattr(options, name) for name in MODES)
+    only_one = options.quick or options.soak or options.load or any(getattr(options, name) for name in MODES)
     options.rates = options.rates or ([800] if only_one else [800, 1600])
     options.sensors = options.sensors or ([1] if only_one or options.cards is not None else [1, 2])
     return options
