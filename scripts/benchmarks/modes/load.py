@@ -108,8 +108,8 @@ def measure_load(setup: Setup, loops: int, with_ros: bool, console: Console) -> 
 def table(rows: dict[str, dict[str, Any]], rate_hz: int, loops: int) -> Table:
     """A row for each chain."""
     title = f"{rate_hz} Hz beside {loops} endless loops: ages in µs, p50 / p99 / p99.9"
-    made = Table(title=title, box=box.SIMPLE_HEAD)
-    for name in ("", "lost (in stalls)", "handed out", "on arrival", "outside stalls"):
+    made = Table(title=title, box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for name in ("", "lost (stalls)", "handed out", "on arrival", "outside stalls"):
         made.add_column(name, justify="right" if name else "left", no_wrap=True)
     for name, row in rows.items():
         ages = (row[key] for key in ("hand_out_us", "age_us", "age_outside_stalls_us"))
