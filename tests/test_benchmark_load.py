@@ -29,7 +29,7 @@ def test_each_chain_has_a_row() -> None:
     console.print(table({"wrench, real-time": figures}, 800, 4))
     text = console.export_text()
     assert "800 Hz beside 4 endless loops" in text
-    for cell in ("wrench, real-time", "3 (2)", "1 / 3 / 3", " - "):
+    for cell in ("wrench, real-time", "3 (2)", "1 / 3 / 3", " -\n"):
         assert cell in text
 
 
