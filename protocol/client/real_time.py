@@ -58,7 +58,7 @@ def make_real_time(priority: int, cpu: int = -1, *, thread: int = 0) -> Scheduli
     if priority:
         try:
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
-        except PermissionError:
+        except (PermissionError, ProcessLookupError):
             refused.append(f"SCHED_FIFO {priority} ({_grants_priority(priority)})")
             priority = 0
         else:

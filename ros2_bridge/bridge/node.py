@@ -192,8 +192,8 @@ def spin(node: BridgeNode, on_started: Callable[[], object] = lambda: None) -> i
     listening.start()
     node.reader.start()
     node.monitor.start()
-    on_started()
     try:
+        on_started()
         if node.exit_code is not None:  # a signal came before there was a spinner
             spinner.stop()
         spinner.run()

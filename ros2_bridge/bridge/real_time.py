@@ -34,8 +34,10 @@ def prepare(parameters: Parameters, log: Log) -> None:
     """Give the node's threads, which run, their scheduling as far as allowed, and log one line of it."""
     if not parameters.rt_priority and parameters.cpu < 0:
         return
-    stream = next(thread.native_id for thread in threading.enumerate() if thread.name == STREAM)
-    scheduling = make_real_time(parameters.rt_priority, parameters.cpu, thread=stream or 0)
+    stream = next((each.native_id for each in threading.enumerate() if each.name == STREAM), None)
+    if stream is None:  # it has failed, and the node ends
+        return
+    scheduling = make_real_time(parameters.rt_priority, parameters.cpu, thread=stream)
     if scheduling.priority:
         below = os.sched_param(max(1, scheduling.priority - 1))
         for thread in _beside():
