@@ -1,5 +1,9 @@
-"""Clients over TCP: a framed connection, and the small blocking client. The only sockets in `protocol`."""
+"""Clients over TCP: a framed connection, the small blocking client, real-time scheduling.
+
+The only sockets in `protocol`.
+"""
 
 from protocol.client.blocking import Client, connect
+from protocol.client.real_time import Scheduling, make_real_time
 
-__all__ = ["Client", "connect"]
+__all__ = ["Client", "Scheduling", "connect", "make_real_time"]

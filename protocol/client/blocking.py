@@ -21,6 +21,7 @@ from typing import Any, Final
 
 from protocol.accounting import NOT_NEW
 from protocol.client.connection import CONNECT_TIMEOUT_S, FramedConnection
+from protocol.client.real_time import Scheduling, make_real_time
 from protocol.control import Event, check_version, request
 from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError
 from protocol.framing import DataMessage
@@ -43,13 +44,18 @@ def connect(
     every: int = 1,
     fresh_only: bool = True,
     imu_units: ImuUnits = ImuUnits.G_DPS,
+    rt_priority: int = 0,
+    cpu: int = -1,
 ) -> Client:
     """Connect and subscribe: `sensors` by position on the bus, None for all; one frame in `every`.
+
+    `rt_priority` and `cpu` are the calling thread's (`make_real_time`); `scheduling` has what was granted.
 
     UnreachableError where there is no server, RefusedError if it does not grant the subscription.
     """
     client = Client(port, host, imu_units=imu_units)
     try:
+        client.scheduling = make_real_time(rt_priority, cpu)
         client.subscribe(sensors, every=every, fresh_only=fresh_only)
     except BaseException:
         client.close()
@@ -64,6 +70,7 @@ class Client:
         description: the reply to `describe`; after `subscribe` that reply, which says the same.
         events: the server's events, oldest first, the last thousand; take them out with `popleft`.
         frame: the DATA message that the last sample came from: its sequence, stamps, sensor, flags.
+        scheduling: what `connect` was granted of `rt_priority` and `cpu`.
     """
 
     def __init__(
@@ -80,6 +87,7 @@ class Client:
         """
         self.events: deque[JsonObject] = deque(maxlen=_MOST_EVENTS)
         self.frame: DataMessage | None = None
+        self.scheduling = Scheduling()
         self._frames: deque[DataMessage] = deque(maxlen=_MOST_FRAMES)
         self._decoders = {size: SampleDecoder(size, imu_units) for size in LAYOUTS}
         self._asked = 0

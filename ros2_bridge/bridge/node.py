@@ -20,6 +20,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
+from bridge import real_time
 from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics.monitor import Monitor
@@ -64,7 +65,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         super().__init__("bridge", cli_args=arguments, use_global_arguments=arguments is None)
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
-        parameters = declare(self)
+        self.parameters = parameters = declare(self)
         compensated = make_compensated(self, parameters, lambda: self.reader.link.rate_hz)
         outputs = make(self, parameters, compensated)
         self.reader = Reader(
@@ -164,15 +165,18 @@ def run(arguments: Sequence[str]) -> int:
     try:
         node = BridgeNode.create()
         call_on_stop_signal(lambda _signal: node.finish(0))
-        return spin(node)
+        return spin(node, lambda: real_time.prepare(node.parameters, node.get_logger()))
     except StartError as error:
         return _refuse(str(error), 2)
     finally:
         rclpy.try_shutdown()
 
 
-def spin(node: BridgeNode) -> int:
-    """Run the node until it is told to finish, and destroy it; returns its exit code."""
+def spin(node: BridgeNode, on_started: Callable[[], object] = lambda: None) -> int:
+    """Run the node until it is told to finish, and destroy it; returns its exit code.
+
+    `on_started` is called once its threads run.
+    """
     prompt = PromptExecutor(node)
     executor = OrdinaryExecutor(node, prompt)
     spinner, prompt_spinner = Spinner(executor), Spinner(prompt)
@@ -189,6 +193,7 @@ def spin(node: BridgeNode) -> int:
     node.reader.start()
     node.monitor.start()
     try:
+        on_started()
         if node.exit_code is not None:  # a signal came before there was a spinner
             spinner.stop()
         spinner.run()

@@ -25,6 +25,7 @@ from scripts.benchmarks.chain import OVERSAMPLING_HZ, Setup, cpu_of_machine, sto
 from scripts.benchmarks.comparison import Compared, Progress, measure
 from scripts.benchmarks.modes import cards
 from scripts.benchmarks.modes.cpp import measure_cpp
+from scripts.benchmarks.modes.load import measure_load
 from scripts.benchmarks.modes.node import measure_node
 from scripts.benchmarks.modes.soak import soak
 from scripts.benchmarks.records import may_be_real_time
@@ -69,6 +70,25 @@ MODES: Final[dict[str, Mode]] = {
 }
 
 
+def _measure_one(
+    options: argparse.Namespace, setup: Callable[[int, int], Setup], console: Console
+) -> dict[str, Any]:
+    """What an option measures by itself; empty without one."""
+    one = setup(options.rates[0], options.sensors[0])
+    if options.soak:
+        return {"soak": soak(one, options.soak * 60, console)}
+    if options.cards is not None:
+        length = options.seconds or (cards.QUICK_SECONDS if options.quick else cards.SECONDS)
+        setups = [replace(setup(rate, options.sensors[0]), seconds=length) for rate in options.rates]
+        return {"seconds": length, "cards": cards.measure_cards(setups, options.cards, console)}
+    if options.load:
+        return {"load": measure_load(setup(options.rates[0], 1), options.load, options.ros, console)}
+    for name, mode in MODES.items():
+        if getattr(options, name):
+            return {name: mode.measure(replace(one, seconds=options.seconds or mode.seconds), console)}
+    return {}
+
+
 def run(options: argparse.Namespace, console: Console) -> None:
     """Measure, show, write. DemoError or Stopped end it early."""
     loopback_up()
@@ -85,27 +105,10 @@ def run(options: argparse.Namespace, console: Console) -> None:
     def setup(rate: int, sensors: int) -> Setup:
         return Setup(rate, sensors, seconds, warm_up_s=1.0, priority=priority, ppm=options.ppm)
 
-    if options.soak:
-        result: dict[str, Any] = soak(setup(options.rates[0], options.sensors[0]), options.soak * 60, console)
-        write_json(options.json, options, priority, soak=result)
+    if found := _measure_one(options, setup, console):
+        write_json(options.json, options, priority, **found)
         print(f"written: {options.json}")
         return
-    if options.cards is not None:
-        length = options.seconds or (cards.QUICK_SECONDS if options.quick else cards.SECONDS)
-        setups = [replace(setup(rate, options.sensors[0]), seconds=length) for rate in options.rates]
-        measured = cards.measure_cards(setups, options.cards, console)
-        write_json(options.json, options, priority, seconds=length, cards=measured)
-        print(f"written: {options.json}")
-        return
-    for name, mode in MODES.items():
-        if getattr(options, name):
-            one = replace(
-                setup(options.rates[0], options.sensors[0]), seconds=options.seconds or mode.seconds
-            )
-            result = mode.measure(one, console)
-            write_json(options.json, options, priority, **{name: result})
-            print(f"written: {options.json}")
-            return
     wanted = [setup(rate, sensors) for rate in options.rates for sensors in options.sensors]
     compared = Compared.find(options)
     alone, beside = 1 + compared.ros, 1 + compared.ros + compared.driver
@@ -176,6 +179,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         parser.add_argument(f"--{name}", action="store_true", help=mode.help)
     parser.add_argument("--cards", type=_round_trips, nargs="?", const=(), metavar="MS,...",
                         help="only slow network cards, of these round trips (all)")  # fmt: skip
+    parser.add_argument("--load", type=int, choices=range(1, 65), metavar="N",
+                        help="only ages beside N endless loops, ordinary and real-time")  # fmt: skip
     parser.add_argument("--no-ros", dest="ros", action="store_false", help="TCP only")
     parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
                         help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip
@@ -183,7 +188,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     options.page = options.page and here / options.page
     plot = options.page.with_suffix(".png") if options.page else folder / "benchmark.png"
     options.json, options.plot = here / options.json, here / (options.plot or plot)
-    only_one = options.quick or options.soak or any(getattr(options, name) for name in MODES)
+    only_one = options.quick or options.soak or options.load or any(getattr(options, name) for name in MODES)
     options.rates = options.rates or ([800] if only_one else [800, 1600])
     options.sensors = options.sensors or ([1] if only_one or options.cards is not None else [1, 2])
     return options

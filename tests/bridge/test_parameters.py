@@ -26,6 +26,7 @@ def test_defaults_are_the_contracts() -> None:
     defaults = {name: row.default for name, row in ROWS.items()}
     assert defaults == {
         "server_host": "localhost", "server_port": 12001, "SERVER_PORT": 0, "sensor": 0,
+        "rt_priority": 40, "cpu": -1,
         "publishing_frequency": 0.0, "array_topic": "sensone_sensor_data", "frame_id": "ft_sensor",
         "imu_frame_id": "ft_sensor_imu", "imu_raw_units": "g_dps", "temperature_variance": 0.0,
         "orientation_covariance": (0.0, 0.0, 0.0), "angular_velocity_covariance": (0.0, 0.0, 0.0),

@@ -55,6 +55,14 @@ def test_units_and_sizes(scripted: ScriptedServer) -> None:
         assert next(iter(sensor)).acceleration[0] == 3.0 + 6 / 16
 
 
+def test_what_is_not_granted_does_not_end_it(scripted: ScriptedServer) -> None:
+    with connect(scripted.port, cpu=10**6) as sensor:
+        (refused,) = sensor.scheduling.refused
+        assert refused.startswith("CPU 1000000 (there are ")
+        scripted.send_sample(1.0)
+        assert next(iter(sensor)).force[0] == 1.0
+
+
 def test_frames_gives_everything_and_ends_when_the_server_shuts_down(scripted: ScriptedServer) -> None:
     with connect(scripted.port, fresh_only=False, every=2, sensors=[0]) as sensor:
         assert scripted.subscribed.wait(PATIENCE_S)

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from bridge.parameters.table import PARAMETERS
 from ethercat_server.daemon.config_file import EMPTY, read_config
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.daemon.server_settings import SERVER_SETTINGS
 from ethercat_server.ethercat.nic import lock
+from ethercat_server.process import realtime
 from protocol.settings import check_settings, start_up_defaults
 from tests.systemd.staging import (
     BRIDGE_UNIT,
@@ -68,6 +70,15 @@ def test_the_server_may_have_real_time_priority_and_locked_memory() -> None:
     assert not values(SERVER_UNIT, "RestrictRealtime")
     assert values(SERVER_UNIT, "LimitRTPRIO") == ["99"]
     assert values(SERVER_UNIT, "LimitMEMLOCK") == ["infinity"]
+
+
+def test_so_may_the_node_but_below_the_servers() -> None:
+    assert not values(BRIDGE_UNIT, "RestrictRealtime")
+    assert values(BRIDGE_UNIT, "LimitMEMLOCK") == ["infinity"]
+    (limit,) = values(BRIDGE_UNIT, "LimitRTPRIO")
+    (node,) = (row.default for row in PARAMETERS if row.name == "rt_priority")
+    assert isinstance(node, int)
+    assert node <= int(limit) < realtime.DEFAULT_PRIORITY
 
 
 def test_the_locks_of_the_interfaces_have_their_directory() -> None:

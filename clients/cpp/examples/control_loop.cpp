@@ -6,8 +6,7 @@
 // The robot is left out: `send_to_robot` stands for it.
 #include <bota_ethercat.hpp>
 
-#include <sched.h>
-#include <sys/mman.h>
+#include <time.h>
 
 #include <cmath>
 #include <csignal>
@@ -34,15 +33,6 @@ Vector3 follow(const Vector3& force) {
         velocity[axis] = std::copysign(speed < kLimit ? speed : kLimit, force[axis]);
     }
     return velocity;
-}
-
-/// Steadier where the system lets us: memory that stays, a real-time priority. Both are refused to most users.
-void become_real_time() {
-    if (mlockall(MCL_CURRENT | MCL_FUTURE) != 0) std::fprintf(stderr, "control_loop: memory is not locked\n");
-    sched_param priority{};
-    priority.sched_priority = 70;
-    if (sched_setscheduler(0, SCHED_FIFO, &priority) != 0)
-        std::fprintf(stderr, "control_loop: ordinary scheduling, no real-time priority\n");
 }
 
 void sleep_until(std::int64_t due_ns) {
@@ -79,7 +69,8 @@ int main(int argc, char** argv) {
     bota_ethercat::Client sensor(options);
     if (!sensor.connect()) return std::fprintf(stderr, "control_loop: %s\n", sensor.error()), 1;
     std::printf("%s, %.0f Hz\n", sensor.description().sensors[0].name.c_str(), sensor.description().sensors[0].rate_hz);
-    become_real_time();
+    const bota_ethercat::Scheduling given = bota_ethercat::make_real_time(70, -1, true);
+    if (!given.refused.empty()) std::fprintf(stderr, "control_loop: not granted: %s\n", given.refused.c_str());
 
     long cycles = 0, used = 0, held = 0;
     std::int64_t oldest_ns = 0;

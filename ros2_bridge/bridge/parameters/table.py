@@ -13,6 +13,7 @@ from bridge.parameters.compensation import ROWS as COMPENSATION_ROWS
 from bridge.parameters.compensation import CompensationParameters, gather
 from bridge.parameters.row import NO_TEXTS, Numbers, ParameterError, Row
 from bridge.parameters.wrench_frames import WrenchFrame, parse
+from protocol.client.real_time import HIGHEST_PRIORITY
 from protocol.health.limits import LIMITS, Limits
 from protocol.pdo import ImuUnits
 
@@ -35,6 +36,14 @@ _TABLE: Final = (
     SERVER_PORT,
     Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535),
     Row("sensor", 0, "The sensor's position on the bus, from 0", 0, 255),
+    Row(
+        "rt_priority",
+        40,
+        "SCHED_FIFO priority of the stream's thread, if allowed; 0 = as the node was started",
+        0,
+        HIGHEST_PRIORITY,
+    ),
+    Row("cpu", -1, "CPU of the stream's thread; -1 = any", -1, 1023),
     Row("publishing_frequency", 0.0, "Most messages a second, always the newest; 0 = every sample", 0, 1e6),
     Row("array_topic", "sensone_sensor_data", "Topic of the Float64MultiArray"),
     Row("frame_id", "ft_sensor", "Frame of the wrench (its origin is the sensor's) and of the temperature"),
@@ -130,6 +139,8 @@ class Parameters(NamedTuple):
     limits: Limits = LIMITS
     compensation: CompensationParameters = CompensationParameters()
     """As they are at start."""
+    rt_priority: int = 0
+    cpu: int = -1
 
 
 def gather_all(values: dict[str, Any]) -> Parameters:

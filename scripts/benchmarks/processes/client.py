@@ -8,6 +8,7 @@ import socket
 import time
 
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
+from protocol.client import make_real_time
 from protocol.control import request
 from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from protocol.pdo import SampleDecoder
@@ -19,9 +20,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     recording_arguments(parser)
     parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--rt-priority", type=int, default=0)
     arguments = parser.parse_args()
     recording = Recording(arguments.path, arguments.warm_up, arguments.seconds)
     gc.disable()
+    make_real_time(arguments.rt_priority)
     with socket.create_connection(("127.0.0.1", arguments.port)) as connection:
         connection.sendall(encode_json(request("subscribe")))
         record(connection, recording)

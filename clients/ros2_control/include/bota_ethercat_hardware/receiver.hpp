@@ -7,13 +7,11 @@
 
 #include <poll.h>
 #include <pthread.h>
-#include <sched.h>
 
 #include <atomic>
 #include <chrono>
 #include <cmath>
 #include <csignal>
-#include <cstring>
 #include <functional>
 #include <memory>
 #include <optional>
@@ -147,12 +145,10 @@ private:
 
     /// As `receive_priority` has it.
     void set_priority() noexcept {
-        sched_param wanted{};
-        wanted.sched_priority = parameters_.receive_priority;
-        const int failed = pthread_setschedparam(pthread_self(), wanted.sched_priority > 0 ? SCHED_FIFO : SCHED_OTHER, &wanted);
-        if (failed != 0)
-            log_(Level::warning, "the receiving thread has no real-time priority (" + std::string(std::strerror(failed)) +
-                                     "): samples come late on a busy machine; allow it (rtprio), or set receive_priority to 0");
+        const auto given = bota_ethercat::make_real_time(parameters_.receive_priority);
+        if (!given.refused.empty())
+            log_(Level::warning, "the receiving thread was not granted " + given.refused +
+                                     ": samples come late on a busy machine; allow it, or set receive_priority to 0");
     }
 
     /// One attempt. Null: `why`, and whether it may succeed later without anybody doing something about the sensor.
