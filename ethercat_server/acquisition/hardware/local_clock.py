@@ -30,15 +30,16 @@ _DRIFT: Final = 1.7e-23
 _CONTRADICTS: Final = 5.0
 _CONTRADICTIONS: Final = 3
 """Blocks in a row that are off by more than so many standard deviations: the clock has jumped."""
-_PULL_GAIN: Final = 0.2
-_PULLED: Final = 1.0
+_PULL_GAIN: Final = 0.15
+_PULLED: Final = 1.2
 _RATE_STEP: Final = 100e-6
 """If the errors have a mean of so many standard deviations, the rate has changed: by about so much."""
 _KNOWN_NS: Final = 10_000.0
 _KNOWN: Final = 1 / 32
 _KNOWN_BLOCKS: Final = 12
+_STILL: Final = 5
 """It is known once its standard deviation is less than one of these, the second as part of the shortest round
-trip, after so many blocks."""
+trip, after so many blocks; and still while it is less than so many times that."""
 
 
 class LocalClock:
@@ -134,5 +135,5 @@ class LocalClock:
             self._restart()
         else:
             self._doubt_ns = _CONTRADICTS * math.sqrt(self.variance)
-            enough_ns = max(_KNOWN_NS, _KNOWN * self._timing.least_ns)
+            enough_ns = max(_KNOWN_NS, _KNOWN * self._timing.least_ns) * (_STILL if self.is_known else 1)
             self.is_known = self._blocks >= _KNOWN_BLOCKS and self.variance < enough_ns * enough_ns

@@ -15,7 +15,7 @@ _LOSS_PERIODS: Final = 10.0
 _NO_TIME: Final = 0.5
 """There is none if a round trip takes more than this part of a period."""
 _LARGEST_MARGIN: Final = 0.4
-_LESSON: Final = 1.5
+_LESSON: Final = 1.2
 """By this factor an early look costs more where it teaches nothing, for events date the samples."""
 
 
