@@ -67,12 +67,16 @@ def play(scene: Callable[[Stage], Awaitable[None]], stage: Stage | None = None) 
 
 def test_tare_asks_first_and_only_y_does_it() -> None:
     async def scene(stage: Stage) -> None:
-        assert "Tare sensor 0? Its reading becomes zero" in await stage.press("t")
+        assert "Tare sensor 0? y: yes, u: undo the last tare, c: clear it, any" in await stage.press("t")
         assert "Not tared" in await stage.press("enter")
         await stage.press("n", "t")
         assert "Tare sensor 1?" in stage.shown()
         await stage.press("y")
         wait_until(lambda: "Sensor 1 was not tared: no connection to the server" in stage.shown(), "a word")
+        await stage.press("t", "u")
+        wait_until(lambda: "The tare of sensor 1 was not undone: " in stage.shown(), "another")
+        await stage.press("t", "C")
+        wait_until(lambda: "The offset of sensor 1 was not cleared: " in stage.shown(), "the last")
 
     play(scene)
 

@@ -153,7 +153,7 @@ class Harness:
         self.model = WebModel(made.ADDRESS)
         self.model.connected(made.description(("one", "two")), made.OWN_PEER, START_S)
         self.token = Token()
-        self.tares: list[tuple[int, Callable[[str, bool], None]]] = []
+        self.tares: list[tuple[int, Callable[[str, bool], None], str]] = []
         self.hub = Hub[str](self.model, self.token, lambda *tare: self.tares.append(tare))
 
     def states(self) -> dict[str, Any]:
@@ -247,7 +247,7 @@ def test_pages_are_limited_in_number(web: Harness) -> None:
 # Who may.
 
 
-@pytest.mark.parametrize("action", ["tare", "reset"])
+@pytest.mark.parametrize("action", ["tare", "clear", "reset"])
 def test_without_the_token_nothing_is_done(web: Harness, action: str) -> None:
     for token in ("", "wrong", web.token.text[:-1], web.token.text + "A", None, 5, ["x"], "\ud800é"):
         reply = web.hear("page", token=token, do=action)
@@ -270,15 +270,16 @@ def test_with_the_token_the_sensor_is_tared_once_at_a_time(web: Harness) -> None
     assert refused is not None, "the token of one page is no other's"
     assert not refused["control"]
     web.hear("page", do="tare", sensor=1)
-    [(position, said)] = web.tares
-    assert position == 1
+    [(position, said, way)] = web.tares
+    assert (position, way) == (1, "tare")
     assert "Taring sensor 1" in web.message()
     web.hear("page", do="tare")
     assert "A tare is running already" in web.message()
     said("Sensor 1 was tared", False)
     assert web.states()["page"]["message"]["text"].endswith("Sensor 1 was tared")
-    web.hear("page", do="tare")
-    assert len(web.tares) == 2
+    web.hear("page", do="undo")
+    assert (web.tares[1][0], web.tares[1][2]) == (1, "undo")
+    assert "Undoing the tare of sensor 1" in web.message()
 
 
 def test_with_the_token_peaks_are_reset(web: Harness) -> None:

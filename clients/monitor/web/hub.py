@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final, Generic, TypeVar
 
 from clients.monitor.model.server import Model, clock_text
+from clients.monitor.tare import WAYS, Say
 from clients.monitor.web.access import Token
 from clients.monitor.web.message import state_text
 from clients.monitor.web.points import Feed
@@ -49,10 +50,8 @@ class WebModel(Model):
 class Hub(Generic[Page]):
     """The viewers, each by the page that it stands for."""
 
-    def __init__(
-        self, model: WebModel, token: Token, tare: Callable[[int, Callable[[str, bool], None]], object]
-    ) -> None:
-        """`tare` tares the sensor at a position in the background and calls with the result."""
+    def __init__(self, model: WebModel, token: Token, tare: Callable[[int, Say, str], object]) -> None:
+        """`tare` tares the sensor at a position in the background, one of WAYS, and calls with the result."""
         self._model = model
         self._token = token
         self._tare = tare
@@ -119,8 +118,8 @@ class Hub(Generic[Page]):
             self._say("A tare is running already", True)
         else:
             self._taring = True
-            self._say(f"Taring sensor {wish.sensor}: keep it stationary", False)
-            self._tare(wish.sensor, self._tared)
+            self._say(WAYS[wish.action].begins.format(wish.sensor), False)
+            self._tare(wish.sensor, self._tared, wish.action)
 
     def _tared(self, text: str, bad: bool) -> None:
         self._taring = False

@@ -6,6 +6,7 @@ import asyncio
 import errno
 import signal
 import sys
+from functools import partial
 from typing import Final
 
 from clients.monitor.options import Options
@@ -43,7 +44,7 @@ async def _serve(options: Options, where: Address) -> None:
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
             loop.add_signal_handler(number, stop.set)
     token, model = Token(), WebModel(str(options.address), options.imu_units)
-    hub = PageHub(model, token, lambda position, said: start_tare(options.address, position, said))
+    hub = PageHub(model, token, partial(start_tare, options.address))
     reader = Reader(options.address, model, POINTS_S)
     async with WebServer(hub, model).serving(*where) as port:
         sys.stdout.write(
