@@ -6,7 +6,6 @@ Ten times a second the state is rendered as rows of text, and only rows that cha
 from __future__ import annotations
 
 import asyncio
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,6 +25,7 @@ from clients.monitor.tare import WAYS, start_tare
 from clients.monitor.view.glyphs import Glyphs
 from clients.monitor.view.screen import Look, render
 from clients.numbers import duration
+from clients.program import call_on
 from protocol.address import Address
 
 REFRESH_S: Final = 0.1
@@ -105,9 +105,7 @@ class Monitor(App[None]):
 
     def on_mount(self) -> None:
         """Start the timers and the signal handlers."""
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            loop.add_signal_handler(number, self.exit)
+        call_on(asyncio.get_running_loop(), self.exit, "SIGTERM", "SIGHUP")
         self.app_resume_signal.subscribe(self, lambda _: self.repaint())
         self.set_interval(REFRESH_S, self.draw)
         if self._seconds is not None:
