@@ -26,6 +26,7 @@ from ethercat_server.virtual_sensor.foreign.kinds import KINDS
 from ethercat_server.virtual_sensor.measurement.signals import SIGNALS
 from ethercat_server.virtual_sensor.options import EEPROM_MS, BusOptions, ForeignOptions, SensorOptions
 from protocol.pdo import LAYOUTS
+from protocol.program.completion import add_completion
 from protocol.settings import SETTINGS
 
 
@@ -69,6 +70,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--control", metavar="PATH", help="Unix socket for commands")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    add_completion(parser)
     return parser
 
 
