@@ -141,7 +141,7 @@ def two() -> tuple[str, str]:
         "settings": {**described()["settings"], EVIL: 1, "sinc_length": EVIL},
     }  # fmt: skip
     first = subject_of(simulate(1), row, source=EVIL)
-    examined = [examine(first), examine(replace(first, position=1, serial="9", columns=decoded([])))]
+    examined = [examine(first), examine(replace(first, position=1, serial=9, columns=decoded([])))]
     with undrawn():
         return render(examined, made=MADE, program="p", note=EVIL), as_json(examined)
 

@@ -28,6 +28,7 @@
 #define BOTA_ETHERCAT_HPP
 
 #include "bota_ethercat/control.hpp"
+#include "bota_ethercat/server_choice.hpp"
 #include "bota_ethercat/stream.hpp"
 
 #endif  // BOTA_ETHERCAT_HPP
