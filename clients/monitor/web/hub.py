@@ -5,6 +5,7 @@ No sockets. All but `WebModel.take` and `connected`, which the reader's thread c
 
 from __future__ import annotations
 
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, Generic, TypeVar
 
@@ -12,7 +13,7 @@ from clients.monitor.model.server import Model, clock_text
 from clients.monitor.tare import WAYS, Say
 from clients.monitor.web.access import Token
 from clients.monitor.web.message import state_text
-from clients.monitor.web.points import Feed
+from clients.monitor.web.points import Feed, start_s
 from clients.monitor.web.viewer import Viewer, Wish
 from protocol.framing import DataMessage
 from protocol.pdo import ImuUnits
@@ -20,6 +21,7 @@ from protocol.text.json_text import JsonObject, encode_json_text
 
 MOST_VIEWERS: Final = 8
 TOO_MANY: Final = f"{MOST_VIEWERS} pages are connected already: close one of them"
+KEPT_S: Final = 60.0
 _SILENT_S: Final = 0.1
 
 Page = TypeVar("Page")
@@ -43,8 +45,8 @@ class WebModel(Model):
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
         """See `Model`."""
         super().take(frames, now_s)
-        if self.feed.take(frames):
-            self.on_points()
+        self.feed.take(frames)
+        self.on_points()
 
 
 class Hub(Generic[Page]):
@@ -59,31 +61,29 @@ class Hub(Generic[Page]):
         self._viewers: dict[Page, Viewer] = {}
         self._number = 0
         self._points_s = 0.0
+        self._kept: dict[int, deque[bytes]] = defaultdict(deque)
+        """The points of the last minute by position, for a page that comes later."""
 
     def join(self, page: Page) -> Viewer | None:
         """A page has connected; None if there are enough."""
         if len(self._viewers) >= MOST_VIEWERS:
             return None
         viewer = self._viewers[page] = Viewer(self._token)
-        self._watch()
         return viewer
 
     def leave(self, page: Page) -> None:
         """Its connection has ended."""
         self._viewers.pop(page, None)
-        self._watch()
 
     def hear(self, page: Page, text: str | bytes) -> str | None:
         """A message of a page; what to answer."""
         viewer = self._viewers[page]
-        before = viewer.sensor, viewer.control
+        before = viewer.control
         heard = viewer.hear(text)
-        if viewer.sensor != before[0]:
-            self._watch()
         refused = heard if isinstance(heard, str) else None
         if isinstance(heard, Wish):
             self._do(heard)
-        if refused or viewer.control != before[1]:
+        if refused or viewer.control != before:
             return encode_json_text({"control": viewer.control, "refused": refused}).decode()
         return None
 
@@ -105,10 +105,20 @@ class Hub(Generic[Page]):
         silent = now_s - self._points_s > _SILENT_S
         for position, batch in self._model.feed.batches(silent=silent).items():
             self._points_s = now_s
-            yield [p for p, v in self._viewers.items() if v.sensor == position and not v.behind], batch
+            self._keep(position, batch)
+            pages = [p for p, v in self._viewers.items() if v.sensor == position and not v.behind]
+            if pages:
+                yield pages, batch
 
-    def _watch(self) -> None:
-        self._model.feed.watch({viewer.sensor for viewer in self._viewers.values()})
+    def kept(self, page: Page) -> list[bytes]:
+        """The points of the last minute of the sensor that a page shows, for one that has just begun to."""
+        return list(self._kept.get(self._viewers[page].sensor, ()))
+
+    def _keep(self, position: int, batch: bytes) -> None:
+        kept = self._kept[position]
+        kept.append(batch)
+        while not start_s(batch) - KEPT_S <= start_s(kept[0]) <= start_s(batch):  # or of another server
+            kept.popleft()
 
     def _do(self, wish: Wish) -> None:
         if wish.action == "reset":
