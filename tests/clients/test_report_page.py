@@ -90,6 +90,7 @@ def test_it_is_one_file_with_nothing_outside_it(page: str) -> None:
 
 def test_it_can_be_read_without_seeing_it(page: str) -> None:
     reader = Reader(page)
+    assert "`" not in "".join(reader.words), "commands are set as code"
     identifiers = [attributes["id"] for _, attributes in reader.tags if "id" in attributes]
     assert len(identifiers) == len(set(identifiers))
     plots = reader.of("svg")
