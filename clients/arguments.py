@@ -9,6 +9,7 @@ from pathlib import Path
 from protocol.address import Address
 from protocol.pdo import ImuUnits
 from protocol.program import server_choice
+from protocol.program.completion import add_completion
 from protocol.program.version import VERSION
 from protocol.sensor_choice import MOST_PLACES
 
@@ -17,6 +18,7 @@ def parser(prog: str, description: str, epilog: str, usage: str | None = None) -
     """The parser of a program, with --version."""
     made = argparse.ArgumentParser(prog=prog, usage=usage, description=description, epilog=epilog)
     made.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
+    add_completion(made)
     return made
 
 

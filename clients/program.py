@@ -12,8 +12,11 @@ from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from types import FrameType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 from urllib.parse import unquote, urlsplit
+
+if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
 
 _PROJECT: Final = "bota-ethercat-bridge"
 _CHECKOUT: Final = Path(__file__).parent.parent
@@ -32,14 +35,14 @@ def missing(name: str) -> str:
     pip = [sys.executable, "-m", "pip", "install"]
     source = _source()
     if source is None:
-        return f"{name} is not installed: in this project's folder run {shlex.join([*pip, '.[tools]'])}"
+        return f"{name} is not installed: in this project's folder run {shlex.join([*pip, '.[client]'])}"
     return f"{name} is not installed: {shlex.join([*pip, source])}"
 
 
 def _source() -> str | None:
     """What pip installed, with the extra: a folder, a wheel or a repository; None if that is not known."""
     if (_CHECKOUT / "pyproject.toml").exists():
-        return f"{_CHECKOUT}[tools]"
+        return f"{_CHECKOUT}[client]"
     try:
         found = json.loads(distribution(_PROJECT).read_text("direct_url.json") or "")
         url, vcs = str(found["url"]), found.get("vcs_info", {}).get("vcs")
@@ -47,8 +50,8 @@ def _source() -> str | None:
         return None
     if url.startswith("file:") and vcs is None:
         path = unquote(urlsplit(url).path)
-        return f"{path}[tools]" if Path(path).exists() else None
-    return f"{_PROJECT}[tools] @ {vcs}+{url}" if vcs else f"{_PROJECT}[tools] @ {url}"
+        return f"{path}[client]" if Path(path).exists() else None
+    return f"{_PROJECT}[client] @ {vcs}+{url}" if vcs else f"{_PROJECT}[client] @ {url}"
 
 
 def not_installed(program: str, error: ImportError) -> int:
@@ -61,6 +64,15 @@ def discard_output() -> None:
     """The reader of standard output has gone: avoid another error when Python flushes it at exit."""
     with contextlib.suppress(OSError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def call_on(loop: AbstractEventLoop, stop: Callable[[], object], *names: str) -> None:
+    """Have these signals call `stop`; those that nohup ignores do not, nor any on Windows."""
+    for name in names:
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) != signal.SIG_IGN:
+            with contextlib.suppress(NotImplementedError):
+                loop.add_signal_handler(number, stop)
 
 
 class Signals:

@@ -1,6 +1,24 @@
-"""Entry points of the programs here."""
+"""Entry points of the programs here, which need Linux and what `pip install .` installs there."""
 
-from protocol.program.start import run
+import sys
+from pathlib import PurePath
+
+from protocol.program import start
+
+_NEEDED = frozenset({"pysoem", "pyroute2", "fcntl", "grp", "pwd", "resource"})
+"""What is missing after `pip install --no-deps .`, and on other systems."""
+
+
+def run(module: str) -> int:
+    """As `start.run`, with a sentence if something is missing."""
+    try:
+        return start.run(module)
+    except ModuleNotFoundError as error:
+        if error.name not in _NEEDED:
+            raise
+        program = PurePath(sys.argv[0]).name
+        sys.stderr.write(f"{program}: {error.name} is missing: this needs Linux and 'pip install .' there\n")
+        return 1
 
 
 def server() -> int:

@@ -72,6 +72,7 @@ PACKAGES: Final[dict[str, set[str]]] = {
     "rich": {"clients"},
     "textual": {"clients.monitor.app"},
     "websockets": {"clients.monitor.web.server"},
+    "shtab": {"protocol.program.completion"},
 } | {
     ros: {"bridge"}
     for ros in (

@@ -17,6 +17,7 @@ from typing import Final
 import pytest
 
 from clients import program
+from ethercat_server import programs
 from ethercat_server.virtual_sensor.cli import main as virtual_sensor
 from protocol.program.output import never_fail
 from scripts.demonstration.program import _seconds as demo_seconds
@@ -26,7 +27,7 @@ ROOT: Final = Path(__file__).parent.parent
 SCRIPTS: Final[dict[str, str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 PROGRAMS: Final = {name: entry for name, entry in SCRIPTS.items() if name != "bridge-client"}
 CLIENTS: Final = [name for name, entry in PROGRAMS.items() if entry.startswith("clients.")]
-UNKNOWN: Final = "numpy is not installed: in this project's folder run PIP '.[tools]'"
+UNKNOWN: Final = "numpy is not installed: in this project's folder run PIP '.[client]'"
 EXTRA: Final = ("jinja2", "matplotlib", "mcap", "numpy", "rich", "textual", "zstandard")
 
 INTERRUPTED: Final = """
@@ -75,6 +76,19 @@ def test_every_program_starts_so(name: str, monkeypatch: pytest.MonkeyPatch) -> 
         signal.signal(signal.SIGINT, before)
 
 
+def test_the_server_says_what_it_needs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def start(_: str) -> int:
+        raise ModuleNotFoundError("No module named 'pysoem'", name="pysoem")
+
+    monkeypatch.setattr("protocol.program.start.run", start)
+    monkeypatch.setattr(sys, "argv", ["/opt/bin/ethercat-server"])
+    assert programs.server() == 1
+    sentence = "ethercat-server: pysoem is missing: this needs Linux and 'pip install .' there\n"
+    assert capsys.readouterr().err == sentence
+
+
 def test_a_terminal_without_the_characters_gets_them_spelled(monkeypatch: pytest.MonkeyPatch) -> None:
     raw = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, "ascii"))
@@ -119,10 +133,10 @@ for name, entry in {[(name, PROGRAMS[name]) for name in CLIENTS]!r}:
 @pytest.mark.parametrize(
     ("url", "what"),
     [
-        ({"url": ROOT.as_uri(), "dir_info": {}}, f"numpy is not installed: PIP '{ROOT}[tools]'"),
+        ({"url": ROOT.as_uri(), "dir_info": {}}, f"numpy is not installed: PIP '{ROOT}[client]'"),
         (
             {"url": "https://example.org/a.git", "vcs_info": {"vcs": "git"}},
-            "numpy is not installed: PIP 'bota-ethercat-bridge[tools] @ git+https://example.org/a.git'",
+            "numpy is not installed: PIP 'bota-ethercat-bridge[client] @ git+https://example.org/a.git'",
         ),
         ({"url": "file:///no/such/folder"}, UNKNOWN),
         (None, UNKNOWN),

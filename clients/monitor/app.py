@@ -6,7 +6,6 @@ Ten times a second the state is rendered as rows of text, and only rows that cha
 from __future__ import annotations
 
 import asyncio
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,13 +21,16 @@ from textual.widget import Widget
 from clients.monitor.model.server import Model, clock_text
 from clients.monitor.model.state import SensorState, State
 from clients.monitor.recorder import Recorder
-from clients.monitor.tare import start_tare
+from clients.monitor.tare import WAYS, start_tare
 from clients.monitor.view.glyphs import Glyphs
 from clients.monitor.view.screen import Look, render
 from clients.numbers import duration
+from clients.program import call_on
 from protocol.address import Address
 
 REFRESH_S: Final = 0.1
+_ANSWERS: Final = {"y": "tare", "u": "undo", "c": "clear"}
+"""Keys that answer the question whether to tare, and what they do."""
 
 
 class View(Widget):
@@ -94,7 +96,8 @@ class Monitor(App[None]):
         self.recorder = Recorder(address)
         """The caller closes it after the terminal is restored."""
         self._state: State | None = None
-        self._confirmed: Callable[[], None] | None = None
+        self._to_tare: int | None = None
+        """The position that the question is about."""
 
     def compose(self) -> ComposeResult:
         """The only widget."""
@@ -102,9 +105,7 @@ class Monitor(App[None]):
 
     def on_mount(self) -> None:
         """Start the timers and the signal handlers."""
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            loop.add_signal_handler(number, self.exit)
+        call_on(asyncio.get_running_loop(), self.exit, "SIGTERM", "SIGHUP")
         self.app_resume_signal.subscribe(self, lambda _: self.repaint())
         self.set_interval(REFRESH_S, self.draw)
         if self._seconds is not None:
@@ -144,7 +145,7 @@ class Monitor(App[None]):
         if event.key == "ctrl+l":
             self.repaint()
         elif self._look.question:
-            self._answer(event.character in {"y", "Y"})
+            self._answer((event.character or "").lower())
         elif self._look.help:
             self._look = replace(self._look, help=False)
         else:
@@ -176,21 +177,19 @@ class Monitor(App[None]):
             self._say("No sensor to tare: not connected to the server", True)
             return
 
-        def confirmed() -> None:
-            self._say(f"Taring sensor {sensor.position}: keep it stationary")
-            start_tare(self._address, sensor.position, self._say)
+        self._to_tare = sensor.position
+        answers = "y: yes, u: undo the last tare, c: clear it, any other key: no"
+        self._look = replace(self._look, question=f"Tare sensor {sensor.position}? {answers}")
 
-        self._confirmed = confirmed
-        question = f"Tare sensor {sensor.position}? Its reading becomes zero. y: yes, any other key: no"
-        self._look = replace(self._look, question=question)
-
-    def _answer(self, yes: bool) -> None:
-        confirmed, self._confirmed = self._confirmed, None
+    def _answer(self, key: str) -> None:
+        position, self._to_tare = self._to_tare, None
         self._look = replace(self._look, question="")
-        if yes and confirmed is not None:
-            confirmed()
-        else:
+        way = _ANSWERS.get(key)
+        if way is None or position is None:
             self._say("Not tared")
+        else:
+            self._say(WAYS[way].begins.format(position))
+            start_tare(self._address, position, self._say, way)
 
     def _record(self) -> None:
         if self.recorder.running:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -24,8 +22,7 @@ _STOP_TIMEOUT_S: Final = 20.0
 
 def program() -> list[str] | None:
     """The command, beside this interpreter or on PATH; None if it is not installed."""
-    beside = Path(sys.executable).with_name(PROGRAM)
-    found = str(beside) if beside.exists() else shutil.which(PROGRAM)
+    found = shutil.which(PROGRAM, path=Path(sys.executable).parent) or shutil.which(PROGRAM)
     return None if found is None else [found]
 
 
@@ -78,17 +75,15 @@ class Recorder:
     def stop(self) -> None:
         """Request the end; `ended` reports it."""
         if self._process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                self._process.send_signal(signal.SIGINT)
+            self._close_input()
 
     def ended(self) -> tuple[str, bool] | None:
         """A message about a recording that has ended, and whether it is an error; else None."""
         if self._process is None or self._process.poll() is None:
             return None
-        code, stdin = self._process.returncode, self._process.stdin
+        code = self._process.returncode
+        self._close_input()
         self._process = None
-        if stdin is not None:
-            stdin.close()
         last = self._last_words().removeprefix(f"{PROGRAM}: ")
         if code == 0:
             return f"Recorded {last}" if last else "The recording has ended", False
@@ -106,6 +101,11 @@ class Recorder:
             self._process.wait()
         found = self.ended()
         return found[0] if found else None
+
+    def _close_input(self) -> None:
+        """Which it takes as the request to stop."""
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()
 
     def _last_words(self) -> str:
         if self._said is None:

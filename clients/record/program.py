@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import socket
+import threading
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -34,6 +34,8 @@ _say = partial(say, "ethercat-record")
 def run(argv: Sequence[str] | None, signals: Signals) -> int:
     """Record; returns the exit code."""
     options = parse_options(argv)
+    if options.until_eof:
+        _stop_at_eof(signals)
     parts = Parts(
         options.path, size=options.rotate_size, seconds=options.rotate_seconds, overwrite=options.force
     )
@@ -70,7 +72,7 @@ def _connect(source: Source, options: RecordOptions, signals: Signals) -> Batch 
         if not waiting:
             _say(f"waiting for a server at {options.address}")
             waiting = True
-        if _asked(options, signals):
+        if signals.asked:
             return None
         time.sleep(_WAIT_S)
 
@@ -88,7 +90,7 @@ def _record(
                 if recorder.failed:
                     code = 1
                     break
-                if _asked(options, signals):
+                if signals.asked:
                     break
                 if options.seconds is not None and time.monotonic() - began >= options.seconds:
                     reason = "time is up"
@@ -117,11 +119,16 @@ def _record(
     return code
 
 
-def _asked(options: RecordOptions, signals: Signals) -> bool:
-    """Whether it was asked to stop."""
-    if options.until_eof and not signals.asked and select.select([0], [], [], 0)[0]:
-        signals.asked = not os.read(0, 4096)
-    return signals.asked
+def _stop_at_eof(signals: Signals) -> None:
+    """Wait for the end of standard input. A thread: Windows has no `select` for it."""
+
+    def read() -> None:
+        with contextlib.suppress(OSError):
+            while os.read(0, 4096):
+                pass
+        signals.asked = True
+
+    threading.Thread(target=read, name="stdin", daemon=True).start()
 
 
 def _report(batch: Batch, progress: Progress) -> None:

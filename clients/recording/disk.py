@@ -7,17 +7,28 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 from clients.errors import DiskError
 from protocol.program.new_file import EXISTS
 
+_LOCKS = True
+try:
+    import fcntl
+except ImportError:  # Windows: it removes no open file, and has no such lock
+    _LOCKS = False
+
+_BINARY: Final = getattr(os, "O_BINARY", 0)
+"""Windows would write other line ends."""
+
 
 def _lock(fd: int) -> None:
     """Lock the file until it is closed; OSError."""
+    if not _LOCKS:
+        return
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -25,19 +36,28 @@ def _lock(fd: int) -> None:
 
 
 def remove(paths: Sequence[Path]) -> None:
-    """Remove these files, or none if one of them is in use; DiskError."""
+    """Remove these files, or none if one of them is in use (on Windows, those before it); DiskError."""
     for really in (False, True):
         for path in paths:
             try:
-                fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-                try:
-                    _lock(fd)
+                with _locked(path):
                     if really:
                         path.unlink()
-                finally:
-                    os.close(fd)
             except OSError as error:
                 raise DiskError(f"{path} cannot be replaced: {error.strerror}") from None
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    if not _LOCKS:
+        yield
+        return
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        _lock(fd)
+        yield
+    finally:
+        os.close(fd)
 
 
 class DiskFile:
@@ -52,7 +72,7 @@ class DiskFile:
         self._written = 0
         try:
             self._fd = os.open(
-                path, os.O_WRONLY | os.O_CREAT | (0 if overwrite else os.O_EXCL) | os.O_CLOEXEC, 0o666
+                path, os.O_WRONLY | os.O_CREAT | (0 if overwrite else os.O_EXCL) | _BINARY, 0o666
             )
         except FileExistsError:
             raise DiskError(f"{path} {EXISTS}") from None
@@ -60,7 +80,7 @@ class DiskFile:
             raise DiskError(f"{path} cannot be created: {error.strerror}") from None
         try:
             _lock(self._fd)
-            os.truncate(self._fd, 0)
+            os.ftruncate(self._fd, 0)
         except OSError as error:
             os.close(self._fd)
             raise DiskError(f"{path} cannot be written: {error.strerror}") from None
@@ -82,11 +102,12 @@ class DiskFile:
         self._waiting.clear()
         done = 0
         try:
+            os.lseek(self._fd, self._written, os.SEEK_SET)
             while done < len(data):
-                done += os.pwrite(self._fd, data[done:], self._written + done)
+                done += os.write(self._fd, data[done:])
         except OSError as error:
             with contextlib.suppress(OSError):
-                os.truncate(self._fd, self._written)
+                os.ftruncate(self._fd, self._written)
             self._position = self._written
             raise DiskError(f"{self.path} cannot be written: {error.strerror}") from None
         self._written = self._position

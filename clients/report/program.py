@@ -64,7 +64,7 @@ def _summary(examinations: Sequence[Examination]) -> str:
     lines = []
     for each in examinations:
         subject = each.subject
-        who = f"Sensor {subject.position} ({subject.name}, serial {subject.serial})"
+        who = f"Sensor {subject.position} ({subject.who})"
         lines.append(f"{who}: {each.verdict.headline}. {each.verdict.sentence}")
         lines += [f"  {remark}" for remark in subject.remarks]
         for check in each.checks:

@@ -16,6 +16,7 @@ from ethercat_server.daemon.server_settings import KEEP, SERVER_SETTINGS, Server
 from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
 from protocol.errors import SettingError
+from protocol.program.completion import add_completion
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
 from protocol.text.did_you_mean import did_you_mean
@@ -156,6 +157,7 @@ def build_parser() -> argparse.ArgumentParser:
             type=_parse_with(setting), action="append" if setting.many else "store",
         )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    add_completion(parser)
     return parser
 
 

@@ -18,6 +18,7 @@ from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.nic.claim import MAX_NAME_LENGTH
 from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import command_line
+from protocol.program.completion import add_completion
 
 if TYPE_CHECKING:
     from ethercat_server.doctor.finding import Finding
@@ -57,6 +58,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    add_completion(parser)
     return parser
 
 

@@ -5,9 +5,7 @@ Names are looked up when they are read, never in the loop: a directory service c
 
 from __future__ import annotations
 
-import grp
 import os
-import pwd
 from collections.abc import Collection, Iterable
 from typing import Final
 
@@ -58,15 +56,20 @@ def controlling_uids(users: Iterable[str], groups: Iterable[str]) -> frozenset[i
 
 def _uid(name: str, option: str) -> int:
     try:
+        import pwd  # noqa: PLC0415 - Windows, where recordings are replayed, has none
+
         return int(name) if name.isdecimal() else pwd.getpwnam(name).pw_uid
-    except KeyError:
+    except (KeyError, ImportError):
         raise UsageError(f"{option}: there is no such user on this machine") from None
 
 
 def _members(name: str) -> set[int]:
     try:
+        import grp  # noqa: PLC0415
+        import pwd  # noqa: PLC0415
+
         group = grp.getgrgid(int(name)) if name.isdecimal() else grp.getgrnam(name)
-    except KeyError:
+    except (KeyError, ImportError):
         raise UsageError(f"--control-group {name}: there is no such group on this machine") from None
     found = {user.pw_uid for user in pwd.getpwall() if user.pw_gid == group.gr_gid}
     for member in group.gr_mem:

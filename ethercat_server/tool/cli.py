@@ -13,6 +13,7 @@ from ethercat_server.process import command_line
 from ethercat_server.tool.command import Command
 from ethercat_server.tool.commands import bus, find, objects, settings, snapshot, tare, watch
 from ethercat_server.tool.show import say_json
+from protocol.program.completion import OPTION, add_completion
 from protocol.text.did_you_mean import did_you_mean
 
 _PROGRAM: Final = "ethercat-sensor"
@@ -58,6 +59,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("command", choices=list(COMMANDS), metavar="COMMAND", help="see below")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    add_completion(parser, _build_whole_parser)
     return parser
 
 
@@ -68,9 +70,22 @@ def build_command_parser(command: Command) -> argparse.ArgumentParser:
         description=f"{command.summary[0].upper()}{command.summary[1:]}.",
         epilog=_EXIT_CODES,
     )
+    _add_arguments(parser, command)
+    return parser
+
+
+def _add_arguments(parser: argparse.ArgumentParser, command: Command) -> None:
     command.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="machine-readable output")
-    return parser
+
+
+def _build_whole_parser() -> argparse.ArgumentParser:
+    """All subcommands in one, for the shell's completion."""
+    whole = _Parser(prog=_PROGRAM)
+    commands = whole.add_subparsers()
+    for command in COMMANDS.values():
+        _add_arguments(commands.add_parser(command.name, help=command.summary), command)
+    return whole
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -83,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         guess = did_you_mean(arguments[0], COMMANDS)
         parser.error(f"no command {arguments[0]!r}: there are {', '.join(COMMANDS)}{guess}")
-    command = COMMANDS[parser.parse_args(arguments[:1]).command]
+    command = COMMANDS[parser.parse_args(arguments[: 2 if arguments[:1] == [OPTION] else 1]).command]
     args = build_command_parser(command).parse_intermixed_args(arguments[1:])
     return command_line.run(_PROGRAM, lambda: command.run(args), as_json=args.json)
 

@@ -33,6 +33,7 @@ from ethercat_server.virtual_sensor.options import (
     SensorOptions,
 )
 from protocol.pdo import LAYOUTS
+from protocol.program.completion import add_completion
 from protocol.settings import SETTINGS
 
 
@@ -85,6 +86,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--control", metavar="PATH", help="Unix socket for commands")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    add_completion(parser)
     return parser
 
 

@@ -21,7 +21,13 @@ from protocol.text.visible import printable
 CONNECT_TIMEOUT_S: Final = 2.0
 SILENCE_S: Final = 1.0
 """`receive` gives up waiting after this time, so that silence can be reported."""
-_KEEPALIVE: Final = ((socket.TCP_KEEPIDLE, 2), (socket.TCP_KEEPINTVL, 1), (socket.TCP_KEEPCNT, 3))
+_KEEPALIVE: Final = tuple(
+    (getattr(socket, option), value)
+    for option, value in (("TCP_KEEPIDLE", 2), ("TCP_KEEPALIVE", 2), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3))
+    if hasattr(socket, option)  # the second is what macOS calls the first
+)
+_DONT_WAIT: Final = getattr(socket, "MSG_DONTWAIT", 0)
+"""0 on Windows, where the socket's timeouts would be of another type, too: there it waits with `select`."""
 
 
 class FramedConnection:
@@ -29,7 +35,7 @@ class FramedConnection:
 
     Attributes:
         same_machine: whether the server's CLOCK_MONOTONIC is ours; by its address until `take_description`.
-        sock: the socket, blocking, with the kernel's timeouts of SILENCE_S.
+        sock: the socket, blocking, with the kernel's timeouts of SILENCE_S (not on Windows).
     """
 
     def __init__(self, host: str, port: int, timeout_s: float = CONNECT_TIMEOUT_S) -> None:
@@ -59,8 +65,9 @@ class FramedConnection:
             self.sock.setsockopt(socket.IPPROTO_TCP, option, value)
         # The kernel's own timeouts cost no system call per read, as settimeout() would.
         self.sock.settimeout(None)
-        self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(SILENCE_S))
-        self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _timeval(SILENCE_S))
+        if _DONT_WAIT:
+            self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(SILENCE_S))
+            self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _timeval(SILENCE_S))
 
     def take_description(self, description: JsonObject) -> None:
         """Learn whose clock the server has from its reply to `describe`: the address may be a tunnel's."""
@@ -85,9 +92,11 @@ class FramedConnection:
         True if more may be waiting, False if that was all, None if nothing came within SILENCE_S (or, not
         waiting, there is nothing). Then call `next_message`. ConnectionFailedError when it is over.
         """
+        if not _DONT_WAIT and not self.wait(SILENCE_S if wait else 0.0):
+            return None
         with self._decoder.get_buffer() as buffer:
             try:
-                count = self.sock.recv_into(buffer, 0, 0 if wait else socket.MSG_DONTWAIT)
+                count = self.sock.recv_into(buffer, 0, 0 if wait else _DONT_WAIT)
             except BlockingIOError:
                 return None
             except OSError as error:

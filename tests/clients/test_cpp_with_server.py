@@ -10,6 +10,7 @@ from itertools import pairwise
 import pytest
 
 from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.address import Address
 from protocol.client import connect
 from protocol.framing import DataFlag
 from protocol.pdo import SampleDecoder
@@ -292,3 +293,18 @@ def test_threads_with_a_client_each_have_no_race() -> None:
         command = ["setarch", "-R", str(program), str(running.port)]
         done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
+
+
+def test_a_server_is_named_as_in_the_other_programs() -> None:
+    texts = (
+        "robot", "robot:14101", "14101", ":14101", "[::1]", "[::1]:14101", "::1", "robot:", "robot:0", "0",
+        "robot:65535", "robot:65536", "robot:+1", "robot:1x", ":",
+    )  # fmt: skip
+    with driver(1) as running:
+        assert running.do("server") == [True, "localhost", 12001], "$BOTA_SERVER of the tests"
+        for text in texts:
+            try:
+                wanted = [True, *Address.parse(text)]
+            except ValueError:
+                wanted = [False, "localhost", 12001]
+            assert running.do("server", text) == wanted, text

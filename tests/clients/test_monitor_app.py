@@ -20,11 +20,10 @@ from tests.clients import monitor_states as made
 from tests.server.running import free_port, wait_until
 
 RECORDER = """
-import signal, sys, time
-signal.signal(signal.SIGINT, lambda *_: sys.exit(print("ethercat-record: %s of %s: nothing was lost"
-    % (sys.argv[1], sys.argv[3]), file=sys.stderr) or 0))
+import sys
 open(sys.argv[1], "w").close()
-time.sleep(60)
+sys.stdin.read()
+print("ethercat-record: %s of %s: nothing was lost" % (sys.argv[1], sys.argv[3]), file=sys.stderr)
 """
 
 
@@ -67,12 +66,16 @@ def play(scene: Callable[[Stage], Awaitable[None]], stage: Stage | None = None) 
 
 def test_tare_asks_first_and_only_y_does_it() -> None:
     async def scene(stage: Stage) -> None:
-        assert "Tare sensor 0? Its reading becomes zero" in await stage.press("t")
+        assert "Tare sensor 0? y: yes, u: undo the last tare, c: clear it, any" in await stage.press("t")
         assert "Not tared" in await stage.press("enter")
         await stage.press("n", "t")
         assert "Tare sensor 1?" in stage.shown()
         await stage.press("y")
         wait_until(lambda: "Sensor 1 was not tared: no connection to the server" in stage.shown(), "a word")
+        await stage.press("t", "u")
+        wait_until(lambda: "The tare of sensor 1 was not undone: " in stage.shown(), "another")
+        await stage.press("t", "C")
+        wait_until(lambda: "The offset of sensor 1 was not cleared: " in stage.shown(), "the last")
 
     play(scene)
 

@@ -25,11 +25,12 @@ from clients.monitor.model.server import Model
 from clients.monitor.model.state import State
 from clients.monitor.options import parse
 from clients.monitor.reader import Reader
-from clients.monitor.tare import tare
+from clients.monitor.tare import WAYS, tare
 from clients.recording.reader import RecordingError, open_recording
 from ethercat_server.serving.transport.in_memory import ManualClock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.address import Address
+from protocol.client import Client
 from tests.bridge.scripted_server import ScriptedServer
 from tests.served_simulation import ServedSimulation, served
 from tests.server.as_another_user import NO_OTHER_USER
@@ -312,6 +313,44 @@ def test_tare_says_what_is_left() -> None:
         text, bad = tare(Address("localhost", 1), 0)
     assert not bad
     assert re.fullmatch(r"Sensor 0 was tared; residual at most [0-9.]+ N and [0-9.]+ Nm", text)
+
+
+@pytest.fixture(autouse=True)
+def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where this user's last tares are kept."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return tmp_path
+
+
+def test_a_tare_is_undone_and_cleared() -> None:
+    address = Address("localhost", 1)
+
+    def offset() -> list[float]:
+        with Client(address.port) as client:
+            found: list[float] = client.description["sensors"][0]["offset"]
+            return found
+
+    with simulated_bus("--signal", "rest") as bus, simulated_server(bus):
+        assert WAYS["undo"].do(address, 0) == (
+            "The tare of sensor 0 was not undone: no tare of it by this user is known; its offset can be "
+            "cleared", True,
+        )  # fmt: skip
+        tare(address, 0)
+        tared = offset()
+        assert WAYS["undo"].do(address, 0) == ("The tare of sensor 0 was undone", False)
+        assert offset() == [0.0] * 6
+        assert not WAYS["undo"].do(address, 0)[1], "of the undoing"
+        assert offset() == tared
+        assert WAYS["clear"].do(address, 0) == ("The offset of sensor 0 was cleared", False)
+        assert offset() == [0.0] * 6
+        with Client(address.port) as client:
+            client.ask("sdo_write", sensor=0, index=0x8000, subindex=1, type="f32", value=1.0)
+        assert "its offset has changed since" in WAYS["undo"].do(address, 0)[0]
+        bus.command("on-write 0x8000 2 abort 0x8000 3 0x08000022")
+        text, bad = WAYS["clear"].do(address, 0)
+        assert bad
+        assert text.startswith("The offset of sensor 0 was not cleared: ")
+        assert offset() == [1.0, *[0.0] * 5]
 
 
 def test_tare_says_why_not() -> None:

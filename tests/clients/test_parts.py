@@ -64,18 +64,19 @@ def test_what_the_disk_does_not_take_is_taken_off_again(
     disk = DiskFile(tmp_path / "a", overwrite=False)
     disk.write(b"first")
     disk.flush()
-    real, room = os.pwrite, 3
+    real, room = os.write, 3
 
-    def full(fd: int, data: bytes, offset: int) -> int:
+    def full(fd: int, data: bytes) -> int:
         nonlocal room
         if not room:
             raise OSError(28, "No space left on device")
         count, room = min(room, len(data)), 0
-        return int(real(fd, data[:count], offset))
+        return int(real(fd, data[:count]))
 
-    monkeypatch.setattr("os.pwrite", full)
     disk.write(b"second")
+    monkeypatch.setattr("os.write", full)
     with pytest.raises(DiskError, match="No space left"):
         disk.flush()
+    monkeypatch.undo()
     disk.close()
     assert (tmp_path / "a").read_bytes() == b"first"

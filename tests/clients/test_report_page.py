@@ -90,6 +90,7 @@ def test_it_is_one_file_with_nothing_outside_it(page: str) -> None:
 
 def test_it_can_be_read_without_seeing_it(page: str) -> None:
     reader = Reader(page)
+    assert "`" not in "".join(reader.words), "commands are set as code"
     identifiers = [attributes["id"] for _, attributes in reader.tags if "id" in attributes]
     assert len(identifiers) == len(set(identifiers))
     plots = reader.of("svg")
@@ -141,7 +142,7 @@ def two() -> tuple[str, str]:
         "settings": {**described()["settings"], EVIL: 1, "sinc_length": EVIL},
     }  # fmt: skip
     first = subject_of(simulate(1), row, source=EVIL)
-    examined = [examine(first), examine(replace(first, position=1, serial="9", columns=decoded([])))]
+    examined = [examine(first), examine(replace(first, position=1, serial=9, columns=decoded([])))]
     with undrawn():
         return render(examined, made=MADE, program="p", note=EVIL), as_json(examined)
 

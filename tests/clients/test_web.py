@@ -59,9 +59,7 @@ def batch(feed: Feed, frames: list[DataMessage]) -> Batch:
 
 @pytest.fixture
 def feed() -> Feed:
-    made = Feed()
-    made.watch({0})
-    return made
+    return Feed()
 
 
 def f32(value: float) -> float:
@@ -127,16 +125,12 @@ def test_what_is_not_a_number_is_none_and_hides_no_other(feed: Feed) -> None:
 )
 def test_the_imu_is_in_si_units(units: ImuUnits, g: float, dps: float) -> None:
     feed = Feed(units)
-    feed.watch({0})
     found = batch(feed, [frame(0, {"acceleration.z": 2.0, "angular_rate.x": 90.0})])
     assert (found.newest[AZ], found.columns[AZ]) == (f32(2 * g), [f32(2 * g)])
     assert found.newest[WX] == f32(90 * dps)
 
 
-def test_nothing_is_kept_for_nobody_and_not_endlessly_for_somebody(feed: Feed) -> None:
-    idle = Feed()
-    assert not idle.take([frame(0)])
-    assert idle.batches(silent=True) == {}
+def test_nothing_waits_endlessly(feed: Feed) -> None:
     feed.take([frame(k)._replace(monotonic_ns=10**12 + k * 20_000_000) for k in range(6000)])
     assert len(decode(feed.batches()[0]).times) == 4096
     assert decode(feed.batches(silent=True)[0]).sensor == 0
@@ -153,7 +147,7 @@ class Harness:
         self.model = WebModel(made.ADDRESS)
         self.model.connected(made.description(("one", "two")), made.OWN_PEER, START_S)
         self.token = Token()
-        self.tares: list[tuple[int, Callable[[str, bool], None]]] = []
+        self.tares: list[tuple[int, Callable[[str, bool], None], str]] = []
         self.hub = Hub[str](self.model, self.token, lambda *tare: self.tares.append(tare))
 
     def states(self) -> dict[str, Any]:
@@ -187,6 +181,30 @@ def test_each_page_gets_the_sensor_that_it_shows(web: Harness) -> None:
     web.hub.leave("other")
     web.model.take([frame(k, sensor=s) for k in range(40, 80) for s in (0, 1)], START_S + 0.1)
     assert [pages for pages, _ in web.hub.points(START_S + 2)] == [["page"]]
+
+
+def test_a_page_that_comes_later_gets_the_last_minute(web: Harness) -> None:
+    def pass_by(first_s: int, last_s: int) -> None:
+        for second in range(first_s, last_s):
+            moment = 10**12 + second * 10**9
+            frames = [frame(second, sensor=s)._replace(monotonic_ns=moment) for s in (0, 1)]
+            web.model.take(frames, START_S)
+            list(web.hub.points(START_S + second))
+
+    def kept(page: str) -> list[float]:
+        return [time for message in web.hub.kept(page) for time in decode(message).times]
+
+    pass_by(0, 100)
+    web.hub.join("later")
+    assert kept("later") == pytest.approx(range(1039, 1100))
+    web.hear("later", sensor=1)
+    assert {decode(message).sensor for message in web.hub.kept("later")} == {1}
+    web.hear("later", sensor=5)
+    assert kept("later") == []
+    web.hear("later", sensor=1)
+    web.model.connected(made.description(("one", "two")), made.OWN_PEER, START_S)
+    pass_by(-500, -490)  # a restarted machine
+    assert kept("later") == pytest.approx(range(500, 510))
 
 
 def test_a_page_that_lags_misses_what_came_and_goes_on_with_the_newest(web: Harness) -> None:
@@ -247,7 +265,7 @@ def test_pages_are_limited_in_number(web: Harness) -> None:
 # Who may.
 
 
-@pytest.mark.parametrize("action", ["tare", "reset"])
+@pytest.mark.parametrize("action", ["tare", "clear", "reset"])
 def test_without_the_token_nothing_is_done(web: Harness, action: str) -> None:
     for token in ("", "wrong", web.token.text[:-1], web.token.text + "A", None, 5, ["x"], "\ud800é"):
         reply = web.hear("page", token=token, do=action)
@@ -270,15 +288,16 @@ def test_with_the_token_the_sensor_is_tared_once_at_a_time(web: Harness) -> None
     assert refused is not None, "the token of one page is no other's"
     assert not refused["control"]
     web.hear("page", do="tare", sensor=1)
-    [(position, said)] = web.tares
-    assert position == 1
+    [(position, said, way)] = web.tares
+    assert (position, way) == (1, "tare")
     assert "Taring sensor 1" in web.message()
     web.hear("page", do="tare")
     assert "A tare is running already" in web.message()
     said("Sensor 1 was tared", False)
     assert web.states()["page"]["message"]["text"].endswith("Sensor 1 was tared")
-    web.hear("page", do="tare")
-    assert len(web.tares) == 2
+    web.hear("page", do="undo")
+    assert (web.tares[1][0], web.tares[1][2]) == (1, "undo")
+    assert "Undoing the tare of sensor 1" in web.message()
 
 
 def test_with_the_token_peaks_are_reset(web: Harness) -> None:

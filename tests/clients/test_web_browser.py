@@ -14,6 +14,7 @@ from tests.clients.chromium import needs_chromium
 from tests.clients.devtools import Page, browser
 from tests.clients.monitor_states import frame, moving
 from tests.clients.web_pages import Web
+from tests.server.running import wait_until
 
 pytestmark = needs_chromium
 
@@ -154,9 +155,24 @@ def test_a_page_with_the_token_tares_after_a_question(page: Page, web: Web) -> N
     page.click("#ask [value=no]")
     page.click("#tare")
     assert web.tared == []
-    page.click("#ask [value=yes]")
+    page.click("#ask [value=tare]")
     wait_for_text(page, "#message", "Sensor 0 was tared")
-    assert web.tared == [0]
+    page.click("#tare")
+    page.click("#ask [value=undo]")
+    page.wait_for("!document.querySelector('#ask').open")
+    wait_until(lambda: web.tared == [(0, "tare"), (0, "undo")], "the undoing")
+
+
+@pytest.mark.long
+def test_a_page_opened_later_shows_what_was_before(page: Page, web: Web) -> None:
+    feed(web)
+    page.wait_for("document.querySelector('#force').plot.data[0].length > 150")
+    page.open("about:blank")
+    page.wait_for("location.href === 'about:blank'")
+    page.open(web.origin)
+    page.wait_for("document.querySelector('#force')?.plot?.data[0].length > 150")
+    assert trace(page, "force")[3].count(-412.0) == 1
+    assert page.complaints == []
 
 
 @pytest.mark.long

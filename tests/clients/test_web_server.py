@@ -98,7 +98,7 @@ def test_states_and_points_come_and_a_wish_is_answered(web: Web) -> None:
         stream.send('{"do":"tare"}')
         while "was tared" not in str(message(stream, "state")["message"]):
             pass
-        assert web.tared == [0]
+        assert web.tared == [(0, "tare")]
 
 
 @pytest.mark.parametrize(

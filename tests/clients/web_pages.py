@@ -21,7 +21,7 @@ class Web:
     """A monitor that is connected to a server with one sensor, at START_S.
 
     Attributes:
-        tared: the positions that were to be tared.
+        tared: the positions that were to be tared, and the way.
         tare_answer: what taring says.
     """
 
@@ -32,11 +32,11 @@ class Web:
         self.hub = PageHub(self.model, self.token, self._tare)
         self.now_s = START_S
         self.port = 0
-        self.tared: list[int] = []
+        self.tared: list[tuple[int, str]] = []
         self.tare_answer = ("Sensor 0 was tared", False)
 
-    def _tare(self, position: int, said: Callable[[str, bool], None]) -> None:
-        self.tared.append(position)
+    def _tare(self, position: int, said: Callable[[str, bool], None], way: str) -> None:
+        self.tared.append((position, way))
         said(*self.tare_answer)
 
     @property

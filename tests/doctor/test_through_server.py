@@ -36,6 +36,7 @@ def test_its_figures_and_clients_instead_of_the_bus(bench: Bench, tmp_path: Path
     findings = examined(bus, tmp_path, 1.0)
     found = findings.of("server")
     assert set(found) == {"server", "sensors", "wake-ups", "exchanges", "age of data", "clients"}
+    assert [finding.check for finding in findings].count("server") == 1
     assert f"process {os.getpid()}" in found["server"].found
     assert found["server"].values["port"] == ADDRESS.port
     assert not findings.of("bus")

@@ -66,13 +66,38 @@ def test_no_other_folder_has_files() -> None:
     }  # fmt: skip
 
 
-@pytest.mark.long
-def test_the_wheel_has_them_where_ros_looks(tmp_path: Path) -> None:
-    # Of a copy: pip leaves what it builds in the folder that it builds from.
-    copy = tmp_path / "copy"
+def copied(folder: Path) -> Path:
+    """The checkout: what is built would otherwise be left in it."""
+    copy = folder / "copy"
     shutil.copytree(
         ROOT, copy, symlinks=True, ignore=shutil.ignore_patterns(".*", "build", "*.egg-info", "__pycache__")
     )
+    return copy
+
+
+@pytest.mark.long
+def test_what_is_for_an_index_is_built_and_checked(tmp_path: Path) -> None:
+    if (wheels := os.environ.get("TEST_WHEELS")) is None:
+        pytest.skip("build and twine come from PyPI: run scripts/test --long with a network")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--find-links", wheels]
+    subprocess.run([*pip, "--target", tmp_path / "tools", "build", "twine"], check=True)
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "tools")}
+
+    def run(*command: str | Path) -> None:
+        done = subprocess.run(
+            [sys.executable, "-m", *command], env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    run("build", "--no-isolation", "--outdir", tmp_path / "dist", copied(tmp_path))
+    made = sorted((tmp_path / "dist").iterdir())
+    assert [path.suffix for path in made] == [".whl", ".gz"]
+    run("twine", "check", "--strict", *made)
+
+
+@pytest.mark.long
+def test_the_wheel_has_them_where_ros_looks(tmp_path: Path) -> None:
+    copy = copied(tmp_path)
     build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
     subprocess.run([*build, "-w", tmp_path, copy], check=True)
     (wheel,) = tmp_path.glob("*.whl")

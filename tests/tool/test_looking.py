@@ -84,6 +84,9 @@ def test_objects_that_cannot_be_read_have_a_line_with_the_reason(bench: Simulate
     assert "this firmware does not have it (abort 0x06020000)" in missing
     assert "refused" in next(line for line in lines if "0x8002:1" in line)
     assert any("Sampling rate" in line and "800" in line for line in lines)
+    bench.command("abort 0x8010 4 0x06020000")
+    alone = tool_here("read", near, "0x8010:4", code=1)
+    assert "this firmware does not have it" in alone.out + alone.err
 
 
 @pytest.mark.parametrize(("size", "missing"), [("61", 5), ("77", 1)])

@@ -1,6 +1,6 @@
 // A control loop at 1 kHz: a velocity that follows the force felt at the sensor, and zero when the force is not known.
 //
-//     control_loop [--host HOST] [--port PORT] [--hz 1000] [--seconds N]
+//     control_loop [--server HOST:PORT] [--hz 1000] [--seconds N]        (without --server: $BOTA_SERVER)
 //
 // What to copy: one `latest` a cycle, `fresh` asked before the sample is used, a command that goes to zero otherwise.
 // The robot is left out: `send_to_robot` stands for it.
@@ -54,15 +54,17 @@ double number(const char* option, const char* text, double low, double high) {
 int main(int argc, char** argv) {
     bota_ethercat::Options options;
     options.max_age = std::chrono::milliseconds(5);  // four samples at 800 Hz: older is not acted on
+    const char* server = nullptr;
     double hz = 1000.0, seconds = 1e9;
     for (int i = 1; i < argc; i += 2) {
         const char* const value = i + 1 < argc ? argv[i + 1] : nullptr;
-        if (std::strcmp(argv[i], "--host") == 0 && value) options.host = value;
-        else if (std::strcmp(argv[i], "--port") == 0) options.port = static_cast<std::uint16_t>(number("--port", value, 1, 65535));
+        if (std::strcmp(argv[i], "--server") == 0 && value) server = value;
         else if (std::strcmp(argv[i], "--hz") == 0) hz = number("--hz", value, 1, 10000);
         else if (std::strcmp(argv[i], "--seconds") == 0) seconds = number("--seconds", value, 0, 1e9);
-        else return std::fprintf(stderr, "usage: control_loop [--host HOST] [--port PORT] [--hz N] [--seconds N]\n"), 2;
+        else return std::fprintf(stderr, "usage: control_loop [--server HOST:PORT] [--hz N] [--seconds N]\n"), 2;
     }
+    if (!bota_ethercat::choose_server(server, options))
+        return std::fprintf(stderr, "control_loop: %s is no HOST:PORT\n", server ? server : "$BOTA_SERVER"), 2;
     std::signal(SIGINT, [](int) { ending = 1; });
     std::signal(SIGTERM, [](int) { ending = 1; });
 

@@ -1,12 +1,15 @@
-// Prints every sample in order, in SI units: `print_samples [HOST [PORT]]`. The shortest useful program.
+// Prints every sample in order, in SI units: `print_samples [--server HOST:PORT]`, else from $BOTA_SERVER. The shortest useful program.
 #include <bota_ethercat.hpp>
 
 #include <cstdio>
-#include <cstdlib>
+#include <cstring>
 
 int main(int argc, char** argv) {
-    bota_ethercat::Client sensor(argc > 1 ? argv[1] : "localhost",
-                                 static_cast<std::uint16_t>(argc > 2 ? std::atoi(argv[2]) : 12001));
+    bota_ethercat::Options options;
+    const bool given = argc == 3 && std::strcmp(argv[1], "--server") == 0;
+    if ((argc > 1 && !given) || !bota_ethercat::choose_server(given ? argv[2] : nullptr, options))
+        return std::fprintf(stderr, "usage: print_samples [--server HOST:PORT], else $BOTA_SERVER\n"), 2;
+    bota_ethercat::Client sensor(options);
     if (!sensor.connect()) return std::fprintf(stderr, "print_samples: %s\n", sensor.error()), 1;
     for (;;) {
         const bota_ethercat::Reading reading = sensor.next(std::chrono::milliseconds(100));

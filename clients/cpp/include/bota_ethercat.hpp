@@ -30,6 +30,7 @@
 
 #include "bota_ethercat/control.hpp"
 #include "bota_ethercat/real_time.hpp"
+#include "bota_ethercat/server_choice.hpp"
 #include "bota_ethercat/stream.hpp"
 
 #endif  // BOTA_ETHERCAT_HPP

@@ -15,7 +15,7 @@ from clients.monitor.view.glyphs import ALARM, BAD, LABEL, NOTICE, UNICODE, VALU
 from clients.monitor.view.panel import MOST_TALL, Row, alerts, field, panel
 
 KEYS: Final = (
-    ("t", "tare", "zero this sensor's reading, in the sensor; asks first"),
+    ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),
     ("r", "record", "start or stop a recording in this folder (ethercat-record)"),
     ("p", "pause", "freeze the display; samples and peaks still count"),
     ("0", "reset", "reset peaks and past warnings"),

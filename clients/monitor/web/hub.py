@@ -5,13 +5,15 @@ No sockets. All but `WebModel.take` and `connected`, which the reader's thread c
 
 from __future__ import annotations
 
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, Generic, TypeVar
 
 from clients.monitor.model.server import Model, clock_text
+from clients.monitor.tare import WAYS, Say
 from clients.monitor.web.access import Token
 from clients.monitor.web.message import state_text
-from clients.monitor.web.points import Feed
+from clients.monitor.web.points import Feed, start_s
 from clients.monitor.web.viewer import Viewer, Wish
 from protocol.framing import DataMessage
 from protocol.pdo import ImuUnits
@@ -19,6 +21,7 @@ from protocol.text.json_text import JsonObject, encode_json_text
 
 MOST_VIEWERS: Final = 8
 TOO_MANY: Final = f"{MOST_VIEWERS} pages are connected already: close one of them"
+KEPT_S: Final = 60.0
 _SILENT_S: Final = 0.1
 
 Page = TypeVar("Page")
@@ -42,17 +45,15 @@ class WebModel(Model):
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
         """See `Model`."""
         super().take(frames, now_s)
-        if self.feed.take(frames):
-            self.on_points()
+        self.feed.take(frames)
+        self.on_points()
 
 
 class Hub(Generic[Page]):
     """The viewers, each by the page that it stands for."""
 
-    def __init__(
-        self, model: WebModel, token: Token, tare: Callable[[int, Callable[[str, bool], None]], object]
-    ) -> None:
-        """`tare` tares the sensor at a position in the background and calls with the result."""
+    def __init__(self, model: WebModel, token: Token, tare: Callable[[int, Say, str], object]) -> None:
+        """`tare` tares the sensor at a position in the background, one of WAYS, and calls with the result."""
         self._model = model
         self._token = token
         self._tare = tare
@@ -60,31 +61,29 @@ class Hub(Generic[Page]):
         self._viewers: dict[Page, Viewer] = {}
         self._number = 0
         self._points_s = 0.0
+        self._kept: dict[int, deque[bytes]] = defaultdict(deque)
+        """The points of the last minute by position, for a page that comes later."""
 
     def join(self, page: Page) -> Viewer | None:
         """A page has connected; None if there are enough."""
         if len(self._viewers) >= MOST_VIEWERS:
             return None
         viewer = self._viewers[page] = Viewer(self._token)
-        self._watch()
         return viewer
 
     def leave(self, page: Page) -> None:
         """Its connection has ended."""
         self._viewers.pop(page, None)
-        self._watch()
 
     def hear(self, page: Page, text: str | bytes) -> str | None:
         """A message of a page; what to answer."""
         viewer = self._viewers[page]
-        before = viewer.sensor, viewer.control
+        before = viewer.control
         heard = viewer.hear(text)
-        if viewer.sensor != before[0]:
-            self._watch()
         refused = heard if isinstance(heard, str) else None
         if isinstance(heard, Wish):
             self._do(heard)
-        if refused or viewer.control != before[1]:
+        if refused or viewer.control != before:
             return encode_json_text({"control": viewer.control, "refused": refused}).decode()
         return None
 
@@ -106,10 +105,20 @@ class Hub(Generic[Page]):
         silent = now_s - self._points_s > _SILENT_S
         for position, batch in self._model.feed.batches(silent=silent).items():
             self._points_s = now_s
-            yield [p for p, v in self._viewers.items() if v.sensor == position and not v.behind], batch
+            self._keep(position, batch)
+            pages = [p for p, v in self._viewers.items() if v.sensor == position and not v.behind]
+            if pages:
+                yield pages, batch
 
-    def _watch(self) -> None:
-        self._model.feed.watch({viewer.sensor for viewer in self._viewers.values()})
+    def kept(self, page: Page) -> list[bytes]:
+        """The points of the last minute of the sensor that a page shows, for one that has just begun to."""
+        return list(self._kept.get(self._viewers[page].sensor, ()))
+
+    def _keep(self, position: int, batch: bytes) -> None:
+        kept = self._kept[position]
+        kept.append(batch)
+        while not start_s(batch) - KEPT_S <= start_s(kept[0]) <= start_s(batch):  # or of another server
+            kept.popleft()
 
     def _do(self, wish: Wish) -> None:
         if wish.action == "reset":
@@ -119,8 +128,8 @@ class Hub(Generic[Page]):
             self._say("A tare is running already", True)
         else:
             self._taring = True
-            self._say(f"Taring sensor {wish.sensor}: keep it stationary", False)
-            self._tare(wish.sensor, self._tared)
+            self._say(WAYS[wish.action].begins.format(wish.sensor), False)
+            self._tare(wish.sensor, self._tared, wish.action)
 
     def _tared(self, text: str, bad: bool) -> None:
         self._taring = False

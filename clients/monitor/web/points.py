@@ -13,7 +13,7 @@ import struct
 import threading
 from array import array
 from collections import deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 from protocol.accounting import NOT_NEW
@@ -24,13 +24,18 @@ STEP_NS: Final = 10_000_000
 KIND: Final = 1
 HEADER: Final = struct.Struct("<BBHId")
 MOST_POINTS: Final = 4096
-"""Points kept for a page that is slow to take them: 20 s."""
+"""Points that wait to be taken: 20 s."""
 
 _COMMON: Final = LAYOUTS[min(LAYOUTS)]
 CHANNELS: Final = tuple(field.name for field in _COMMON.fields if field.type is PdoType.REAL)
 """Six axes of the wrench, acceleration, angular rate, temperature."""
 
 Values = tuple[float, ...]
+
+
+def start_s(batch: bytes) -> float:
+    """The time of its first point."""
+    return float(HEADER.unpack_from(batch)[4])
 
 
 def scales(imu_units: ImuUnits) -> Values:
@@ -113,17 +118,12 @@ def _finite(values: Values) -> Values:
 
 
 class Feed:
-    """The points of the sensors that somebody watches. One thread feeds it, another takes the batches."""
+    """The points of all sensors. One thread feeds it, another takes the batches."""
 
     def __init__(self, imu_units: ImuUnits = ImuUnits.G_DPS) -> None:
         self._lock = threading.Lock()
         self._scale = scales(imu_units)
         self._points: dict[int, Points] = {}
-
-    def watch(self, positions: Collection[int]) -> None:
-        """From now on these sensors only."""
-        with self._lock:
-            self._points = {p: self._points.get(p) or Points(self._scale) for p in positions}
 
     def restart(self) -> None:
         """A new connection to the server."""
@@ -131,12 +131,12 @@ class Feed:
             for points in self._points.values():
                 points.restart()
 
-    def take(self, frames: Sequence[DataMessage]) -> bool:
-        """Frames of any sensors in order of arrival; whether anybody watches."""
+    def take(self, frames: Sequence[DataMessage]) -> None:
+        """Frames of any sensors in order of arrival."""
         with self._lock:
-            for position, points in self._points.items():
+            for position in {frame.sensor for frame in frames}:
+                points = self._points.setdefault(position, Points(self._scale))
                 points.take(frame for frame in frames if frame.sensor == position)
-            return bool(self._points)
 
     def batches(self, *, silent: bool = False) -> dict[int, bytes]:
         """The messages that are due, by position."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import signal
 import sys
+from functools import partial
 from typing import Final
 
 from clients.monitor.options import Options
@@ -14,7 +14,7 @@ from clients.monitor.tare import start_tare
 from clients.monitor.web.access import Token
 from clients.monitor.web.hub import WebModel
 from clients.monitor.web.server import PageHub, WebServer
-from clients.program import say
+from clients.program import call_on, say
 from protocol.address import Address
 
 POINTS_S: Final = 1 / 30
@@ -38,12 +38,10 @@ def run_web(options: Options, where: Address) -> int:
 
 
 async def _serve(options: Options, where: Address) -> None:
-    stop, loop = asyncio.Event(), asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
-            loop.add_signal_handler(number, stop.set)
+    stop = asyncio.Event()
+    call_on(asyncio.get_running_loop(), stop.set, "SIGINT", "SIGTERM", "SIGHUP")
     token, model = Token(), WebModel(str(options.address), options.imu_units)
-    hub = PageHub(model, token, lambda position, said: start_tare(options.address, position, said))
+    hub = PageHub(model, token, partial(start_tare, options.address))
     reader = Reader(options.address, model, POINTS_S)
     async with WebServer(hub, model).serving(*where) as port:
         sys.stdout.write(

@@ -94,9 +94,13 @@ class WebServer:
             await page.close(_TRY_AGAIN_LATER, TOO_MANY)
             return
         self._send_state()
+        self._send_kept(page)
         try:
             async for text in page:
+                sensor = viewer.sensor
                 reply = self._hub.hear(page, text)
+                if viewer.sensor != sensor:
+                    self._send_kept(page)
                 if viewer.end:
                     await page.close(_POLICY_VIOLATION, viewer.end)
                 elif reply is not None:
@@ -115,6 +119,10 @@ class WebServer:
     def _send_state(self) -> None:
         for pages, text in self._hub.states(self._clock()):
             broadcast(pages, text)
+
+    def _send_kept(self, page: ServerConnection) -> None:
+        for batch in self._hub.kept(page):
+            broadcast([page], batch)
 
     def _send_points(self) -> None:
         for pages, batch in self._hub.points(self._clock()):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Final, NamedTuple
 
+from clients.monitor.tare import WAYS
 from clients.monitor.web.access import Token
 from protocol.errors import BadMessageError
 from protocol.sensor_choice import MOST_PLACES
@@ -27,7 +28,7 @@ class Wish(NamedTuple):
     """What a page asks for."""
 
     action: str
-    """`tare` or `reset`."""
+    """`reset`, or one of WAYS to tare."""
     sensor: int
 
 
@@ -85,7 +86,7 @@ class Viewer:
         action = message.get("do")
         if action is None:
             return None
-        if action not in {"tare", "reset"}:
+        if not isinstance(action, str) or action not in {"reset", *WAYS}:
             self.end = "Not a message of this page"
             return None
         if not self.control:

@@ -42,7 +42,7 @@ def render(examinations: Sequence[Examination], *, made: str, program: str, note
     """The whole page. `made` is the time, `program` what made it; `note` is a remark of the user's."""
     views = [_view(examination, f"s{number}") for number, examination in enumerate(examinations)]
     first = examinations[0].subject
-    several = f"{len(views)} sensors" if len(views) > 1 else f"{first.name}, serial {first.serial}"
+    several = f"{len(views)} sensors" if len(views) > 1 else first.who
     return _PAGE.get_template("report.html").render(
         title=f"Sensor report: {several}",
         made=made,
@@ -62,7 +62,7 @@ def _view(examination: Examination, name: str) -> dict[str, Any]:
     cutoffs = plots.cutoffs(series)
     return {
         **vars(examination),
-        "name": f"Sensor {subject.position}: {subject.name}, serial {subject.serial}",
+        "name": f"Sensor {subject.position}: {subject.who}",
         "checks": sorted(examination.checks, key=lambda check: -check.level),
         "recorded": f"{moment(int(stamps[0]))} to {moment(int(stamps[-1]))}"
         if len(stamps)

@@ -13,6 +13,7 @@ from typing import Any, Final
 from clients.recording.columns import Columns
 from protocol.errors import SettingError
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor
+from protocol.text.untrusted import whole
 from protocol.text.visible import printable
 
 _LONGEST_TEXT: Final = 80
@@ -26,7 +27,7 @@ class Subject:
 
     position: int
     name: str
-    serial: str
+    serial: int | None
     hardware: str
     firmware: str
     rate_hz: float
@@ -40,6 +41,11 @@ class Subject:
     """Of the samples on arrival; None from a recording, or another machine."""
     remarks: tuple[str, ...] = ()
     """Sentences about the recording for the reader of the report."""
+
+    @property
+    def who(self) -> str:
+        """Name and serial number."""
+        return f"{self.name}, serial {_text(self.serial)}"
 
     @property
     def sinc_length(self) -> int | None:
@@ -89,7 +95,7 @@ def subject(
     return Subject(
         position=position,
         name=_text(description.get("name")),
-        serial=_text(description.get("serial")),
+        serial=whole(description.get("serial")),
         hardware=_text(description.get("hardware")),
         firmware=_text(description.get("firmware")),
         rate_hz=_rate(description.get("rate_hz")),

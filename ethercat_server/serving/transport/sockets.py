@@ -19,10 +19,14 @@ _SEND_BUFFER: Final = 65536
 """Small, so that a client that reads on after a pause gets recent samples, not seconds of old ones."""
 
 
+_EXCLUSIVE: Final = getattr(socket, "SO_EXCLUSIVEADDRUSE", socket.SO_REUSEADDR)
+"""On Windows the second would share a port with another program; here it takes one in TIME_WAIT."""
+
+
 class SocketStream:
     """An accepted TCP connection."""
 
-    def __init__(self, sock: socket.socket, diagnostics: socket.socket) -> None:
+    def __init__(self, sock: socket.socket, diagnostics: socket.socket | None) -> None:
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
@@ -37,7 +41,7 @@ class SocketStream:
 
     def peer_uid(self) -> int | None:
         """See `Stream`."""
-        return peer_uid(self._diagnostics, self._sock)
+        return None if self._diagnostics is None else peer_uid(self._diagnostics, self._sock)
 
     def end_sending(self) -> None:
         """See `Stream`."""
@@ -52,7 +56,7 @@ class SocketTransport:
         """Bind at once, so that a port in use is found before the bus is touched; ServerError then."""
         self.port = port
         self._listeners = {listener.fileno(): listener for listener in listen(hosts, port)}
-        self._diagnostics = open_diagnostics()
+        self._diagnostics = open_diagnostics() if hasattr(socket, "AF_NETLINK") else None
 
     def listening(self) -> Sequence[int]:
         """See `Transport`."""
@@ -82,7 +86,8 @@ class SocketTransport:
     def close(self) -> None:
         """See `Transport`."""
         self.stop_listening()
-        self._diagnostics.close()
+        if self._diagnostics is not None:
+            self._diagnostics.close()
 
 
 def _peer(sock: socket.socket) -> str:
@@ -104,7 +109,7 @@ def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
             listener = socket.socket(family, socket.SOCK_STREAM)
         except OSError:
             continue  # no IPv6 on this machine
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.setsockopt(socket.SOL_SOCKET, _EXCLUSIVE, 1)
         if family == socket.AF_INET6:  # IPv4 has a listener of its own
             listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
         try:

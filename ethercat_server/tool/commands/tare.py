@@ -14,8 +14,8 @@ from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.commands.settings import UNSAVED
 from ethercat_server.tool.show import columns, report
-from ethercat_server.tool.tare_memory import Tared, recall, remember
 from protocol.control import ACTIONS, MAX_TARE_SAMPLES
+from protocol.program.tare_memory import Tared, recall, remember
 
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _UNSAVED: Final = UNSAVED.replace("--save, or the command save,", "the command save")

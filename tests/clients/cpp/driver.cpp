@@ -3,6 +3,7 @@
 //   new [OPTION=VALUE ...]    another client; the one before is gone
 //   moved                     the same client, moved to another place and back
 //   connect MS | reconnect | close | latest [POSITION] | peek [POSITION] | next MS | collect COUNT MS | follow COUNT HZ [POSITION]
+//   server [HOST:PORT]        which one a program uses that is given this, or nothing
 //   info [POSITION] | ask REQUEST | describe | status | tare SAMPLES FX FY FZ MX MY MZ
 //
 // Built with ASan, whose hook counts what `latest` and `next` allocate.
@@ -192,6 +193,15 @@ int main(int argc, char** argv) {
             maybe_client.emplace(options);
             maybe_control.emplace(options.host, options.port);
             allocated = received = called = 0;
+            continue;
+        }
+        if (command == "server") {
+            std::string given;
+            words >> given;
+            Options options;
+            const bool ok = choose_server(given.empty() ? nullptr : given.c_str(), options);
+            std::printf("[%s,%s,%u]\n", yes(ok), quoted(options.host.c_str()).c_str(), unsigned{options.port});
+            std::fflush(stdout);
             continue;
         }
         if (!maybe_client) return 2;

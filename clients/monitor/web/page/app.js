@@ -175,8 +175,9 @@ byId("tare").addEventListener("click", () => {
   byId("ask").showModal();
 });
 byId("ask").addEventListener("click", ({ target }) => {
-  if (target.value === "yes") link.send({ do: "tare", sensor: Number(byId("ask").dataset.sensor) });
-  if (target.value) byId("ask").close();
+  if (!target.value) return;
+  if (target.value !== "no") link.send({ do: target.value, sensor: Number(byId("ask").dataset.sensor) });
+  byId("ask").close();
 });
 
 // The token comes behind the # of the link, which no request carries, and does not stay in the address.

@@ -1,4 +1,4 @@
-"""What `tare` changed last in each sensor, for `tare --undo`: a file of this user's, by serial number.
+"""What a tare changed last in each sensor, so that it can be undone: a file of this user's, by serial number.
 
 $XDG_STATE_HOME/bota-ethercat-bridge/tares.json, or below ~/.local/state.
 """

@@ -1,0 +1,78 @@
+"""`--print-completion`: every program's script, in a shell that completes with it."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import subprocess
+import sys
+from typing import Final
+
+import pytest
+
+from tests.ended import run_here
+from tests.test_programs import PROGRAMS
+
+pytest.importorskip("shtab", reason="shtab is missing: pip install shtab")
+
+COMPLETED: Final = {
+    "ethercat-server --s": ["--set", "--stall-timeout"],
+    "ethercat-server --set fi": ["fir=true", "fir=false"],
+    "ethercat-server lo 12001 --conf": ["--config"],
+    "ethercat-doctor virt": ["virtual"],
+    "ethercat-sensor ta": ["tare"],
+    "ethercat-sensor tare --un": ["--undo"],
+    "ethercat-sensor tare virt": ["virtual"],
+    "ethercat-sensor plan lo --set acceleration_r": [f"acceleration_range_g={g}" for g in (2, 4, 8, 16)],
+    "ethercat-virtual-sensor --pdo 7": ["77"],
+    "ethercat-monitor --on": ["--once"],
+    "ethercat-export pyproj": ["pyproject.toml"],
+    "ethercat-report --output pyproj": ["pyproject.toml"],
+    "ethercat-record --server ": [],
+}
+COMPLETE: Final = """
+complete_line() {
+    local COMP_WORDS=($1) COMPREPLY=()
+    [[ $1 != *" " ]] || COMP_WORDS+=("")
+    local COMP_CWORD=$((${#COMP_WORDS[@]} - 1))
+    "_shtab_${COMP_WORDS[0]//-/_}" 2>/dev/null
+    echo "${COMPREPLY[@]}"
+}
+"""
+
+
+def printed(name: str, shell: str) -> str:
+    package, _, entry = PROGRAMS[name].partition(":")
+    started: list[str] = []
+    module = importlib.import_module(package)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "run", started.append)
+        getattr(module, entry)()
+    ended = run_here(importlib.import_module(started[0]).main, "--print-completion", shell)
+    assert ended.code == 0, ended.err
+    return ended.out
+
+
+def test_a_shell_completes_with_what_is_printed() -> None:
+    if (bash := shutil.which("bash")) is None:
+        pytest.skip("bash is missing")
+    lines = "\n".join(f"complete_line {line!r}" for line in COMPLETED)
+    script = "\n".join(printed(name, "bash") for name in PROGRAMS) + COMPLETE + lines
+    done = subprocess.run([bash, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    found = dict(zip(COMPLETED, map(str.split, done.stdout.splitlines()), strict=True))
+    assert found == COMPLETED
+
+
+def test_zsh_has_interfaces_settings_and_files() -> None:
+    text = printed("ethercat-sensor", "zsh")
+    assert "_net_interfaces" in text
+    assert "fir=true" in text
+    assert "_files" in text
+
+
+def test_without_shtab_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    ended = run_here(importlib.import_module("clients.monitor.cli").main, "--print-completion", "bash")
+    assert ended.code == 1
+    assert ended.err.endswith(f"shtab is not installed: {sys.executable} -m pip install shtab\n")

@@ -1,0 +1,51 @@
+"""What scripts/environment says while it installs, and what the demo needs no more of."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).parent.parent
+PIP: Final = """
+echo 'Collecting numpy<3,>=1.26 (from bota)'; echo '  Downloading https://example.org/numpy-2.4.whl (6.6 kB)'
+until [ -e "$1/seen" ]; do sleep 0.02; done
+"""
+
+
+def run(script: str, folder: Path) -> tuple[int, str]:
+    source = f'source "{ROOT}/scripts/environment"; filling={folder} every=0.05\n'
+    done = subprocess.run(
+        ["bash", "-c", source + script, "demo", folder], capture_output=True, text=True, check=False
+    )
+    return done.returncode, done.stderr
+
+
+def test_it_says_what_it_installs_how_much_of_it_and_how_long(tmp_path: Path) -> None:
+    (tmp_path / "pip").write_text(PIP)
+    script = """
+about=295
+say() { printf '%s\n' "$*" >&2; [[ $* != *numpy* ]] || touch "$filling/seen"; }
+quietly bash "$1/pip" "$1"
+"""
+    code, said = run(script, tmp_path)
+    assert code == 0
+    line = said.splitlines()[-1]
+    assert re.fullmatch(rf"\d+ s, \d+ of about 295 MB in {tmp_path} \(numpy\)", line), said
+
+
+def test_what_failed_is_shown(tmp_path: Path) -> None:
+    script = "quietly bash -c 'echo out; echo no space left >&2; exit 3' || fail 'see above'"
+    code, said = run(script, tmp_path)
+    assert (code, said) == (1, "out\nno space left\ndemo: see above\n")
+
+
+def test_the_demo_needs_no_tools_of_developers() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    (asked,) = re.findall(r"^make_owners_environment (\S+)", (ROOT / "scripts/demo").read_text(), re.M)
+    names = {re.split(r"[\[=<>]", line)[0] for extra in asked.split(",") for line in extras[extra]}
+    assert names == {"ros-rclpy", "ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "numpy", "rich"}
+    sizes = (ROOT / "scripts/environment").read_text()
+    assert all(f"    {extra}) echo" in sizes for extra in extras if extra != "tools")
