@@ -29,7 +29,7 @@ _IDLE_MS = 10
 _FRAMES_PER_TURN = 64
 _FIRST_HALF_NS: Final = 10_000.0
 _STEP: Final = 0.003
-"""The lower quartile of half the time to an answer is followed by this part of it: a quick exchange counts."""
+"""The lower quartile of half the time to an answer is followed in steps of this part of it."""
 
 
 class LinkError(Exception):

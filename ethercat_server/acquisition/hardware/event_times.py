@@ -21,7 +21,7 @@ _SLACK_NS: Final = 5_000
 """A controller may note the two by so much differently."""
 _PASSING: Final = 0.5
 """What that counts as a contradiction."""
-_LEAST_VARIANCE: Final = 2_000.0**2
+_LEAST_VARIANCE: Final = 3_000.0**2
 _ASYMMETRY: Final = 1 / 24
 """Standard deviation of the outward part of a round trip, as part of the shortest one."""
 

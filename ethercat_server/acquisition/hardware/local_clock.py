@@ -31,8 +31,8 @@ _CONTRADICTS: Final = 5.0
 _CONTRADICTIONS: Final = 3
 """Blocks in a row that are off by more than so many standard deviations: the clock has jumped."""
 _PULL_GAIN: Final = 0.15
-_PULLED: Final = 1.2
-_RATE_STEP: Final = 100e-6
+_PULLED: Final = 1.0
+_RATE_STEP: Final = 50e-6
 """If the errors have a mean of so many standard deviations, the rate has changed: by about so much."""
 _KNOWN_NS: Final = 10_000.0
 _KNOWN: Final = 1 / 32
