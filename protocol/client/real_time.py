@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import os
-import resource
+import sys
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -46,6 +46,8 @@ def make_real_time(priority: int, cpu: int = -1, *, thread: int = 0) -> Scheduli
     another thread of this process: its `threading.Thread.native_id`. Threads that the thread starts later
     inherit its priority and CPU.
     """
+    if sys.platform != "linux":
+        return Scheduling(refused=("real-time scheduling (there is one on Linux only)",))
     refused = []
     if cpu >= 0:
         try:
@@ -69,6 +71,8 @@ def make_real_time(priority: int, cpu: int = -1, *, thread: int = 0) -> Scheduli
 
 
 def _grants_priority(priority: int) -> str:
+    import resource  # noqa: PLC0415 - not on all systems
+
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     if limit >= priority or limit == resource.RLIM_INFINITY:
         return "a container, a control group or RestrictRealtime= forbids it"
@@ -77,6 +81,8 @@ def _grants_priority(priority: int) -> str:
 
 def _lock_memory() -> bool:
     """Whether it is locked. Not up to a limit: beyond it every allocation would fail."""
+    import resource  # noqa: PLC0415 - not on all systems
+
     hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
     if hard != resource.RLIM_INFINITY and not _may_lock_all():
         return False

@@ -21,7 +21,11 @@ DOCS = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()
 def test_every_option_is_described(program: object, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         program.parse_options(["--help"])  # type: ignore[attr-defined]
-    options = set(re.findall(r"--[a-z][a-z-]+", capsys.readouterr().out)) - {"--help", "--version"}
+    options = set(re.findall(r"--[a-z][a-z-]+", capsys.readouterr().out)) - {
+        "--help",
+        "--version",
+        "--print-completion",
+    }
     assert len(options) > 5
     assert not {option for option in options if f"`{option}" not in DOCS}
 

@@ -7,6 +7,7 @@ event belongs to is certain: it came after the frame before, which did not bring
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 from ethercat_server.acquisition.hardware.local_clock import LocalClock
@@ -19,6 +20,10 @@ _HALF: Final = 1 << 31
 _LONG_AGO: Final = -(1 << 63)
 _SLACK_NS: Final = 5_000
 """A controller may note the two by so much differently."""
+_OUTLIER: Final = 5.0
+"""An instant that is off by more than so many standard deviations is not used."""
+_OLDEST: Final = 1.5
+"""A sensor whose newest event is older, in periods, has made samples without events."""
 _PASSING: Final = 0.5
 """What that counts as a contradiction."""
 _LEAST_VARIANCE: Final = 3_000.0**2
@@ -27,11 +32,11 @@ _ASYMMETRY: Final = 1 / 24
 
 
 class EventTimes:
-    """Of one sensor. `took` follows every exchange; one that brought a new sample, `judge` or `compare`."""
+    """Of one sensor. `took` follows every exchange; one that brought a new sample, `date` or `compare`."""
 
     __slots__ = (
         "_answers", "_event", "_half_behind_ns", "_is_passing", "_local", "_moved", "_offset", "_reading_ns",
-        "_timing", "_took_ns", "instant_ns", "local_clock", "trust",
+        "_timing", "_took_ns", "instant_ns", "is_doubtful", "local_clock", "trust",
     )  # fmt: skip
 
     def __init__(self, clock: DistributedClock, timing: ExchangeTiming) -> None:
@@ -48,6 +53,8 @@ class EventTimes:
         """Local times of the newest exchange and of the newest sample's event."""
         self._took_ns = 0
         """By the newest exchange."""
+        self.is_doubtful = False
+        """Whether samples may have been lost that nobody knows of, though it is dated."""
         self._is_passing = False
         """Whether that event came while the frame passed: it may be this sample's or the next one's."""
         self._moved = 0
@@ -88,23 +95,34 @@ class EventTimes:
             self._took_ns = back_ns - sent_ns
         self._is_passing = local < event < local + self._reading_ns
 
-    def judge(self, difference_ns: float, variance: float, back_ns: int) -> bool:
-        """Whether the new sample is dated by `instant_ns`: to be asked for each, while they are trusted.
+    def date(
+        self, expected_ns: float, period_ns: float, variance: float, sent_ns: int, back_ns: int
+    ) -> float | None:
+        """By how many periods `instant_ns` is later than expected; None if the new sample has another instant.
 
-        That is so much later than the estimate expects, which has this variance; the exchange was back at
-        `back_ns`.
+        To be asked for each new sample while they are trusted. `variance` is that of `expected_ns`.
         """
-        trust = self.trust
-        if self.instant_ns and trust.keeps(difference_ns, variance + self.variance, self._took_ns / 2):
-            return True
-        if not self.instant_ns:
+        trust, late = self.trust, 0.0
+        if self.instant_ns:
+            late = (self.instant_ns - expected_ns) / period_ns
+            off_ns = abs(late - round(late) if late > -0.5 else late) * period_ns
+            doubt_ns = _OUTLIER * math.sqrt(variance + self.variance)
+            self.is_doubtful = off_ns > doubt_ns or doubt_ns > period_ns / 2
+            is_old = sent_ns - self.instant_ns > _OLDEST * period_ns
+            # So far a jump of the local clock would show in the round trip: it is the sensor's that changed.
+            if not is_old and not doubt_ns < off_ns < self._took_ns / 2:
+                trust.confirmed()
+                return late
+            trust.contradicted(not is_old)
+        else:
             trust.contradicted(_PASSING if self._is_passing else 1.0)
         trust.reconsider(self._evidence, back_ns)
-        return False
+        return None
 
     def compare(self, difference_ns: float, variance: float, back_ns: int) -> float:
-        """Try them on the new sample: as `judge`, while they are not trusted.
+        """Try them on the new sample: by polling, with this variance, it came so much before `instant_ns`.
 
+        To be called for each new sample while they are not trusted; the exchange was back at `back_ns`.
         Returns the variance of the differences once they are trusted from here on, else 0.
         """
         trust = self.trust

@@ -17,8 +17,6 @@ _FITTING: Final = 0.95
 """Part of them whose events must lie between the frames around the sample."""
 _CONTRADICTS: Final = 3.0
 """Off by more than so many standard deviations in the mean, they are wrong."""
-_OUTLIER: Final = 5.0
-"""Once they are trusted, one that is off by so many is not used."""
 _MOST_FAILURES: Final = 5
 """After so many event times are not used any more."""
 _PROVEN_NS: Final = 60_000_000_000
@@ -66,21 +64,13 @@ class Trust:
         self._compared = self._unfit = 0
         self._sum_ns = self._squares = 0.0
 
-    def keeps(self, difference_ns: float, variance: float, jump_ns: float) -> bool:
-        """Whether a sample is dated by its event, so far from the estimate, which has this variance.
-
-        If it is further than `jump_ns` the sensor's own clock has changed: so far a jump of the local clock
-        would show in the round trip.
-        """
-        if not _OUTLIER * math.sqrt(variance) < abs(difference_ns) < jump_ns:
-            if self._contradictions > 0:
-                self._contradictions -= _FORGET
-            return True
-        self._contradictions += 1
-        return False
+    def confirmed(self) -> None:
+        """A sample is dated by its event."""
+        if self._contradictions > 0:
+            self._contradictions -= _FORGET
 
     def contradicted(self, weight: float) -> None:
-        """A sample has no event that can be its own."""
+        """A sample has no event that can be its own, or that agrees with the sensor's clock."""
         self._contradictions += weight
 
     def reconsider(self, evidence: Evidence, now_ns: int) -> None:

@@ -203,11 +203,9 @@ class SampleClock:
         self.uncertain = False
         events, self._by_event = self.events, 0.0
         if events is not None and events.are_trusted:
-            at_ns = events.instant_ns - least_ns / 2 if events.instant_ns else phase_ns
-            late = (at_ns - phase_ns) / period_ns
-            off = late - round(late) if late > -0.5 else late
-            if events.judge(off * period_ns, self.estimate.variance, back_ns):
-                self._by_event = at_ns
+            late = events.date(phase_ns + least_ns / 2, period_ns, self.estimate.variance, sent_ns, back_ns)
+            if late is not None:
+                self._by_event, self.uncertain = events.instant_ns - least_ns / 2, events.is_doubtful
                 self._count(1 + round(late), late)
                 self.instant_ns = min(events.instant_ns, back_ns)
                 return
@@ -266,10 +264,10 @@ class SampleClock:
         elif fresh:
             if self._newest != 1:
                 estimate.advance(self._newest - 1)
-            if self.uncertain:
-                pass  # it may be another sample's
-            elif self._by_event and self.events is not None:
+            if self._by_event and self.events is not None:
                 estimate.learn_instant(self._by_event, self.events.variance)
+            elif self.uncertain:
+                pass  # it may be another sample's
             elif self.locked and not (looked_ns > estimate.phase_ns and self._is_late(looked_ns, variance)):
                 estimate.learn_bit(look_ns, variance, 1)
             elif look_ns - looked_ns < estimate.period_ns:
