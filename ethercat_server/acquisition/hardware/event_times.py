@@ -98,7 +98,7 @@ class EventTimes:
     def date(
         self, expected_ns: float, period_ns: float, variance: float, sent_ns: int, back_ns: int
     ) -> float | None:
-        """By how many periods `instant_ns` is later than expected; None if the new sample has another instant.
+        """By how many periods `instant_ns` is later than expected; None if it does not date the sample.
 
         To be asked for each new sample while they are trusted. `variance` is that of `expected_ns`.
         """
