@@ -199,7 +199,7 @@ def _clock(s: Snapshot, findings: list[health.Finding], *, is_silent: bool) -> S
     else:
         verdict.add_all(findings)
     values: Values = {
-        name: clock.get(name, "") for name in ("mode", "period_us", "offset_ppm", "uncertainty_us")
+        name: clock.get(name, "") for name in ("mode", "stamps", "period_us", "offset_ppm", "uncertainty_us")
     }
     return verdict.status("clock", "locked to the sensor's clock", values)
 
