@@ -14,6 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from protocol.client import Client
 from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import PORT, Chain, Setup, chain, recording, start_server, virtual_bus
 from scripts.benchmarks.statistics import Arrivals, Ints
@@ -46,13 +47,7 @@ def measure_tcp(setup: Setup, ifname: str, loops: int, priority: int) -> dict[st
         how = ("--port", PORT, "--rt-priority", priority)
         running.start_recorder(path, "scripts.benchmarks.processes.client", *arguments, *how)
         start_loops(running, loops)
-        usage = running.record(path)
-        status = link.ask("status")
-        link.close()
-        running.stop()
-        figures = _figures(running, path)
-    figures["hand_out_us"] = status["sensors"][0]["age_us"]
-    return {**figures, **usage}
+        return _figures(running, link, path)
 
 
 def measure_ros(setup: Setup, ifname: str, loops: int, priority: int) -> dict[str, Any]:
@@ -66,23 +61,22 @@ def measure_ros(setup: Setup, ifname: str, loops: int, priority: int) -> dict[st
         how = ("--wrench", "--rt-priority", priority)
         running.start_recorder(path, "scripts.benchmarks.processes.subscriber", *arguments, *how, _WRENCH)
         start_loops(running, loops)
-        usage = running.record(path)
-        status = link.ask("status")
-        link.close()
-        running.stop()
-        figures = _figures(running, path)
-    figures["hand_out_us"] = status["sensors"][0]["age_us"]
-    return {**figures, **usage}
+        return _figures(running, link, path)
 
 
-def _figures(running: Chain, path: Path) -> dict[str, Any]:
-    """What was recorded, after `stop`; also without the samples that were on their way during a stall."""
+def _figures(running: Chain, link: Client, path: Path) -> dict[str, Any]:
+    """What is recorded; also without the samples that were on their way during a stall."""
+    usage = running.record(path)
+    status = link.ask("status")
+    link.close()
+    running.stop()
     figures, _ = running.figures(path)
     (arrivals,) = statistics.read_arrivals(path)
     outside = ~in_stalls(arrivals, running.stops())
     figures["age_outside_stalls_us"] = statistics.spread_us(statistics.ages(arrivals)[outside])
     figures["outside_stalls"] = int(np.count_nonzero(outside))
-    return figures
+    figures["hand_out_us"] = status["sensors"][0]["age_us"]
+    return {**figures, **usage}
 
 
 def in_stalls(arrivals: Arrivals, stalls: Ints) -> NDArray[np.bool_]:
