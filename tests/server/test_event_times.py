@@ -127,7 +127,8 @@ EVERY_WRONG = [(name, since_s) for name in WRONG for since_s in (0.0, LIES_FROM_
 @pytest.mark.parametrize(
     ("name", "since_s"), more_if_long(EVERY_WRONG[1::4] + EVERY_WRONG[2::4], EVERY_WRONG)
 )
-def test_wrong_event_times_are_refused_and_polling_goes_on(name: str, since_s: float) -> None:
+def test_wrong_event_times_are_refused_and_polling_goes_on(wrong: tuple[str, float]) -> None:
+    name, since_s = wrong
     simulation = run(replace(WRONG[name], lies_from_s=since_s), seconds=8.0)
     assert verdict(simulation) is Verdict.REFUSED
     assert REASONS.get(name, "they ") in why(simulation)
