@@ -124,9 +124,7 @@ REASONS = {
 EVERY_WRONG = [(name, since_s) for name in WRONG for since_s in (0.0, LIES_FROM_S)]
 
 
-@pytest.mark.parametrize(
-    ("name", "since_s"), more_if_long(EVERY_WRONG[1::4] + EVERY_WRONG[2::4], EVERY_WRONG)
-)
+@pytest.mark.parametrize("wrong", more_if_long(EVERY_WRONG[1::4] + EVERY_WRONG[2::4], EVERY_WRONG), ids=str)
 def test_wrong_event_times_are_refused_and_polling_goes_on(wrong: tuple[str, float]) -> None:
     name, since_s = wrong
     simulation = run(replace(WRONG[name], lies_from_s=since_s), seconds=8.0)
