@@ -179,6 +179,7 @@ class SensorStream:
 
     def status(self) -> dict[str, Any]:
         """The sensor's part of the `status` reply, but for the age."""
+        clock = self.clock
         return {
             "sensor": self.number,
             "fresh": self.fresh,
@@ -187,7 +188,13 @@ class SensorStream:
             "lost_samples": self.lost_samples,
             "not_finite": self.health.not_finite,
             "recoveries": self.recoveries,
-            "clock": self.clock.describe(),
+            "clock": {
+                "mode": "locked" if clock.locked else "oversampling",
+                "stamps": "hardware" if clock.by_events else "polling",
+                "period_us": clock.period_ns / 1000,
+                "offset_ppm": round((1 / (1 + clock.estimate.pull) - 1) * 1e6, 1),
+                "uncertainty_us": round(clock.uncertainty_ns / 1000, 1) if clock.locked else None,
+            },
         }
 
 

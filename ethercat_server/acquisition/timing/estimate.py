@@ -49,8 +49,8 @@ class Estimate:
     """Of one clock. Times in ns, variances in ns²."""
 
     __slots__ = (
-        "_contradictions", "_covariance", "_jitter", "_nominal_ns", "_period_variance", "_pull", "_restless",
-        "_run", "_wander", "period_ns", "phase_ns", "variance",
+        "_contradictions", "_covariance", "_jitter", "_nominal_ns", "_period_variance", "_pull", "_run",
+        "_wander", "period_ns", "phase_ns", "restless", "variance",
     )  # fmt: skip
 
     def __init__(self, period_ns: float) -> None:
@@ -67,7 +67,7 @@ class Estimate:
         self._jitter = _JITTER_NS**2
         self._wander = (_WANDER * period_ns) ** 2
         """Variances that phase and period gain with each sample."""
-        self._restless = 0.0
+        self.restless = 0.0
         """Logarithm of how much more the clock wanders than a crystal: a program that sleeps does."""
         self._run = 0.0
         """Negative log-likelihood of the looks since the last that was early."""
@@ -134,7 +134,7 @@ class Estimate:
             # That a look was late says nothing of how late: it pulls, but makes nothing more certain.
             self._run += surprise
             if self._run > _UNLIKELY_RUN:
-                self._restless += _RESTLESS_STEP
+                self.restless += _RESTLESS_STEP
         else:
             self._run = 0.0
             self._narrow(slope * slope + slope * late / deviation_ns)
@@ -159,11 +159,11 @@ class Estimate:
 
     def _stir(self, excess: float) -> None:
         """Something was more surprising than the model has it, by so much."""
-        restless = self._restless + _RESTLESS_GAIN * excess
-        if restless > 0 or self._restless > 0:
-            self._restless = min(max(restless, 0.0), _MOST_RESTLESS)
-            self._jitter = math.exp(self._restless) * _JITTER_NS**2
-            self._wander = math.exp(_RESTLESS_RATE * self._restless) * (_WANDER * self._nominal_ns) ** 2
+        restless = self.restless + _RESTLESS_GAIN * excess
+        if restless > 0 or self.restless > 0:
+            self.restless = min(max(restless, 0.0), _MOST_RESTLESS)
+            self._jitter = math.exp(self.restless) * _JITTER_NS**2
+            self._wander = math.exp(_RESTLESS_RATE * self.restless) * (_WANDER * self._nominal_ns) ** 2
 
     def _move(self, weight: float) -> None:
         self.phase_ns += self.variance * weight

@@ -8,7 +8,7 @@ machine stood still, leaves it as it is: it holds over, and its uncertainty grow
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Final
 
 from ethercat_server.acquisition.hardware.event_times import EventTimes
 from ethercat_server.acquisition.timing.estimate import CERTAIN, CONTRADICTS, Estimate
@@ -54,7 +54,7 @@ class SampleClock:
 
     __slots__ = (
         "_absent", "_aim_ns", "_begun", "_by_event", "_caution", "_doubtful", "_hits",
-        "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_newest", "_nominal_ns", "_overdue",
+        "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_newest", "_overdue",
         "_probed_above", "_probing", "_single", "_timing", "_turn", "_usual_margin_ns", "estimate", "events",
         "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
     )  # fmt: skip
@@ -62,7 +62,6 @@ class SampleClock:
     def __init__(self, period_ns: float, timing: ExchangeTiming, events: EventTimes | None = None) -> None:
         """`period_ns` is the nominal sample period; `timing` that of the bus."""
         self.events = events
-        self._nominal_ns = period_ns
         self.estimate = Estimate(period_ns)
         """Its phase is the next sample's instant less the outward part of the shortest round trip."""
         self._timing = timing
@@ -127,16 +126,6 @@ class SampleClock:
     def one_by_one(self) -> bool:
         """Whether it is followed, and an exchange is back before the next one is wanted."""
         return self.locked and not self._single
-
-    def describe(self) -> dict[str, Any]:
-        """What `status` says of it."""
-        return {
-            "mode": "locked" if self.locked else "oversampling",
-            "stamps": "hardware" if self.by_events else "polling",
-            "period_us": self.period_ns / 1000,
-            "offset_ppm": round((self._nominal_ns / self.period_ns - 1) * 1e6, 1),
-            "uncertainty_us": round(self.uncertainty_ns / 1000, 1) if self.locked else None,
-        }
 
     # -- when to poll
 
@@ -246,6 +235,11 @@ class SampleClock:
         elif late > _EARLY:
             self.steps += self._absent  # those that did not come are missing, too
 
+    @property
+    def _goes_on(self) -> bool:
+        """Whether the new sample is the expected one, after another one that was."""
+        return self.steps == self._newest == 1 and not (self.uncertain or self._doubtful or self._overdue)
+
     def _is_late(self, look_ns: float, variance: float) -> bool:
         """Whether the sample that is expected should have been there at a look."""
         estimate = self.estimate
@@ -254,6 +248,15 @@ class SampleClock:
     def observe(self, sent_ns: int, back_ns: int, fresh: bool) -> None:
         """Learn from one valid exchange whether it brought a new sample (`fresh`: after `predict`)."""
         estimate = self.estimate
+        if self._turn > 0 and fresh and self._by_event and self._goes_on and not estimate.restless:
+            # A steady clock need not be learned from every sample.
+            self._turn -= 1
+            self._hits += 1
+            self._looked_ns = sent_ns
+            estimate.phase_ns += estimate.period_ns
+            self._aim_ns += estimate.period_ns
+            self.quiet_until_ns += estimate.period_ns
+            return
         look_ns, variance = self._timing.look(sent_ns, back_ns)
         looked_ns, self._looked_ns = self._looked_ns, sent_ns
         if not self._begun:
