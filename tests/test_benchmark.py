@@ -368,7 +368,7 @@ def test_a_run_with_ros_and_two_sensors(tmp_path: Path) -> None:
     content = json.loads((tmp_path / "b.json").read_text())
     assert all(map(math.isfinite, numbers(content)))
     one, two = content["configurations"]
-    assert two["polling"] is None
+    assert "polling" not in two
     for figures in (one["project"]["ros"], two["project"]["ros"], one["polling"]["ros"]):
         assert figures["made"] > 1
         assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"]

@@ -161,12 +161,12 @@ class Bus:
             return False
         position = self._damaged_at()
         intact = self._escs[:position]
-        start = self.now
         for esc in intact:
-            esc.clock.frame_start = start
+            esc.clock.frame_start = now
         for datagram in datagrams:
             if datagram.command:  # a NOP passes unchanged
-                self.now = start + (datagram.header - wire.FRAME_HEADER) * _BYTE_NS
+                # Frames of a simulated wire may overlap.
+                self.now = max(self.now, now + (datagram.header - wire.FRAME_HEADER) * _BYTE_NS)
                 pass_through(intact, frame, datagram)
         if position is not None:  # the network card of the master throws it away
             self.frames_lost += 1

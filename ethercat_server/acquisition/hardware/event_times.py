@@ -54,7 +54,7 @@ class EventTimes:
         self._took_ns = 0
         """By the newest exchange."""
         self.is_doubtful = False
-        """Whether samples may have been lost that nobody knows of, though it is dated."""
+        """Whether samples may have been lost before it that nobody knows of."""
         self._is_passing = False
         """Whether that event came while the frame passed: it may be this sample's or the next one's."""
         self._moved = 0
@@ -76,7 +76,7 @@ class EventTimes:
 
         `fresh`: it brought a new sample. Exchanges come in the order in which they were sent.
         """
-        self.instant_ns, self._is_passing = 0.0, False
+        self.instant_ns, self._is_passing, self.is_doubtful = 0.0, False, False
         system, counted, _, change, counted_too = latched
         self._answers = counted == counted_too == 1
         if not self._answers:
@@ -116,6 +116,7 @@ class EventTimes:
             trust.contradicted(not is_old)
         else:
             trust.contradicted(_PASSING if self._is_passing else 1.0)
+        self.is_doubtful = not self._is_passing
         trust.reconsider(self._evidence, back_ns)
         return None
 

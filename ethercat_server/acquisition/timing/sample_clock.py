@@ -41,8 +41,8 @@ _LONGEST_LOOK: Final = 0.5
 """The sensor looks at its data within this part of a period after the frame usually has reached it."""
 _EARLY: Final = -0.25
 """A sample so much before the expected one, in periods, is the one that was watched for before."""
-_ONE_ONLY: Final = 0.8
-"""Only one sample can have come in this part of a period."""
+_ONE_ONLY, _MISSABLE = 0.8, 1.25
+"""Only one sample can have come in this part of a period; more may have in this."""
 
 
 class SampleClock:
@@ -164,8 +164,7 @@ class SampleClock:
             self._single = has_no_time_for_two(timing, period_ns)
             self._usual_margin_ns = margin_ns(timing, period_ns, variance, by_events=self.by_events)
             self._probed_above = (timing.look_variance + _PROBE_BELOW) / 4
-        steady = self._single or self.by_events
-        self._margin_ns = self._usual_margin_ns if steady else self._usual_margin_ns * self._caution
+        self._margin_ns = self._usual_margin_ns * (1.0 if self._single or self.by_events else self._caution)
         self._probing = self._hits > _UNPROBED or (variance > self._probed_above and not self.by_events)
         self._aim_ns = estimate.phase_ns + self._margin_ns - timing.look_ns
         if self._probing and not self._single and self.by_events:
@@ -215,7 +214,8 @@ class SampleClock:
                 doubt_ns += least_ns / 4  # the outward part of a short round trip varies, too
             least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
-            self.uncertain = self._doubtful or (most > 0 and least < most)
+            lost_track = events is not None and events.is_doubtful and unwatched_ns > _MISSABLE * period_ns
+            self.uncertain = self._doubtful or lost_track or (most > 0 and least < most)
         self._count(newest, late)
         instant_ns = max(phase_ns + (self._newest - 1) * period_ns, looked_ns) + least_ns / 2
         # After a stall in the exchange its end says nothing of when the sample came to be.
