@@ -19,13 +19,13 @@ _WRAP: Final = 1 << 32
 _HALF: Final = 1 << 31
 _LONG_AGO: Final = -(1 << 63)
 _SLACK_NS: Final = 5_000
-"""A controller may note the two by so much differently."""
+"""Tolerance between the latched times of an event and of a frame's arrival."""
 _OUTLIER: Final = 5.0
-"""An instant that is off by more than so many standard deviations is not used."""
+"""Standard deviations from the estimate beyond which an instant is not used."""
 _OLDEST: Final = 1.5
-"""A sensor whose newest event is older, in periods, has made samples without events."""
+"""Age of the newest event, in periods, beyond which samples have come without events."""
 _PASSING: Final = 0.5
-"""What that counts as a contradiction."""
+"""Weight, as a contradiction, of an event that came while the frame passed."""
 _LEAST_VARIANCE: Final = 3_000.0**2
 _ASYMMETRY: Final = 1 / 24
 """Standard deviation of the outward part of a round trip, as part of the shortest one."""
@@ -109,7 +109,8 @@ class EventTimes:
             doubt_ns = _OUTLIER * math.sqrt(variance + self.variance)
             self.is_doubtful = off_ns > doubt_ns or doubt_ns > period_ns / 2
             is_old = sent_ns - self.instant_ns > _OLDEST * period_ns
-            # So far a jump of the local clock would show in the round trip: it is the sensor's that changed.
+            # A jump of the local clock by more than half a round trip is noticed by `fits`: a larger
+            # difference means that the sensor's own sampling clock has changed.
             if not is_old and not doubt_ns < off_ns < self._took_ns / 2:
                 trust.confirmed()
                 return late

@@ -29,17 +29,17 @@ _DRIFT: Final = 1.7e-23
 """Variance that the rate gains in each ns: 1 ppm in a minute."""
 _CONTRADICTS: Final = 5.0
 _CONTRADICTIONS: Final = 3
-"""Blocks in a row that are off by more than so many standard deviations: the clock has jumped."""
+"""Consecutive blocks beyond `_CONTRADICTS` standard deviations after which the clock has jumped."""
 _PULL_GAIN: Final = 0.15
 _PULLED: Final = 1.0
 _RATE_STEP: Final = 50e-6
-"""If the errors have a mean of so many standard deviations, the rate has changed: by about so much."""
+"""The rate has changed by about this once the mean error exceeds `_PULLED` standard deviations."""
 _KNOWN_NS: Final = 10_000.0
 _KNOWN: Final = 1 / 32
 _KNOWN_BLOCKS: Final = 12
 _STILL: Final = 5
-"""It is known once its standard deviation is less than one of these, the second as part of the shortest round
-trip, after so many blocks; and still while it is less than so many times that."""
+"""The clock is known after `_KNOWN_BLOCKS` blocks, once its standard deviation is below `_KNOWN_NS` or the
+part `_KNOWN` of the shortest round trip, and until it exceeds that `_STILL` times."""
 
 
 class LocalClock:
@@ -96,7 +96,7 @@ class LocalClock:
             self._block = self._left = min(_BLOCK, self._block + _FIRST_BLOCK)
             excess_ns = self._best_took_ns - self._timing.least_ns
             self._best_took_ns = math.inf
-            # The slave was somewhere within the excess, and ever on the same side perhaps.
+            # Where within the excess the slave was is unknown, and the bias may be the same every time.
             self._learn(excess_ns * excess_ns / 4 + _LEAST_VARIANCE)
 
     def fits(self, sent_ns: int, back_ns: int) -> bool:

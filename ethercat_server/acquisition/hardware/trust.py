@@ -12,20 +12,20 @@ from typing import Final, NamedTuple
 
 _SAMPLES: Final = 100
 _TRIAL_NS: Final = 500_000_000
-"""A trial takes so many samples and so long."""
+"""Minimum samples and duration of a trial."""
 _FITTING: Final = 0.95
 """Part of them whose events must lie between the frames around the sample."""
 _CONTRADICTS: Final = 3.0
-"""Off by more than so many standard deviations in the mean, they are wrong."""
+"""Standard deviations by which the mean difference from polling may deviate."""
 _MOST_FAILURES: Final = 5
-"""After so many event times are not used any more."""
+"""Failed trials after which event times are not used any more."""
 _PROVEN_NS: Final = 60_000_000_000
-"""Trusted for so long, they have a clean record."""
+"""Time trusted after which earlier failures are forgotten."""
 _RESTARTS: Final = 3
-"""A local clock that starts anew so often in a trial is none."""
+"""Restarts of the local clock in one trial beyond which it counts as not running."""
 _MOST_CONTRADICTIONS: Final = 4.0
 _FORGET: Final = 1 / 32
-"""The trust ends with so many, of which each sample that fits takes back this part of one."""
+"""Contradictions at which the trust ends; each sample that fits takes `_FORGET` back."""
 
 
 class Verdict(Enum):
