@@ -148,7 +148,7 @@ class Controller:
                     event_ns += random.Random(number).gauss(0, self.jitter_ns)
                 change = 0 if self.stuck else self.local(event_ns)
         wrap = 1 << 32
-        return self.local(look_ns) % wrap, self.counter, change % wrap, change % wrap, self.counter
+        return self.local(look_ns) % wrap, self.counter, change % wrap, self.counter
 
 
 class Sample(NamedTuple):
@@ -282,8 +282,8 @@ class ClockSimulation:
         self._flying.append(Exchange(sent_ns, self._last_back_ns, number, latched))
 
     def _take(self, exchange: Exchange) -> None:
-        clock, sent, back, number = self.clock, int(exchange.sent_ns), int(self.now_ns), exchange.number
-        self.timing.took(sent, back)
+        clock, number = self.clock, exchange.number
+        sent, arrived, back = int(exchange.sent_ns), int(exchange.back_ns), int(self.now_ns)
         fresh = number > (self.samples[-1].number if self.samples else -1)
         if clock.events is not None and exchange.latched is not None:
             clock.events.took(exchange.latched, sent, back, fresh)
@@ -291,7 +291,10 @@ class ClockSimulation:
             clock.predict(sent, back)
             told = clock.uncertainty_ns, clock.locked, clock.steps, clock.uncertain
             self.samples.append(Sample(number, self.instants_ns[number], back, clock.instant_ns, *told))
-        clock.observe(sent, back, fresh)
+        self.timing.took(sent, arrived)
+        clock.observe(sent, arrived, fresh)
+        if clock.events is not None and exchange.latched is not None:
+            clock.events.learn(sent, arrived)
         if not clock.locked:
             self.unlocked_ns.append(back)
 

@@ -229,6 +229,7 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     content = {
         "date": "2026-11-23T01:02:03",
         "machine": machine,
+        "idle_states": True,
         "stolen_percent": 0.5,
         "configurations": [RESULT],
     }
@@ -324,12 +325,13 @@ def test_what_was_measured_is_shown_and_written(tmp_path: Path, monkeypatch: pyt
     files = ("--json", str(tmp_path / "b.json"), "--plot", str(tmp_path / "b.png"))
     shown = io.StringIO()
     options = benchmark.parse([*files, "--no-ros", "--rates", "800", "--sensors", "1", "--rt-priority", "0"])
-    benchmark.run(options, Console(file=shown, width=100))
+    benchmark.run(options, Console(file=shown, width=100), idle_states=True)
     content = json.loads((tmp_path / "b.json").read_text())
     (result,) = content["configurations"]
     assert all(map(math.isfinite, numbers(content)))
     assert (result["rate_hz"], result["sensors"]) == (800, 1)
     assert result["polling"]["tcp"]["made"] == 100
+    assert content["idle_states"]
     assert "Up to a TCP client" in shown.getvalue()
     assert (tmp_path / "b.png").exists() == (find_spec("matplotlib") is not None)
 
@@ -410,7 +412,7 @@ def test_a_short_run(tmp_path: Path) -> None:
 def test_it_can_be_stopped(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made, measuring = tmp_path / "made", threading.Event()
 
-    def measure(*_: object) -> None:
+    def measure(*_: object, **__: object) -> None:
         made.mkdir()
         measuring.set()
         time.sleep(PATIENCE_S)

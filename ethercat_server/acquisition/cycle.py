@@ -2,8 +2,8 @@
 
 The schedule says when that is, as an absolute time on CLOCK_MONOTONIC; answers are handed out whenever they
 arrive, so that a slow network card has several exchanges on their way. One thread does everything, and
-`_step`, `_receive` and `_hand_out` are all of the hot path outside `SensorStream.take` and
-`Connection.offer`.
+`_step`, `_receive`, `_hand_out` and `_learn` are all of the hot path outside `SensorStream.take`, its `learn`
+and `Connection.offer`.
 """
 
 from __future__ import annotations
@@ -202,16 +202,24 @@ class Cycle:
         back = bus.clock.monotonic_ns()
         if frame is None or not (sent := bus.process_data.take(frame)):
             return frame
-        self._timing.took(sent, back)
-        self._exchange.record(back - sent)
-        if (
-            late := back - sent - self._timing.usual_ns
-        ) > self._schedule.shortest_ns:  # the computer stood still
-            self._missed_deadlines += int(late // self._schedule.shortest_ns)
         self._hand_out(sent, back)
+        self._learn(sent, back)
         if len(self._streams) > 1:
             self._schedule.cost(bus.clock.monotonic_ns() - back)
         return None
+
+    def _learn(self, sent: int, back: int) -> None:
+        """Learn from the exchange that was taken last, once its samples are on their way."""
+        timing, arrived = self._timing, self._bus.backend.arrived_ns()
+        if not sent < arrived < back:  # the kernel does not say, or CLOCK_REALTIME was set
+            arrived = back
+        if (late := back - sent - timing.usual_ns) > self._schedule.shortest_ns:  # the computer stood still
+            self._missed_deadlines += int(late // self._schedule.shortest_ns)
+        timing.took(sent, arrived)
+        self._exchange.record(back - sent)
+        for stream in self._streams_of[self._bus.process_data.which]:
+            if stream.learns:
+                stream.learn(arrived)
 
     def _hand_out(self, sent: int, back: int) -> None:
         """Hand out what the exchange that was taken last brought."""
@@ -231,9 +239,6 @@ class Cycle:
                 new.append((made[0], number, made[1]))
         if new:
             self._hub.publish(new, back)
-        for stream in self._streams_of[which]:
-            if stream.learns:
-                stream.learn()
 
     def _roll(self) -> None:
         """Once a second."""

@@ -110,15 +110,21 @@ class SensorStream:
         self._moment_ns = moment_ns
         return self._frame(moment_ns, flags, wkc)
 
-    def learn(self) -> None:
-        """What the last exchange teaches, which can wait until its frame is on its way."""
+    def learn(self, arrived_ns: int) -> None:
+        """What the last exchange teaches, which can wait until its frame is on its way.
+
+        `arrived_ns` is when the kernel had it, up to `back_ns`.
+        """
         self.learns = False
         sent_ns, back_ns, fresh = self._seen
-        locked = self.clock.locked
-        self.clock.observe(sent_ns, back_ns, fresh)
+        clock = self.clock
+        locked, events = clock.locked, clock.events
+        clock.observe(sent_ns, arrived_ns, fresh)
+        if events is not None:
+            events.learn(sent_ns, arrived_ns)
         if fresh:
             if locked:
-                self.age.record(back_ns - int(self.clock.instant_ns))
+                self.age.record(back_ns - int(clock.instant_ns))
             if self._handed_out is self.process_data and not is_finite(self.process_data):
                 self.health.not_finite += 1
 

@@ -90,3 +90,7 @@ class Backend(Protocol):
     def receive(self, timeout_s: float, /) -> bytes | None:
         """The next EtherCAT frame from any sender; None if none arrives within `timeout_s`."""
         ...
+
+    def arrived_ns(self) -> int:
+        """CLOCK_MONOTONIC when the frame that was received last had arrived; 0 or wrong if unknown."""
+        ...

@@ -7,13 +7,19 @@ those it receives.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import select
 import socket
 import stat
+import struct
+import time
 from typing import Final
 
 _LONGEST_FRAME: Final = 1514
+_SIOCGSTAMPNS: Final = 0x80108907
+_TIMESPEC: Final = struct.Struct("=qq")
+_NS: Final = 1_000_000_000
 
 
 class RawSocket:
@@ -43,6 +49,10 @@ class RawSocket:
             return None
         return None
 
+    def arrived_ns(self) -> int:
+        """When the frame that was received last had arrived; see `arrived_ns`."""
+        return arrived_ns(self._fd)
+
     def discard(self) -> None:
         """Discard the frames that have arrived."""
         while self.receive(0) is not None:
@@ -51,6 +61,19 @@ class RawSocket:
     def close(self) -> None:
         """Close this handle."""
         self._socket.close()
+
+
+def arrived_ns(fd: int) -> int:
+    """CLOCK_MONOTONIC when the packet that was received last from the socket `fd` had arrived.
+
+    0 if the kernel does not say, as at the first call, which has it stamp packets. The stamp is in
+    CLOCK_REALTIME: it is wrong if that was set in between.
+    """
+    try:
+        seconds, ns = _TIMESPEC.unpack(fcntl.ioctl(fd, _SIOCGSTAMPNS, bytes(_TIMESPEC.size)))
+    except OSError:
+        return 0
+    return time.monotonic_ns() - time.time_ns() + int(seconds * _NS + ns)
 
 
 def packet_sockets() -> set[int]:

@@ -28,6 +28,7 @@ class MemoryBackend:
         self._on_the_wire: list[tuple[int, int, bytes]] = []
         self._sent = 0
         self._last_arrival_ns = 0
+        self._arrived_ns = 0
 
     def command(self, line: str) -> str:
         """Do what a fault command of the virtual sensor says, now; returns its answer."""
@@ -73,7 +74,12 @@ class MemoryBackend:
         if self._on_the_wire and self._on_the_wire[0][0] <= until_ns:
             arrives_ns, _, frame = heapq.heappop(self._on_the_wire)
             clock.advance(arrives_ns)
+            self._arrived_ns = arrives_ns
             return frame
         if timeout_s > 0:  # a look does not go to sleep
             clock.wake_at(until_ns)
         return None
+
+    def arrived_ns(self) -> int:
+        """See `Backend`."""
+        return self._arrived_ns

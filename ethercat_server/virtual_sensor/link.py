@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Final, TextIO
 
 from ethercat_server.ethercat.nic.interface import look_up
+from ethercat_server.ethercat.raw_socket import arrived_ns
 from ethercat_server.ethercat.wire import ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.control import CommandChannel
@@ -27,9 +28,12 @@ LONGEST_NAME: Final = 15
 _BUFFER = 2048
 _IDLE_MS = 10
 _FRAMES_PER_TURN = 64
-_FIRST_HALF_NS: Final = 10_000.0
-_STEP: Final = 0.003
-"""The lower quartile of half the time to an answer is followed in steps of this part of it."""
+_FIRST_HALF_NS: Final = 20_000.0
+_LONGEST_WAIT_NS: Final = 100_000_000
+_STEP: Final = 0.001
+_QUICK: Final = 1 / 16
+"""Half the time that an answer takes is followed in steps of `_STEP`, as this part of the quickest has it:
+by those a master knows the time that its frames take."""
 
 
 class LinkError(Exception):
@@ -147,15 +151,17 @@ class _Answers:
     def waiting(self) -> bool:
         """Answer a bounded number of waiting frames; False if the interface is down."""
         raw, bus, buffer = self._raw, self._bus, self._buffer
-        view = memoryview(buffer)
+        view, descriptor = memoryview(buffer), raw.fileno()
         for _ in range(_FRAMES_PER_TURN):
             try:
                 size = raw.recv_into(buffer)
-                arrived = time.monotonic_ns()
-                if bus.process(buffer, size, arrived + int(self._half_ns)):
-                    half_ns = (time.monotonic_ns() - arrived) / 2
+                arrived, now = arrived_ns(descriptor), time.monotonic_ns()
+                if not now - _LONGEST_WAIT_NS < arrived < now:
+                    arrived = now
+                if bus.process(buffer, size, (arrived + now) // 2 + int(self._half_ns)):
+                    half_ns = (time.monotonic_ns() - now) / 2
                     raw.send(view[:size])
-                    self._half_ns *= 1 + _STEP if half_ns > self._half_ns else 1 - 3 * _STEP
+                    self._half_ns *= 1 + _STEP if half_ns > self._half_ns else 1 - _STEP / _QUICK
             except BlockingIOError:
                 bus.prepare()
                 return True

@@ -23,6 +23,7 @@ from rich.console import Console
 from ethercat_server.errors import ServerError
 from scripts.benchmarks.chain import OVERSAMPLING_HZ, Setup, cpu_of_machine, stolen_percent
 from scripts.benchmarks.comparison import Compared, Progress, measure
+from scripts.benchmarks.idle_states import no_idle_states
 from scripts.benchmarks.modes import cards
 from scripts.benchmarks.modes.cpp import measure_cpp
 from scripts.benchmarks.modes.load import measure_load
@@ -89,9 +90,16 @@ def _measure_one(
     return {}
 
 
-def run(options: argparse.Namespace, console: Console) -> None:
-    """Measure, show, write. DemoError or Stopped end it early."""
+def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> None:
+    """Measure, show, write. DemoError or Stopped end it early.
+
+    `idle_states`: idle CPUs may halt meanwhile.
+    """
     loopback_up()
+    if idle_states:
+        console.print(
+            "idle CPUs may halt (no access to /dev/cpu_dma_latency): samples are older than as root"
+        )
     os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:MOST_CPUS]))
     priority = options.rt_priority
     if priority and not may_be_real_time():
@@ -106,7 +114,7 @@ def run(options: argparse.Namespace, console: Console) -> None:
         return Setup(rate, sensors, seconds, warm_up_s=1.0, priority=priority, ppm=options.ppm)
 
     if found := _measure_one(options, setup, console):
-        write_json(options.json, options, priority, **found)
+        write_json(options.json, options, priority, idle_states=idle_states, **found)
         print(f"written: {options.json}")
         return
     wanted = [setup(rate, sensors) for rate in options.rates for sensors in options.sensors]
@@ -122,7 +130,13 @@ def run(options: argparse.Namespace, console: Console) -> None:
         print_configuration(result, console)
     stolen = stolen_percent(machine)
     content = write_json(
-        options.json, options, priority, seconds=seconds, stolen_percent=stolen, configurations=results
+        options.json,
+        options,
+        priority,
+        idle_states=idle_states,
+        seconds=seconds,
+        stolen_percent=stolen,
+        configurations=results,
     )
     written = str(options.json)
     try:
@@ -233,7 +247,8 @@ def main() -> int:
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
         options = parse()
-        run(options, Console(width=max(Console().width, _WIDTH)))
+        with no_idle_states() as held:
+            run(options, Console(width=max(Console().width, _WIDTH)), idle_states=not held)
     except Stopped:
         print("stopped; nothing is written", file=sys.stderr)
         return 130

@@ -70,11 +70,11 @@ def simulate(
         data, now = life.inputs(), sent + _EXCHANGE_NS
         valid = not (script.lost_frames and chance.random() < script.lost_frames)
         timing.sends(sent)
+        made = stream.take(data, 3, sent, now) if valid else None
         if valid:
             timing.took(sent, now)
-        made = stream.take(data, 3, sent, now) if valid else None
         if stream.learns:
-            stream.learn()
+            stream.learn(now)
         if made is None and now >= stream.idle_at_ns:
             made = stream.idle(now)
         if made is not None:

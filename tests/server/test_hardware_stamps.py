@@ -129,9 +129,9 @@ def test_frames_carry_the_latched_times_of_the_sensors_in_them(count: int, lrw: 
                 assert inputs.latched == 0
                 continue
             first = datagrams[inputs.latched]
-            second = datagrams[inputs.latched + LATCHED.size - 10]
+            second = datagrams[inputs.latched + LATCHED.size - 6]
             assert (first.adp, first.ado, first.length) == (station, reg.DC_SYSTEM_TIME, 4)
-            assert (second.adp, second.ado, second.length) == (station, reg.DC_PDI_START_EVENT, 8)
+            assert (second.adp, second.ado, second.length) == (station, reg.DC_PDI_CHANGE_EVENT, 4)
             assert len(latched_datagrams(station)) == 2
 
 

@@ -47,6 +47,22 @@ def test_frames_go_both_ways_and_none_is_none(ends: tuple[socket.socket, socket.
         assert raw.receive(0) is None
 
 
+def test_the_kernel_says_when_a_frame_had_arrived(ends: tuple[socket.socket, socket.socket, Veth]) -> None:
+    near, far, _ = ends
+    with contextlib.closing(RawSocket(near.fileno())) as raw:
+        raw.arrived_ns()  # from now on
+        right = False
+        for _ in range(50):  # it is early if this process stops while it reads two clocks
+            before = time.monotonic_ns()
+            far.send(FRAME)
+            after = time.monotonic_ns()
+            time.sleep(0.002)  # in which it lies there
+            assert raw.receive(LONG_S) == FRAME
+            assert raw.arrived_ns() < after
+            right |= before < raw.arrived_ns()
+        assert right
+
+
 def test_waiting_leaves_the_processor_to_others(ends: tuple[socket.socket, socket.socket, Veth]) -> None:
     near, _, _ = ends
     with contextlib.closing(RawSocket(near.fileno())) as raw:

@@ -27,10 +27,10 @@ class Feeder:
         self.sample += new
         data = self.sample.to_bytes(61, "little")
         self.timing.sends(self.now - took_ns)
-        self.timing.took(self.now - took_ns, self.now)
         made = self.stream.take(data, 3, self.now - took_ns, self.now) if valid else None
+        self.timing.took(self.now - took_ns, self.now)
         if self.stream.learns:
-            self.stream.learn()
+            self.stream.learn(self.now)
         if made is None and self.now >= self.stream.idle_at_ns:
             made = self.stream.idle(self.now)
         if made is None:

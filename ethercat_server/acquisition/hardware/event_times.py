@@ -32,17 +32,20 @@ _ASYMMETRY: Final = 1 / 24
 
 
 class EventTimes:
-    """Of one sensor. `took` follows every exchange; one that brought a new sample, `date` or `compare`."""
+    """Of one sensor. `took` follows every exchange; then, if it brought a new sample, `date` or `compare`;
+    then `learn`."""
 
     __slots__ = (
         "_answers", "_event", "_half_behind_ns", "_is_passing", "_local", "_moved", "_offset", "_reading_ns",
-        "_timing", "_took_ns", "instant_ns", "is_doubtful", "local_clock", "trust",
+        "_timing", "_took_ns", "are_trusted", "instant_ns", "is_doubtful", "local_clock", "trust",
     )  # fmt: skip
 
     def __init__(self, clock: DistributedClock, timing: ExchangeTiming) -> None:
         """`clock` is the slave controller's; `timing` that of the bus."""
         self.local_clock = LocalClock(timing)
         self.trust = Trust()
+        self.are_trusted = False
+        """Whether samples are dated by them."""
         self.instant_ns = 0.0
         """CLOCK_MONOTONIC of the new sample of the newest exchange; 0 if its event does not say."""
         self._timing = timing
@@ -66,24 +69,18 @@ class EventTimes:
         """Of `instant_ns`, in ns², but for where on its way a round trip takes its time."""
         return self.local_clock.variance + _LEAST_VARIANCE
 
-    @property
-    def are_trusted(self) -> bool:
-        """Whether samples are dated by them."""
-        return self.trust.verdict is Verdict.TRUSTED
-
     def took(self, latched: Latched, sent_ns: int, back_ns: int, fresh: bool) -> None:
         """Take what was latched when a frame passed that was sent and back then.
 
         `fresh`: it brought a new sample. Exchanges come in the order in which they were sent.
         """
         self.instant_ns, self._is_passing, self.is_doubtful = 0.0, False, False
-        system, counted, _, change, counted_too = latched
+        system, counted, change, counted_too = latched
         self._answers = counted == counted_too == 1
         if not self._answers:
             return
         clock = self.local_clock
-        clock.saw((system - self._offset) % _WRAP, sent_ns, back_ns)
-        before, local = self._local, clock.local
+        before, local = self._local, clock.follow((system - self._offset) % _WRAP, back_ns)
         self._local = local
         if not fresh:
             return
@@ -94,6 +91,11 @@ class EventTimes:
             self.instant_ns = clock.time(event) - self._half_behind_ns
             self._took_ns = back_ns - sent_ns
         self._is_passing = local < event < local + self._reading_ns
+
+    def learn(self, sent_ns: int, arrived_ns: int) -> None:
+        """Learn from the exchange that `took` was about: it was sent and had arrived then."""
+        if self._answers:
+            self.local_clock.learn(sent_ns, arrived_ns)
 
     def date(
         self, expected_ns: float, period_ns: float, variance: float, sent_ns: int, back_ns: int
@@ -119,6 +121,7 @@ class EventTimes:
             trust.contradicted(_PASSING if self._is_passing else 1.0)
         self.is_doubtful = not self._is_passing
         trust.reconsider(self._evidence, back_ns)
+        self.are_trusted = trust.verdict is Verdict.TRUSTED
         return None
 
     def compare(self, difference_ns: float, variance: float, back_ns: int) -> float:
@@ -136,7 +139,10 @@ class EventTimes:
             trust.unfit()
         # Polling does not tell where on its way a round trip takes its time.
         asymmetry_ns = _ASYMMETRY * self._timing.least_ns
-        return trust.end(self._evidence, variance + self.variance + asymmetry_ns * asymmetry_ns, back_ns)
+        variance += self.variance + asymmetry_ns * asymmetry_ns
+        found = trust.end(self._evidence, variance, back_ns)
+        self.are_trusted = trust.verdict is Verdict.TRUSTED
+        return found
 
     @property
     def _evidence(self) -> Evidence:

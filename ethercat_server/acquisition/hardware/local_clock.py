@@ -82,12 +82,16 @@ class LocalClock:
         passed = local - self._local_at
         return self._time_at + passed + passed * self.rate
 
-    def saw(self, low: int, sent_ns: int, back_ns: int) -> None:
-        """Take an exchange: the local time modulo 2**32, when it was sent and back. They come in order."""
+    def follow(self, low: int, back_ns: int) -> int:
+        """The local time of an exchange that was back then; `low` is it modulo 2**32. They come in order."""
         passed = low - self._low
         self.local += passed + round((back_ns - self._back_ns - passed) / _WRAP) * _WRAP
         self._low, self._back_ns = low, back_ns
-        took_ns = back_ns - sent_ns
+        return self.local
+
+    def learn(self, sent_ns: int, arrived_ns: int) -> None:
+        """Learn from the exchange that was followed last: it was sent and had arrived then."""
+        took_ns = arrived_ns - sent_ns
         if took_ns < self._best_took_ns:
             self._best_took_ns = took_ns
             self._best_local, self._best_ns = self.local, sent_ns + took_ns / 2
@@ -97,13 +101,13 @@ class LocalClock:
             excess_ns = self._best_took_ns - self._timing.least_ns
             self._best_took_ns = math.inf
             # Where within the excess the slave was is unknown, and the bias may be the same every time.
-            self._learn(excess_ns * excess_ns / 4 + _LEAST_VARIANCE)
+            self._correct(excess_ns * excess_ns / 4 + _LEAST_VARIANCE)
 
     def fits(self, sent_ns: int, back_ns: int) -> bool:
         """Whether the newest exchange agrees with it: else the clock has jumped."""
         return sent_ns - self._doubt_ns < self.time(self.local) < back_ns + self._doubt_ns
 
-    def _learn(self, variance: float) -> None:
+    def _correct(self, variance: float) -> None:
         """The best exchange of a block, with the variance of when its frame was at the slave."""
         if not self._blocks:
             self._blocks = 1

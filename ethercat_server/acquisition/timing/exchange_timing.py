@@ -1,7 +1,8 @@
 """How long exchanges take on this bus and how late this machine wakes, measured all the time.
 
-The shortest recent round trip is what the wire, the slaves and the network card need at least. What an
-exchange took beyond it was spent somewhere on its way, before the slaves looked at their data or after.
+A round trip ends when the answer has arrived, not when this machine wakes over it. The shortest recent one is
+what the wire, the slaves and the network card need at least. What an exchange took beyond it was spent
+somewhere on its way, before the slaves looked at their data or after.
 """
 
 from __future__ import annotations
@@ -76,14 +77,14 @@ class ExchangeTiming:
             self.unanswered_since_ns = now_ns
         self.unanswered += 1
 
-    def took(self, sent_ns: int, back_ns: int) -> None:
-        """An exchange is back."""
-        took_ns = back_ns - sent_ns
+    def took(self, sent_ns: int, arrived_ns: int) -> None:
+        """An exchange is back: the answer had arrived then."""
+        took_ns = arrived_ns - sent_ns
         if sent_ns >= self.sent_ns:
             self.in_flight = False
         self.unanswered = 0
-        if back_ns >= self._roll_at_ns:
-            self._roll_at_ns = back_ns + _WINDOW_NS
+        if arrived_ns >= self._roll_at_ns:
+            self._roll_at_ns = arrived_ns + _WINDOW_NS
             if self._least_now_ns < math.inf:
                 self.least_ns = self._least_now_ns
             self._least_now_ns = math.inf
@@ -107,12 +108,12 @@ class ExchangeTiming:
         self.late_ns += _GAIN * error
         self._late_variance += _GAIN * (error * error - self._late_variance)
 
-    def look(self, sent_ns: int, back_ns: int) -> tuple[float, float]:
+    def look(self, sent_ns: int, arrived_ns: int) -> tuple[float, float]:
         """When the slaves looked at their data in an exchange, less the outward part of the shortest one.
 
         Returns the instant and its variance.
         """
-        excess_ns = back_ns - sent_ns - self.least_ns
+        excess_ns = arrived_ns - sent_ns - self.least_ns
         if excess_ns <= 0:
             return sent_ns, 0.0
         return sent_ns + excess_ns / 2, excess_ns * excess_ns / 12

@@ -49,7 +49,8 @@ class SampleClock:
     """The sampling clock of one sensor, as far as the exchanges have shown it. Times are CLOCK_MONOTONIC ns.
 
     Call `observe` after every valid exchange, before it `predict` if that brought a new sample; ask
-    `next_poll_ns` when the next exchange is wanted. Exchanges come in the order in which they were sent.
+    `next_poll_ns` when the next exchange is wanted. Exchanges come in the order in which they were sent. They
+    are back when this program has them, and have arrived when the kernel has.
     """
 
     __slots__ = (
@@ -197,9 +198,7 @@ class SampleClock:
                 self._count(1 + round(late), late)
                 self.instant_ns = min(events.instant_ns, back_ns)
                 return
-        excess_ns = back_ns - sent_ns - least_ns
-        if excess_ns < 0:
-            excess_ns = 0.0
+        excess_ns = max(0.0, back_ns - sent_ns - least_ns)
         # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought is
         # dated from before, never as younger than it may be.
         looked_at_ns = sent_ns + (excess_ns / 2 if excess_ns < _LONGEST_LOOK * period_ns else 0.0)
@@ -245,7 +244,7 @@ class SampleClock:
         estimate = self.estimate
         return look_ns > estimate.phase_ns + CONTRADICTS * math.sqrt(estimate.variance + variance)
 
-    def observe(self, sent_ns: int, back_ns: int, fresh: bool) -> None:
+    def observe(self, sent_ns: int, arrived_ns: int, fresh: bool) -> None:
         """Learn from one valid exchange whether it brought a new sample (`fresh`: after `predict`)."""
         estimate = self.estimate
         if self._turn > 0 and fresh and self._by_event and self._goes_on and not estimate.restless:
@@ -257,7 +256,7 @@ class SampleClock:
             self._aim_ns += estimate.period_ns
             self.quiet_until_ns += estimate.period_ns
             return
-        look_ns, variance = self._timing.look(sent_ns, back_ns)
+        look_ns, variance = self._timing.look(sent_ns, arrived_ns)
         looked_ns, self._looked_ns = self._looked_ns, sent_ns
         if not self._begun:
             # The first exchange brings what was there before: it has no instant.

@@ -21,15 +21,15 @@ _LINKS: Final = 4
 """Bit of the DL status that says whether port 0 has a link."""
 _MOST_BEHIND_NS: Final = 1_000_000
 _WRAP: Final = 1 << 32
-_EVENTS_SIZE: Final = 8
+_TIME_SIZE: Final = 4
 _BYTE_NS: Final = 80
 """At 100 Mbit/s."""
 _SLACK_NS: Final = 10_000
 
-Latched = tuple[int, int, int, int, int]
-"""System time when the frame arrived, a working counter; times of the events PDI buffer start and PDI buffer
-change, a working counter. Local times and system times modulo 2**32 ns."""
-LATCHED: Final = struct.Struct(f"<IH{DATAGRAM_HEADER}xIIH")
+Latched = tuple[int, int, int, int]
+"""System time when the frame arrived, a working counter; local time of the event PDI buffer change, a working
+counter. Both times are modulo 2**32 ns."""
+LATCHED: Final = struct.Struct(f"<IH{DATAGRAM_HEADER}xIH")
 LATCHED_SIZE: Final = DATAGRAM_HEADER + LATCHED.size
 """Bytes in a frame, of two datagrams."""
 
@@ -48,14 +48,14 @@ class DistributedClock(NamedTuple):
 def latched_datagrams(station: int) -> tuple[tuple[int, int, int, bytes], ...]:
     """The datagrams that read `Latched`, for `wire.build`."""
     return (
-        (Command.FPRD, station, reg.DC_SYSTEM_TIME, bytes(4)),
-        (Command.FPRD, station, reg.DC_PDI_START_EVENT, bytes(_EVENTS_SIZE)),
+        (Command.FPRD, station, reg.DC_SYSTEM_TIME, bytes(_TIME_SIZE)),
+        (Command.FPRD, station, reg.DC_PDI_CHANGE_EVENT, bytes(_TIME_SIZE)),
     )
 
 
 def switch_latched(frame: bytearray, at: int, *, reads: bool) -> None:
     """Have a frame read what is latched, to be found at `at`, or not (NOP)."""
-    for data in (at, at + LATCHED.size - COUNTER_SIZE - _EVENTS_SIZE):
+    for data in (at, at + LATCHED.size - COUNTER_SIZE - _TIME_SIZE):
         frame[data - DATAGRAM_HEADER] = Command.FPRD if reads else Command.NOP
 
 

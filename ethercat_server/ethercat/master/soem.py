@@ -102,6 +102,10 @@ class SoemBackend:
         """See `Backend`."""
         return self._socket.receive(timeout_s)
 
+    def arrived_ns(self) -> int:
+        """See `Backend`."""
+        return self._socket.arrived_ns()
+
     def check_present(self) -> None:
         """See `Backend`."""
         check_present(self.ifname, self._ifindex)

@@ -27,9 +27,11 @@ def measured(content: Mapping[str, Any]) -> str:
     """The answer, the table of the first configuration, and one line for each of them."""
     first = content["configurations"][0]
     machine = content["machine"]
+    idle = "with" if content["idle_states"] else "without"
     where = (
         f"{content['date'][:10]}, {machine['cpus_used']} CPUs, Linux {machine['kernel'].split('-')[0]}, "
-        f"Python {machine['python']}; a hypervisor took {content['stolen_percent']} % of the time meanwhile."
+        f"Python {machine['python']}, {idle} idle states; a hypervisor took {content['stolen_percent']} % of "
+        "the time meanwhile."
     )
     return "\n\n".join([answer(first), main_table(first), summary(content["configurations"]), where]) + "\n"
 
