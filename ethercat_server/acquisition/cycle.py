@@ -119,20 +119,19 @@ class Cycle:
             if jobs.waiting:
                 jobs.step(due)
                 due = self._due_ns()
-            now = monotonic_ns()
+            now, slept = monotonic_ns(), False
             if not timing.in_flight:
                 if due > now or now > serve_by:
                     hub.serve(due)
                     serve_by = now + _SERVE_EVERY_NS
                     if (left := due - monotonic_ns()) > 0:  # the outlet had nothing to wait for
                         sleep(left * 1e-9)
-                    if due > now:
-                        self._woke(monotonic_ns() - due)
+                    slept = due > now
             elif now > serve_by:
                 hub.serve(now)
                 serve_by = now + _SERVE_IN_FLIGHT_NS
             self._answered = False
-            self._step(due, (now if timing.in_flight else due) + _SERVE_EVERY_NS)
+            self._step(due, (now if timing.in_flight else due) + _SERVE_EVERY_NS, slept=slept)
             now = monotonic_ns()
             if self._answered:
                 recovery.attend(self._complete, now)
@@ -144,10 +143,6 @@ class Cycle:
             if now >= feed_at:
                 feed_at = now + watchdog.feed_every_ns
                 watchdog.feed()
-
-    def _woke(self, late: int) -> None:
-        self._timing.woke(late)
-        self._wake.record(late)
 
     def _due_ns(self) -> int:
         """When the next exchange is due."""
@@ -167,11 +162,11 @@ class Cycle:
             if not (in_time or self._answered):  # what had arrived by then is taken though this is late
                 return None
 
-    def _step(self, due: int, until_ns: int) -> bytes | None:
+    def _step(self, due: int, until_ns: int, *, slept: bool = False) -> bytes | None:
         """Hand out what arrives until the next exchange is `due`, then send it; return by `until_ns`.
 
         After it is sent its answer is awaited, until yet another one is due. Returns a frame that answers no
-        exchange.
+        exchange. `slept`: the loop has slept until it was due.
         """
         bus, timing, monotonic_ns = self._bus, self._timing, self._bus.clock.monotonic_ns
         frame, now = None, monotonic_ns()
@@ -180,12 +175,14 @@ class Cycle:
             frame = self._receive(wait)
             if self._answered or (now := monotonic_ns()) < due:
                 return frame
-            if wait > 0:
-                self._woke(now - due)
+            slept = slept or wait > 0
         if (late := now - due) > self._schedule.shortest_ns:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
-        timing.sends(bus.process_data.send())
+        timing.sends(sent := bus.process_data.send())
         self._cycles += 1
+        if slept:
+            timing.woke(sent - due)
+            self._wake.record(sent - due)
         for stream in self._streams:
             if now >= stream.idle_at_ns and (made := stream.idle(now)):
                 self._hub.publish(((made[0], stream.number, made[1]),), now)
