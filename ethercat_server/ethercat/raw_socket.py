@@ -73,7 +73,8 @@ def arrived_ns(fd: int) -> int:
         seconds, ns = _TIMESPEC.unpack(fcntl.ioctl(fd, _SIOCGSTAMPNS, bytes(_TIMESPEC.size)))
     except OSError:
         return 0
-    return time.monotonic_ns() - time.time_ns() + int(seconds * _NS + ns)
+    waited = time.time_ns() - int(seconds * _NS + ns)
+    return time.monotonic_ns() - waited  # if anything comes between the two clocks, it is too late
 
 
 def packet_sockets() -> set[int]:
