@@ -41,7 +41,7 @@ def test_samples_are_dated_by_the_slave_controller(caplog: pytest.LogCaptureFixt
     running = simulation("ppm=40+at=4294000000")
     running.run(SETTLED_S)
     assert stamps(running) == "hardware"
-    assert caplog.text.count("the clock of its slave controller dates the samples") == 1
+    assert caplog.text.count("time-stamped by the distributed clock") == 1
     cycles, count = running.status()["cycles"], len(running.frames)
     running.run(1.0)
     errors = errors_ns(running)[count:]
@@ -73,7 +73,7 @@ def test_registers_that_stop_in_operation_cost_no_sample(caplog: pytest.LogCaptu
     running.command("dc stuck")
     running.run(SETTLED_S)
     assert stamps(running) == "polling"
-    assert caplog.text.count("its samples are dated by polling") == 1
+    assert caplog.text.count("its samples are time-stamped by polling") == 1
     status = running.status()["sensors"][0]
     assert (status["lost_samples"], status["invalid"], status["recoveries"]) == (0, 0, 0)
 

@@ -89,19 +89,23 @@ class SampleHealth:
             )  # fmt: skip
 
     def _check_events(self, clock: SampleClock) -> None:
-        """Say once that the slave controller dates the samples, and once that it does not, or no longer."""
+        """Say once whether the slave controller time-stamps the samples, and once if it no longer does."""
         if clock.events is None:
             return
         trust = clock.events.trust
         if trust.verdict is Verdict.TRUSTED:
             if not self._trusted:
-                log.info("sensor %d: the clock of its slave controller dates the samples", self._number)
+                log.info(
+                    "sensor %d: its samples are time-stamped by the distributed clock of its slave "
+                    "controller",
+                    self._number,
+                )
             self._trusted = True
         elif trust.why and not self._distrust_reported:
             self._distrust_reported = True
             log.log(
                 logging.WARNING if self._trusted else logging.INFO,
-                "sensor %d: its samples are dated by polling, for its slave controller's event times are "
-                "unusable: %s",
+                "sensor %d: its samples are time-stamped by polling, for its slave controller's event times "
+                "are unusable: %s",
                 self._number, trust.why,
             )  # fmt: skip
