@@ -29,7 +29,7 @@ from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.control import request
 from protocol.framing import encode_json
 from protocol.pdo import encode
-from scripts.benchmarks import chains, comparison, statistics
+from scripts.benchmarks import chains, comparison, idle_states, statistics
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.chain import Setup
 from scripts.benchmarks.modes.soak import Tally, slope_kb_per_hour
@@ -307,6 +307,19 @@ def test_the_polling_client_takes_what_is_there_when_it_looks(tmp_path: Path) ->
     assert counts.repeated == pytest.approx(counts.made, abs=2)
     assert statistics.ages(found).min() > 0
     assert not found.stamp.any()
+
+
+def test_idle_states_are_off_as_long_as_the_device_is_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = tmp_path / "cpu_dma_latency"
+    monkeypatch.setattr(idle_states, "_LATENCY", device)
+    with idle_states.no_idle_states() as held:
+        assert held
+        assert device.read_bytes() == b"\0\0\0\0"
+    monkeypatch.setattr(idle_states, "_LATENCY", tmp_path / "missing" / "device")
+    with idle_states.no_idle_states() as held:
+        assert not held
 
 
 # -- the thing itself
