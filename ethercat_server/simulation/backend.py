@@ -27,7 +27,7 @@ class MemoryBackend:
         self.sensors = virtual.Bus(BusOptions(slaves or (SensorOptions(),)), self.clock.now_ns)
         self._on_the_wire: list[tuple[int, int, bytes]] = []
         self._sent = 0
-        self._last_arrival_ns = 0
+        self._free_at_ns = 0
         self._arrived_ns = 0
 
     def command(self, line: str) -> str:
@@ -60,13 +60,13 @@ class MemoryBackend:
         outward_ns, round_trip_ns = times
         answer, now_ns = bytearray(frame), self.clock.now_ns
         # On their way out frames queue up: none overtakes another.
-        self._last_arrival_ns = arrives_ns = max(now_ns + outward_ns, self._last_arrival_ns)
+        arrives_ns, passes_ns = max(now_ns + outward_ns, self._free_at_ns), len(frame) * virtual.BYTE_NS
+        self._free_at_ns = arrives_ns + passes_ns
         self.sensors.idle(arrives_ns)  # the watchdogs have run meanwhile
         if self.sensors.process(answer, len(answer), arrives_ns):
             self._sent += 1
-            heapq.heappush(
-                self._on_the_wire, (arrives_ns + round_trip_ns - outward_ns, self._sent, bytes(answer))
-            )
+            back_ns = arrives_ns + max(round_trip_ns - outward_ns, passes_ns)
+            heapq.heappush(self._on_the_wire, (back_ns, self._sent, bytes(answer)))
 
     def receive(self, timeout_s: float) -> bytes | None:
         """See `Backend`."""
