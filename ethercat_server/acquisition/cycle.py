@@ -85,6 +85,8 @@ class Cycle:
         self._missed_deadlines = 0
         self._timing = timing
         self._schedule = Schedule(streams, timing)
+        self._wire_ns = bus.process_data.wire_ns
+        timing.wire_ns = max(self._wire_ns)
         self._round_trip = RoundTripHealth(timing, bus.ifname)
         carried = bus.process_data.inputs
         self._carried = [[(*at, sensors[at.number], streams[at.number]) for at in each] for each in carried]
@@ -210,11 +212,13 @@ class Cycle:
         timing, arrived = self._timing, self._bus.backend.arrived_ns()
         if not sent < arrived < back:  # the kernel does not say, or CLOCK_REALTIME was set
             arrived = back
+        which = self._bus.process_data.which
+        arrived = max(sent, arrived - self._wire_ns[which])
         if (late := back - sent - timing.usual_ns) > self._schedule.shortest_ns:  # the computer stood still
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
         timing.took(sent, arrived)
         self._exchange.record(back - sent)
-        for stream in self._streams_of[self._bus.process_data.which]:
+        for stream in self._streams_of[which]:
             if stream.learns:
                 stream.learn(arrived)
 

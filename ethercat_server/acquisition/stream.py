@@ -64,6 +64,8 @@ class SensorStream:
         self.health = SampleHealth(number)
         self._discard = DISCARDED_AT_START
         self._gap = False
+        self._resuming = 0
+        """Samples until the silence counts as over."""
         self.learns = False
         """Whether `learn` has something to do."""
         self._seen = (0, 0, False)
@@ -136,6 +138,7 @@ class SensorStream:
         """The frame that shows the sensor's silence, and its flags; None before its first sample."""
         if not self.process_data:
             return None
+        self._resuming = 2
         self._discard = 0  # a sensor that is stuck from the start is to be seen too
         self._handed_out = self._handed_out or self.process_data
         period_ns = self.clock.period_ns
@@ -161,6 +164,10 @@ class SensorStream:
         lost = self.clock.steps - 1 if self.sequence else 0
         # -1 takes back one that was counted after a stall but came after all.
         self.lost_samples = max(0, self.lost_samples + lost)
+        if self._resuming:
+            # What ended the silence may have come to be before: one may be missing after it.
+            self._resuming -= 1
+            self._gap |= not self._resuming
         flags = GAP if lost > 0 or self.clock.uncertain or self._gap else 0
         self._gap = False
         return flags

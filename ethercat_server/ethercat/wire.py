@@ -23,6 +23,8 @@ DATAGRAM_INDEX: Final = FRAME_HEADER + 1
 """Offset of the first datagram's index in a frame."""
 FIRST_DATA: Final = FRAME_HEADER + DATAGRAM_HEADER
 """Offset of the first datagram's data."""
+BYTE_NS: Final = 80
+"""What a byte takes at 100 Mbit/s."""
 SHORTEST_FRAME: Final = 60
 """Bytes on Ethernet, without the checksum."""
 PROCESSED_BIT: Final = 0x02

@@ -8,8 +8,10 @@ from __future__ import annotations
 import heapq
 
 from ethercat_server.ethercat.nic.interface import CHECK_CABLE
+from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
 from ethercat_server.virtual_sensor import bus as virtual
+from ethercat_server.virtual_sensor.dc.unit import HOP_NS
 from ethercat_server.virtual_sensor.faults.table import obey
 from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions, SlaveOptions
 
@@ -60,12 +62,13 @@ class MemoryBackend:
         outward_ns, round_trip_ns = times
         answer, now_ns = bytearray(frame), self.clock.now_ns
         # On their way out frames queue up: none overtakes another.
-        arrives_ns, passes_ns = max(now_ns + outward_ns, self._free_at_ns), len(frame) * virtual.BYTE_NS
+        arrives_ns, passes_ns = max(now_ns + outward_ns, self._free_at_ns), len(frame) * BYTE_NS
         self._free_at_ns = arrives_ns + passes_ns
         self.sensors.idle(arrives_ns)  # the watchdogs have run meanwhile
         if self.sensors.process(answer, len(answer), arrives_ns):
             self._sent += 1
-            back_ns = arrives_ns + max(round_trip_ns - outward_ns, passes_ns)
+            hops_ns = 2 * HOP_NS * (len(self.sensors.slaves) - 1)
+            back_ns = arrives_ns + passes_ns + hops_ns + round_trip_ns - outward_ns
             heapq.heappush(self._on_the_wire, (back_ns, self._sent, bytes(answer)))
 
     def receive(self, timeout_s: float) -> bytes | None:

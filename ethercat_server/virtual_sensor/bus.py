@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from ethercat_server.ethercat import wire
-from ethercat_server.virtual_sensor.dc.unit import HOP_NS
 from ethercat_server.virtual_sensor.esc import registers as reg
 from ethercat_server.virtual_sensor.esc.commands import pass_through
 from ethercat_server.virtual_sensor.esc.controller import Esc
@@ -34,8 +33,6 @@ from ethercat_server.virtual_sensor.slave.application import Application
 Slave = VirtualSensor | ForeignSlave
 
 _LONGEST_PERIOD_NS = 50_000_000
-BYTE_NS = 80
-"""At 100 Mbit/s: what a datagram reads is of the moment at which it passes, not of the start of its frame."""
 _FIRST_STATION = 0x1001
 """Where another master begins."""
 
@@ -65,7 +62,7 @@ class Bus:
     def __init__(self, options: BusOptions, now: int) -> None:
         """All slaves are switched on at `now`."""
         self.now = now
-        self.slaves: list[Slave] = [self._made(each, at) for at, each in enumerate(options.slaves)]
+        self.slaves: list[Slave] = [self._made(each) for each in options.slaves]
         self.sensors = [slave for slave in self.slaves if isinstance(slave, VirtualSensor)]
         self.disconnected: set[Slave] = set()
         """Those whose cable at port 0 is unplugged."""
@@ -78,16 +75,13 @@ class Bus:
         self._alive: list[Application] = []
         self._escs: list[Esc] = []
         self._last_frame = 0
-        self._free_at = 0
-        """When the wire is free for the next frame."""
         self.rewire()
         self._leave_behind()
 
-    def _made(self, options: SensorOptions | ForeignOptions, position: int) -> Slave:
-        later = position * HOP_NS
+    def _made(self, options: SensorOptions | ForeignOptions) -> Slave:
         if isinstance(options, ForeignOptions):
-            return ForeignSlave(options, lambda: self.now + later)
-        return VirtualSensor(options, lambda: self.now + later)
+            return ForeignSlave(options, lambda: self.now)
+        return VirtualSensor(options, lambda: self.now)
 
     def _leave_behind(self) -> None:
         """Take slaves to the state of their options as another master does: all outputs, then all inputs."""
@@ -153,8 +147,6 @@ class Bus:
         datagrams = wire.parse(frame, size)
         if not datagrams:
             return False
-        now = max(now, self._free_at)  # a frame waits until the one before is through
-        self._free_at = now + size * BYTE_NS
         self.set_time(now)
         self.frames += 1
         if self.deaf_after is not None:
@@ -171,7 +163,9 @@ class Bus:
             esc.clock.frame_start = now
         for datagram in datagrams:
             if datagram.command:  # a NOP passes unchanged
-                self.now = max(self.now, now + (datagram.header - wire.FRAME_HEADER) * BYTE_NS)
+                # What it reads is of the moment at which it passes, not of the start of its frame. Frames of
+                # a simulated wire may overlap.
+                self.now = max(self.now, now + (datagram.header - wire.FRAME_HEADER) * wire.BYTE_NS)
                 pass_through(intact, frame, datagram)
         if position is not None:  # the network card of the master throws it away
             self.frames_lost += 1

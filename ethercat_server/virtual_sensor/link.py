@@ -17,7 +17,7 @@ from typing import Final, TextIO
 
 from ethercat_server.ethercat.nic.interface import look_up
 from ethercat_server.ethercat.raw_socket import arrived_ns
-from ethercat_server.ethercat.wire import ETHERTYPE
+from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.control import CommandChannel
 from ethercat_server.virtual_sensor.faults.table import QuitCommand
@@ -139,8 +139,8 @@ def _serve(
 class _Answers:
     """Answers the frames that arrive.
 
-    A frame passes the slaves halfway between its arrival and its answer: as on a wire, where slaves take no
-    time, the way out is then as long as the way back.
+    The middle of a frame passes the slaves halfway between its arrival and its answer: as on a wire, where
+    slaves take no time, the way out is then as long as the way back.
     """
 
     def __init__(self, raw: socket.socket, bus: Bus, ifname: str) -> None:
@@ -158,7 +158,8 @@ class _Answers:
                 arrived, now = arrived_ns(descriptor), time.monotonic_ns()
                 if not now - _LONGEST_WAIT_NS < arrived < now:
                     arrived = now
-                if bus.process(buffer, size, (arrived + now) // 2 + int(self._half_ns)):
+                middle = (arrived + now) // 2 + int(self._half_ns)
+                if bus.process(buffer, size, middle - size * BYTE_NS // 2):
                     half_ns = (time.monotonic_ns() - now) / 2
                     raw.send(view[:size])
                     self._half_ns *= 1 + _STEP if half_ns > self._half_ns else 1 - _STEP / _QUICK

@@ -56,9 +56,9 @@ def measure(simulation: Simulation, **values: float) -> None:
         newest, count = sampler.newest, itertools.count()
         last: list[bytes] = [b"", b""]
 
-        def changed() -> bytes:
-            if last[0] != newest():
-                last[:] = newest(), encode(len(newest()), {**values, "torque.z": next(count)})
+        def changed(later: int = 0) -> bytes:
+            if last[0] != newest(later):
+                last[:] = newest(later), encode(len(newest(later)), {**values, "torque.z": next(count)})
             return last[1]
 
         sampler.newest = changed

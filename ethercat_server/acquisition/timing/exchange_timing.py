@@ -1,8 +1,9 @@
 """How long exchanges take on this bus and how late this machine wakes, measured all the time.
 
-A round trip ends when the answer has arrived, not when this machine wakes over it. The shortest recent one is
-what the wire, the slaves and the network card need at least. What an exchange took beyond it was spent
-somewhere on its way, before the slaves looked at their data or after.
+A round trip ends when the answer begins to arrive, as it begins when the frame leaves: neither its length nor
+how late this machine wakes counts. The shortest recent one is what the wire, the slaves and the network card
+need at least. What an exchange took beyond it was spent somewhere on its way, before the slaves looked at
+their data or after.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class ExchangeTiming:
     __slots__ = (
         "_excess_square", "_late_variance", "_least_now_ns", "_most_excess_ns", "_most_late_ns",
         "_roll_at_ns", "_turn", "excess_ns", "in_flight", "late_ns", "least_ns", "look_ns", "look_variance",
-        "patience_ns", "sent_ns", "unanswered", "unanswered_since_ns", "usual_ns", "variance",
+        "patience_ns", "sent_ns", "unanswered", "unanswered_since_ns", "usual_ns", "variance", "wire_ns",
     )  # fmt: skip
 
     def __init__(self, now_ns: int = 0) -> None:
@@ -45,6 +46,8 @@ class ExchangeTiming:
         """When the first of them was sent."""
         self.least_ns = math.inf
         """The shortest recent round trip."""
+        self.wire_ns = 0
+        """What the bytes of the longest frame take on the wire."""
         self.late_ns = 0.0
         """Usual lateness of a wake-up."""
         self.excess_ns = _FIRST_EXCESS_NS
@@ -63,7 +66,8 @@ class ExchangeTiming:
         self.variance = self.look_variance + self._late_variance
         """Of the difference between the instant aimed at and that of the look."""
         least_ns = self.least_ns if self.least_ns < math.inf else _FIRST_GUESS_NS
-        self.usual_ns = least_ns + self.excess_ns
+        self.usual_ns = least_ns + self.excess_ns + self.wire_ns
+        """What an exchange usually takes until its answer is there."""
         self._most_excess_ns = _OUTLIER * math.sqrt(self._excess_square) + _ROOM_NS
         self._most_late_ns = _OUTLIER * math.sqrt(self._late_variance) + _ROOM_NS
         self.patience_ns = self.usual_ns + 3 * self.excess_ns + _PATIENCE_NS
@@ -78,7 +82,7 @@ class ExchangeTiming:
         self.unanswered += 1
 
     def took(self, sent_ns: int, arrived_ns: int) -> None:
-        """An exchange is back: the answer had arrived then."""
+        """An exchange is back: the answer began to arrive then."""
         took_ns = arrived_ns - sent_ns
         if sent_ns >= self.sent_ns:
             self.in_flight = False
@@ -122,6 +126,6 @@ class ExchangeTiming:
         """What `status` says of it."""
         known = self.least_ns < math.inf
         return {
-            "least_us": round(self.least_ns / 1000, 1) if known else None,
+            "least_us": round((self.least_ns + self.wire_ns) / 1000, 1) if known else None,
             "usual_us": round(self.usual_ns / 1000, 1) if known else None,
         }

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 from ethercat_server.ethercat.datagrams import Datagrams
 from ethercat_server.ethercat.slave import registers as reg
-from ethercat_server.ethercat.wire import COUNTER_SIZE, DATAGRAM_HEADER, Command
+from ethercat_server.ethercat.wire import BYTE_NS, COUNTER_SIZE, DATAGRAM_HEADER, Command
 
 _U64_U32: Final = struct.Struct("<QI")
 _PORTS: Final = struct.Struct("<4I")
@@ -22,8 +22,6 @@ _LINKS: Final = 4
 _MOST_BEHIND_NS: Final = 1_000_000
 _WRAP: Final = 1 << 32
 _TIME_SIZE: Final = 4
-_BYTE_NS: Final = 80
-"""At 100 Mbit/s."""
 _SLACK_NS: Final = 10_000
 
 Latched = tuple[int, int, int, int]
@@ -75,7 +73,7 @@ def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
     if data is None:
         return None
     offset, delay = _U64_U32.unpack(data)
-    return DistributedClock((offset - delay) % _WRAP, _behind_ns(bus, number), at * _BYTE_NS + _SLACK_NS)
+    return DistributedClock((offset - delay) % _WRAP, _behind_ns(bus, number), at * BYTE_NS + _SLACK_NS)
 
 
 def _behind_ns(bus: Datagrams, number: int) -> int:

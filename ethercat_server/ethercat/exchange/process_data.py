@@ -9,7 +9,7 @@ from typing import Final
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.exchange.distributed_clock import switch_latched
 from ethercat_server.ethercat.exchange.frames import Area, make_frames
-from ethercat_server.ethercat.wire import DATAGRAM_INDEX, FRAME_HEADER, Command
+from ethercat_server.ethercat.wire import BYTE_NS, DATAGRAM_INDEX, FRAME_HEADER, Command
 
 FIRST_INDEX: Final = 0x90
 """Single datagrams and SOEM use the indices below."""
@@ -38,6 +38,8 @@ class ProcessData:
         frames = make_frames(areas, stations or [None] * len(areas), lrw=lrw)
         self._lrw, self._command = lrw, int(Command.LRW if lrw else Command.LRD)
         self._frames = [frame.content for frame in frames]
+        self.wire_ns = [len(frame.content) * BYTE_NS for frame in frames]
+        """By frame: what its bytes take on the wire."""
         self._ends = [frame.end for frame in frames]
         self._written = [frame.written for frame in frames]
         self._tags = [frame.tag for frame in frames]

@@ -82,7 +82,7 @@ class DistributedClock:
 
     def show_events(self) -> None:
         """The event times are about to be read."""
-        self.events.update(self._clock())
+        self.events.update(self._clock() + self.before * HOP_NS)
 
     def exchanged(self) -> None:
         """This frame has exchanged a buffer whose sync manager latches that."""

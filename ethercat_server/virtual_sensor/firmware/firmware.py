@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ethercat_server.virtual_sensor.dc.kinds import parse_clock
+from ethercat_server.virtual_sensor.dc.unit import HOP_NS
 from ethercat_server.virtual_sensor.faults.aborts import AbortFaults
 from ethercat_server.virtual_sensor.firmware.dictionary import OBJECT_NAMES, Dictionary
 from ethercat_server.virtual_sensor.firmware.flash import Flash
@@ -55,7 +56,7 @@ class Firmware(Application):
 
     def inputs(self) -> bytes:
         """The newest process data."""
-        return self.sampler.newest()
+        return self.sampler.newest(self.esc.clock.before * HOP_NS)
 
     def prepare(self, expected: int) -> None:
         """Compute the sample that a frame at the time `expected` will read."""

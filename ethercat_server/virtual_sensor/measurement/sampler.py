@@ -58,11 +58,11 @@ class Sampler:
         """Instant of a sample: it is in the controller's buffer."""
         return self.clock.instant(number)
 
-    def newest(self) -> bytes:
-        """The newest process data."""
+    def newest(self, later: int = 0) -> bytes:
+        """The newest process data, `later` ns from now."""
         if self._stuck:
             return self._stuck
-        number = self.number_at(self._now())
+        number = self.number_at(self._now() + later)
         if number != self._number:
             if number == self._prepared_number:
                 self._data = self._prepared
