@@ -64,8 +64,9 @@ class SensorStream:
         self.health = SampleHealth(number)
         self._discard = DISCARDED_AT_START
         self._gap = False
-        self._resuming = 0
-        """Samples until the silence counts as over."""
+        self._silent = self._held_back = False
+        """Whether nothing new has come for long; whether what ended that may have been held back: it has no
+        event at that time."""
         self.learns = False
         """Whether `learn` has something to do."""
         self._seen = (0, 0, False)
@@ -138,7 +139,7 @@ class SensorStream:
         """The frame that shows the sensor's silence, and its flags; None before its first sample."""
         if not self.process_data:
             return None
-        self._resuming = 2
+        self._silent = True
         self._discard = 0  # a sensor that is stuck from the start is to be seen too
         self._handed_out = self._handed_out or self.process_data
         period_ns = self.clock.period_ns
@@ -164,12 +165,12 @@ class SensorStream:
         lost = self.clock.steps - 1 if self.sequence else 0
         # -1 takes back one that was counted after a stall but came after all.
         self.lost_samples = max(0, self.lost_samples + lost)
-        if self._resuming:
-            # What ended the silence may have come to be before: one may be missing after it.
-            self._resuming -= 1
-            self._gap |= not self._resuming
-        flags = GAP if lost > 0 or self.clock.uncertain or self._gap else 0
-        self._gap = False
+        # What was held back is dated too young: one may be missing after it.
+        flags = GAP if lost > 0 or self.clock.uncertain or self._gap or self._held_back else 0
+        self._gap = self._held_back = False
+        if self._silent:
+            events, self._silent = self.clock.events, False
+            self._held_back = events is not None and events.has_none
         return flags
 
     def check(self) -> None:

@@ -69,6 +69,11 @@ class EventTimes:
         """Of `instant_ns`, in ns², but for where on its way a round trip takes its time."""
         return self.local_clock.variance + _LEAST_VARIANCE
 
+    @property
+    def has_none(self) -> bool:
+        """Whether the new sample of the newest exchange has none, although one would be known."""
+        return self._answers and self.local_clock.is_known and not self.instant_ns
+
     def took(self, latched: Latched, sent_ns: int, back_ns: int, fresh: bool) -> None:
         """Take what was latched when a frame passed that was sent and back then.
 
