@@ -116,7 +116,7 @@ class SensorStream:
     def learn(self, arrived_ns: int) -> None:
         """What the last exchange teaches, which can wait until its frame is on its way.
 
-        `arrived_ns` is when the kernel had it, up to `back_ns`.
+        `arrived_ns` is when its answer began to arrive.
         """
         self.learns = False
         sent_ns, back_ns, fresh = self._seen

@@ -30,10 +30,11 @@ _IDLE_MS = 10
 _FRAMES_PER_TURN = 64
 _FIRST_HALF_NS: Final = 20_000.0
 _LONGEST_WAIT_NS: Final = 100_000_000
+"""A frame that seems to have waited for longer has no usable time stamp: CLOCK_REALTIME was set."""
 _STEP: Final = 0.001
 _QUICK: Final = 1 / 16
-"""Half the time that an answer takes is followed in steps of `_STEP`, as this part of the quickest has it:
-by those a master knows the time that its frames take."""
+"""Quantile of half the time that an answer takes, followed in steps of `_STEP`: a master estimates the round
+trip from its quickest frames."""
 
 
 class LinkError(Exception):

@@ -47,3 +47,14 @@ def test_stamps_do_not_depend_on_how_late_the_machine_wakes(monkeypatch: pytest.
 def test_an_arrival_that_cannot_be_is_not_used(monkeypatch: pytest.MonkeyPatch, wrong: int) -> None:
     error_ns = median(errors_ns(monkeypatch, "", lambda: wrong))
     assert WAKES_NS / 3 < error_ns < WAKES_NS * 2 / 3, "half of the wake-up counts as the way out"
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_neither_the_length_of_a_frame_nor_the_slaves_behind_are_in_a_stamp(count: int) -> None:
+    running = Simulation(*(SensorOptions(serial=n + 1, signal="clock", ppm=150.0) for n in range(count)))
+    running.run(SETTLED_S)
+    running.frames.clear()
+    running.run(1.0)
+    for number in range(count):
+        frames = [frame for frame in fresh(running.frames) if frame.sensor == number]
+        assert abs(median(frame.monotonic_ns - reading(frame).instant_ns for frame in frames)) < 500

@@ -98,7 +98,7 @@ class EventTimes:
         self._is_passing = local < event < local + self._reading_ns
 
     def learn(self, sent_ns: int, arrived_ns: int) -> None:
-        """Learn from the exchange that `took` was about: it was sent and had arrived then."""
+        """Learn from the exchange that `took` was about: sent, and begun to arrive, then."""
         if self._answers:
             self.local_clock.learn(sent_ns, arrived_ns)
 

@@ -90,7 +90,7 @@ class LocalClock:
         return self.local
 
     def learn(self, sent_ns: int, arrived_ns: int) -> None:
-        """Learn from the exchange that was followed last: it was sent and had arrived then."""
+        """Learn from the exchange that was followed last: sent, and begun to arrive, then."""
         took_ns = arrived_ns - sent_ns
         if took_ns < self._best_took_ns:
             self._best_took_ns = took_ns

@@ -50,7 +50,7 @@ class SampleClock:
 
     Call `observe` after every valid exchange, before it `predict` if that brought a new sample; ask
     `next_poll_ns` when the next exchange is wanted. Exchanges come in the order in which they were sent. They
-    are back when this program has them, and have arrived when the kernel has.
+    are back when this program has them, and arrive when their first byte does.
     """
 
     __slots__ = (
