@@ -9,6 +9,8 @@ import itertools
 import json
 import math
 import os
+import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -35,7 +37,7 @@ from scripts.benchmarks.chain import Setup
 from scripts.benchmarks.modes.soak import Tally, slope_kb_per_hour
 from scripts.benchmarks.processes import client, polling
 from scripts.benchmarks.records import Recording, began, write
-from scripts.benchmarks.results.page import renew
+from scripts.benchmarks.results.page import BLOCKS, renew
 from scripts.benchmarks.results.report import print_configuration, rows
 from scripts.benchmarks.statistics import Arrivals, Counts, Ints
 from scripts.demonstration.child import DemoError
@@ -224,27 +226,46 @@ def test_table_has_what_there_is() -> None:
     assert "no column 'Bota's driver': it cannot be had" in shown.getvalue()
 
 
+def card(server: str, lost: float) -> dict[str, Any]:
+    about = {"rate_hz": 800, "card": {"round_trip_ms": 2, "jitter_us": 200}, "server": server}
+    return {**about, "lost_percent": lost, "age_us": AGES, "stamp_error_us": {"p50": -3, "p99_absolute": 9}}
+
+
 def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     machine = {"cpus_used": 2, "kernel": "6.1.0-x", "python": "3.11.2"}
+    chain = {"lost": 3, "lost_in_stops": 2, "hand_out_us": AGES, "age_us": AGES}
     content = {
         "date": "2026-11-23T01:02:03",
         "machine": machine,
         "idle_states": True,
         "stolen_percent": 0.5,
         "configurations": [RESULT],
+        "load": {"rate_hz": 800, "loops": 4, "chains": {"TCP, ordinary": chain}},
+        "cards": [card("this", 0), card("one at a time", 13)],
     }
     page = tmp_path / "page.md"
-    page.write_text("above\n<!-- measured: by X -->\nold\n<!-- end -->\nbelow\n")
+    names = ("load", "node", "comparison", "cards")
+    page.write_text("above\n" + "".join(f"<!-- measured: {name} -->\nold\n<!-- end -->\n" for name in names))
     for _ in range(2):
         renew(page, content)
         text = page.read_text()
-        assert text.startswith("above\n<!-- measured: by X -->\n**Your controller gets a sample 80 µs")
-        assert text.endswith("\n<!-- end -->\nbelow\n")
+        assert text.startswith("above\n<!-- measured: load -->\n| 800 Hz beside 4 loops |")
+        assert "| TCP, ordinary | 3 (2) | 80 / 120 / 150 | 80 / 120 / 150 |" in text
+        assert "<!-- measured: node -->\nNot measured: there was no ROS 2.\n<!-- end -->" in text
+        assert "<!-- measured: comparison -->\n**Your controller gets a sample 80 µs" in text
         assert "| lost | 1 (0.5%), in stalls 1 | 0 |  |" in text
         assert "| 800 Hz, 1 virtual sensor | 1 of 200 | 80 / 120 | 2.0 / 2.0 | 9.0 | 2.0 |" in text
-    page.write_text("no place")
-    with pytest.raises(DemoError, match="no part between"):
-        renew(page, content)
+        assert text.endswith("| 800 Hz, 2 ms ± 200 µs | 0 (13) | 80 (80) | 3 / 9 |\n<!-- end -->\n")
+    for wrong, why in (("no place", "has no <!-- measured: "), (text * 2, "or it is there twice")):
+        page.write_text(wrong)
+        with pytest.raises(DemoError, match=why):
+            renew(page, content)
+        assert page.read_text() == wrong
+
+
+def test_the_pages_blocks_are_those_that_a_run_renews() -> None:
+    page = (ROOT / "docs" / "benchmark.md").read_text()
+    assert sorted(re.findall("<!-- measured: (.*) -->", page)) == sorted(BLOCKS)
 
 
 @pytest.mark.parametrize(
@@ -376,10 +397,17 @@ def numbers(content: Any) -> Iterator[float]:
 @pytest.mark.bus
 @pytest.mark.long
 @pytest.mark.ros
-def test_a_run_with_ros_and_two_sensors(tmp_path: Path) -> None:
+def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
-    said, _ = (running := run(tmp_path, "--seconds", "1", "--rates", "400")).communicate(timeout=100)
+    page = shutil.copy(ROOT / "docs" / "benchmark.md", tmp_path)
+    running = run(tmp_path, "--seconds", "1", "--rates", "400", "--page", str(page))
+    said, _ = running.communicate(timeout=400)
     assert running.returncode == 0, said
+    text = Path(page).read_text()
+    assert all(
+        f"| 400 Hz{what} |" in text for what in (", 2 virtual sensors", " beside 4 loops", ", 0.86 ms")
+    )
+    assert "| the node | 800 Hz | 1600 Hz |" in text
     content = json.loads((tmp_path / "b.json").read_text())
     assert all(map(math.isfinite, numbers(content)))
     one, two = content["configurations"]

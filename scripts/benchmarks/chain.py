@@ -65,6 +65,12 @@ class Setup:
         return f"--sensors {self.sensors} --signal {self.signal} --sinc {self.sinc} --ppm={errors}"
 
 
+def own_cpus() -> tuple[int, int]:
+    """The CPU of the virtual sensors and that of their master: a real sensor takes no time of any."""
+    cpus = sorted(os.sched_getaffinity(0))
+    return cpus[0], cpus[-1]
+
+
 class CpuUse:
     """What a process uses of one core from now on."""
 
@@ -113,6 +119,13 @@ class Chain:
         """Start any program that may end by itself once it has written `path`."""
         child = self.start_command(path.name, *command)
         self.results[child] = path
+        return child
+
+    def start_master(self, path: Path, module: str, *arguments: object) -> Child:
+        """As `start_recorder`, for a program in the place of the server, on its CPU."""
+        child = self.start_recorder(path, module, *arguments)
+        os.sched_setaffinity(child.pid, own_cpus()[1:])
+        self.watch("server", child.pid)
         return child
 
     def watch(self, name: str, pid: int) -> None:
@@ -230,6 +243,7 @@ def virtual_bus(setup: Setup) -> Iterator[tuple[str, int]]:
     known = set(psutil.Process().children())
     with VirtualBus(setup.sensor_arguments, setup.priority) as bus:
         (sensor,) = set(psutil.Process().children()) - known
+        os.sched_setaffinity(sensor.pid, own_cpus()[:1])
         yield bus.ifname, sensor.pid
 
 
@@ -238,7 +252,7 @@ def start_server(running: Chain, ifname: str, module: str = SERVER) -> Client:
     setup = running.setup
     server = running.start(
         "server", module, ifname, PORT,
-        "--set", f"sinc_length={setup.sinc}", "--rt-priority", setup.priority,
+        "--set", f"sinc_length={setup.sinc}", "--rt-priority", setup.priority, "--cpu", own_cpus()[1],
     )  # fmt: skip
     running.watch("server", server.pid)
     clients: list[Client] = []

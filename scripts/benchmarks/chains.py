@@ -28,8 +28,7 @@ def yardstick(setup: Setup, ifname: str, sensor: int, program: Path) -> tuple[Fi
         running.start_canaries()
         own = running.directory / "yardstick"
         how = ("--port", port, "--rate", setup.rate_hz, "--priority", setup.priority)
-        master = running.start_recorder(own, _YARDSTICK, program, own, "--ifname", ifname, *how)
-        running.watch("server", master.pid)
+        running.start_master(own, _YARDSTICK, program, own, "--ifname", ifname, *how)
         running.watch("sensor", sensor)
         path = running.directory / "client"
         running.watch("client", _start_c_client(running, program, port, path).pid)
@@ -129,8 +128,7 @@ def polling_ros(setup: Setup, ifname: str, sensor: int) -> tuple[Figures, Floats
 def _start_polling_server(running: Chain, ifname: str, sensor: int) -> Any:
     own = running.directory / "polling-server"
     port = ("--port", PORT + _PORTS_BESIDE, "--rate", running.setup.rate_hz)
-    server = running.start_recorder(own, _POLLING, "server", own, "--ifname", ifname, *port)
-    running.watch("server", server.pid)
+    running.start_master(own, _POLLING, "server", own, "--ifname", ifname, *port)
     running.watch("sensor", sensor)
     return own
 

@@ -42,6 +42,9 @@ _WIDTH: Final = 108
 """Minimum width of the tables."""
 _SECONDS: Final = 6.0
 _QUICK_SECONDS: Final = 3.0
+PAGE_LOOPS: Final = 4
+PAGE_CARDS: Final = (0.05, 0.86, 2.0, 3.0)
+"""What the page has of `--load` and of `--cards`."""
 _RATES: Final = tuple(OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512))
 
 
@@ -90,6 +93,21 @@ def _measure_one(
     return {}
 
 
+def _measure_rest(
+    options: argparse.Namespace, setup: Callable[[int, int], Setup], console: Console
+) -> dict[str, Any]:
+    """What the page has beside the comparison."""
+    slow = [replace(setup(rate, 1), seconds=options.seconds or cards.SECONDS) for rate in options.rates]
+    rest = {
+        "load": measure_load(setup(options.rates[0], 1), PAGE_LOOPS, options.ros, console),
+        "cards": cards.measure_cards(slow, PAGE_CARDS, console),
+    }
+    if options.ros:
+        node = replace(setup(options.rates[0], 1), seconds=options.seconds or MODES["node"].seconds)
+        rest["node"] = measure_node(node, console)
+    return rest
+
+
 def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> None:
     """Measure, show, write. DemoError or Stopped end it early.
 
@@ -128,6 +146,7 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
         results.append(result)
     for result in results:
         print_configuration(result, console)
+    rest = _measure_rest(options, setup, console) if options.page else {}
     stolen = stolen_percent(machine)
     content = write_json(
         options.json,
@@ -137,6 +156,7 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
         seconds=seconds,
         stolen_percent=stolen,
         configurations=results,
+        **rest,
     )
     written = str(options.json)
     try:
@@ -183,7 +203,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--json", type=Path, default=folder / "benchmark.json", metavar="FILE")
     parser.add_argument("--plot", type=Path, metavar="FILE.png")
     parser.add_argument("--page", type=Path, metavar="FILE.md",
-                        help="renew figures and plot of this page (docs/benchmark.md)")  # fmt: skip
+                        help="measure all that this page has (docs/benchmark.md), and renew it")  # fmt: skip
     parser.add_argument("--vendor", action="store_true", help="Bota's own Python driver, too")
     parser.add_argument("--rates", type=_rates, metavar="HZ,...", help="sample rates (800,1600)")
     parser.add_argument("--sensors", type=_counts, metavar="N,...", help="sensors on the bus (1,2)")

@@ -28,8 +28,8 @@ class DistributedClock:
     """A view of the controller's clock registers. `clock` gives the time in ns.
 
     Attributes:
-        before: number of slaves before it.
-        behind: number of slaves behind it.
+        way_ns: a frame's way from the first slave to it.
+        behind_ns: a frame's way through the slaves behind it and back.
         frame_start: when the frame that is being processed reached the first slave.
         time_mask: the bits of the system time that it has.
     """
@@ -37,7 +37,7 @@ class DistributedClock:
     def __init__(self, memory: bytearray, clock: Callable[[], int]) -> None:
         self._memory = memory
         self._clock = clock
-        self.before = self.behind = 0
+        self.way_ns = self.behind_ns = 0
         self.frame_start = clock()
         self.time_mask = _U64
         self.local = LocalClock(self.frame_start)
@@ -45,21 +45,25 @@ class DistributedClock:
         self.events = EventTimes(memory, self.local)
         self._stuck_at: int | None = None
 
+    def place(self, before: int, behind: int) -> None:
+        """Tell it how many slaves are before and behind it."""
+        self.way_ns, self.behind_ns = before * HOP_NS, 2 * behind * HOP_NS
+
     @property
     def _arrival(self) -> int:
         """When the frame that is being processed reached this slave."""
-        return self.frame_start + self.before * HOP_NS
+        return self.frame_start + self.way_ns
 
     def _system(self) -> int:
         """The system time when this frame passed the reference clock, as this clock has it."""
         offset, delay = _offset_and_delay(self._memory, _DC_OFFSET)
-        arrival = self.frame_start + self.before * HOP_NS  # in line: it is read in every frame
+        arrival = self.frame_start + self.way_ns  # in line: it is read in every frame
         return int(self.local.at(arrival) + offset - delay) & self.time_mask
 
     def latch(self) -> None:
         """The master wrote to the receive times: keep when its frame came, and came back."""
         out = self.local.at(self._arrival)
-        back = self.local.at(self._arrival + 2 * self.behind * HOP_NS) if self.behind else 0
+        back = self.local.at(self._arrival + self.behind_ns) if self.behind_ns else 0
         struct.pack_into("<II", self._memory, reg.DC_RECEIVE_TIMES, out & _U32, back & _U32)
         _TIME.pack_into(self._memory, reg.DC_RECEIVE_TIME, out & self.time_mask)
 
@@ -82,7 +86,7 @@ class DistributedClock:
 
     def show_events(self) -> None:
         """The event times are about to be read."""
-        self.events.update(self._clock() + self.before * HOP_NS)
+        self.events.update(self._clock() + self.way_ns)
 
     def exchanged(self) -> None:
         """This frame has exchanged a buffer whose sync manager latches that."""

@@ -103,7 +103,7 @@ class Esc:
 
     def set_line(self, before: int, behind: int) -> None:
         """So many slaves are before it and behind it. Port 0 is always open; port 1 if one is behind."""
-        self.clock.before, self.clock.behind = before, behind
+        self.clock.place(before, behind)
         next_slave = behind > 0
         status = _LINE_GOES_ON if next_slave else _LINE_ENDS
         before = _U16.unpack_from(self.memory, reg.DL_STATUS)[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ethercat_server.virtual_sensor.dc.kinds import parse_clock
-from ethercat_server.virtual_sensor.dc.unit import HOP_NS
 from ethercat_server.virtual_sensor.faults.aborts import AbortFaults
 from ethercat_server.virtual_sensor.firmware.dictionary import OBJECT_NAMES, Dictionary
 from ethercat_server.virtual_sensor.firmware.flash import Flash
@@ -56,7 +55,7 @@ class Firmware(Application):
 
     def inputs(self) -> bytes:
         """The newest process data."""
-        return self.sampler.newest(self.esc.clock.before * HOP_NS)
+        return self.sampler.newest(self.esc.clock.way_ns)
 
     def prepare(self, expected: int) -> None:
         """Compute the sample that a frame at the time `expected` will read."""

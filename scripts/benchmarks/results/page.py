@@ -1,39 +1,47 @@
-"""The figures of docs/benchmark.md, between its two comments: a run can renew them."""
+"""The figures of docs/benchmark.md, between comments that name them: one run can renew all of them."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from scripts.benchmarks.modes.cards import SERVERS, Card
 from scripts.benchmarks.results.report import NONE, Row, count, figure, get, headings, programs, title
 from scripts.demonstration.child import DemoError
 
-_BETWEEN: Final = re.compile(r"(<!-- measured[^>]*-->\n).*(<!-- end -->)", re.DOTALL)
+_BLOCK: Final = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def renew(path: Path, content: Mapping[str, Any]) -> None:
-    """Put what was measured into the page. DemoError if the page has no place for it."""
-    text, found = _BETWEEN.subn(
-        lambda match: match[1] + measured(content) + match[2], path.read_text(encoding="utf-8")
-    )
-    if not found:
-        raise DemoError(f"{path} has no part between <!-- measured --> and <!-- end -->")
+    """Put what was measured into the page. DemoError if the page has no place for all of it."""
+    wanted = dict(BLOCKS)
+
+    def measured(match: re.Match[str]) -> str:
+        make = wanted.pop(match[2], None)
+        if make is None:
+            raise DemoError(f"{path}: there is no block of figures {match[2]!r}, or it is there twice")
+        there = match[2] == "comparison" or match[2] in content
+        return match[1] + (make(content) if there else "Not measured: there was no ROS 2.") + "\n" + match[3]
+
+    text = _BLOCK.sub(measured, path.read_text(encoding="utf-8"))
+    if wanted:
+        raise DemoError(f"{path} has no <!-- measured: {next(iter(wanted))} --> ... <!-- end -->")
     path.write_text(text, encoding="utf-8")
 
 
-def measured(content: Mapping[str, Any]) -> str:
+def comparison(content: Mapping[str, Any]) -> str:
     """The answer, the table of the first configuration, and one line for each of them."""
     first = content["configurations"][0]
     machine = content["machine"]
     idle = "with" if content["idle_states"] else "without"
     where = (
-        f"{content['date'][:10]}, {machine['cpus_used']} CPUs, Linux {machine['kernel'].split('-')[0]}, "
-        f"Python {machine['python']}, {idle} idle states; a hypervisor took {content['stolen_percent']} % of "
-        "the time meanwhile."
+        f"All figures on this page are of one run: {content['date'][:10]}, {machine['cpus_used']} CPUs, "
+        f"Linux {machine['kernel'].split('-')[0]}, Python {machine['python']}, {idle} idle states. "
+        f"A hypervisor took {content['stolen_percent']} % of the time meanwhile."
     )
-    return "\n\n".join([answer(first), main_table(first), summary(content["configurations"]), where]) + "\n"
+    return "\n\n".join([answer(first), main_table(first), summary(content["configurations"]), where])
 
 
 def answer(result: Mapping[str, Any]) -> str:
@@ -96,6 +104,87 @@ def summary(results: Sequence[Mapping[str, Any]]) -> str:
         )
     heads = ["this project", "lost", "age p50 / p99, µs", "/ C", "CPU, %", "/ C"]
     return table(heads, lines)
+
+
+def load(content: Mapping[str, Any]) -> str:
+    """Ages beside endless loops."""
+    found = content["load"]
+
+    def points(ages: Mapping[str, float]) -> str:
+        return " / ".join(f"{ages[point]:.0f}" for point in ("p50", "p99", "p999"))
+
+    lines = [
+        Row(
+            name,
+            (f"{row['lost']} ({row['lost_in_stops']})", points(row["hand_out_us"]), points(row["age_us"])),
+        )
+        for name, row in found["chains"].items()
+    ]
+    beside = f"{found['rate_hz']} Hz beside {found['loops']} loops"
+    return table([beside, "lost (in stalls)", "handed out, µs", "on arrival, µs"], lines)
+
+
+def node(content: Mapping[str, Any]) -> str:
+    """What the node adds, and how old a message is that comes after everybody had to wait."""
+    rates = content["node"]["rates"]
+    ages = content["node"]["first_message_age_us"]
+
+    def line(name: str, text: Callable[[Mapping[str, Any]], str]) -> Row:
+        return Row(name, tuple(text(rate) for rate in rates))
+
+    def points(rate: Mapping[str, Any], where: str) -> str:
+        found = [f"{age:.0f}" for age in rate[f"{where}_age_us"].values()]
+        return " / ".join(found[:2])
+
+    lines = [
+        line(
+            "lost / repeated / decoded wrongly",
+            lambda rate: (
+                f"{rate['lost']} / {rate['repeated']} / {rate['decoded_wrongly']} of {rate['samples']}"
+            ),
+        ),
+        line("age in a callback p50 / p99, µs", lambda rate: points(rate, "ros")),
+        line("the same samples at a TCP client, µs", lambda rate: points(rate, "tcp")),
+        line("CPU with one topic / all, %", lambda rate: " / ".join(
+            f"{rate[topics]['cpu_percent']:.1f}" for topics in ("one", "all"))),
+        line("memory, MB", lambda rate: f"{rate['all']['rss_mb']:.0f}"),
+    ]  # fmt: skip
+    waits = "; ".join(f"{name}: {max(each) / 1000:.1f} ms" for name, each in ages.items())
+    heads = ["the node", *(f"{rate['rate_hz']} Hz" for rate in rates)]
+    return f"{table(heads, lines)}\n\nAge of the first message after a wait, at most: {waits}."
+
+
+def slow_cards(content: Mapping[str, Any]) -> str:
+    """Slow network cards: the server, and the same with one exchange at a time in parentheses."""
+    found: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for each in content["cards"]:
+        found.setdefault(f"{each['rate_hz']} Hz, {Card(**each['card'])}", {})[each["server"]] = each
+    ours, other = SERVERS
+    lines = []
+    for name, by in found.items():
+        this, one = by[ours], by[other]
+        error = this["stamp_error_us"]
+        lines.append(
+            Row(
+                name,
+                (
+                    f"{this['lost_percent']:g} ({one['lost_percent']:g})",
+                    f"{this['age_us']['p50']:.0f} ({one['age_us']['p50']:.0f})",
+                    f"{abs(error['p50']):.0f} / {error['p99_absolute']:.0f}",
+                ),
+            )
+        )
+    heads = ["rate, round trip", f"lost, % ({other})", "age p50, µs", "stamp error p50 / p99, µs"]
+    return table(heads, lines)
+
+
+BLOCKS: Final[dict[str, Callable[[Mapping[str, Any]], str]]] = {
+    "comparison": comparison,
+    "load": load,
+    "node": node,
+    "cards": slow_cards,
+}
+"""By name in the page, and in what was measured."""
 
 
 def table(head: Sequence[str], rows: Sequence[Row]) -> str:
