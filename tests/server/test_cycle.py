@@ -131,3 +131,13 @@ def test_a_run_is_repeated_by_its_seed() -> None:
 
     assert run(1) == run(1)
     assert run(1) != run(2)
+
+
+def test_what_a_stuck_sensor_leaves_out_is_flagged() -> None:
+    running = simulation()
+    running.run(2.0)
+    for eighth in range(24):  # of a period: it is freed before and after polls
+        running.at(0.0, "stick")
+        running.at(0.02 + eighth * PERIOD_NS / 8e9, "unstick")
+        running.run(0.1)
+    check_frames(running.frames)
