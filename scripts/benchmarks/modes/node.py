@@ -1,4 +1,4 @@
-"""What the ROS 2 node adds: the age of each sample in a subscriber's callback beside its age at a TCP client
+"""What the ROS 2 node adds: the age of each sample at a subscriber beside its age at a TCP client
 that listens at the same time, what the node takes, and what comes first after everybody had to wait.
 """
 
@@ -198,7 +198,7 @@ _LINES: Final[tuple[tuple[str, Callable[[dict[str, Any]], str]], ...]] = (
         lambda row: f"{row['lost']} / {row['repeated']} / {row['decoded_wrongly']}",
     ),
     ("age at TCP, µs (p50 / p99 / p99.9)", lambda row: _ages(row, "tcp")),
-    ("age in the callback, µs", lambda row: _ages(row, "ros")),
+    ("age at the subscriber, µs", lambda row: _ages(row, "ros")),
     ("CPU, wrench / all topics, %", lambda row: f"{row['one']['cpu_percent']} / {row['all']['cpu_percent']}"),
     ("memory, MB (growth, kB)", lambda row: f"{row['all']['rss_mb']} ({row['all']['rss_growth_kb']})"),
 )

@@ -1,4 +1,4 @@
-"""Notes when each sample arrives: at a TCP client, or in the callback of a ROS 2 subscriber of `wrench`.
+"""Notes when each sample arrives: at a TCP client, or at a ROS 2 subscriber of `wrench`.
 
 Four whole numbers an arrival: the sample's `stamp_ns`, its `monotonic_ns` (0: ROS messages have none), a
 check sum of force and torque, CLOCK_MONOTONIC of the arrival.
@@ -20,9 +20,11 @@ from typing import Any
 
 from protocol.client import connect
 from protocol.errors import ConnectionFailedError
+from scripts.benchmarks.processes.subscriber import messages
 from scripts.benchmarks.records import began, write
 
 COLUMNS = 4
+_DEPTH = 50
 _WRENCH = struct.Struct("<6d")
 
 
@@ -43,27 +45,35 @@ def tcp(port: int, note: Any) -> None:
             return
 
 
-def ros(note: Any, depth: int = 50, *, every_topic: bool = False) -> None:
-    """Every message of the node's, until the process is ended."""
+def ros(note: Any, depth: int) -> None:
+    """Every message of the topic `wrench`, until the process is ended."""
+    from geometry_msgs.msg import WrenchStamped  # noqa: PLC0415 - the arguments come first
+
+    for _, message, now in messages(WrenchStamped, ["wrench"], depth):
+        stamp, force, torque = message.header.stamp, message.wrench.force, message.wrench.torque
+        values = check_sum((force.x, force.y, force.z), (torque.x, torque.y, torque.z))
+        note((stamp.sec * 1_000_000_000 + stamp.nanosec, 0, values, now))
+
+
+def every_topic(note: Any) -> None:
+    """Subscribe to every topic of the node's, with rclpy's executor, until the process is ended."""
     import rclpy  # noqa: PLC0415 - the arguments come first
     from diagnostic_msgs.msg import DiagnosticArray  # noqa: PLC0415
     from geometry_msgs.msg import WrenchStamped  # noqa: PLC0415
     from sensor_msgs.msg import Imu, Temperature  # noqa: PLC0415
     from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
 
-    def on_wrench(message: WrenchStamped) -> None:
-        now = time.monotonic_ns()
-        stamp, force, torque = message.header.stamp, message.wrench.force, message.wrench.torque
-        values = check_sum((force.x, force.y, force.z), (torque.x, torque.y, torque.z))
-        note((stamp.sec * 1_000_000_000 + stamp.nanosec, 0, values, now))
+    def on_message(_message: Any) -> None:
+        note((0, 0, 0, time.monotonic_ns()))
 
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
-    node.create_subscription(WrenchStamped, "wrench", on_wrench, depth)
-    if every_topic:
-        others = (Float64MultiArray, "/sensone_sensor_data"), (Imu, "imu/data_raw")
-        for kind, topic in (*others, (Temperature, "temperature"), (DiagnosticArray, "/diagnostics")):
-            node.create_subscription(kind, topic, lambda _message: None, 50)
+    topics = (
+        (WrenchStamped, "wrench"), (Float64MultiArray, "/sensone_sensor_data"), (Imu, "imu/data_raw"),
+        (Temperature, "temperature"), (DiagnosticArray, "/diagnostics"),
+    )  # fmt: skip
+    for kind, topic in topics:
+        node.create_subscription(kind, topic, on_message, _DEPTH)
     rclpy.spin(node)
 
 
@@ -90,9 +100,10 @@ def main() -> None:
     try:
         if arguments.what == "tcp":
             tcp(arguments.port, note)
+        elif arguments.what == "all":
+            every_topic(note)
         else:
-            depth = 1 if arguments.what == "newest" else 50
-            ros(note, depth, every_topic=arguments.what == "all")
+            ros(note, 1 if arguments.what == "newest" else _DEPTH)
     except KeyboardInterrupt:
         pass
     finally:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import gc
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final, cast
 
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
@@ -36,9 +36,7 @@ def main() -> None:
 
 def receive(topics: list[str], recording: Recording, *, wrench: bool = False) -> None:
     """Note every message that comes until the time is over."""
-    import rclpy  # noqa: PLC0415 - the arguments come first
-    from geometry_msgs.msg import WrenchStamped  # noqa: PLC0415
-    from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: PLC0415
+    from geometry_msgs.msg import WrenchStamped  # noqa: PLC0415 - the arguments come first
     from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
 
     def values(message: Any) -> Sequence[float]:
@@ -47,26 +45,33 @@ def receive(topics: list[str], recording: Recording, *, wrench: bool = False) ->
         force, torque = message.wrench.force, message.wrench.torque
         return force.x, force.y, force.z, torque.x
 
-    kind = WrenchStamped if wrench else Float64MultiArray
+    for position, message, now in messages(WrenchStamped if wrench else Float64MultiArray, topics):
+        if not recording.take(position, *decode_clock(values(message)), 0, now):
+            return
+
+
+def messages(kind: Any, topics: Sequence[str], depth: int = _DEPTH) -> Iterator[tuple[int, Any, int]]:
+    """Subscribe; position of its topic, message, and when it was taken, for each that comes."""
+    import rclpy  # noqa: PLC0415 - the arguments come first
+    from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: PLC0415
+
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
-    handles = [
-        node.create_subscription(kind, topic, lambda _message: None, _DEPTH).handle for topic in topics
-    ]
-    with node.context.handle:
-        wait_set = rclpy_implementation.WaitSet(len(handles), 0, 0, 0, 0, 0, node.context.handle)
-    going_on = True
-    while going_on:
-        wait_set.clear_entities()
-        for handle in handles:
-            wait_set.add_subscription(handle)
-        wait_set.wait(1_000_000_000)
-        for position, handle in enumerate(handles):
-            while (taken := handle.take_message(kind, False)) is not None:
-                now = time.monotonic_ns()
-                going_on = recording.take(position, *decode_clock(values(taken[0])), 0, now)
-    node.destroy_node()
-    rclpy.try_shutdown()
+    handles = [node.create_subscription(kind, topic, lambda _message: None, depth).handle for topic in topics]
+    try:
+        with node.context.handle:
+            wait_set = rclpy_implementation.WaitSet(len(handles), 0, 0, 0, 0, 0, node.context.handle)
+        while True:
+            wait_set.clear_entities()
+            for handle in handles:
+                wait_set.add_subscription(handle)
+            wait_set.wait(1_000_000_000)
+            for position, handle in enumerate(handles):
+                while (taken := handle.take_message(kind, False)) is not None:
+                    yield position, taken[0], time.monotonic_ns()
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
 
 
 if __name__ == "__main__":

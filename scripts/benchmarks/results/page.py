@@ -143,7 +143,7 @@ def node(content: Mapping[str, Any]) -> str:
                 f"{rate['lost']} / {rate['repeated']} / {rate['decoded_wrongly']} of {rate['samples']}"
             ),
         ),
-        line("age in a callback p50 / p99, µs", lambda rate: points(rate, "ros")),
+        line("age at a subscriber p50 / p99, µs", lambda rate: points(rate, "ros")),
         line("the same samples at a TCP client, µs", lambda rate: points(rate, "tcp")),
         line("CPU with one topic / all, %", lambda rate: " / ".join(
             f"{rate[topics]['cpu_percent']:.1f}" for topics in ("one", "all"))),
