@@ -30,7 +30,7 @@ from scripts.benchmarks.modes.load import measure_load
 from scripts.benchmarks.modes.node import measure_node
 from scripts.benchmarks.modes.soak import soak
 from scripts.benchmarks.records import may_be_real_time
-from scripts.benchmarks.results.page import renew
+from scripts.benchmarks.results.page import check, renew
 from scripts.benchmarks.results.plot import draw
 from scripts.benchmarks.results.report import print_configuration
 from scripts.demonstration.child import DemoError
@@ -114,6 +114,8 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
     `idle_states`: idle CPUs may halt meanwhile.
     """
     loopback_up()
+    if options.page:
+        check(options.page)
     if idle_states:
         console.print(
             "idle CPUs may halt (no access to /dev/cpu_dma_latency): samples are older than as root"

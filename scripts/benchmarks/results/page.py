@@ -14,21 +14,25 @@ from scripts.demonstration.child import DemoError
 _BLOCK: Final = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
+def check(path: Path) -> None:
+    """DemoError if the page cannot be renewed."""
+    found = [match[2] for match in _BLOCK.finditer(path.read_text(encoding="utf-8"))]
+    if sorted(found) != sorted(BLOCKS):
+        raise DemoError(
+            f"{path} must have <!-- measured: NAME --> and <!-- end --> once for each of {', '.join(BLOCKS)}"
+        )
+
+
 def renew(path: Path, content: Mapping[str, Any]) -> None:
-    """Put what was measured into the page. DemoError if the page has no place for all of it."""
-    wanted = dict(BLOCKS)
+    """Put what was measured into the page. DemoError if it has not one place for each part."""
+    check(path)
 
     def measured(match: re.Match[str]) -> str:
-        make = wanted.pop(match[2], None)
-        if make is None:
-            raise DemoError(f"{path}: there is no block of figures {match[2]!r}, or it is there twice")
         there = match[2] == "comparison" or match[2] in content
-        return match[1] + (make(content) if there else "Not measured: there was no ROS 2.") + "\n" + match[3]
+        figures = BLOCKS[match[2]](content) if there else "Not measured: there was no ROS 2."
+        return f"{match[1]}{figures}\n{match[3]}"
 
-    text = _BLOCK.sub(measured, path.read_text(encoding="utf-8"))
-    if wanted:
-        raise DemoError(f"{path} has no <!-- measured: {next(iter(wanted))} --> ... <!-- end -->")
-    path.write_text(text, encoding="utf-8")
+    path.write_text(_BLOCK.sub(measured, path.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 def comparison(content: Mapping[str, Any]) -> str:
