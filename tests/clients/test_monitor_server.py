@@ -294,8 +294,12 @@ def samples(model: Model) -> int:
 
 
 def test_rate_jitter_age_and_the_own_row_among_the_clients_are_known(shared: ServedSimulation) -> None:
+    def is_whole(found: State) -> bool:  # only a sample that was waited for has an age
+        ages = [sensor.stream.age_us for sensor in found.sensors]
+        return bool(found.clients) and None not in ages
+
     with reading(shared.port) as model:
-        wait_until(lambda: samples(model) > 50 and bool(state(model).clients), "samples and a status")
+        wait_until(lambda: samples(model) > 50 and is_whole(state(model)), "samples, their ages and a status")
         found = state(model)
     assert sum(client.is_this for client in found.clients) == 1
     for sensor in found.sensors:
