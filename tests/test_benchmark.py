@@ -395,6 +395,7 @@ def numbers(content: Any) -> Iterator[float]:
 @pytest.mark.bus
 @pytest.mark.long
 @pytest.mark.ros
+@pytest.mark.timeout(500)
 def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
     page = shutil.copy(ROOT / "docs" / "benchmark.md", tmp_path)
