@@ -431,30 +431,32 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
 @pytest.mark.bus
 @needs_bus
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize(("ros", "most"), [((), 0.15), (("--ros",), 0.25)], ids=["frames", "ros"])
+@pytest.mark.parametrize(("ros", "most"), [((), 0.5), (("--ros",), 1.0)], ids=["frames", "ros"])
 def test_two_sensors_at_1600_hz_for_a_minute(out: Path, ros: tuple[str, ...], most: float) -> None:
-    """Nothing lost between server and file, under 15 % of a core; with three ROS messages a frame, 25 %."""
+    """Nothing lost between server and file, for a part of the server's CPU; the whole with ROS messages."""
     seconds = 60
     with server("virtual", "--virtual", "--sensors 2", "--set", "sinc_length=32") as running:
         recorder = RecorderProcess(out, running.port, "--seconds", str(seconds), *ros)
         used = psutil.Process(recorder.process.pid)
-        spent = 0.0
+        serves = psutil.Process(running.process.pid)
+        spent, began = 0.0, sum(serves.cpu_times()[:2])
         try:
             while recorder.process.poll() is None:
                 with contextlib.suppress(psutil.NoSuchProcess):
                     spent = max(spent, sum(used.cpu_times()[:2]))
                 time.sleep(0.1)
+            served_s = sum(serves.cpu_times()[:2]) - began
             assert recorder.wait() == 0
             said = recorder.said()
         finally:
             recorder.close()
-    print(f"{100 * spent / seconds:.1f} % of a core; {said}")
+    print(f"{100 * spent / seconds:.1f} % of a core, server {100 * served_s / seconds:.1f} %; {said}")
     frames = read(out)
     assert "not read in time" not in said
     assert "could not be written" not in said
     assert is_whole(frames)
     assert len(frames) > 0.95 * 2 * 1600 * seconds
-    assert spent < most * seconds
+    assert spent < most * served_s
     with Reader(out) as bag:  # another library's
         counts = {connection.topic: connection.msgcount for connection in bag.connections}
     assert counts[frame_topic(0)] + counts[frame_topic(1)] == len(frames)
