@@ -244,7 +244,8 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     }
     page = tmp_path / "page.md"
     names = ("load", "node", "comparison", "cards")
-    page.write_text("above\n" + "".join(f"<!-- measured: {name} -->\nold\n<!-- end -->\n" for name in names))
+    blocks = "".join(f"<!-- measured: {name} -->\nold\n<!-- end -->\n" for name in names)
+    page.write_text(f"above\n{blocks}below\n")
     for _ in range(2):
         renew(page, content)
         text = page.read_text()
@@ -254,7 +255,7 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
         assert "<!-- measured: comparison -->\n**Your controller gets a sample 80 µs" in text
         assert "| lost | 1 (0.5%), in stalls 1 | 0 |  |" in text
         assert "| 800 Hz, 1 virtual sensor | 1 of 200 | 80 / 120 | 2.0 / 2.0 | 9.0 | 2.0 |" in text
-        assert text.endswith("| 800 Hz, 2 ms ± 200 µs | 0 (13) | 80 (80) | 3 / 9 |\n<!-- end -->\n")
+        assert text.endswith("| 800 Hz, 2 ms ± 200 µs | 0 (13) | 80 (80) | 3 / 9 |\n<!-- end -->\nbelow\n")
     for wrong in ("no place", text * 2, text.replace("cards", "others")):
         page.write_text(wrong)
         with pytest.raises(DemoError, match="once for each of comparison, load, node, cards"):

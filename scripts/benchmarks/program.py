@@ -42,8 +42,8 @@ _WIDTH: Final = 108
 """Minimum width of the tables."""
 _SECONDS: Final = 6.0
 _QUICK_SECONDS: Final = 3.0
-PAGE_LOOPS: Final = 4
-PAGE_CARDS: Final = (0.05, 0.86, 2.0, 3.0)
+_PAGE_LOOPS: Final = 4
+_PAGE_CARDS: Final = (0.05, 0.86, 2.0, 3.0)
 """What the page has of `--load` and of `--cards`."""
 _RATES: Final = tuple(OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512))
 
@@ -99,8 +99,8 @@ def _measure_rest(
     """What the page has beside the comparison."""
     slow = [replace(setup(rate, 1), seconds=options.seconds or cards.SECONDS) for rate in options.rates]
     rest = {
-        "load": measure_load(setup(options.rates[0], 1), PAGE_LOOPS, options.ros, console),
-        "cards": cards.measure_cards(slow, PAGE_CARDS, console),
+        "load": measure_load(setup(options.rates[0], 1), _PAGE_LOOPS, options.ros, console),
+        "cards": cards.measure_cards(slow, _PAGE_CARDS, console),
     }
     if options.ros:
         node = replace(setup(options.rates[0], 1), seconds=options.seconds or MODES["node"].seconds)

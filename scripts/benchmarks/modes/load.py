@@ -5,6 +5,7 @@ at a ROS 2 subscriber, each with ordinary and with real-time scheduling.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -108,9 +109,10 @@ def table(rows: dict[str, dict[str, Any]], rate_hz: int, loops: int) -> Table:
     for name, row in rows.items():
         ages = (row[key] for key in ("hand_out_us", "age_us", "age_outside_stalls_us"))
         lost = f"{row['lost']} ({row['lost_in_stops']})"
-        made.add_row(name, lost, *map(_points, ages))
+        made.add_row(name, lost, *map(points, ages))
     return made
 
 
-def _points(ages: dict[str, float] | None) -> str:
+def points(ages: Mapping[str, float] | None) -> str:
+    """Median and tail of ages."""
     return " / ".join(f"{ages[point]:.0f}" for point in ("p50", "p99", "p999")) if ages else "-"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from scripts.benchmarks.modes.cards import SERVERS, Card
+from scripts.benchmarks.modes.load import points
 from scripts.benchmarks.results.report import NONE, Row, count, figure, get, headings, programs, title
 from scripts.demonstration.child import DemoError
 
@@ -113,10 +114,6 @@ def summary(results: Sequence[Mapping[str, Any]]) -> str:
 def load(content: Mapping[str, Any]) -> str:
     """Ages beside endless loops."""
     found = content["load"]
-
-    def points(ages: Mapping[str, float]) -> str:
-        return " / ".join(f"{ages[point]:.0f}" for point in ("p50", "p99", "p999"))
-
     lines = [
         Row(
             name,
@@ -136,7 +133,7 @@ def node(content: Mapping[str, Any]) -> str:
     def line(name: str, text: Callable[[Mapping[str, Any]], str]) -> Row:
         return Row(name, tuple(text(rate) for rate in rates))
 
-    def points(rate: Mapping[str, Any], where: str) -> str:
+    def ages_at(rate: Mapping[str, Any], where: str) -> str:
         found = [f"{age:.0f}" for age in rate[f"{where}_age_us"].values()]
         return " / ".join(found[:2])
 
@@ -147,8 +144,8 @@ def node(content: Mapping[str, Any]) -> str:
                 f"{rate['lost']} / {rate['repeated']} / {rate['decoded_wrongly']} of {rate['samples']}"
             ),
         ),
-        line("age at a subscriber p50 / p99, µs", lambda rate: points(rate, "ros")),
-        line("the same samples at a TCP client, µs", lambda rate: points(rate, "tcp")),
+        line("age at a subscriber p50 / p99, µs", lambda rate: ages_at(rate, "ros")),
+        line("the same samples at a TCP client, µs", lambda rate: ages_at(rate, "tcp")),
         line("CPU with one topic / all, %", lambda rate: " / ".join(
             f"{rate[topics]['cpu_percent']:.1f}" for topics in ("one", "all"))),
         line("memory, MB", lambda rate: f"{rate['all']['rss_mb']:.0f}"),
