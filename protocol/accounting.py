@@ -92,6 +92,11 @@ class StreamAccounting:
         """A new subscription begins: nothing before its first frame counts as missing, unless it has GAP."""
         self._sequence = self._monotonic_ns = self.new_ns = -1
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether a frame has come since `begin`."""
+        return self._sequence >= 0
+
     def take(self, sequence: int, monotonic_ns: int, flags: int) -> FrameKind:
         """Count the next frame; what it is."""
         counts, jump = self.counts, 0

@@ -10,6 +10,7 @@ ProtocolError
 |   +-- UnreachableError  there is no server at that address
 |   +-- NoReplyError      a request was not answered in time
 +-- RefusedError          the server refused a request; the connection goes on
++-- NoSampleError         no new, valid sample came in time; the client goes on
 +-- FileError             a file cannot be written, or would replace another
 """
 

@@ -3,7 +3,7 @@
 The only sockets in `protocol`.
 """
 
-from protocol.client.blocking import Client, connect
+from protocol.client.client import Client, NoSampleError, connect
 from protocol.client.real_time import Scheduling, make_real_time
 
 __all__ = ["Client", "Scheduling", "connect", "make_real_time"]
