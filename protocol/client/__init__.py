@@ -1,9 +1,11 @@
-"""Clients over TCP: a framed connection, the small blocking client, real-time scheduling.
-
-The only sockets in `protocol`.
-"""
+"""The client: samples, conditions, requests and events over TCP, and real-time scheduling."""
 
 from protocol.client.client import Client, NoSampleError, connect
+from protocol.client.reading import Condition, Reading
 from protocol.client.real_time import Scheduling, make_real_time
+from protocol.client.session import Connected, Disconnected
 
-__all__ = ["Client", "Scheduling", "connect", "make_real_time"]
+__all__ = [
+    "Client", "Condition", "Connected", "Disconnected", "NoSampleError", "Reading", "Scheduling", "connect",
+    "make_real_time",
+]  # fmt: skip

@@ -109,7 +109,7 @@ class TcpChannel:
     def _begin(self, family: socket.AddressFamily, address: tuple[object, ...]) -> None:
         self._give_up_ns = self.monotonic_ns() + round(CONNECT_TIMEOUT_S * 1e9)
         self._sock = socket.socket(family, socket.SOCK_STREAM)
-        # Before connecting: else the kernel lets the buffer grow to megabytes, which hold a minute of samples.
+        # Before connecting: else the kernel lets it grow to megabytes, which hold a minute of samples.
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._receive_buffer)
         self._sock.setblocking(False)
         self._sock.connect_ex(address)  # how it went, SO_ERROR tells

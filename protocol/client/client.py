@@ -100,7 +100,7 @@ class Client:
         """Nothing is sent yet.
 
         `sensors`: by position on the bus, of those that are there; None for all. `every`: one frame in so
-        many. `fresh_only`: REPEATED frames only every 10 ms. `raw`: REPEATED and INVALID frames are handed out.
+        many. `fresh_only`: REPEATED frames only every 10 ms. `raw`: REPEATED and INVALID frames come, too.
         `stream` False: no frames, only requests and events. `reconnect` False: ConnectionFailedError tells
         that the only connection has ended. `channel`: another one than TCP.
         """

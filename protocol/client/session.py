@@ -2,8 +2,8 @@
 
 The rules it keeps:
 
-- A connection begins with `describe`: the version is checked, and of the sensors asked for, those that are there
-  are subscribed to. If none is there, the connection has failed.
+- A connection begins with `describe`: the version is checked, and of the sensors asked for, those that are
+  there are subscribed to. If none is there, the connection has failed.
 - Whoever has the socket passes what arrives to `received` and sends what is returned.
 - After a connection that ended the next attempt is due at `retry_at_ns`: later each time, at once after one
   that lasted.
@@ -71,8 +71,8 @@ class Session:
     Attributes:
         connected: whether there is a connection and its subscription is granted.
         description: the server's newest description; None before the first connection.
-        items: what has arrived and was not taken yet, in order: new and valid frames, or all of them if `raw`;
-            the server's events; `Connected` and `Disconnected`.
+        items: what has arrived and was not taken yet, in order: new and valid frames, or all of them if
+            `raw`; the server's events; `Connected` and `Disconnected`.
         same_machine: whether the server's CLOCK_MONOTONIC is this machine's.
         sensors: by position on the bus.
         connections: number of those that were made.
@@ -118,7 +118,7 @@ class Session:
     # -- the connection
 
     def opened(self, now_ns: int, *, is_near: bool) -> bytes:
-        """There is a connection; what to send. `is_near`: probably to this machine, unless its server tells."""
+        """There is a connection; what to send. `is_near`: to this machine, unless its server says otherwise."""
         self._open, self._opened_ns = True, now_ns
         self.same_machine = is_near
         self._decoder = FrameDecoder()
@@ -165,7 +165,7 @@ class Session:
                     self._take(now_ns)
                 if message is None:
                     return answer
-                answer += self._hear(message, now_ns)
+                answer += self._hear(message)
         except (RemoteProtocolError, BadMessageError) as error:
             raise ConnectionFailedError(f"what came is not this protocol: {printable(error)}") from None
 
@@ -194,7 +194,7 @@ class Session:
             if waiting is future:
                 self._replies.pop(identifier, None)
 
-    def _hear(self, message: JsonObject, now_ns: int) -> bytes:
+    def _hear(self, message: JsonObject) -> bytes:
         """Take a JSON message; what to send."""
         if "event" in message:
             self._hear_event(message)
@@ -294,7 +294,7 @@ class Session:
         return self.wanted[0] if self.wanted else min(self.sensors, default=0)
 
     def find_silent(self, timeout_ns: int) -> int | None:
-        """A sensor without a new sample for this time in which another had some; told again after such a time."""
+        """A sensor without new samples for this time, in which another had some; told again after it."""
         awaited = [self.sensors[position] for position in self.wanted or self.sensors]
         if len(awaited) < 2:
             return None
