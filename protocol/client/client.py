@@ -36,6 +36,7 @@ _MOST_READS: Final = 64
 _BACKLOG: Final = 2048
 """Bytes received at once that are more than any steady stream: more may be waiting."""
 _AGAIN_S: Final = 0.5
+_CLOSED: Final = "this client has been closed"
 
 
 class NoSampleError(ProtocolError):
@@ -53,6 +54,7 @@ def connect(
     sensors: Sequence[int] | None = None,
     every: int = 1,
     fresh_only: bool = True,
+    timeout_s: float | None = None,
     imu_units: ImuUnits = ImuUnits.G_DPS,
     rt_priority: int = 0,
     cpu: int = -1,
@@ -61,7 +63,9 @@ def connect(
 
     UnreachableError where there is no server, RefusedError if it does not grant the subscription.
     """
-    client = Client(port, host, sensors=sensors, every=every, fresh_only=fresh_only, imu_units=imu_units)
+    client = Client(
+        port, host, sensors=sensors, every=every, fresh_only=fresh_only, timeout_s=timeout_s, imu_units=imu_units
+    )
     try:
         client.scheduling = make_real_time(rt_priority, cpu)
         return client.connect()
@@ -93,6 +97,7 @@ class Client:
         raw: bool = False,
         stream: bool = True,
         reconnect: bool = True,
+        timeout_s: float | None = None,
         imu_units: ImuUnits = ImuUnits.G_DPS,
         receive_buffer: int = RECEIVE_BUFFER,
         channel: Channel | None = None,
@@ -102,7 +107,8 @@ class Client:
         `sensors`: by position on the bus, of those that are there; None for all. `every`: one frame in so
         many. `fresh_only`: REPEATED frames only every 10 ms. `raw`: REPEATED and INVALID frames come, too.
         `stream` False: no frames, only requests and events. `reconnect` False: ConnectionFailedError tells
-        that the only connection has ended. `channel`: another one than TCP.
+        that the only connection has ended. `timeout_s`: how long `receive` waits for a sample; by default 5
+        periods, at least 20 ms. `channel`: another one than TCP.
         """
         self.address = Address(host, port)
         self.events: deque[ClientEvent] = deque(maxlen=_MOST_EVENTS)
@@ -113,10 +119,11 @@ class Client:
         )
         self.channel: Channel = TcpChannel(host, port, receive_buffer) if channel is None else channel
         self._decoders = {size: SampleDecoder(size, imu_units) for size in LAYOUTS}
-        self._reconnect = reconnect
+        self._reconnect, self._timeout_s = reconnect, timeout_s
         self._open = False
         self._failed: ProtocolError | None = None
         self._reader: int | None = None
+        self._stepping = False
         self._sending = threading.Lock()
         self._closing = threading.Event()
 
@@ -142,8 +149,8 @@ class Client:
         """End the connection for good. From any thread, which ends a wait and fails requests that wait."""
         self._closing.set()
         self.channel.shutdown()
-        if self._reader in (None, threading.get_ident()):
-            self._end(ConnectionFailedError("this client has been closed"))
+        if not self._stepping:  # else the thread that is there closes the socket, which it may be reading
+            self._end(ConnectionFailedError(_CLOSED))
 
     def fileno(self) -> int:
         """For `poll` or `epoll`; another one after a new connection, -1 without one."""
@@ -179,11 +186,11 @@ class Client:
     def receive(self, timeout_s: float | None = None) -> list[DataMessage]:
         """New, valid samples in the order of arrival, at least one; NoSampleError if none comes in time.
 
-        `timeout_s` is by default 5 periods, at least 20 ms. Of several sensors each must have one in it.
+        `timeout_s` is by default that of the client. Of several sensors each must have one in it.
         """
         session = self.session
         if timeout_s is None:
-            timeout_s = session.timeout_s
+            timeout_s = session.timeout_s if self._timeout_s is None else self._timeout_s
         deadline_ns = self.channel.monotonic_ns() + round(timeout_s * 1e9)
         left_s, frames = timeout_s, list[DataMessage]()
         while not frames and left_s > 0:
@@ -201,7 +208,7 @@ class Client:
         raise NoSampleError(condition, f"no new sample of sensor {silent} for {timeout_s * 1e3:g} ms: {why}")
 
     def __iter__(self) -> Iterator[Sample]:
-        """Every new and valid sample as it comes, decoded; as `receive`, with its default timeout."""
+        """Every new and valid sample as it comes, decoded; as `receive`."""
         while True:
             for frame in self.receive():
                 self.frame = frame
@@ -284,10 +291,10 @@ class Client:
         ConnectionFailedError where there is no connection and none is to be made.
         """
         session, channel = self.session, self.channel
-        self._reader = threading.get_ident()
-        if self._closing.is_set():
-            raise ConnectionFailedError("this client has been closed")
+        self._reader, self._stepping = threading.get_ident(), True
         try:
+            if self._closing.is_set():
+                raise ConnectionFailedError(_CLOSED)
             if self._open:
                 with session.get_buffer() as buffer:
                     count = channel.receive(buffer, timeout_s)
@@ -307,6 +314,10 @@ class Client:
             if self._failed is error:
                 raise
             self._end(error)
+            if self._closing.is_set():
+                raise
+        finally:
+            self._stepping = False
         return 0
 
     def _end(self, error: ProtocolError) -> None:

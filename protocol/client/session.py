@@ -118,7 +118,7 @@ class Session:
     # -- the connection
 
     def opened(self, now_ns: int, *, is_near: bool) -> bytes:
-        """There is a connection; what to send. `is_near`: to this machine, unless its server says otherwise."""
+        """There is a connection; what to send. `is_near`: to this machine, unless its server denies it."""
         self._open, self._opened_ns = True, now_ns
         self.same_machine = is_near
         self._decoder = FrameDecoder()

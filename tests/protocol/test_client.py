@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from bridge.stream.connection import Connection
 from protocol import address
 from protocol.address import boot_id
-from protocol.client import Client, connect
+from protocol.client import Client, Condition, Connected, Disconnected, NoSampleError, connect
 from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
 from protocol.framing import DataFlag
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.bridge.scripted_server import ScriptedServer, description, process_data
+from tests.memory_channel import MemoryChannel
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port
+from tests.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]
 
@@ -33,7 +36,7 @@ def scripted() -> Iterator[ScriptedServer]:
 
 
 def test_samples_come_decoded_in_order_and_nothing_old(scripted: ScriptedServer) -> None:
-    with connect(scripted.port) as sensor:
+    with connect(scripted.port, timeout_s=PATIENCE_S) as sensor:
         assert scripted.subscribed.wait(PATIENCE_S)
         scripted.send_sample(1.0)
         scripted.send_sample(1.0, DataFlag.REPEATED)
@@ -49,65 +52,101 @@ def test_samples_come_decoded_in_order_and_nothing_old(scripted: ScriptedServer)
 
 
 def test_units_and_sizes(scripted: ScriptedServer) -> None:
-    with connect(scripted.port, imu_units=ImuUnits.SI) as sensor:
+    with connect(scripted.port, imu_units=ImuUnits.SI, timeout_s=PATIENCE_S) as sensor:
         assert scripted.subscribed.wait(PATIENCE_S)
         scripted.send_sample(3.0, process_data=process_data(3.0, 77))
         assert next(iter(sensor)).acceleration[0] == 3.0 + 6 / 16
 
 
 def test_what_is_not_granted_does_not_end_it(scripted: ScriptedServer) -> None:
-    with connect(scripted.port, cpu=10**6) as sensor:
+    with connect(scripted.port, cpu=10**6, timeout_s=PATIENCE_S) as sensor:
         (refused,) = sensor.scheduling.refused
         assert refused.startswith("CPU 1000000 (there are ")
         scripted.send_sample(1.0)
         assert next(iter(sensor)).force[0] == 1.0
 
 
-def test_frames_gives_everything_and_ends_when_the_server_shuts_down(scripted: ScriptedServer) -> None:
-    with connect(scripted.port, fresh_only=False, every=2, sensors=[0]) as sensor:
-        assert scripted.subscribed.wait(PATIENCE_S)
-        assert {**scripted.requests[-1], "id": 0} == {
+def test_raw_gives_every_frame_and_event_in_order(scripted: ScriptedServer) -> None:
+    with Client(scripted.port, fresh_only=False, every=2, sensors=[0], raw=True) as sensor:
+        sensor.connect()
+        assert scripted.requests[-1] | {"id": 0} == {
             "action": "subscribe", "id": 0, "fresh_only": False, "every": 2, "sensors": [0]
         }  # fmt: skip
-        for flags in (0, DataFlag.REPEATED, DataFlag.INVALID):
-            scripted.send_sample(1.0, flags)
-        scripted.send_json({"event": "shutting_down"})
-        scripted.drop()
-        assert [frame.flags for frame in sensor.frames()] == [0, 1, 2]
-        assert sensor.events.popleft() == {"event": "shutting_down"}
-
-
-def test_a_connection_that_breaks_is_an_error_after_the_last_frame(scripted: ScriptedServer) -> None:
-    with connect(scripted.port) as sensor:
-        assert scripted.subscribed.wait(PATIENCE_S)
-        scripted.send_sample(1.0)
-        scripted.drop()
-        frames = sensor.frames()
-        assert next(frames).sequence == 1
-        with pytest.raises(ConnectionFailedError, match="closed"):
-            next(frames)
-
-
-def test_what_comes_before_a_reply_is_kept(scripted: ScriptedServer) -> None:
-    with connect(scripted.port) as sensor:
-        assert scripted.subscribed.wait(PATIENCE_S)
         scripted.send_sample(1.0)
         scripted.send_json({"event": "reconfigured", "sensor": 0})
-        assert sensor.ask("status")["ok"]
-        assert [frame.sequence for frame in sensor.receive(0.0)] == [1]
-        assert sensor.events[0]["event"] == "reconfigured"
-        assert sensor.receive(0.01) == []
+        for flags in (DataFlag.REPEATED, DataFlag.INVALID):
+            scripted.send_sample(1.0, flags)
+        scripted.drop()
+        items: list[object] = []
+        while not items or not isinstance(items[-1], Disconnected):
+            items += sensor.poll_all(PATIENCE_S)
+        assert isinstance(items[0], Connected)
+        assert [getattr(item, "flags", item) for item in items[1:-1]] == [
+            0, {"event": "reconfigured", "sensor": 0}, 1, 2
+        ]  # fmt: skip
 
 
-def test_receive_hands_out_the_last_frames_of_a_connection_that_ended(scripted: ScriptedServer) -> None:
-    with connect(scripted.port) as sensor:
+def test_without_reconnection_the_last_frames_come_before_the_error(scripted: ScriptedServer) -> None:
+    with Client(scripted.port, reconnect=False).connect() as sensor:
         assert scripted.subscribed.wait(PATIENCE_S)
         scripted.send_sample(1.0)
         scripted.drop()
         scripted.disconnected.wait(PATIENCE_S)
-        assert len(sensor.receive(5.0)) == 1
-        with pytest.raises(ConnectionFailedError):
-            sensor.receive(5.0)
+        assert [frame.sequence for frame in sensor.receive(PATIENCE_S)] == [1]
+        with pytest.raises(ConnectionFailedError, match="closed"):
+            while True:
+                sensor.poll(PATIENCE_S)
+
+
+def test_a_connection_that_ended_is_made_anew_and_its_first_sample_has_a_gap(scripted: ScriptedServer) -> None:
+    with connect(scripted.port, timeout_s=PATIENCE_S) as sensor:
+        for connections in (1, 2, 3):
+            assert scripted.subscribed.wait(PATIENCE_S)
+            scripted.send_sample(1.0)
+            (frame,) = sensor.receive(PATIENCE_S)
+            assert bool(frame.flags & DataFlag.GAP) == (connections > 1)
+            assert scripted.connections == connections
+            scripted.drop()
+            while sensor.session.connected:
+                sensor.poll(PATIENCE_S)
+            while not sensor.session.connected:
+                sensor.poll(PATIENCE_S)
+        kinds = [type(event) for event in sensor.events]
+        assert kinds == [Connected, Disconnected, Connected, Disconnected, Connected, Disconnected, Connected]
+
+
+def test_nothing_new_is_an_error_that_says_why(scripted: ScriptedServer) -> None:
+    with connect(scripted.port) as sensor:
+        with pytest.raises(NoSampleError, match="no new sample of sensor 0 for 20 ms: silent") as caught:
+            next(iter(sensor))
+        assert caught.value.condition is Condition.SILENT
+        for flags, condition in ((DataFlag.REPEATED, Condition.REPEATED), (DataFlag.INVALID, Condition.INVALID)):
+            scripted.send_sample(1.0)
+            assert len(sensor.receive(PATIENCE_S)) == 1
+            scripted.send_sample(1.0, flags)
+            with pytest.raises(NoSampleError) as caught:
+                sensor.receive(0.3)
+            assert caught.value.condition in (condition, Condition.SILENT)
+        scripted.send_json({"event": "sensor_lost", "sensor": 0})
+        with pytest.raises(NoSampleError) as caught:
+            sensor.receive()
+        assert caught.value.condition is Condition.SENSOR_LOST
+        scripted.close()
+        with pytest.raises(NoSampleError, match=r"disconnected \(.+\)") as caught:
+            while True:
+                sensor.receive()
+        assert caught.value.condition is Condition.DISCONNECTED
+
+
+def test_what_comes_before_a_reply_is_kept(scripted: ScriptedServer) -> None:
+    with connect(scripted.port, timeout_s=PATIENCE_S) as sensor:
+        assert scripted.subscribed.wait(PATIENCE_S)
+        scripted.send_sample(1.0)
+        scripted.send_json({"event": "reconfigured", "sensor": 0})
+        assert sensor.ask("status")["ok"]
+        assert [frame.sequence for frame in sensor.poll()] == [1]
+        assert sensor.events[-1] == {"event": "reconfigured", "sensor": 0}
+        assert sensor.poll(0.01) == []
 
 
 OURS = boot_id()
@@ -125,14 +164,8 @@ def test_the_clock_that_a_server_names_decides_whose_it_is(
 ) -> None:
     """By its address the server is always here, as behind an SSH tunnel; what cannot be a name is none."""
     scripted.description = description(boot_id=claimed)
-    with Client(scripted.port) as client:
-        assert client.connection.same_machine == near
-    connection = Connection("localhost", scripted.port)
-    try:
-        connection.subscribe(0)
-        assert connection.same_machine == near
-    finally:
-        connection.close()
+    with connect(scripted.port) as client:
+        assert client.session.same_machine == near
 
 
 @pytest.fixture
@@ -175,7 +208,7 @@ def test_a_refusal_is_the_servers_sentence(scripted: ScriptedServer) -> None:
     refused = {"code": "sensor", "message": "it\nrefuses", "abort_code": 0x06090011}
     scripted.answers["sdo_read"] = lambda _: {"ok": False, "error": refused}
     scripted.answers["status"] = lambda _: {"ok": False}
-    with Client(scripted.port) as client:
+    with connect(scripted.port) as client:
         with pytest.raises(RefusedError, match="it\\?refuses") as caught:
             client.ask("sdo_read", sensor=0, index=0x8011)
         assert (caught.value.code, caught.value.abort_code) == ("sensor", 0x06090011)
@@ -186,7 +219,7 @@ def test_a_refusal_is_the_servers_sentence(scripted: ScriptedServer) -> None:
 
 def test_no_reply_and_another_protocol_and_bytes_that_are_none(scripted: ScriptedServer) -> None:
     scripted.answers["status"] = lambda _: None
-    with Client(scripted.port) as client:
+    with connect(scripted.port) as client:
         with pytest.raises(NoReplyError, match="no reply to status"):
             client.ask("status", timeout_s=0.05)
         scripted.send_raw(b"HTTP/1.1 400 Bad Request\r\n\r\n")
@@ -195,7 +228,7 @@ def test_no_reply_and_another_protocol_and_bytes_that_are_none(scripted: Scripte
     for version in (2, True, None):
         scripted.description = description(protocol=version)
         with pytest.raises(ConnectionFailedError, match="install the same version"):
-            Client(scripted.port)
+            connect(scripted.port)
 
 
 def test_nobody_there() -> None:
@@ -226,22 +259,34 @@ def test_another_thread_may_close_it(scripted: ScriptedServer) -> None:
     closer = threading.Timer(0.1, client.close)
     closer.start()
     with pytest.raises(ConnectionFailedError):
-        list(client)
+        client.receive(PATIENCE_S)
     closer.join()
     with pytest.raises(ConnectionFailedError, match="closed"):
         client.receive(1.0)
+    with pytest.raises(ConnectionFailedError, match="closed"):
+        client.ask("status")
 
 
-def test_another_thread_may_close_it_in_the_very_moment_of_waiting(scripted: ScriptedServer) -> None:
-    client = connect(scripted.port)
-    os.close(client.fileno())
-    with pytest.raises(ConnectionFailedError, match=r"closed|Bad file descriptor"):
-        client.receive(1.0)
-    client.connection.sock.detach()
+def test_another_thread_may_ask_while_one_receives(scripted: ScriptedServer) -> None:
+    with connect(scripted.port) as client:
+        over = threading.Event()
+
+        def read() -> None:
+            while not over.is_set():
+                client.poll(0.05)
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        client.channel.wait(over, 0.1)
+        try:
+            assert all(client.ask("status")["ok"] for _ in range(20))
+        finally:
+            over.set()
+            reader.join()
 
 
 def test_every_sample_of_a_whole_server_once_and_in_order() -> None:
-    with served(sinc_length=256) as server, connect(server.port) as sensor:
+    with served(sinc_length=256) as server, connect(server.port, timeout_s=PATIENCE_S) as sensor:
         assert sensor.description["sensors"][0]["rate_hz"] == 200
         numbers = []
         for sample in sensor:
@@ -252,19 +297,23 @@ def test_every_sample_of_a_whole_server_once_and_in_order() -> None:
                 break
         assert numbers == sorted(set(numbers))
         assert sensor.ask("status")["ok"]
-        assert sensor.receive(30.0)
+        assert sensor.receive(PATIENCE_S)
+
+
+def examples() -> list[str]:
+    """Of the section of the docs."""
+    text = (ROOT / "docs" / "protocol.md").read_text().split("## A client in ten lines")[1].split("\n## ")[0]
+    return [part.split("```")[0] for part in text.split("```python\n")[1:]]
 
 
 def test_the_ten_lines_of_the_docs_run() -> None:
-    text = (ROOT / "docs" / "protocol.md").read_text()
-    example = text.split("## A client in ten lines")[1].split("```python\n")[1].split("```")[0]
+    example = examples()[0]
     assert len(example.splitlines()) <= 10
     with ScriptedServer() as scripted:
 
         def three_samples() -> None:
             for number in range(3):
                 scripted.send_sample(float(number))
-            scripted.send_json({"event": "shutting_down"})
             scripted.drop()
 
         scripted.on_subscribe = three_samples
@@ -273,5 +322,48 @@ def test_the_ten_lines_of_the_docs_run() -> None:
             check=False, capture_output=True, text=True, timeout=30, cwd=ROOT,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )  # fmt: skip
-    assert run.stdout.count("\n") == 3, run.stderr
-    assert run.returncode == 0, run.stderr
+    assert run.stdout.count("\n") >= 3, run.stderr
+    assert "NoSampleError: no new sample of sensor 0" in run.stderr
+
+
+def pull_the_sensor(server: Simulation, _: MemoryChannel) -> None:
+    server.command("power off")
+
+
+def pull_the_cable(server: Simulation, _: MemoryChannel) -> None:
+    server.command("disconnect")
+
+
+def stop_the_server(_: Simulation, channel: MemoryChannel) -> None:
+    channel.hangs = True
+
+
+def kill_the_server(_: Simulation, channel: MemoryChannel) -> None:
+    channel.kill()
+
+
+@pytest.mark.parametrize(
+    ("pull", "reason"),
+    [
+        (pull_the_sensor, "no force: invalid"), (pull_the_cable, "no force: invalid"),
+        (stop_the_server, "no force: (silent|late)"), (kill_the_server, "no force: disconnected"),
+    ],
+)  # fmt: skip
+def test_the_guard_of_the_docs_stops_within_two_timeouts(
+    pull: Callable[[Simulation, MemoryChannel], None], reason: str
+) -> None:
+    source = examples()[1]
+    assert len(source.splitlines()) <= 15
+    server = Simulation(settings={"sinc_length": 64})
+    channel = MemoryChannel(server)
+    names: dict[str, Any] = {}
+    exec(source, names)
+    names["connect"] = lambda port, **options: Client(port, channel=channel, **options).connect()
+    pulled_ns = server.clock.now_ns + 2_000_000_000
+
+    def stop(why: str) -> None:
+        assert pulled_ns < server.clock.now_ns < pulled_ns + 21_000_000, why
+        assert re.match(reason, why)
+
+    server.clock.at(pulled_ns, lambda: pull(server, channel))
+    names["guard"](stop)
