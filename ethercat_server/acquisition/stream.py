@@ -20,6 +20,7 @@ from ethercat_server.acquisition.timing.sample_clock import SILENT_PERIODS, Samp
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
 from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
+from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.sensor.sensor import Sensor
 from protocol.framing import DataFlag, encode_data
 from protocol.pdo import is_finite
@@ -43,12 +44,17 @@ class SensorStream:
         timing: ExchangeTiming,
         clock: Clock = SYSTEM_CLOCK,
         latching: DistributedClock | None = None,
+        passing_ns: int = 0,
     ) -> None:
-        """`latching` is the clock of the slave controller, if that latches when samples come to be."""
+        """`latching` is the clock of the slave controller, if that latches when samples come to be.
+
+        Its process data passes the slave `passing_ns` after the frame has arrived there.
+        """
         self.number = number
         self._monotonic_ns, self._time_ns = clock.monotonic_ns, clock.time_ns
         self._timing = timing
-        self.clock = SampleClock(period_ns, timing, latching and EventTimes(latching, timing))
+        self._passing_ns = passing_ns
+        self.clock = self._new_clock(period_ns, latching)
         self.process_data = b""
         """The newest valid process data."""
         self._handed_out = b""
@@ -80,6 +86,10 @@ class SensorStream:
         self.idle_at_ns = 0.0
         """`idle` is to be called from then on."""
 
+    def _new_clock(self, period_ns: float, latching: DistributedClock | None) -> SampleClock:
+        events = latching and EventTimes(latching, self._timing, self._passing_ns)
+        return SampleClock(period_ns, self._timing, events, self._passing_ns)
+
     def take(
         self, data: bytes, wkc: int, sent_ns: int, back_ns: int, latched: Latched | None = None
     ) -> tuple[bytes, int] | None:
@@ -96,7 +106,7 @@ class SensorStream:
         self._wkc, self._valid_ns = wkc, back_ns
         self.learns = True
         if latched is not None and clock.events is not None:
-            clock.events.took(latched, sent_ns, back_ns, fresh)
+            clock.events.took(latched, sent_ns, back_ns, fresh, clock.period_ns)
         if not fresh:
             return None
         self.process_data = data
@@ -186,8 +196,7 @@ class SensorStream:
         """The sensor is back after it was out; `period_ns` if it entered OP anew, None if it never left."""
         self.recoveries += lost
         if period_ns is not None:
-            events = latching and EventTimes(latching, self._timing)
-            self.clock = SampleClock(period_ns, self._timing, events)
+            self.clock = self._new_clock(period_ns, latching)
             self._discard = DISCARDED_AT_START
             self._gap = True
 
@@ -214,7 +223,8 @@ class SensorStream:
 
 def make_streams(bus: Bus, sensors: Sequence[Sensor], timing: ExchangeTiming) -> list[SensorStream]:
     """Those of the sensors on a bus in OP."""
+    passing_ns = {at.number: at.start * BYTE_NS for inputs in bus.process_data.inputs for at in inputs}
     return [
-        SensorStream(sensor.number, sensor.period_ns, timing, bus.clock, bus.read_clock(sensor.number))
-        for sensor in sensors
+        SensorStream(number, each.period_ns, timing, bus.clock, bus.read_clock(number), passing_ns[number])
+        for number, each in enumerate(sensors)
     ]

@@ -160,6 +160,22 @@ def test_a_change_of_the_clocks_rate_is_followed() -> None:
     assert percentile(simulation.outcome(7.0).errors_ns, 99) < 10e3
 
 
+@pytest.mark.parametrize("controller", [None, HONEST], ids=["polling", "events"])
+@pytest.mark.parametrize("excess_ns", [0.0, 30e3])
+@pytest.mark.parametrize("outward", [0.0, 0.5, 1.0])
+def test_the_uncertainty_covers_an_excess_on_one_side(
+    controller: Controller | None, excess_ns: float, outward: float
+) -> None:
+    """Which side cannot be told; the shortest round trip is a rare one."""
+    card = Card(16e3, spread=0, jitter_ns=2e3, excess_ns=excess_ns, outward=outward)
+    simulation = run(controller, card=card, seconds=8.0)
+    outcome = simulation.outcome(3.0)
+    assert simulation.clock.by_events is bool(controller)
+    assert outcome.outside == 0
+    told = percentile(sorted(sample.uncertainty_ns for sample in outcome.samples), 99)
+    assert told < (16e3 + excess_ns) / 2 + 12e3
+
+
 def test_the_uncertainty_covers_the_stamps_of_a_lopsided_round_trip() -> None:
     simulation = run(Controller(late_ns=-4e3))
     assert simulation.outcome(1.0).outside == 0

@@ -6,7 +6,9 @@ How event times are judged is in test_event_times.py.
 from __future__ import annotations
 
 import logging
+import random
 import struct
+from itertools import pairwise
 
 import pytest
 
@@ -16,6 +18,7 @@ from ethercat_server.ethercat.exchange.frames import Area, fit_a_frame, make_fra
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import Command, Datagram, parse
 from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.framing import DataFlag
 from tests.simulation import Simulation, fresh, reading
 
 SETTLED_S = 3.0
@@ -106,6 +109,28 @@ def test_what_another_master_has_written_to_the_clock_is_taken_into_account() ->
     running.run(SETTLED_S)
     assert stamps(running) == "hardware"
     assert max(map(abs, errors_ns(running)[-400:])) < 10_000
+
+
+@pytest.mark.parametrize(("sensors", "sinc_length"), [(1, 32), (1, 64), (8, 32), (8, 64)])
+def test_a_stop_of_the_machine_costs_neither_stamps_nor_the_count(sensors: int, sinc_length: int) -> None:
+    """The next sample may come between the pass of the process data and that of its event."""
+    options = [SensorOptions(serial=n, signal="clock", ppm=150.0 - 37 * n) for n in range(sensors)]
+    running = Simulation(*options, settings={"sinc_length": sinc_length})
+    running.run(SETTLED_S / 2)
+    assert {stamps(running, number) for number in range(sensors)} == {"hardware"}
+    chance, count, at_s = random.Random(1), len(running.frames), 0.0
+    seconds = 8.0 / sensors
+    while (at_s := at_s + chance.uniform(0.005, 0.05)) < seconds:
+        running.at(at_s, lambda: running.clock.stall(chance.uniform(0.5e6, 5e6)))
+    running.run(seconds)
+    wrong = 0
+    for number in range(sensors):
+        frames = [frame for frame in fresh(running.frames[count:]) if frame.sensor == number]
+        for before, after in pairwise(frames):
+            missing = reading(after).number - reading(before).number - 1
+            assert bool(after.flags & DataFlag.GAP) is (missing > 0)
+            wrong += abs(after.monotonic_ns - reading(after).instant_ns) > 10_000
+    assert wrong == 0
 
 
 def areas(count: int, size: int = 61) -> list[list[Area]]:

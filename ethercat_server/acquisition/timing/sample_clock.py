@@ -55,16 +55,26 @@ class SampleClock:
 
     __slots__ = (
         "_absent", "_aim_ns", "_begun", "_by_event", "_caution", "_doubtful", "_hits",
-        "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_newest", "_overdue",
-        "_probed_above", "_probing", "_single", "_timing", "_turn", "_usual_margin_ns", "estimate", "events",
-        "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
+        "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_moved_ns", "_newest", "_overdue",
+        "_passing_ns", "_probed_above", "_probing", "_single", "_timing", "_turn", "_usual_margin_ns",
+        "estimate", "events", "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
     )  # fmt: skip
 
-    def __init__(self, period_ns: float, timing: ExchangeTiming, events: EventTimes | None = None) -> None:
-        """`period_ns` is the nominal sample period; `timing` that of the bus."""
+    def __init__(
+        self,
+        period_ns: float,
+        timing: ExchangeTiming,
+        events: EventTimes | None = None,
+        passing_ns: int = 0,
+    ) -> None:
+        """`period_ns` is the nominal sample period; `timing` that of the bus.
+
+        The process data passes the slave `passing_ns` after the frame has arrived there.
+        """
         self.events = events
         self.estimate = Estimate(period_ns)
         """Its phase is the next sample's instant less the outward part of the shortest round trip."""
+        self._passing_ns = passing_ns
         self._timing = timing
         self.locked = False
         self.instant_ns = 0.0
@@ -81,6 +91,7 @@ class SampleClock:
         """Instant of the newest sample as its event has it, less the outward part; 0: it says nothing."""
         self._looked_ns = 0
         """When the last valid exchange was sent."""
+        self._moved_ns = timing.moved_ns
         self._newest = 1
         """Number of the newest sample, counted from the one before it by the phase alone."""
         self._absent = 0
@@ -113,10 +124,17 @@ class SampleClock:
 
     @property
     def uncertainty_ns(self) -> float:
-        """How far `instant_ns` may be off: two standard deviations, and where the slave is on the way."""
-        events = self.events
-        variance = events.variance if events is not None and events.are_trusted else self.estimate.variance
-        return 2 * math.sqrt(variance) + self._timing.least_ns / 2
+        """How far `instant_ns` may be off: two standard deviations, and where the slave is on the way.
+
+        What a round trip usually takes beyond the shortest may be on one side of it, which none can tell. A
+        sample that may be another one than thought may be off by a period.
+        """
+        events, timing = self.events, self._timing
+        if events is not None and events.are_trusted:
+            variance, way_ns = events.variance, events.way_ns
+        else:
+            variance, way_ns = self.estimate.variance, timing.least_ns + timing.excess_ns
+        return 2 * math.sqrt(variance) + way_ns / 2 + (self.estimate.period_ns if self.uncertain else 0.0)
 
     @property
     def by_events(self) -> bool:
@@ -181,6 +199,7 @@ class SampleClock:
         """
         phase_ns, period_ns = self.estimate.phase_ns, self.estimate.period_ns
         looked_ns, least_ns = self._looked_ns, self._timing.least_ns
+        outward_ns = least_ns / 2 + self._passing_ns
         unwatched_ns = back_ns - looked_ns
         if not self._begun:
             self._newest = 1
@@ -192,9 +211,9 @@ class SampleClock:
         self.uncertain = False
         events, self._by_event = self.events, 0.0
         if events is not None and events.are_trusted:
-            late = events.date(phase_ns + least_ns / 2, period_ns, self.estimate.variance, sent_ns, back_ns)
+            late = events.date(phase_ns + outward_ns, period_ns, self.estimate.variance, sent_ns, back_ns)
             if late is not None:
-                self._by_event, self.uncertain = events.instant_ns - least_ns / 2, events.is_doubtful
+                self._by_event, self.uncertain = events.instant_ns - outward_ns, events.is_doubtful
                 self._count(1 + round(late), late)
                 self.instant_ns = min(events.instant_ns, back_ns)
                 return
@@ -216,7 +235,7 @@ class SampleClock:
             lost_track = events is not None and events.is_doubtful and unwatched_ns > _MISSABLE * period_ns
             self.uncertain = self._doubtful or lost_track or (most > 0 and least < most)
         self._count(newest, late)
-        instant_ns = max(phase_ns + (self._newest - 1) * period_ns, looked_ns) + least_ns / 2
+        instant_ns = max(phase_ns + (self._newest - 1) * period_ns, looked_ns) + outward_ns
         # After a stall in the exchange its end says nothing of when the sample came to be.
         self.instant_ns = min(instant_ns if self.locked else sent_ns + period_ns, back_ns)
         if events is not None and self.locked and not (events.are_trusted or self.uncertain):
@@ -246,7 +265,9 @@ class SampleClock:
 
     def observe(self, sent_ns: int, arrived_ns: int, fresh: bool) -> None:
         """Learn from one valid exchange whether it brought a new sample (`fresh`: after `predict`)."""
-        estimate = self.estimate
+        estimate, moved_ns = self.estimate, self._timing.moved_ns
+        estimate.phase_ns += moved_ns - self._moved_ns
+        self._moved_ns = moved_ns
         if self._turn > 0 and fresh and self._by_event and self._goes_on and not estimate.restless:
             # A steady clock need not be learned from every sample.
             self._turn -= 1
