@@ -93,6 +93,11 @@ class Trust:
         self._sum_ns += difference_ns
         self._squares += difference_ns * difference_ns
 
+    @property
+    def mean_ns(self) -> float:
+        """By how much events were later than what polling says, in the latest trial."""
+        return self._sum_ns / max(self._compared, 1)
+
     def unfit(self) -> None:
         """An event that cannot be the sample's."""
         self._unfit += 1
@@ -116,8 +121,8 @@ class Trust:
         elif self._compared < _FITTING * count:
             self._fail("they contradict the frames")
             self.begin(evidence, now_ns)
-        elif abs(mean_ns := self._sum_ns / self._compared) > _CONTRADICTS * math.sqrt(variance):
-            self._fail(f"they differ from what polling shows by {mean_ns / 1000:+.0f} µs")
+        elif abs(self.mean_ns) > _CONTRADICTS * math.sqrt(variance):
+            self._fail(f"they differ from what polling shows by {self.mean_ns / 1000:+.0f} µs")
             self.begin(evidence, now_ns)
         else:
             self.verdict, self._since_ns = Verdict.TRUSTED, now_ns

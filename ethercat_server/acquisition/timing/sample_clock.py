@@ -41,6 +41,7 @@ _LONGEST_LOOK: Final = 0.5
 """The sensor looks at its data within this part of a period after the frame usually has reached it."""
 _EARLY: Final = -0.25
 """A sample so much before the expected one, in periods, is the one that was watched for before."""
+_BIAS_GAIN: Final = 1 / 64
 _ONE_ONLY, _MISSABLE = 0.8, 1.25
 """Only one sample can have come in this part of a period; more may have in this."""
 
@@ -54,7 +55,7 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_absent", "_aim_ns", "_begun", "_by_event", "_caution", "_doubtful", "_hits",
+        "_absent", "_aim_ns", "_begun", "_bias_ns", "_by_event", "_caution", "_doubtful", "_hits",
         "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_moved_ns", "_newest", "_overdue",
         "_passing_ns", "_probed_above", "_probing", "_single", "_timing", "_turn", "_usual_margin_ns",
         "estimate", "events", "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
@@ -92,6 +93,8 @@ class SampleClock:
         self._looked_ns = 0
         """When the last valid exchange was sent."""
         self._moved_ns = timing.moved_ns
+        self._bias_ns = 0.0
+        """By how much events are later than polls show, where both are followed."""
         self._newest = 1
         """Number of the newest sample, counted from the one before it by the phase alone."""
         self._absent = 0
@@ -142,6 +145,15 @@ class SampleClock:
         return self.events is not None and self.events.are_trusted
 
     @property
+    def _follows_events(self) -> bool:
+        """Whether phase and period are learned from events.
+
+        Where an early poll costs a sample, only polls tell when to poll: event times may be off by more than
+        polls stand, and agree with polling as far as the long round trip tells.
+        """
+        return self.by_events and not self._single
+
+    @property
     def one_by_one(self) -> bool:
         """Whether it is followed, and an exchange is back before the next one is wanted."""
         return self.locked and not self._single
@@ -181,12 +193,14 @@ class SampleClock:
             self._turn = _TURNS
             self._least_variance, self._most_variance = variance / _CHANGED, variance * _CHANGED
             self._single = has_no_time_for_two(timing, period_ns)
-            self._usual_margin_ns = margin_ns(timing, period_ns, variance, by_events=self.by_events)
+            self._usual_margin_ns = margin_ns(timing, period_ns, variance, by_events=self._follows_events)
             self._probed_above = (timing.look_variance + _PROBE_BELOW) / 4
         self._margin_ns = self._usual_margin_ns * (1.0 if self._single or self.by_events else self._caution)
-        self._probing = self._hits > _UNPROBED or (variance > self._probed_above and not self.by_events)
+        self._probing = self._hits > _UNPROBED or (
+            variance > self._probed_above and not self._follows_events
+        )
         self._aim_ns = estimate.phase_ns + self._margin_ns - timing.look_ns
-        if self._probing and not self._single and self.by_events:
+        if self._probing and self._follows_events:
             self._aim_ns -= 2 * self._margin_ns
         self.quiet_until_ns = estimate.phase_ns - CERTAIN * deviation_ns if self.locked else 0.0
 
@@ -211,9 +225,15 @@ class SampleClock:
         self.uncertain = False
         events, self._by_event = self.events, 0.0
         if events is not None and events.are_trusted:
-            late = events.date(phase_ns + outward_ns, period_ns, self.estimate.variance, sent_ns, back_ns)
+            bias_ns = self._bias_ns if self._single else 0.0
+            expected_ns = phase_ns + outward_ns + bias_ns
+            late = events.date(expected_ns, period_ns, self.estimate.variance, sent_ns, back_ns)
             if late is not None:
-                self._by_event, self.uncertain = events.instant_ns - outward_ns, events.is_doubtful
+                if self._single:
+                    self._bias_ns += _BIAS_GAIN * (late - round(late)) * period_ns
+                else:
+                    self._by_event = events.instant_ns - outward_ns
+                self.uncertain = events.is_doubtful
                 self._count(1 + round(late), late)
                 self.instant_ns = min(events.instant_ns, back_ns)
                 return
@@ -241,7 +261,9 @@ class SampleClock:
         if events is not None and self.locked and not (events.are_trusted or self.uncertain):
             difference_ns = events.instant_ns - instant_ns
             if variance := events.compare(difference_ns, self.estimate.variance, back_ns):
-                self.estimate.expect(variance)
+                self._bias_ns = events.trust.mean_ns
+                if not self._single:
+                    self.estimate.expect(variance)
 
     def _count(self, newest: int, late: float) -> None:
         """The new sample is this one by the estimate, and so late there, in periods."""
@@ -310,10 +332,10 @@ class SampleClock:
             self._overdue = look_ns > estimate.phase_ns + _OVERDUE * math.sqrt(estimate.variance + variance)
             # One in doubt may have been seen already; one that is late may be missing. The next one tells.
             if self.locked and not (self._doubtful or self._is_late(look_ns, variance)):
-                if not self.by_events:
+                if not self._follows_events:
                     estimate.learn_bit(look_ns, variance, -1)
-                if look_ns > estimate.phase_ns - doubt_ns - self._margin_ns * (1 + self.by_events):
-                    if self._hits and not self.by_events:
+                if look_ns > estimate.phase_ns - doubt_ns - self._margin_ns * (1 + self._follows_events):
+                    if self._hits and not self._follows_events:
                         self._caution += _CAUTION_GAIN * self._caution
                         self._caution = min(self._caution, 1.0)
                     self._hits = 0
