@@ -129,7 +129,9 @@ class Controller:
     counter: int = 1
     """Working counter of its registers."""
     lies_from_s: float = 0.0
-    """When all this begins, in s from the start."""
+    """When all this begins, in s from the start,"""
+    lies_until_s: float = math.inf
+    """and ends, but for a local time that was another meanwhile."""
 
     def local(self, at_ns: float) -> int:
         """The local time then."""
@@ -146,7 +148,7 @@ class Controller:
         """What a frame reads that is at the slave at `look_ns`, when the sample `number` is the newest."""
         change = 0
         if number >= 0:
-            if look_ns < self.lies_from_s * SECOND:
+            if not self.lies_from_s * SECOND <= look_ns < self.lies_until_s * SECOND:
                 change = self.local(instants_ns[number])
             else:
                 event_ns = instants_ns[max(0, number - self.lags)] + self.late_ns

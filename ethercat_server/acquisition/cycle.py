@@ -180,6 +180,7 @@ class Cycle:
             slept = slept or wait > 0
         if (late := now - due) > self._schedule.shortest_ns:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
+            self._recovery.causes.stood_still(late, now)
         timing.sends(sent := bus.process_data.send())
         self._cycles += 1
         if slept:
@@ -199,7 +200,10 @@ class Cycle:
         bus = self._bus
         frame = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0)
         back = bus.clock.monotonic_ns()
-        if frame is None or not (sent := bus.process_data.take(frame)):
+        if frame is None:
+            return None
+        if not (sent := bus.process_data.take(frame)):
+            self._recovery.causes.stray(frame, back)
             return frame
         self._hand_out(sent, back)
         self._learn(sent, back)
@@ -216,6 +220,7 @@ class Cycle:
         arrived = max(sent, arrived - self._wire_ns[which])
         if (late := back - sent - timing.usual_ns) > self._schedule.shortest_ns:  # the computer stood still
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
+            self._recovery.causes.stood_still(back - arrived - self._wire_ns[which], back)
         timing.took(sent, arrived)
         self._exchange.record(back - sent)
         for stream in self._streams_of[which]:
@@ -247,6 +252,7 @@ class Cycle:
         self._exchange.roll()
         self._schedule.roll()
         self._round_trip.check()
+        self._recovery.causes.check()
         for stream in self._streams:
             stream.age.roll()
             stream.check()

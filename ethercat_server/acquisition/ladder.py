@@ -72,6 +72,7 @@ class Ladder:
                 if not (yield from self._restore_station()):
                     yield from self._pause(_ABSENT_PAUSE_S)
             elif status.is_op:
+                self._latch_events()
                 if self._sensor.unsettled:
                     yield from put_right(self.sdo, self._sensor)
                 return left_op
@@ -144,6 +145,12 @@ class Ladder:
         self.states.write(reg.FMMU, self._bus.fmmus[self._sensor.number])
         yield from self.states.go(AlState.SAFEOP)
         yield from self.states.go(AlState.OP)
+
+    def _latch_events(self) -> None:
+        """Have the controller latch again when samples come to be: another master may have ended that."""
+        for at in range(reg.SM_ACTIVATE, len(self._sync_managers), reg.SYNC_MANAGER_SIZE):
+            if self._sync_managers[at] & reg.SM_LATCH_PDI:
+                self.states.write(reg.SYNC_MANAGER + at, self._sync_managers[at : at + 1])
 
     def _pause(self, seconds: float) -> Steps[None]:
         """Steps that take at least `seconds`."""

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
+from ethercat_server.acquisition.health.causes import Causes
 from ethercat_server.acquisition.health.mailboxes import Mailboxes
 from ethercat_server.acquisition.ladder import DifferentSensorError, Ladder
 from ethercat_server.acquisition.stream import SensorStream
@@ -72,6 +73,7 @@ class Recovery:
         self._ladders = [Ladder(bus, sensor) for sensor in sensors]
         self._mailboxes = Mailboxes(bus, sensors, [ladder.mailbox for ladder in self._ladders], announce)
         self._clock = bus.clock
+        self.causes = Causes(bus.ifname)
         self._work: dict[int, Steps[bool]] = {}
         """What is under way to bring back those that do not stream."""
         self._lost_at_ns: dict[int, int] = {}
@@ -179,7 +181,8 @@ class Recovery:
 
     def _report_lost(self, number: int, reason: str) -> None:
         sensor = self._sensors[number]
-        self._lost_at_ns[number] = self._clock.monotonic_ns()
+        self._lost_at_ns[number] = now_ns = self._clock.monotonic_ns()
+        reason = self.causes.explain(reason, now_ns)
         log.warning("sensor %d (%s) is lost: %s", number, sensor.identity, reason)
         self._announce(
             event(

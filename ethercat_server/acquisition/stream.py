@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from ethercat_server.acquisition.hardware.event_times import EventTimes
-from ethercat_server.acquisition.hardware.trust import Verdict
 from ethercat_server.acquisition.health.samples import SampleHealth
 from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
@@ -187,7 +186,7 @@ class SensorStream:
         """To be called once a second: log what the samples show of the sensor."""
         self.health.check(self.fresh, self.repeated, self.clock)
         events = self.clock.events
-        if events is not None and events.trust.verdict is Verdict.REFUSED:
+        if events is not None and events.trust.is_final:
             self.clock.events = None
 
     def recover(

@@ -19,6 +19,8 @@ DATAGRAM_HEADER: Final = 10
 COUNTER_SIZE: Final = 2
 TYPE_DATAGRAMS: Final = 1
 SOURCE_ADDRESS: Final = 6
+SOURCE: Final = b"\x01" * 6
+"""The address that frames of this project come from, SOEM's too."""
 DATAGRAM_INDEX: Final = FRAME_HEADER + 1
 """Offset of the first datagram's index in a frame."""
 FIRST_DATA: Final = FRAME_HEADER + DATAGRAM_HEADER
@@ -109,7 +111,7 @@ def parse(frame: bytes | bytearray | memoryview, size: int) -> list[Datagram]:
 
 def build(
     *datagrams: tuple[int, int, int, bytes],
-    source: bytes = b"\x01\x01\x01\x01\x01\x01",
+    source: bytes = SOURCE,
     first_index: int = 0,
 ) -> bytearray:
     """A frame of (command, ADP, ADO, data) datagrams.

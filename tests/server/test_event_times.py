@@ -139,6 +139,40 @@ def test_wrong_event_times_are_refused_and_polling_goes_on(wrong: tuple[str, flo
     assert percentile(after.errors_ns, 99) < 20e3
 
 
+@pytest.mark.parametrize("late_ns", [-200e3, -100e3, 100e3, 200e3])
+@pytest.mark.parametrize("since_s", [0.0, LIES_FROM_S])
+def test_no_lie_costs_a_sample_on_a_slow_card(late_ns: float, since_s: float) -> None:
+    """Of a long round trip so much may be on one side, so such event times are believed."""
+    for rate_hz, jitter_ns in ((800.0, 5e4), (800.0, 4e5), (1600.0, 5e4), (1600.0, 4e5)):
+        lying = Controller(late_ns=late_ns, lies_from_s=since_s)
+        card = Card(2.2e6, spread=0, jitter_ns=jitter_ns)
+        simulation = run(lying, Sensor(rate_hz, ppm=150.0), card, seconds=5.0)
+        outcome = simulation.outcome(1.0)
+        assert (outcome.lost, outcome.counted, outcome.unflagged, outcome.unlocked) == (0, 0, 0, 0)
+        assert outcome.outside == 0
+        assert outcome.exchanges < 1.05
+
+
+@pytest.mark.parametrize("jitter_ns", [10e3, 20e3])
+def test_event_times_that_are_worse_than_polling_are_not_used(jitter_ns: float) -> None:
+    simulation = run(Controller(jitter_ns=jitter_ns), seconds=12.0)
+    assert verdict(simulation) is Verdict.REFUSED
+    outcome = simulation.outcome(4.0)
+    assert percentile(outcome.errors_ns, 99) < 12e3
+    by_polling = run(None, seconds=12.0).outcome(4.0)
+    assert percentile(outcome.errors_ns, 99) < percentile(by_polling.errors_ns, 99) + 3e3
+
+
+def test_event_times_are_trusted_again_once_they_are_right() -> None:
+    """After several trials that failed there is a pause, and a longer one after the next."""
+    lying = Controller(jitter_ns=50e3, lies_from_s=LIES_FROM_S, lies_until_s=9.0)
+    simulation = run(lying, seconds=9.0)
+    assert verdict(simulation) is Verdict.REFUSED
+    simulation.run(17.0)
+    assert verdict(simulation) is Verdict.TRUSTED
+    assert_right(simulation.outcome(16.5))
+
+
 def test_registers_that_nobody_has_are_refused_within_a_second() -> None:
     for controller in (Controller(counter=0), Controller(stuck=True)):
         assert verdict(run(controller, seconds=1.0)) is Verdict.REFUSED

@@ -69,6 +69,11 @@ class EventTimes:
         """Whether the controller knows the registers."""
 
     @property
+    def _is_in_time(self) -> bool:
+        """Whether the newest exchange was no longer away than usual: else the machine was busy meanwhile."""
+        return self._took_ns < self._timing.patience_ns
+
+    @property
     def variance(self) -> float:
         """Of `instant_ns`, in ns², but for where on its way a round trip takes its time."""
         return self.local_clock.variance + _LEAST_VARIANCE
@@ -90,6 +95,7 @@ class EventTimes:
         """
         self.instant_ns, self._is_next, self.is_doubtful = 0.0, False, False
         system, counted, change, counted_too = latched
+        self._took_ns = back_ns - sent_ns
         self._answers = counted == counted_too == 1
         if not self._answers:
             return
@@ -107,7 +113,6 @@ class EventTimes:
         fits = self._is_next or oldest < event <= newest + _SLACK_NS
         if fits and clock.is_known and clock.fits(sent_ns, back_ns):
             self.instant_ns = clock.time(event) - self._half_behind_ns - self._is_next * period_ns
-            self._took_ns = back_ns - sent_ns
 
     def learn(self, sent_ns: int, arrived_ns: int) -> None:
         """Learn from the exchange that `took` was about: sent, and begun to arrive, then."""
@@ -135,9 +140,9 @@ class EventTimes:
             if not (is_old or is_late) and not doubt_ns < off_ns < self._took_ns / 2:
                 trust.confirmed()
                 return late
-            trust.contradicted(not is_old)
+            trust.contradicted(self._is_in_time and not is_old)
         else:
-            trust.contradicted(1.0)
+            trust.contradicted(self._is_in_time)
         self.is_doubtful = True
         trust.reconsider(self._evidence, back_ns)
         self.are_trusted = trust.verdict is Verdict.TRUSTED
@@ -150,13 +155,11 @@ class EventTimes:
         Returns the variance of the differences once they are trusted from here on, else 0.
         """
         trust = self.trust
-        if trust.verdict is Verdict.REFUSED:
-            return 0.0
         if self._is_next:
             pass
         elif self.instant_ns:
             trust.compare(difference_ns)
-        elif not (self._answers and not self.local_clock.is_known):
+        elif self._is_in_time and not (self._answers and not self.local_clock.is_known):
             trust.unfit()
         # Polling does not tell where on its way a round trip takes its time.
         asymmetry_ns = _ASYMMETRY * self._timing.least_ns

@@ -13,18 +13,22 @@ from typing import Final, NamedTuple
 _SAMPLES: Final = 100
 _TRIAL_NS: Final = 500_000_000
 """Minimum samples and duration of a trial."""
-_FITTING: Final = 0.95
-"""Part of them whose events must lie between the frames around the sample."""
+_FITTING: Final = 0.99
+"""Part of them whose events must lie between the frames around the sample. All are in the same clock, so
+right ones always do. One that is off at random does not only where a poll came close, as one in ten does."""
 _CONTRADICTS: Final = 3.0
 """Standard deviations by which the mean difference from polling may deviate."""
 _MOST_FAILURES: Final = 5
-"""Failed trials after which event times are not used any more."""
+"""Failed trials after which event times are not tried any more, for a while."""
+_FIRST_PAUSE_NS: Final = 10_000_000_000
+_LONGEST_PAUSE_NS: Final = 320_000_000_000
+"""That while at first, and at most: it doubles with each trial that fails after it."""
 _PROVEN_NS: Final = 60_000_000_000
 """Time trusted after which earlier failures are forgotten."""
 _RESTARTS: Final = 3
 """Restarts of the local clock in one trial beyond which it counts as not running."""
 _MOST_CONTRADICTIONS: Final = 4.0
-_FORGET: Final = 1 / 32
+_FORGET: Final = 1 / 100
 """Contradictions at which the trust ends; each sample that fits takes `_FORGET` back."""
 
 
@@ -49,15 +53,19 @@ class Trust:
     """In the event times of one sensor. Times in ns, variances in ns²."""
 
     __slots__ = (
-        "_began", "_compared", "_contradictions", "_failures", "_since_ns", "_squares", "_sum_ns", "_unfit",
-        "verdict", "why",
+        "_again_ns", "_began", "_compared", "_contradictions", "_failures", "_pause_ns", "_since_ns",
+        "_squares", "_sum_ns", "_unfit", "_was_trusted", "is_final", "verdict", "why",
     )  # fmt: skip
 
     def __init__(self) -> None:
         self.verdict = Verdict.TRIAL
         self.why = ""
         """What was wrong with them last: part of a sentence."""
-        self._failures = 0
+        self.is_final = False
+        """Whether they are refused for good: the controller has never shown any."""
+        self._was_trusted = False
+        self._failures = self._again_ns = 0
+        self._pause_ns = _FIRST_PAUSE_NS
         self._contradictions = 0.0
         self._since_ns = 0
         self._began = Evidence(0, 0)
@@ -77,12 +85,12 @@ class Trust:
         """End the trust if there were too many contradictions."""
         if self._contradictions > _MOST_CONTRADICTIONS:
             if now_ns - self._since_ns > _PROVEN_NS:
-                self._failures = 0
-            self._fail("they contradict the frames or the sensor's own clock")
+                self._failures, self._pause_ns = 0, _FIRST_PAUSE_NS
+            self._fail("they contradict the frames or the sensor's own clock", now_ns)
             self.begin(evidence, now_ns)
 
     def begin(self, evidence: Evidence, now_ns: int) -> None:
-        """Begin a trial."""
+        """Begin a trial; if they are refused, once the pause has passed."""
         self._since_ns, self._began = now_ns, evidence
         self._compared = self._unfit = 0
         self._sum_ns = self._squares = 0.0
@@ -107,34 +115,42 @@ class Trust:
 
         Returns the variance of the differences between them if they are trusted now, else 0.
         """
+        if self.verdict is Verdict.REFUSED:
+            if self.is_final or now_ns < self._again_ns:
+                return 0.0
+            self.verdict, self._since_ns = Verdict.TRIAL, 0
         if not self._since_ns:
             self.begin(evidence, now_ns)
         if now_ns - self._since_ns < _TRIAL_NS:
             return 0.0
         count = self._compared + self._unfit
         if evidence.restarts - self._began.restarts > _RESTARTS:
-            self._refuse("its local clock does not run")
+            self._refuse("its local clock does not run", now_ns)
+            self.is_final = not self._was_trusted
         elif count < _SAMPLES:
             pass
         elif evidence.moved == self._began.moved:
-            self._refuse("they stand still")
+            self._refuse("they stand still", now_ns)
+            self.is_final = not self._was_trusted
         elif self._compared < _FITTING * count:
-            self._fail("they contradict the frames")
+            self._fail("they contradict the frames", now_ns)
             self.begin(evidence, now_ns)
         elif abs(self.mean_ns) > _CONTRADICTS * math.sqrt(variance):
-            self._fail(f"they differ from what polling shows by {self.mean_ns / 1000:+.0f} µs")
+            self._fail(f"they differ from what polling shows by {self.mean_ns / 1000:+.0f} µs", now_ns)
             self.begin(evidence, now_ns)
         else:
             self.verdict, self._since_ns = Verdict.TRUSTED, now_ns
+            self._was_trusted = True
             self._contradictions = 0.0
             return self._squares / self._compared
         return 0.0
 
-    def _fail(self, why: str) -> None:
+    def _fail(self, why: str, now_ns: int) -> None:
         self._failures += 1
         self.verdict, self.why = Verdict.TRIAL, why
         if self._failures >= _MOST_FAILURES:
-            self._refuse(why)
+            self._refuse(why, now_ns)
 
-    def _refuse(self, why: str) -> None:
+    def _refuse(self, why: str, now_ns: int) -> None:
         self.verdict, self.why = Verdict.REFUSED, why
+        self._again_ns, self._pause_ns = now_ns + self._pause_ns, min(2 * self._pause_ns, _LONGEST_PAUSE_NS)

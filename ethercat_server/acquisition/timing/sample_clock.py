@@ -196,9 +196,7 @@ class SampleClock:
             self._usual_margin_ns = margin_ns(timing, period_ns, variance, by_events=self._follows_events)
             self._probed_above = (timing.look_variance + _PROBE_BELOW) / 4
         self._margin_ns = self._usual_margin_ns * (1.0 if self._single or self.by_events else self._caution)
-        self._probing = self._hits > _UNPROBED or (
-            variance > self._probed_above and not self._follows_events
-        )
+        self._probing = self._hits > _UNPROBED or (variance > self._probed_above and not self._follows_events)
         self._aim_ns = estimate.phase_ns + self._margin_ns - timing.look_ns
         if self._probing and self._follows_events:
             self._aim_ns -= 2 * self._margin_ns
