@@ -140,13 +140,13 @@ class SensorStream:
         if not self.process_data:
             return None
         self._silent = True
-        self._discard = 0  # a sensor that is stuck from the start is to be seen too
         self._handed_out = self._handed_out or self.process_data
         period_ns = self.clock.period_ns
         # The next slot is counted from this one, but a stall makes one frame, not a burst.
         self.idle_at_ns = max(self.idle_at_ns + period_ns, float(now_ns))
         # One lost frame is no news: INVALID is what nothing valid came for in two periods.
         if now_ns - self._valid_ns < max(2 * period_ns, self._timing.patience_ns):
+            self._discard = 0  # what was to be discarded has passed: a sensor that is stuck is to be seen too
             self.repeated += 1
             return self._frame(now_ns, REPEATED, self._wkc)
         self.invalid_frames += 1
@@ -190,6 +190,7 @@ class SensorStream:
             self.clock = SampleClock(period_ns, self._timing, events)
             self._discard = DISCARDED_AT_START
             self._gap = True
+            self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
 
     def status(self) -> dict[str, Any]:
         """The sensor's part of the `status` reply, but for the age."""

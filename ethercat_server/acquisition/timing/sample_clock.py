@@ -184,8 +184,9 @@ class SampleClock:
         unwatched_ns = back_ns - looked_ns
         if not self._begun:
             self._newest = 1
-            # Only what fell into the time the sensor was not watched can have been lost.
-            self.steps = 1 + int(unwatched_ns // period_ns)
+            # Only what fell into the time the sensor was not watched can have been lost; before the first
+            # exchange there was none to lose.
+            self.steps = 1 + int(unwatched_ns // period_ns) if looked_ns else 1
             self.uncertain = unwatched_ns >= period_ns
             self.instant_ns = min(back_ns, sent_ns + period_ns)
             return
