@@ -26,6 +26,8 @@ _SERVE_EVERY_NS: Final = 10_000_000
 """Sockets are served this often even if every deadline has passed."""
 _SERVE_IN_FLIGHT_NS: Final = 2_000_000
 """Sockets are served this often, without waiting, while an exchange is on its way."""
+_REALTIME_EVERY_NS: Final = 20_000_000
+"""Interval between looks at whether CLOCK_REALTIME was set."""
 _RECOVERY_STEP_NS: Final = 500_000
 """Time between two exchanges while all sensors are lost."""
 _SUMMARY_NS: Final = 200_000_000
@@ -115,7 +117,8 @@ class Cycle:
     def _run(self) -> None:
         bus, hub, recovery, jobs, watchdog = self._bus, self._hub, self._recovery, self._jobs, self._watchdog
         timing, monotonic_ns, sleep = self._timing, bus.clock.monotonic_ns, bus.clock.sleep
-        serve_by = roll_at = feed_at = 0
+        realtime_offset = self._streams[0].realtime_offset
+        serve_by = roll_at = feed_at = look_at = 0
         while not self.stopping:
             due = self._due_ns()
             if jobs.waiting:
@@ -142,6 +145,9 @@ class Cycle:
             if now >= roll_at:
                 roll_at = now + SLOT_NS
                 self._roll()
+            if now >= look_at:
+                look_at = now + _REALTIME_EVERY_NS
+                realtime_offset.follow()
             if now >= feed_at:
                 feed_at = now + watchdog.feed_every_ns
                 watchdog.feed()

@@ -18,7 +18,7 @@ from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.timing.sample_clock import SILENT_PERIODS, SampleClock
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, RealtimeOffset
 from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
 from ethercat_server.sensor.sensor import Sensor
 from protocol.framing import DataFlag, encode_data
@@ -43,10 +43,12 @@ class SensorStream:
         timing: ExchangeTiming,
         clock: Clock = SYSTEM_CLOCK,
         latching: DistributedClock | None = None,
+        realtime_offset: RealtimeOffset | None = None,
     ) -> None:
         """`latching` is the clock of the slave controller, if that latches when samples come to be."""
         self.number = number
-        self._monotonic_ns, self._time_ns = clock.monotonic_ns, clock.time_ns
+        self._monotonic_ns = clock.monotonic_ns
+        self.realtime_offset = realtime_offset or RealtimeOffset(clock)
         self._timing = timing
         self.clock = SampleClock(period_ns, timing, latching and EventTimes(latching, timing))
         self.process_data = b""
@@ -154,8 +156,7 @@ class SensorStream:
         return self._frame(now_ns, INVALID, wkc)
 
     def _frame(self, moment_ns: int, flags: int, wkc: int) -> tuple[bytes, int]:
-        stamp_ns = self._time_ns() - (self._monotonic_ns() - moment_ns)
-        sequence = self.sequence
+        stamp_ns, sequence = moment_ns + self.realtime_offset.ns, self.sequence
         self.sequence += 1
         made = encode_data(sequence, stamp_ns, moment_ns, self.number, flags, wkc, self._handed_out)
         return made, flags
@@ -215,7 +216,10 @@ class SensorStream:
 
 def make_streams(bus: Bus, sensors: Sequence[Sensor], timing: ExchangeTiming) -> list[SensorStream]:
     """Those of the sensors on a bus in OP."""
+    offset = RealtimeOffset(bus.clock)
     return [
-        SensorStream(sensor.number, sensor.period_ns, timing, bus.clock, bus.read_clock(sensor.number))
+        SensorStream(
+            sensor.number, sensor.period_ns, timing, bus.clock, bus.read_clock(sensor.number), offset
+        )
         for sensor in sensors
     ]

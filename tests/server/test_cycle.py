@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import random
 
 import pytest
 
-from ethercat_server.simulation.machine import Machine
+from ethercat_server.simulation.machine import REALTIME_START_NS, START_NS, Machine, SimulatedClock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.framing import DataFlag
 from tests.simulation import OLD, Simulation, check_frames, more_if_long, reading
@@ -37,6 +38,46 @@ def test_every_sample_is_handed_out_once_and_its_stamp_is_its_instant() -> None:
     assert status["sensors"][0]["clock"]["mode"] == "locked"
     assert status["sensors"][0]["clock"]["offset_ppm"] == pytest.approx(150, abs=5)
     assert status["cycles"] < 1.5 * len(got), "hardly more than one exchange a sample"
+
+
+def test_a_stamp_is_the_monotonic_moment_whatever_comes_between_two_clock_reads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    time_ns, chance = SimulatedClock.time_ns, random.Random(1)
+
+    def preempted(clock: SimulatedClock) -> int:
+        before_ns, after_ns = chance.choices((0, 1_000_000, 3_000_000), weights=(3, 1, 1), k=2)
+        clock.stall(before_ns)
+        now_ns = time_ns(clock)
+        clock.stall(after_ns)
+        return now_ns
+
+    monkeypatch.setattr(SimulatedClock, "time_ns", preempted)
+    running = simulation()
+    running.run(2.0)
+    (offset_ns,) = {frame.stamp_ns - frame.monotonic_ns for frame in running.frames}
+    assert abs(offset_ns - (REALTIME_START_NS - START_NS)) < 1000
+
+
+@pytest.mark.parametrize("seconds", [-3600, 3600, -1e-5, 1e-5])
+def test_stamps_follow_a_clock_that_is_set_at_once_and_by_exactly_as_much(seconds: float) -> None:
+    running = simulation()
+    running.at(1.0, lambda: running.clock.set_realtime_back(-seconds))
+    running.run(1.0)
+    before = running.frames[-1]
+    running.run(0.03)
+    after = running.frames[-1]
+    assert after.stamp_ns - before.stamp_ns - round(seconds * 1e9) == after.monotonic_ns - before.monotonic_ns
+
+
+def test_stamps_rise_while_the_clock_is_only_slewed() -> None:
+    running = simulation()
+    for millisecond in range(2000):
+        running.at(0.001 * millisecond, lambda: running.clock.set_realtime_back(0.5e-6))
+    running.run(2.0)
+    stamps = [frame.stamp_ns for frame in running.frames]
+    assert stamps == sorted(set(stamps))
+    assert running.clock.time_ns() - stamps[-1] < 3e6
 
 
 def test_a_stall_is_counted_and_followed_by_no_burst() -> None:

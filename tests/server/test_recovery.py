@@ -404,7 +404,7 @@ def test_time_out_of_op_is_no_lost_samples(dc: str, wire: Machine) -> None:
         simulation.command("safeop 0x1B" if recovery % 3 else f"power cycle {0.03 * recovery}")
         client.wait_event("sensor_lost")
         missed = stream.lost_samples
-        simulation.run_until(lambda: stream.recoveries > recovery, "it is back")
+        client.wait_event("sensor_back")
         simulation.backend.become(Machine())
         after = client.fresh(1)[0]
         assert after.flags & DataFlag.GAP

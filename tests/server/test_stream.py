@@ -145,10 +145,11 @@ def test_sequence_goes_on_after_a_recovery_and_the_first_frame_has_gap() -> None
 def test_after_a_recovery_three_samples_are_discarded_and_none_is_counted_as_lost() -> None:
     feeder = Feeder().start()
     feeder.exchange(new=True)
-    while not feeder.exchange(new=False, valid=False):  # until it is silent, so that another such frame is due
+    while not feeder.exchange(new=False, valid=False):
         pass
     feeder.stream.recover(PERIOD_NS)
-    assert feeder.exchange(new=False, valid=False, after_ns=PERIOD_NS) is None, "it gets the time to give its first samples"
+    early = feeder.exchange(new=False, valid=False, after_ns=PERIOD_NS)
+    assert early is None, "it is not silent before it had time for its first samples"
     feeder.start()
     after = feeder.exchange(new=True)
     assert after is not None
