@@ -122,11 +122,11 @@ def test_a_gap_is_flagged_and_counted() -> None:
         for _ in range(3):
             feeder.exchange(new=False)
     feeder.sample += 4
-    message = feeder.exchange(new=True, after_ns=PERIOD_NS // 4 + 4 * PERIOD_NS)
+    message = feeder.exchange(new=True, after_ns=3 * PERIOD_NS // 8 + 4 * PERIOD_NS)
     assert message is not None
     assert message.flags == GAP
     assert feeder.exchange(new=True, after_ns=PERIOD_NS) is not None
-    assert feeder.stream.lost_samples in {3, 4}, "it came at the very instant of a look"
+    assert feeder.stream.lost_samples == 4
 
 
 def test_sequence_goes_on_after_a_recovery_and_the_first_frame_has_gap() -> None:

@@ -56,8 +56,8 @@ class SampleClock:
     __slots__ = (
         "_absent", "_aim_ns", "_begun", "_by_event", "_caution", "_doubtful", "_hits",
         "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_newest", "_overdue",
-        "_probed_above", "_probing", "_single", "_timing", "_turn", "_usual_margin_ns", "estimate", "events",
-        "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
+        "_probed_above", "_probing", "_seen_by_ns", "_single", "_timing", "_turn", "_usual_margin_ns",
+        "estimate", "events", "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
     )  # fmt: skip
 
     def __init__(self, period_ns: float, timing: ExchangeTiming, events: EventTimes | None = None) -> None:
@@ -83,6 +83,8 @@ class SampleClock:
         """When the last valid exchange was sent."""
         self._newest = 1
         """Number of the newest sample, counted from the one before it by the phase alone."""
+        self._seen_by_ns = 0.0
+        """When the sensor had certainly looked in the exchange that brought the newest sample."""
         self._absent = 0
         """Samples in a row that were watched for and did not come."""
         self._begun = False
@@ -196,17 +198,19 @@ class SampleClock:
             late = events.date(phase_ns + least_ns / 2, period_ns, self.estimate.variance, sent_ns, back_ns)
             if late is not None:
                 self._by_event, self.uncertain = events.instant_ns - least_ns / 2, events.is_doubtful
-                self._count(1 + round(late), late)
+                self._count(1 + round(late), late, looked_ns - self._seen_by_ns)
                 self.instant_ns = min(events.instant_ns, back_ns)
                 return
         excess_ns = max(0.0, back_ns - sent_ns - least_ns)
+        watched_ns, self._seen_by_ns = looked_ns - self._seen_by_ns, sent_ns + excess_ns
         # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought is
         # dated from before, never as younger than it may be.
         looked_at_ns = sent_ns + (excess_ns / 2 if excess_ns < _LONGEST_LOOK * period_ns else 0.0)
         late = (looked_at_ns - phase_ns) / period_ns
         if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
             # It was seen coming: whichever it was expected next to.
-            newest = 1 + round(((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns)
+            late = ((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns
+            newest = 1 + round(late)
         else:
             newest = 1 + math.floor(late)
             doubt_ns = CERTAIN * math.sqrt(self.estimate.variance)
@@ -216,7 +220,7 @@ class SampleClock:
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
             lost_track = events is not None and events.is_doubtful and unwatched_ns > _MISSABLE * period_ns
             self.uncertain = self._doubtful or lost_track or (most > 0 and least < most)
-        self._count(newest, late)
+        self._count(newest, late, watched_ns)
         instant_ns = max(phase_ns + (self._newest - 1) * period_ns, looked_ns) + least_ns / 2
         # After a stall in the exchange its end says nothing of when the sample came to be.
         self.instant_ns = min(instant_ns if self.locked else sent_ns + period_ns, back_ns)
@@ -225,12 +229,16 @@ class SampleClock:
             if variance := events.compare(difference_ns, self.estimate.variance, back_ns):
                 self.estimate.expect(variance)
 
-    def _count(self, newest: int, late: float) -> None:
-        """The new sample is this one by the estimate, and so late there, in periods."""
+    def _count(self, newest: int, late: float, watched_ns: float) -> None:
+        """The new sample is this one by the estimate, and so late there, in periods.
+
+        `watched_ns`: for so long exchanges brought nothing new that were sent after it was certain which
+        sample is the newest. What does not come while the sensor itself is held up exists all the same.
+        """
         if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
             newest = 0 if self._doubtful and late < -0.5 else 1
         self._newest = self.steps = newest
-        if self._absent >= SILENT_PERIODS:
+        if self._absent >= SILENT_PERIODS and watched_ns > (SILENT_PERIODS - 1) * self.period_ns:
             self.steps = 1  # a silent sensor is told as such
         elif late > _EARLY:
             self.steps += self._absent  # those that did not come are missing, too
