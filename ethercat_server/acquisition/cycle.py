@@ -87,7 +87,7 @@ class Cycle:
         self._missed_deadlines = 0
         self._timing = timing
         self._schedule = Schedule(streams, timing)
-        self._wire_ns = bus.process_data.wire_ns
+        self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
         timing.wire_ns = max(self._wire_ns)
         self._round_trip = RoundTripHealth(timing, bus.ifname)
         carried = bus.process_data.inputs
@@ -207,6 +207,12 @@ class Cycle:
         back = bus.clock.monotonic_ns()
         if frame is None or not (sent := bus.process_data.take(frame)):
             return frame
+        while sent < 0:  # The answer may be behind duplicates of others: they must not pile up.
+            frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
+            if frame is None or back > self._timing.sent_ns + _SERVE_EVERY_NS:
+                return None
+            if not (sent := bus.process_data.take(frame)):
+                return frame
         self._hand_out(sent, back)
         self._learn(sent, back)
         if len(self._streams) > 1:
@@ -233,7 +239,7 @@ class Cycle:
         process_data = self._bus.process_data
         frame, wkc, which = process_data.frame, process_data.wkc, process_data.which
         self._answered = True
-        self._complete = complete = wkc >= self._recovery.alive_wkc[which]
+        self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
         new: list[Made] = []
         for number, start, end, untouched, at, sensor, stream in self._carried[which]:
             if back < stream.clock.quiet_until_ns:
@@ -273,6 +279,7 @@ class Cycle:
             "round_trip": self._timing.describe(),
             "missed_deadlines": self._missed_deadlines,
             "lost_frames": self._bus.process_data.lost,
+            "duplicate_frames": self._bus.process_data.duplicates,
             "wake_us": wake,
             "exchange_us": exchange,
             "last_10s": {
