@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import itertools
 import random
+from collections.abc import Sequence
 
 import pytest
 
+from ethercat_server.acquisition.stream import Made
 from ethercat_server.simulation.machine import REALTIME_START_NS, START_NS, Machine, SimulatedClock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.framing import DataFlag
-from tests.simulation import OLD, Simulation, check_frames, more_if_long, reading
+from tests.simulation import OLD, Simulation, check_frames, fresh, more_if_long, reading
 
 PERIOD_NS = 1_250_000
 
@@ -161,6 +163,32 @@ def test_whatever_is_lost_is_counted_though_frames_take_long_and_unevenly(
     running = simulation(Machine(seed=seed, frame_jitter_ns=jitter_us * 1e3, wake_ns=50e3), dc=dc)
     running.run(2.0)
     check_lost(running)
+
+
+def test_polls_of_several_sensors_are_merged_where_exchanges_cost_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As they do on a real machine: without cost there is nothing to save."""
+    running = Simulation(*(SensorOptions(serial=n, signal="clock", ppm=37.0 * n) for n in range(4)))
+    publish = running.publish
+
+    def busy(made: Sequence[Made], now_ns: int) -> None:
+        publish(made, now_ns)
+        running.clock.advance(running.clock.now_ns + 15_000 + 15_000 * len(made))
+
+    monkeypatch.setattr(running, "publish", busy)
+    running.run(1.5)
+    before = running.status()["cycles"]
+    running.published_ns.clear()
+    running.frames.clear()
+    running.run(1.0)
+    assert running.status()["cycles"] - before < 0.8 * len(fresh(running.frames))
+    ages = sorted(
+        at_ns - reading(frame).instant_ns
+        for at_ns, frame in zip(running.published_ns, running.frames, strict=True)
+    )
+    assert ages[len(ages) * 99 // 100] < 300_000
+    assert sum(stream.lost_samples for stream in running.streams) == 0
 
 
 def test_at_a_low_rate_too_one_lost_frame_is_no_lost_sensor() -> None:
