@@ -26,6 +26,8 @@ _SERVE_EVERY_NS: Final = 10_000_000
 """Sockets are served this often even if every deadline has passed."""
 _SERVE_IN_FLIGHT_NS: Final = 2_000_000
 """Sockets are served this often, without waiting, while an exchange is on its way."""
+_REALTIME_EVERY_NS: Final = 20_000_000
+"""Interval between looks at whether CLOCK_REALTIME was set."""
 _RECOVERY_STEP_NS: Final = 500_000
 """Time between two exchanges while all sensors are lost."""
 _SUMMARY_NS: Final = 200_000_000
@@ -85,7 +87,7 @@ class Cycle:
         self._missed_deadlines = 0
         self._timing = timing
         self._schedule = Schedule(streams, timing)
-        self._wire_ns = bus.process_data.wire_ns
+        self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
         timing.wire_ns = max(self._wire_ns)
         self._round_trip = RoundTripHealth(timing, bus.ifname)
         carried = bus.process_data.inputs
@@ -115,7 +117,8 @@ class Cycle:
     def _run(self) -> None:
         bus, hub, recovery, jobs, watchdog = self._bus, self._hub, self._recovery, self._jobs, self._watchdog
         timing, monotonic_ns, sleep = self._timing, bus.clock.monotonic_ns, bus.clock.sleep
-        serve_by = roll_at = feed_at = 0
+        realtime_offset = self._streams[0].realtime_offset
+        serve_by = roll_at = feed_at = look_at = 0
         while not self.stopping:
             due = self._due_ns()
             if jobs.waiting:
@@ -142,6 +145,9 @@ class Cycle:
             if now >= roll_at:
                 roll_at = now + SLOT_NS
                 self._roll()
+            if now >= look_at:
+                look_at = now + _REALTIME_EVERY_NS
+                realtime_offset.follow()
             if now >= feed_at:
                 feed_at = now + watchdog.feed_every_ns
                 watchdog.feed()
@@ -205,6 +211,12 @@ class Cycle:
         if not (sent := bus.process_data.take(frame)):
             self._recovery.causes.stray(frame, back)
             return frame
+        while sent < 0:  # The answer may be behind duplicates of others: they must not pile up.
+            frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
+            if frame is None or back > self._timing.sent_ns + _SERVE_EVERY_NS:
+                return None
+            if not (sent := bus.process_data.take(frame)):
+                return frame
         self._hand_out(sent, back)
         self._learn(sent, back)
         if len(self._streams) > 1:
@@ -232,7 +244,7 @@ class Cycle:
         process_data = self._bus.process_data
         frame, wkc, which = process_data.frame, process_data.wkc, process_data.which
         self._answered = True
-        self._complete = complete = wkc >= self._recovery.alive_wkc[which]
+        self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
         new: list[Made] = []
         for number, start, end, untouched, at, sensor, stream in self._carried[which]:
             if back < stream.clock.quiet_until_ns:
@@ -273,6 +285,7 @@ class Cycle:
             "round_trip": self._timing.describe(),
             "missed_deadlines": self._missed_deadlines,
             "lost_frames": self._bus.process_data.lost,
+            "duplicate_frames": self._bus.process_data.duplicates,
             "wake_us": wake,
             "exchange_us": exchange,
             "last_10s": {

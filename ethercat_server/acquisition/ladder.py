@@ -58,6 +58,8 @@ class Ladder:
         self.mailbox = Mailbox(bus, sensor.number, (out, back))
         self.sdo = GuardedSdo(MailboxSdo(self.mailbox))
         """SDO transfers in steps."""
+        self._left_op = False
+        """Whether the sensor was out of OP since the last time it was back: also if the steps began anew."""
 
     def bring_back(self, pause_s: float = 0.0) -> Steps[bool]:
         """Returns once the sensor is in OP: True if it had left it, False if it had only been out of reach.
@@ -65,7 +67,6 @@ class Ladder:
         Raises GoneError, DifferentSensorError, or BusError if the sensor refuses something.
         """
         yield from self._pause(pause_s)
-        left_op = False
         while True:
             status = self.states.status()
             if status is None:
@@ -75,12 +76,13 @@ class Ladder:
                 self._latch_events()
                 if self._sensor.unsettled:
                     yield from put_right(self.sdo, self._sensor)
+                left_op, self._left_op = self._left_op, False
                 return left_op
             elif status.state is AlState.SAFEOP:
-                left_op = True
+                self._left_op = True
                 yield from self.states.go(AlState.OP)
             else:
-                left_op = True
+                self._left_op = True
                 yield from self._set_up_anew()
             yield
 
@@ -94,9 +96,11 @@ class Ladder:
 
     def reconfigure(self) -> Steps[bool]:
         """Take the sensor to PREOP, write what is wanted, and back to OP; raises as `bring_back`."""
+        self._left_op = True
         yield from self.states.go(AlState.PREOP)
         yield from set_up(self.sdo, self._sensor)
         yield from self._go_op()
+        self._left_op = False
         return True
 
     def _restore_station(self) -> Steps[bool]:

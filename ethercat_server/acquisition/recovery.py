@@ -257,14 +257,15 @@ class Recovery:
     def _bring_back(self, number: int, *, left_op: bool) -> None:
         sensor, stream = self._sensors[number], self._streams[number]
         del self._work[number]
-        sensor.enter(SensorState.STREAMING)
-        if left_op:
-            sensor.settle(self._clock)
-        self._count_alive()
+        # Exchanges go on while the clock is read: none may bring a sample before the stream begins anew.
         latching = self._bus.read_clock(number) if left_op else None
         stream.recover(
             sensor.period_ns if left_op else None, lost=number in self._lost_at_ns, latching=latching
         )
+        sensor.enter(SensorState.STREAMING)
+        if left_op:
+            sensor.settle(self._clock)
+        self._count_alive()
         if (change := self._changing.pop(number, None)) is not None:
             if change.failed is None:
                 self._announce(event(Event.RECONFIGURED, sensor=number, **sensor.in_force()))

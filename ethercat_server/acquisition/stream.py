@@ -17,7 +17,7 @@ from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.timing.sample_clock import SILENT_PERIODS, SampleClock
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, RealtimeOffset
 from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
 from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.sensor.sensor import Sensor
@@ -43,6 +43,7 @@ class SensorStream:
         timing: ExchangeTiming,
         clock: Clock = SYSTEM_CLOCK,
         latching: DistributedClock | None = None,
+        realtime_offset: RealtimeOffset | None = None,
         passing_ns: int = 0,
     ) -> None:
         """`latching` is the clock of the slave controller, if that latches when samples come to be.
@@ -50,7 +51,8 @@ class SensorStream:
         Its process data passes the slave `passing_ns` after the frame has arrived there.
         """
         self.number = number
-        self._monotonic_ns, self._time_ns = clock.monotonic_ns, clock.time_ns
+        self._monotonic_ns = clock.monotonic_ns
+        self.realtime_offset = realtime_offset or RealtimeOffset(clock)
         self._timing = timing
         self._passing_ns = passing_ns
         self.clock = self._new_clock(period_ns, latching)
@@ -149,13 +151,13 @@ class SensorStream:
         if not self.process_data:
             return None
         self._silent = True
-        self._discard = 0  # a sensor that is stuck from the start is to be seen too
         self._handed_out = self._handed_out or self.process_data
         period_ns = self.clock.period_ns
         # The next slot is counted from this one, but a stall makes one frame, not a burst.
         self.idle_at_ns = max(self.idle_at_ns + period_ns, float(now_ns))
         # One lost frame is no news: INVALID is what nothing valid came for in two periods.
         if now_ns - self._valid_ns < max(2 * period_ns, self._timing.patience_ns):
+            self._discard = 0  # what was to be discarded has passed: a sensor that is stuck is to be seen too
             self.repeated += 1
             return self._frame(now_ns, REPEATED, self._wkc)
         self.invalid_frames += 1
@@ -163,8 +165,7 @@ class SensorStream:
         return self._frame(now_ns, INVALID, wkc)
 
     def _frame(self, moment_ns: int, flags: int, wkc: int) -> tuple[bytes, int]:
-        stamp_ns = self._time_ns() - (self._monotonic_ns() - moment_ns)
-        sequence = self.sequence
+        stamp_ns, sequence = moment_ns + self.realtime_offset.ns, self.sequence
         self.sequence += 1
         made = encode_data(sequence, stamp_ns, moment_ns, self.number, flags, wkc, self._handed_out)
         return made, flags
@@ -198,6 +199,7 @@ class SensorStream:
             self.clock = self._new_clock(period_ns, latching)
             self._discard = DISCARDED_AT_START
             self._gap = True
+            self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
 
     def status(self) -> dict[str, Any]:
         """The sensor's part of the `status` reply, but for the age."""
@@ -222,8 +224,11 @@ class SensorStream:
 
 def make_streams(bus: Bus, sensors: Sequence[Sensor], timing: ExchangeTiming) -> list[SensorStream]:
     """Those of the sensors on a bus in OP."""
+    offset = RealtimeOffset(bus.clock)
     passing_ns = {at.number: at.start * BYTE_NS for inputs in bus.process_data.inputs for at in inputs}
     return [
-        SensorStream(number, each.period_ns, timing, bus.clock, bus.read_clock(number), passing_ns[number])
+        SensorStream(
+            number, each.period_ns, timing, bus.clock, bus.read_clock(number), offset, passing_ns[number]
+        )
         for number, each in enumerate(sensors)
     ]

@@ -120,14 +120,13 @@ class Datagrams:
     ) -> tuple[int, bytes] | None:
         """Send one datagram and wait for it: its working counter and data; None if it does not come back."""
         self._index = (self._index + 1) % len(self._pending_ns)
-        index = self._index + FIRST_INDEX
-        frame = build((command, adp, ado, data), first_index=index)
+        frame = build((command, adp, ado, data), first_index=self._index + FIRST_INDEX)
         self._pending_ns[self._index] = now_ns = self._monotonic_ns()
         until_ns = now_ns + int(max(timeout_s, self._late.timeout_s) * 1e9)
         self._send(frame.ljust(SHORTEST_FRAME, b"\0"))
         end = FIRST_DATA + len(data)
         while (answer := self.next_frame(until_ns)) is not None:
-            if is_answer(answer, command, index, len(data)):
+            if is_answer(answer, frame, len(data)):
                 if self._late.timeout_s:
                     self._late.in_time(self._index)
                 self._pending_ns[self._index] = 0

@@ -392,6 +392,25 @@ def test_what_is_lost_is_flagged_or_counted_through_recoveries(seed: int) -> Non
     assert client.ask("status")["sensors"][0]["recoveries"] == 30
 
 
+@pytest.mark.parametrize("dc", ["", "none"])
+@pytest.mark.parametrize("wire", [Machine(), Machine(lost=0.1)])
+def test_time_out_of_op_is_no_lost_samples(dc: str, wire: Machine) -> None:
+    """Exchanges go on while it comes back, and bring samples as soon as it is in OP; steps are repeated."""
+    simulation, client = streaming(SensorOptions(signal="clock", ppm=150.0, dc=dc))
+    stream = simulation.streams[0]
+    for recovery in range(20):
+        simulation.backend.become(wire)
+        simulation.run(0.2)
+        simulation.command("safeop 0x1B" if recovery % 3 else f"power cycle {0.03 * recovery}")
+        client.wait_event("sensor_lost")
+        missed = stream.lost_samples
+        client.wait_event("sensor_back")
+        simulation.backend.become(Machine())
+        after = client.fresh(1)[0]
+        assert after.flags & DataFlag.GAP
+        assert stream.lost_samples == missed
+
+
 @pytest.mark.parametrize("most", more_if_long([5], [5, 20]))
 @pytest.mark.parametrize("seed", more_if_long([0], range(5)))
 def test_one_that_returns_with_a_slow_eeprom_costs_the_other_nothing(seed: int, most: int) -> None:

@@ -57,7 +57,8 @@ class SampleClock:
     __slots__ = (
         "_absent", "_aim_ns", "_begun", "_bias_ns", "_by_event", "_caution", "_doubtful", "_hits",
         "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_moved_ns", "_newest", "_overdue",
-        "_passing_ns", "_probed_above", "_probing", "_single", "_timing", "_turn", "_usual_margin_ns",
+        "_passing_ns", "_probed_above", "_probing", "_seen_by_ns", "_single", "_timing", "_turn",
+        "_usual_margin_ns",
         "estimate", "events", "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
     )  # fmt: skip
 
@@ -97,6 +98,8 @@ class SampleClock:
         """By how much events are later than polls show, where both are followed."""
         self._newest = 1
         """Number of the newest sample, counted from the one before it by the phase alone."""
+        self._seen_by_ns = 0.0
+        """When the sensor had certainly looked in the exchange that brought the newest sample."""
         self._absent = 0
         """Samples in a row that were watched for and did not come."""
         self._begun = False
@@ -215,8 +218,9 @@ class SampleClock:
         unwatched_ns = back_ns - looked_ns
         if not self._begun:
             self._newest = 1
-            # Only what fell into the time the sensor was not watched can have been lost.
-            self.steps = 1 + int(unwatched_ns // period_ns)
+            # Only what fell into the time the sensor was not watched can have been lost; before the first
+            # exchange there was none to lose.
+            self.steps = 1 + int(unwatched_ns // period_ns) if looked_ns else 1
             self.uncertain = unwatched_ns >= period_ns
             self.instant_ns = min(back_ns, sent_ns + period_ns)
             return
@@ -232,17 +236,19 @@ class SampleClock:
                 else:
                     self._by_event = events.instant_ns - outward_ns
                 self.uncertain = events.is_doubtful
-                self._count(1 + round(late), late)
+                self._count(1 + round(late), late, looked_ns - self._seen_by_ns)
                 self.instant_ns = min(events.instant_ns, back_ns)
                 return
         excess_ns = max(0.0, back_ns - sent_ns - least_ns)
+        watched_ns, self._seen_by_ns = looked_ns - self._seen_by_ns, sent_ns + excess_ns
         # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought is
         # dated from before, never as younger than it may be.
         looked_at_ns = sent_ns + (excess_ns / 2 if excess_ns < _LONGEST_LOOK * period_ns else 0.0)
         late = (looked_at_ns - phase_ns) / period_ns
         if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
             # It was seen coming: whichever it was expected next to.
-            newest = 1 + round(((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns)
+            late = ((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns
+            newest = 1 + round(late)
         else:
             newest = 1 + math.floor(late)
             doubt_ns = CERTAIN * math.sqrt(self.estimate.variance)
@@ -252,7 +258,7 @@ class SampleClock:
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
             lost_track = events is not None and events.is_doubtful and unwatched_ns > _MISSABLE * period_ns
             self.uncertain = self._doubtful or lost_track or (most > 0 and least < most)
-        self._count(newest, late)
+        self._count(newest, late, watched_ns)
         instant_ns = max(phase_ns + (self._newest - 1) * period_ns, looked_ns) + outward_ns
         # After a stall in the exchange its end says nothing of when the sample came to be.
         self.instant_ns = min(instant_ns if self.locked else sent_ns + period_ns, back_ns)
@@ -263,12 +269,16 @@ class SampleClock:
                 if not self._single:
                     self.estimate.expect(variance)
 
-    def _count(self, newest: int, late: float) -> None:
-        """The new sample is this one by the estimate, and so late there, in periods."""
+    def _count(self, newest: int, late: float, watched_ns: float) -> None:
+        """The new sample is this one by the estimate, and so late there, in periods.
+
+        `watched_ns`: for so long exchanges brought nothing new that were sent after it was certain which
+        sample is the newest. What does not come while the sensor itself is held up exists all the same.
+        """
         if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
             newest = 0 if self._doubtful and late < -0.5 else 1
         self._newest = self.steps = newest
-        if self._absent >= SILENT_PERIODS:
+        if self._absent >= SILENT_PERIODS and watched_ns > (SILENT_PERIODS - 1) * self.period_ns:
             self.steps = 1  # a silent sensor is told as such
         elif late > _EARLY:
             self.steps += self._absent  # those that did not come are missing, too
