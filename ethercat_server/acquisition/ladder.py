@@ -73,13 +73,15 @@ class Ladder:
                 if not (yield from self._restore_station()):
                     yield from self._pause(_ABSENT_PAUSE_S)
             elif status.is_op:
-                self._latch_events()
+                if not self._left_op:
+                    self._latch_events()
                 if self._sensor.unsettled:
                     yield from put_right(self.sdo, self._sensor)
                 left_op, self._left_op = self._left_op, False
                 return left_op
             elif status.state is AlState.SAFEOP:
                 self._left_op = True
+                self._latch_events()
                 yield from self.states.go(AlState.OP)
             else:
                 self._left_op = True

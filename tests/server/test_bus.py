@@ -116,7 +116,7 @@ def test_duplicates_of_answers_are_not_taken_for_those_of_other_registers() -> N
     duplicates: list[bytes] = []
 
     def answer(frame: bytearray) -> list[bytes]:
-        duplicates.append(done(frame, frame[18:22]))
+        duplicates.append(done(frame, bytes(frame[18:22])))
         return [*duplicates[-20:], duplicates[-1]]
 
     bus, wire = scripted(answer)

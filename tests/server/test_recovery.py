@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import random
 from typing import Any
 
 import pytest
 
+from ethercat_server.ethercat.wire import PROCESSED_BIT, SHORTEST_FRAME, SOURCE_ADDRESS, Command, build
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.firmware import firmware
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.framing import DataFlag
 from protocol.settings import sampling_rate_hz
-from tests.simulation import OLD, Client, Simulation, check_frames, more_if_long, reading
+from tests.simulation import OLD, Client, Simulation, check_frames, fresh, more_if_long, reading
 
 CLOCK = SensorOptions(signal="clock", ppm=150.0)
 WANTED = {"acceleration_range_g": 8}
@@ -403,11 +405,11 @@ def test_time_out_of_op_is_no_lost_samples(dc: str, wire: Machine) -> None:
         simulation.run(0.2)
         simulation.command("safeop 0x1B" if recovery % 3 else f"power cycle {0.03 * recovery}")
         client.wait_event("sensor_lost")
-        missed = stream.lost_samples
+        missed, before = stream.lost_samples, len(simulation.frames)
         client.wait_event("sensor_back")
         simulation.backend.become(Machine())
-        after = client.fresh(1)[0]
-        assert after.flags & DataFlag.GAP
+        client.fresh(1)
+        assert fresh(simulation.frames[before:])[0].flags & DataFlag.GAP
         assert stream.lost_samples == missed
 
 
@@ -448,3 +450,42 @@ def test_one_that_is_on_its_way_back_is_not_counted_in_place_of_another() -> Non
     simulation.run(0.2)
     check_frames([frame for frame in simulation.frames if frame.sensor == 1], complete=False)
     assert [sensor.streams for sensor in simulation.sensors] == [True, False]
+
+
+def test_a_busy_computer_is_named_where_it_explains_the_loss() -> None:
+    """And only there: the same AL error without a stall, or a second after it, is the sensor's."""
+    simulation, client = streaming()
+    for stall_ns, later_s, named in ((300e6, 0.0, True), (0.0, 0.0, False), (150e6, 1.5, False)):
+        simulation.clock.stall(stall_ns)
+        simulation.run(0.01 + later_s)
+        if not (lost := [event for event in client.events if event["event"] == "sensor_lost"]):
+            simulation.command("safeop 0x1B")
+            lost = [client.wait_event("sensor_lost")]
+        assert ("this computer stood still for" in lost[0]["message"]) is named
+        client.events.clear()
+        simulation.run(1.5)
+        client.events.clear()
+
+
+def test_another_master_on_the_wire_is_named_and_so_is_its_end(caplog: pytest.LogCaptureFixture) -> None:
+    simulation, client = streaming()
+    caplog.set_level(logging.INFO)
+    on = True
+
+    def send() -> None:
+        """Its frames are seen, too, once the slaves have processed them."""
+        theirs = build((Command.BRD, 0, 0x130, bytes(2)), source=bytes.fromhex("021011223344"))
+        theirs[SOURCE_ADDRESS] |= PROCESSED_BIT
+        simulation.backend.put_on_the_wire(bytes(theirs.ljust(SHORTEST_FRAME, b"\0")))
+        if on:
+            simulation.at(0.01, send)
+
+    send()
+    simulation.run(1.5)
+    simulation.command("disconnect")
+    lost = client.wait_event("sensor_lost")["message"]
+    assert lost.endswith("check for another EtherCAT master, whose frames arrive on memory")
+    assert caplog.text.count("another EtherCAT master is sending on memory") == 1
+    on = False
+    simulation.run(15.0)
+    assert caplog.text.count("the other EtherCAT master on memory has stopped sending") == 1

@@ -1,4 +1,4 @@
-"""What explains that a sensor is lost although it is in order: another master on the wire, a busy computer."""
+"""Why a sensor is lost that is in order: another master on the wire, or a busy computer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _GONE_S: Final = 10
 """Seconds without any after which it has gone."""
 _RECENT_NS: Final = 1_000_000_000
 _STALL_NS: Final = 20_000_000
-"""Standing still for so long in that time explains that a sensor did not answer, or that its watchdog ended."""
+"""Standing still for so long in that time explains a missing answer, or the end of a watchdog."""
 
 log = logging.getLogger(__name__)
 
@@ -66,8 +66,8 @@ class Causes:
         if frames >= _MASTER_FRAMES:
             if self._gone_s >= _GONE_S:
                 log.warning(
-                    "another EtherCAT master is sending on %s (%d frames in a second): stop it, for two masters "
-                    "disturb each other's slaves",
+                    "another EtherCAT master is sending on %s (%d frames in a second): stop it, for two "
+                    "masters disturb each other's slaves",
                     self._ifname, frames,
                 )  # fmt: skip
             self._gone_s = 0
