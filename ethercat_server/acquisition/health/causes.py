@@ -34,11 +34,12 @@ class Causes:
 
     def stray(self, frame: bytes, now_ns: int) -> None:
         """A frame has arrived that answers no exchange."""
-        source = (
-            bytes([frame[SOURCE_ADDRESS] & ~PROCESSED_BIT]) + frame[SOURCE_ADDRESS + 1 : SOURCE_ADDRESS + 6]
-        )
+        at = SOURCE_ADDRESS
+        if len(frame) <= DATAGRAM_INDEX:
+            return
+        source = bytes([frame[at] & ~PROCESSED_BIT]) + frame[at + 1 : at + 6]
         # Of our own only single datagrams arrive here, and answers that come late or twice.
-        if source != SOURCE or len(frame) <= DATAGRAM_INDEX or frame[DATAGRAM_INDEX] < FIRST_INDEX:
+        if source != SOURCE or frame[DATAGRAM_INDEX] < FIRST_INDEX:
             self._frames += 1
             self._frame_ns = now_ns
 
