@@ -64,7 +64,9 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         service = Service(argv, policy, hub, on_sensors, notifier)
         cycle.every_second = service.every_second
         signals.call(cycle.stop, service.reload)
-        hub.start(Actions(hub, cycle, on_sensors, {"others": others.rows}).handle)
+        hub.start(
+            Actions(hub, cycle, on_sensors, {"others": others.rows, "interface": options.ifname}).handle
+        )
         for sensor in sensors:
             log.info(
                 "sensor %d: %s, serial %d, firmware %s, %d bytes at %d Hz",

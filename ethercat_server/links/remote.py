@@ -48,6 +48,7 @@ class ServerLink(Link):
     """One framed connection to the server."""
 
     clock: Clock = SYSTEM_CLOCK
+    restores = True
 
     def __init__(self, address: Address, used: str | None = None) -> None:
         self._name = f"the server at {address}"

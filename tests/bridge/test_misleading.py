@@ -193,8 +193,8 @@ def test_parameters_that_are_none_are_named(server: SimulatedServer) -> None:
     given = {"publish_frequency": 100.0, "settings.sinc_lenght": 64, "zzz": 1, "use_sim_time": True}
     with SimulatedNode(server, **given) as node:
         assert "unknown parameter publish_frequency" in node.log
-        assert "did you mean publishing_frequency?" in node.log
-        assert "did you mean settings.sinc_length?" in node.log
+        assert "did you mean 'publishing_frequency'?" in node.log
+        assert "did you mean 'settings.sinc_length'?" in node.log
         assert "unknown parameter zzz" in node.log
         assert "use_sim_time is true, but a real sensor has no simulation time" in node.log
         assert node.log.count("unknown parameter") == 3

@@ -351,7 +351,7 @@ def test_a_refusal_is_one_sentence_and_leaves_no_file(
     ("arguments", "sentence"),
     [
         ((), "required"),
-        (("x.mcap", "localhost:99999"), "it must be HOST:PORT"),
+        (("x.mcap", "localhost:99999"), "99999 is no port: it must be from 1 to 65535"),
         (("x.mcap", "--seconds", "-1"), "a number of seconds"),
         (("x.mcap", "--seconds", "nan"), "a number of seconds"),
         (("x.mcap", "--rotate-size", "10"), "at least 100k"),
