@@ -23,6 +23,7 @@ from bridge.parameters.wrench_frames import parse
 from bridge.publishing.wrench_frames import make_frames
 from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
 from protocol.control import Event, event
+from protocol.framing import DataMessage
 from protocol.pdo import encode
 from tests.bridge.compensating import six, stamp_ns
 from tests.bridge.conftest import retire, wait_until
@@ -312,7 +313,8 @@ def test_tf_in_a_real_executor(server: Sensor, tf: FakeTf) -> None:
 
     def publishes() -> bool:
         assert topic.is_wanted()
-        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), server.time_ns())
+        frame = DataMessage(0, server.time_ns(), 0, 0, 0, 3, b"")
+        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), frame)
         executor.spin_once(0.01)
         return bool(heard)
 
