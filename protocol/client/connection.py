@@ -19,6 +19,9 @@ from protocol.text.json_text import JsonObject
 from protocol.text.visible import printable
 
 CONNECT_TIMEOUT_S: Final = 2.0
+RECEIVE_BUFFER: Final = 65536
+"""Bytes that the kernel may keep for a client that does not read, and so how old what it gets then can be:
+half a second of one sensor at 800 Hz. The C++ client has the same."""
 SILENCE_S: Final = 1.0
 """`receive` gives up waiting after this time, so that silence can be reported."""
 _KEEPALIVE: Final = tuple(
@@ -44,7 +47,7 @@ class FramedConnection:
         if not 0 < port < 65536:  # create_connection would leave a socket behind
             raise UnreachableError(f"{port} is no port: it must be from 1 to 65535")
         try:
-            self.sock = socket.create_connection((host, port), timeout=timeout_s)
+            self.sock = _connected(host, port, timeout_s)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot be one
             raise UnreachableError(_reason(error)) from None
         try:
@@ -82,7 +85,7 @@ class FramedConnection:
     def wait(self, timeout_s: float) -> bool:
         """Whether something arrives within `timeout_s`; ConnectionFailedError if this end has been closed."""
         try:
-            return bool(select.select((self,), (), (), max(timeout_s, 0.0))[0])
+            return _is_readable(self.sock, max(timeout_s, 0.0))
         except (ValueError, OSError):  # closed before, or by another thread at this very moment
             raise ConnectionFailedError("this client has been closed") from None
 
@@ -136,6 +139,32 @@ class FramedConnection:
         """Close the socket."""
         self.shutdown()
         self.sock.close()
+
+
+def _connected(host: str, port: int, timeout_s: float) -> socket.socket:
+    """Connected to the first address of the host that answers; OSError of the last if none does."""
+    failed: OSError = OSError(f"{host} has no address")
+    for family, kind, protocol, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+        sock = socket.socket(family, kind, protocol)
+        try:
+            # Before connecting: else the kernel lets it grow to megabytes, and to samples of long ago.
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+            sock.settimeout(timeout_s)
+            sock.connect(address)
+        except OSError as error:
+            failed = error
+            sock.close()
+        else:
+            return sock
+    raise failed
+
+
+def _is_readable(sock: socket.socket, timeout_s: float) -> bool:
+    if not hasattr(select, "poll"):  # on Windows, whose `select` takes sockets of any number
+        return bool(select.select((sock,), (), (), timeout_s)[0])
+    poll = select.poll()
+    poll.register(sock, select.POLLIN)
+    return bool(poll.poll(timeout_s * 1e3))
 
 
 def _reason(error: OSError | UnicodeError) -> str:
