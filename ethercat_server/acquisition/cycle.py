@@ -264,7 +264,7 @@ class Cycle:
         self._exchange.roll()
         self._schedule.roll()
         self._round_trip.check()
-        self._recovery.causes.check()
+        self._recovery.check()
         for stream in self._streams:
             stream.age.roll()
             stream.check()

@@ -108,6 +108,19 @@ class Recovery:
         """SDO transfers to a sensor that is not lost, in steps."""
         return self._ladders[number].sdo
 
+    def check(self) -> None:
+        """To be called once a second: name another master, and try refused event times again when it is time.
+
+        Another master may have changed what they need.
+        """
+        self.causes.check()
+        for number, stream in enumerate(self._streams):
+            events = stream.clock.events
+            if events and self._sensors[number].streams and events.trust.is_due(self._clock.monotonic_ns()):
+                self._ladders[number].latch_events()
+                if (clock := self._bus.read_clock(number)) is not None:
+                    events.retry(clock)
+
     def attend(self, complete: bool, now_ns: int) -> None:
         """To be called after every exchange that is back; almost always it has nothing to do.
 

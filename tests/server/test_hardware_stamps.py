@@ -111,6 +111,39 @@ def test_what_another_master_has_written_to_the_clock_is_taken_into_account() ->
     assert max(map(abs, errors_ns(running)[-400:])) < 10_000
 
 
+@pytest.mark.parametrize("leaves_op", [False, True])
+@pytest.mark.parametrize("change", ["offset", "latch"])
+def test_what_another_master_writes_meanwhile_ends_event_times_for_a_while_only(
+    change: str, leaves_op: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It has gone: nobody else puts right what it has left in the controller."""
+    caplog.set_level(logging.INFO)
+    running = simulation("")
+    running.run(SETTLED_S)
+    life = running.backend.sensors.sensors[0].life
+    assert life is not None
+    esc, at = life.esc, reg.SYNC_MANAGER + 3 * reg.SYNC_MANAGER_SIZE + reg.SM_ACTIVATE
+
+    def write() -> None:
+        if change == "offset":
+            esc.write(reg.DC_OFFSET, struct.pack("<QI", 10**18 + 2**31, 350))
+        else:
+            esc.write(at, bytes([esc.memory[at] & ~reg.SM_LATCH_PDI]))
+
+    if leaves_op:
+        esc.write(reg.AL_CONTROL, bytes([1, 0]))
+        while running.status()["sensors"][0]["recoveries"] == 0:
+            running.run(0.01)
+    write()
+    running.run(8.0)
+    assert stamps(running) == "polling"
+    running.run(10.0)
+    assert stamps(running) == "hardware"
+    assert max(map(abs, errors_ns(running)[-400:])) < 10_000
+    assert running.status()["sensors"][0]["lost_samples"] == 0
+    assert caplog.text.count("by the distributed clock of its slave controller again") == 1
+
+
 @pytest.mark.parametrize(("sensors", "sinc_length"), [(1, 32), (1, 64), (8, 32), (8, 64)])
 def test_a_stop_of_the_machine_costs_neither_stamps_nor_the_count(sensors: int, sinc_length: int) -> None:
     """The next sample may come between the pass of the process data and that of its event."""
