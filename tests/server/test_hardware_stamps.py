@@ -17,6 +17,7 @@ from ethercat_server.ethercat.exchange.distributed_clock import LATCHED, latched
 from ethercat_server.ethercat.exchange.frames import Area, fit_a_frame, make_frames
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import Command, Datagram, parse
+from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.framing import DataFlag
 from tests.simulation import Simulation, fresh, reading
@@ -109,6 +110,14 @@ def test_what_another_master_has_written_to_the_clock_is_taken_into_account() ->
     running.run(SETTLED_S)
     assert stamps(running) == "hardware"
     assert max(map(abs, errors_ns(running)[-400:])) < 10_000
+
+
+@pytest.mark.parametrize("seed", range(1, 7))
+def test_lost_frames_at_the_start_do_not_cost_event_times(seed: int) -> None:
+    running = Simulation(SensorOptions(signal="clock"), machine=Machine(seed=seed, lost=0.1))
+    running.backend.become(Machine())
+    running.run(SETTLED_S / 2)
+    assert stamps(running) == "hardware"
 
 
 @pytest.mark.parametrize("leaves_op", [False, True])
