@@ -467,6 +467,24 @@ def test_a_busy_computer_is_named_where_it_explains_the_loss() -> None:
         client.events.clear()
 
 
+def test_a_busy_computer_is_named_in_place_of_the_cable_but_not_of_the_interface(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for why, said in (
+        ("check cable and power", "this computer stood still for"),
+        ("ens5 is down", "ens5 is down"),
+    ):
+        simulation, client = streaming()
+        monkeypatch.setattr(simulation.backend, "why_silent", lambda why=why: why)
+        simulation.clock.stall(60e6)
+        simulation.run(0.005)
+        simulation.command("power off")
+        reason = client.wait_event("sensor_lost")["reason"]
+        assert reason.startswith(f"no frame comes back: {said}")
+        assert "cable" not in reason
+        assert ("stood still" in reason) is ("stood still" in said)
+
+
 def test_another_master_on_the_wire_is_named_and_so_is_its_end(caplog: pytest.LogCaptureFixture) -> None:
     simulation, client = streaming()
     caplog.set_level(logging.INFO)
