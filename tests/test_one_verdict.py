@@ -31,7 +31,7 @@ from ethercat_server.doctor.finding import Level as Found
 from protocol.accounting import NOT_NEW
 from protocol.address import Address
 from protocol.framing import DataFlag, DataMessage
-from protocol.health.judge import judge
+from protocol.health.judge import Observation, judge
 from protocol.health.limits import LIMITS
 from protocol.health.observer import p99
 from protocol.health.verdict import Level
@@ -239,6 +239,22 @@ def node(stream: Stream) -> Said:
     said = " ".join(status.message for status in judge_node(snapshot, LIMITS))
     assert not verdict.findings or verdict.sentence in said
     return verdict.level, verdict.sentence
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        Observation(silent_s=1.0, invalid=5),
+        Observation(is_lost=True),
+        Observation(samples=800, invalid=2),
+        Observation(samples=800, recoveries=1),
+    ],
+)
+def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable(seen: Observation) -> None:
+    for missed, cable in ((0, True), (8, True), (24, False)):
+        verdict = judge(seen._replace(nominal_hz=800.0, missed_deadlines=missed))
+        assert ("its cable" in verdict.sentence) is cable
+        assert ("computer stood still" in verdict.sentence) is not cable
 
 
 def test_the_documented_verdicts_are_these() -> None:

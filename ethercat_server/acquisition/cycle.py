@@ -208,15 +208,16 @@ class Cycle:
         back = bus.clock.monotonic_ns()
         if frame is None:
             return None
-        if not (sent := bus.process_data.take(frame)):
+        while (sent := bus.process_data.take(frame)) < 0:
+            # The answer may be behind duplicates of others: they must not pile up.
+            if back > self._timing.sent_ns + _SERVE_EVERY_NS:
+                return None
+            frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
+            if frame is None:
+                return None
+        if not sent:
             self._recovery.causes.stray(frame, back)
             return frame
-        while sent < 0:  # The answer may be behind duplicates of others: they must not pile up.
-            frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
-            if frame is None or back > self._timing.sent_ns + _SERVE_EVERY_NS:
-                return None
-            if not (sent := bus.process_data.take(frame)):
-                return frame
         self._hand_out(sent, back)
         self._learn(sent, back)
         if len(self._streams) > 1:
