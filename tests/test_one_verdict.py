@@ -170,7 +170,7 @@ def monitor(stream: Stream) -> Said:
     return verdict.level, verdict.sentence
 
 
-def doctor(stream: Stream) -> Said:
+def doctor(stream: Stream, after: Mapping[str, Any] = STATUS) -> Said:
     clock = SimpleNamespace(now_ns=stream.start_ns)
     clock.monotonic_ns = lambda: clock.now_ns
 
@@ -181,9 +181,10 @@ def doctor(stream: Stream) -> Said:
         clock.now_ns = stream.end_ns
         return []
 
+    statuses = iter((STATUS, after))
     link = SimpleNamespace(
         clock=clock, listen=listen, same_machine=True, close=lambda: None,
-        ask=lambda action: {"describe": {"sensors": [ROW]}, "status": STATUS}[action],
+        ask=lambda action: {"sensors": [ROW]} if action == "describe" else next(statuses),
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(through_server, "ServerLink", lambda _: link)
@@ -255,6 +256,15 @@ def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable(seen: Obser
         verdict = judge(seen._replace(nominal_hz=800.0, missed_deadlines=missed))
         assert ("its cable" in verdict.sentence) is cable
         assert ("computer stood still" in verdict.sentence) is not cable
+
+
+def test_the_doctor_knows_whether_it_stood_still() -> None:
+    row = {**STATUS["sensors"][0], "recoveries": 1}
+    level, said = doctor(Stream(second()), {**STATUS, "missed_deadlines": 24, "sensors": [row]})
+    assert level is Level.LOOK
+    assert said.startswith(
+        "The server lost the sensor once and has it back: the server's computer stood still"
+    )
 
 
 def test_the_documented_verdicts_are_these() -> None:

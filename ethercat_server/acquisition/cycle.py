@@ -186,7 +186,8 @@ class Cycle:
             slept = slept or wait > 0
         if (late := now - due) > self._schedule.shortest_ns:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
-            self._recovery.causes.stood_still(late, now)
+            if slept:  # else the answer was held up, and what is due was past when it came
+                self._recovery.causes.stood_still(late, now)
         timing.sends(sent := bus.process_data.send())
         self._cycles += 1
         if slept:
