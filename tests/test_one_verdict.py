@@ -259,7 +259,8 @@ def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable(seen: Obser
 
 
 def test_the_doctor_knows_whether_it_stood_still() -> None:
-    row = {**STATUS["sensors"][0], "recoveries": 1}
+    [row] = cast(list[dict[str, Any]], STATUS["sensors"])
+    row = {**row, "recoveries": 1}
     level, said = doctor(Stream(second()), {**STATUS, "missed_deadlines": 24, "sensors": [row]})
     assert level is Level.LOOK
     assert said.startswith(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import random
 from typing import Any
@@ -461,7 +462,7 @@ def test_a_busy_computer_is_named_where_it_explains_the_loss() -> None:
         (150e6, 1.5, False),
         (5e6, 0.0, False),
     ):
-        simulation.at(0.005, lambda stall_ns=stall_ns: simulation.clock.stall(stall_ns))
+        simulation.at(0.005, functools.partial(simulation.clock.stall, stall_ns))
         simulation.run(0.01 + later_s)
         if not (lost := [event for event in client.events if event["event"] == "sensor_lost"]):
             simulation.command("safeop 0x1B")
@@ -481,7 +482,7 @@ def test_a_busy_computer_is_named_in_place_of_the_cable_but_not_of_the_interface
     ):
         simulation, client = streaming()
         monkeypatch.setattr(simulation.backend, "why_silent", lambda why=why: why)
-        simulation.at(0.005, lambda clock=simulation.clock: clock.stall(60e6))
+        simulation.at(0.005, functools.partial(simulation.clock.stall, 60e6))
         simulation.run(0.01)
         simulation.command("power off")
         reason = client.wait_event("sensor_lost")["reason"]
