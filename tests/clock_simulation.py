@@ -21,6 +21,7 @@ from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock
 
 SECOND: Final = 1e9
 _SEND_NS: Final = 8_000.0
+_DISTRIBUTED: Final = DistributedClock(0, 0, 20_000)
 _HAND_OUT_NS: Final = 30_000.0
 """What the program needs for a poll, and for an answer."""
 
@@ -234,7 +235,7 @@ class ClockSimulation:
         self.machine = machine
         self.controller = controller
         self.timing = ExchangeTiming()
-        events = EventTimes(DistributedClock(0, 0, 20_000), self.timing, 0) if controller else None
+        events = EventTimes(_DISTRIBUTED, self.timing, 0) if controller else None
         self.clock = SampleClock(SECOND / sensor.rate_hz, self.timing, events)
         self.now_ns = 1.0
         self.polls_ns: list[float] = []
@@ -303,6 +304,8 @@ class ClockSimulation:
         clock.observe(sent, arrived, fresh)
         if clock.events is not None and exchange.latched is not None:
             clock.events.learn(sent, arrived)
+            if clock.events.trust.is_due(back):
+                clock.events.retry(_DISTRIBUTED)
         if not clock.locked:
             self.unlocked_ns.append(back)
 

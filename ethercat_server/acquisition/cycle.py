@@ -186,7 +186,8 @@ class Cycle:
             slept = slept or wait > 0
         if (late := now - due) > self._schedule.shortest_ns:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
-            self._recovery.causes.stood_still(late, now)
+            if slept:  # else the answer was held up, and what is due was past when it came
+                self._recovery.causes.stood_still(late, now)
         timing.sends(sent := bus.process_data.send())
         self._cycles += 1
         if slept:
@@ -208,15 +209,16 @@ class Cycle:
         back = bus.clock.monotonic_ns()
         if frame is None:
             return None
-        if not (sent := bus.process_data.take(frame)):
+        while (sent := bus.process_data.take(frame)) < 0:
+            # The answer may be behind duplicates of others: they must not pile up.
+            if back > self._timing.sent_ns + _SERVE_EVERY_NS:
+                return None
+            frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
+            if frame is None:
+                return None
+        if not sent:
             self._recovery.causes.stray(frame, back)
             return frame
-        while sent < 0:  # The answer may be behind duplicates of others: they must not pile up.
-            frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
-            if frame is None or back > self._timing.sent_ns + _SERVE_EVERY_NS:
-                return None
-            if not (sent := bus.process_data.take(frame)):
-                return frame
         self._hand_out(sent, back)
         self._learn(sent, back)
         if len(self._streams) > 1:
@@ -264,7 +266,7 @@ class Cycle:
         self._exchange.roll()
         self._schedule.roll()
         self._round_trip.check()
-        self._recovery.causes.check()
+        self._recovery.check()
         for stream in self._streams:
             stream.age.roll()
             stream.check()

@@ -74,14 +74,14 @@ class Ladder:
                     yield from self._pause(_ABSENT_PAUSE_S)
             elif status.is_op:
                 if not self._left_op:
-                    self._latch_events()
+                    self.latch_events()
                 if self._sensor.unsettled:
                     yield from put_right(self.sdo, self._sensor)
                 left_op, self._left_op = self._left_op, False
                 return left_op
             elif status.state is AlState.SAFEOP:
                 self._left_op = True
-                self._latch_events()
+                self.latch_events()
                 yield from self.states.go(AlState.OP)
             else:
                 self._left_op = True
@@ -152,7 +152,7 @@ class Ladder:
         yield from self.states.go(AlState.SAFEOP)
         yield from self.states.go(AlState.OP)
 
-    def _latch_events(self) -> None:
+    def latch_events(self) -> None:
         """Have the controller latch again when samples come to be: another master may have ended that."""
         for at in range(reg.SM_ACTIVATE, len(self._sync_managers), reg.SYNC_MANAGER_SIZE):
             if self._sync_managers[at] & reg.SM_LATCH_PDI:

@@ -196,7 +196,9 @@ class SensorStream:
         """The sensor is back after it was out; `period_ns` if it entered OP anew, None if it never left."""
         self.recoveries += lost
         if period_ns is not None:
-            self.clock = self._new_clock(period_ns, latching)
+            before, self.clock = self.clock.events, self._new_clock(period_ns, latching)
+            if before is not None and self.clock.events is not None:
+                self.clock.events.trust.was_trusted = before.trust.was_trusted
             self._discard = DISCARDED_AT_START
             self._gap = True
             self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns

@@ -153,9 +153,17 @@ def test_no_lie_costs_a_sample_on_a_slow_card(late_ns: float, since_s: float) ->
         assert outcome.exchanges < 1.05
 
 
-@pytest.mark.parametrize("jitter_ns", [10e3, 20e3])
-def test_event_times_that_are_worse_than_polling_are_not_used(jitter_ns: float) -> None:
-    simulation = run(Controller(jitter_ns=jitter_ns), seconds=12.0)
+@pytest.mark.parametrize(
+    "controller",
+    [
+        Controller(jitter_ns=10e3),
+        Controller(jitter_ns=20e3),
+        Controller(late_ns=18e3, lies_from_s=LIES_FROM_S),
+    ],
+    ids=["10 µs", "20 µs", "late within the frame"],
+)
+def test_event_times_that_are_worse_than_polling_are_not_used(controller: Controller) -> None:
+    simulation = run(controller, seconds=12.0)
     assert verdict(simulation) is Verdict.REFUSED
     outcome = simulation.outcome(4.0)
     assert percentile(outcome.errors_ns, 99) < 12e3
@@ -164,13 +172,54 @@ def test_event_times_that_are_worse_than_polling_are_not_used(jitter_ns: float) 
 
 
 def test_event_times_are_trusted_again_once_they_are_right() -> None:
-    """After several trials that failed there is a pause, and a longer one after the next."""
     lying = Controller(jitter_ns=50e3, lies_from_s=LIES_FROM_S, lies_until_s=9.0)
     simulation = run(lying, seconds=9.0)
     assert verdict(simulation) is Verdict.REFUSED
     simulation.run(17.0)
     assert verdict(simulation) is Verdict.TRUSTED
     assert_right(simulation.outcome(16.5))
+
+
+def test_pauses_between_trials_double_until_event_times_have_proved_right_for_long() -> None:
+    """So those that are hardly right do not switch stamps on and off."""
+    simulation, lying = run(HONEST, Sensor(150.0), seconds=3.0), Controller(jitter_ns=50e3)
+
+    def run_until(wanted: Verdict) -> float:
+        since_s = simulation.now_ns / 1e9
+        while verdict(simulation) is not wanted:
+            simulation.run(simulation.now_ns / 1e9 + 0.1)
+        return simulation.now_ns / 1e9 - since_s
+
+    def pause_s() -> float:
+        run_until(Verdict.REFUSED)
+        return run_until(Verdict.TRIAL)
+
+    simulation.controller = lying
+    assert [pause_s() for _ in range(3)] == pytest.approx([10, 20, 40], abs=0.5)
+    simulation.controller = HONEST
+    run_until(Verdict.TRUSTED)
+    simulation.run(simulation.now_ns / 1e9 + 61.0)
+    simulation.controller = lying
+    assert pause_s() == pytest.approx(10, abs=0.5)
+
+
+@pytest.mark.parametrize("seconds", [0.8, 3.0], ids=["on trial", "trusted"])
+def test_what_does_not_fit_while_the_machine_is_busy_is_not_held_against_event_times(seconds: float) -> None:
+    """An exchange was away for long then: who knows what has held up what."""
+    for took_ns, counts in ((20e6, False), (100e3, True)):
+        simulation = run(HONEST, seconds=seconds)
+        events = simulation.clock.events
+        assert events is not None
+        for number in range(300):
+            sent = int(simulation.now_ns + number * 30e6)
+            back = sent + int(took_ns)
+            long_ago = HONEST.local(sent - 1e9)
+            events.took((HONEST.local(sent), 1, long_ago, 1), sent, back, True, simulation.clock.period_ns)
+            if events.are_trusted:
+                events.date(sent, simulation.clock.period_ns, 1e6, sent, back)
+            else:
+                events.compare(0.0, 1e6, back)
+        assert bool(why(simulation)) is counts
 
 
 def test_registers_that_nobody_has_are_refused_within_a_second() -> None:

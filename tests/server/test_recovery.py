@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import random
 from typing import Any
@@ -455,8 +456,13 @@ def test_one_that_is_on_its_way_back_is_not_counted_in_place_of_another() -> Non
 def test_a_busy_computer_is_named_where_it_explains_the_loss() -> None:
     """And only there: the same AL error without a stall, or a second after it, is the sensor's."""
     simulation, client = streaming()
-    for stall_ns, later_s, named in ((300e6, 0.0, True), (0.0, 0.0, False), (150e6, 1.5, False)):
-        simulation.clock.stall(stall_ns)
+    for stall_ns, later_s, named in (
+        (300e6, 0.0, True),
+        (0.0, 0.0, False),
+        (150e6, 1.5, False),
+        (5e6, 0.0, False),
+    ):
+        simulation.at(0.005, functools.partial(simulation.clock.stall, stall_ns))
         simulation.run(0.01 + later_s)
         if not (lost := [event for event in client.events if event["event"] == "sensor_lost"]):
             simulation.command("safeop 0x1B")
@@ -467,14 +473,46 @@ def test_a_busy_computer_is_named_where_it_explains_the_loss() -> None:
         client.events.clear()
 
 
-def test_another_master_on_the_wire_is_named_and_so_is_its_end(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_busy_computer_is_named_in_place_of_the_cable_but_not_of_the_interface(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for why, said in (
+        ("check cable and power", "this computer stood still for"),
+        ("ens5 is down", "ens5 is down"),
+    ):
+        simulation, client = streaming()
+        monkeypatch.setattr(simulation.backend, "why_silent", lambda why=why: why)
+        simulation.at(0.005, functools.partial(simulation.clock.stall, 60e6))
+        simulation.run(0.01)
+        simulation.command("power off")
+        reason = client.wait_event("sensor_lost")["reason"]
+        assert reason.startswith(f"no frame comes back: {said}")
+        assert "cable" not in reason
+        assert ("stood still" in reason) is ("stood still" in said)
+
+
+@pytest.mark.parametrize(
+    ("source", "index"), [("021011223344", 0x95), ("010101010101", 3)], ids=["IgH", "SOEM"]
+)
+def test_another_master_on_the_wire_is_named_and_so_is_its_end(
+    source: str, index: int, caplog: pytest.LogCaptureFixture
+) -> None:
     simulation, client = streaming()
     caplog.set_level(logging.INFO)
     on = True
+    simulation.backend.become(Machine(late=0.1, late_ns=150e6))
+    simulation.run(2.0)
+    assert "no frame comes back: check cable and power" in caplog.text
+    assert "another" not in caplog.text, "late answers are its own"
+    assert "stood still" not in caplog.text
+    simulation.backend.become(Machine())
+    client.wait_event("sensor_back")
+    simulation.run(1.0)
+    client.events.clear()
 
     def send() -> None:
         """Its frames are seen, too, once the slaves have processed them."""
-        theirs = build((Command.BRD, 0, 0x130, bytes(2)), source=bytes.fromhex("021011223344"))
+        theirs = build((Command.BRD, 0, 0x130, bytes(2)), source=bytes.fromhex(source), first_index=index)
         theirs[SOURCE_ADDRESS] |= PROCESSED_BIT
         simulation.backend.put_on_the_wire(bytes(theirs.ljust(SHORTEST_FRAME, b"\0")))
         if on:

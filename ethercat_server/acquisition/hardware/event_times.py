@@ -52,9 +52,7 @@ class EventTimes:
         self.instant_ns = 0.0
         """CLOCK_MONOTONIC of the new sample of the newest exchange; 0 if its event does not say."""
         self._timing = timing
-        self._offset = clock.offset
-        self._half_behind_ns = clock.behind_ns / 2
-        self._reading_ns = clock.reading_ns
+        self._use(clock)
         self._passing_ns = passing_ns
         self._local = self._event = _LONG_AGO
         """Local times of the newest exchange and of the newest sample's event."""
@@ -67,6 +65,18 @@ class EventTimes:
         self._moved = 0
         self._answers = False
         """Whether the controller knows the registers."""
+
+    def _use(self, clock: DistributedClock) -> None:
+        self._offset = clock.offset
+        self._half_behind_ns = clock.behind_ns / 2
+        self._reading_ns = clock.reading_ns
+
+    def retry(self, clock: DistributedClock) -> None:
+        """Try them again: another master may have changed the controller's clock, which now is `clock`."""
+        if clock.offset != self._offset:
+            self.local_clock = LocalClock(self._timing)
+        self._use(clock)
+        self.trust.retry()
 
     @property
     def _is_in_time(self) -> bool:

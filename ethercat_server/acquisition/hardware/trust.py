@@ -19,7 +19,7 @@ right ones always do. One that is off at random does not only where a poll came 
 _CONTRADICTS: Final = 3.0
 """Standard deviations by which the mean difference from polling may deviate."""
 _MOST_FAILURES: Final = 5
-"""Failed trials after which event times are not tried any more, for a while."""
+"""Failed trials after which event times are not used, for a while."""
 _FIRST_PAUSE_NS: Final = 10_000_000_000
 _LONGEST_PAUSE_NS: Final = 320_000_000_000
 """That while at first, and at most: it doubles with each trial that fails after it."""
@@ -54,7 +54,7 @@ class Trust:
 
     __slots__ = (
         "_again_ns", "_began", "_compared", "_contradictions", "_failures", "_pause_ns", "_since_ns",
-        "_squares", "_sum_ns", "_unfit", "_was_trusted", "is_final", "verdict", "why",
+        "_squares", "_sum_ns", "_unfit", "is_final", "verdict", "was_trusted", "why",
     )  # fmt: skip
 
     def __init__(self) -> None:
@@ -63,7 +63,8 @@ class Trust:
         """What was wrong with them last: part of a sentence."""
         self.is_final = False
         """Whether they are refused for good: the controller has never shown any."""
-        self._was_trusted = False
+        self.was_trusted = False
+        """Whether this controller's ever were: then they are not refused for good."""
         self._failures = self._again_ns = 0
         self._pause_ns = _FIRST_PAUSE_NS
         self._contradictions = 0.0
@@ -90,10 +91,18 @@ class Trust:
             self.begin(evidence, now_ns)
 
     def begin(self, evidence: Evidence, now_ns: int) -> None:
-        """Begin a trial; if they are refused, once the pause has passed."""
+        """Begin a trial."""
         self._since_ns, self._began = now_ns, evidence
         self._compared = self._unfit = 0
         self._sum_ns = self._squares = 0.0
+
+    def is_due(self, now_ns: int) -> bool:
+        """Whether they are refused, and the pause has passed: they are to be tried again."""
+        return self.verdict is Verdict.REFUSED and not self.is_final and now_ns >= self._again_ns
+
+    def retry(self) -> None:
+        """Have another trial begin, though they are refused."""
+        self.verdict, self._since_ns = Verdict.TRIAL, 0
 
     def compare(self, difference_ns: float) -> None:
         """An event is so much later than what polling says."""
@@ -116,9 +125,7 @@ class Trust:
         Returns the variance of the differences between them if they are trusted now, else 0.
         """
         if self.verdict is Verdict.REFUSED:
-            if self.is_final or now_ns < self._again_ns:
-                return 0.0
-            self.verdict, self._since_ns = Verdict.TRIAL, 0
+            return 0.0
         if not self._since_ns:
             self.begin(evidence, now_ns)
         if now_ns - self._since_ns < _TRIAL_NS:
@@ -126,12 +133,12 @@ class Trust:
         count = self._compared + self._unfit
         if evidence.restarts - self._began.restarts > _RESTARTS:
             self._refuse("its local clock does not run", now_ns)
-            self.is_final = not self._was_trusted
+            self.is_final = not self.was_trusted
         elif count < _SAMPLES:
             pass
         elif evidence.moved == self._began.moved:
             self._refuse("they stand still", now_ns)
-            self.is_final = not self._was_trusted
+            self.is_final = not self.was_trusted
         elif self._compared < _FITTING * count:
             self._fail("they contradict the frames", now_ns)
             self.begin(evidence, now_ns)
@@ -140,7 +147,7 @@ class Trust:
             self.begin(evidence, now_ns)
         else:
             self.verdict, self._since_ns = Verdict.TRUSTED, now_ns
-            self._was_trusted = True
+            self.was_trusted = True
             self._contradictions = 0.0
             return self._squares / self._compared
         return 0.0

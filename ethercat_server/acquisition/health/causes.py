@@ -50,16 +50,14 @@ class Causes:
         self._stalled_ns += int(late_ns)
         self._stall_ns = now_ns
 
-    def explain(self, reason: str, now_ns: int) -> str:
-        """Why a sensor is lost, with what explains it, if anything does, in place of its cable and power."""
+    def explain(self, reason: str, now_ns: int, otherwise: str = "") -> str:
+        """Why a sensor is lost, with what explains it; `otherwise` if nothing does."""
         if now_ns - self._frame_ns < _RECENT_NS:
-            return f"{reason}: check for another EtherCAT master, whose frames arrive on {self._ifname}"
-        if now_ns - self._stall_ns < _RECENT_NS and self._stalled_ns > _STALL_NS:
+            otherwise = f"check for another EtherCAT master, whose frames arrive on {self._ifname}"
+        elif now_ns - self._stall_ns < _RECENT_NS and self._stalled_ns > _STALL_NS:
             stalled_ms = self._stalled_ns / 1e6
-            return (
-                f"{reason}: this computer stood still for {stalled_ms:.0f} ms, check it with ethercat-doctor"
-            )
-        return reason
+            otherwise = f"this computer stood still for {stalled_ms:.0f} ms, check it with ethercat-doctor"
+        return f"{reason}: {otherwise}" if otherwise else reason
 
     def check(self) -> None:
         """Say once that there is another master, and once that it has gone."""
