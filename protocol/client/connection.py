@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
+import selectors
 import socket
 import struct
 from typing import Final
@@ -19,11 +19,10 @@ from protocol.text.json_text import JsonObject
 from protocol.text.visible import printable
 
 CONNECT_TIMEOUT_S: Final = 2.0
-RECEIVE_BUFFER: Final = 65536
-"""Bytes that the kernel may keep for a client that does not read, and so how old what it gets then can be:
-half a second of one sensor at 800 Hz. The C++ client has the same."""
 SILENCE_S: Final = 1.0
 """`receive` gives up waiting after this time, so that silence can be reported."""
+RECEIVE_BUFFER: Final = 65536
+"""SO_RCVBUF in bytes. Left to itself the kernel makes it megabytes, and samples wait in it for seconds."""
 _KEEPALIVE: Final = tuple(
     (getattr(socket, option), value)
     for option, value in (("TCP_KEEPIDLE", 2), ("TCP_KEEPALIVE", 2), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3))
@@ -31,6 +30,8 @@ _KEEPALIVE: Final = tuple(
 )
 _DONT_WAIT: Final = getattr(socket, "MSG_DONTWAIT", 0)
 """0 on Windows, where the socket's timeouts would be of another type, too: there it waits with `select`."""
+_Selector: Final = getattr(selectors, "PollSelector", selectors.SelectSelector)
+"""`select` takes no descriptor above 1023. Windows, which has nothing else, limits their number only."""
 
 
 class FramedConnection:
@@ -47,7 +48,7 @@ class FramedConnection:
         if not 0 < port < 65536:  # create_connection would leave a socket behind
             raise UnreachableError(f"{port} is no port: it must be from 1 to 65535")
         try:
-            self.sock = _connected(host, port, timeout_s)
+            self.sock = socket.create_connection((host, port), timeout=timeout_s)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot be one
             raise UnreachableError(_reason(error)) from None
         try:
@@ -62,6 +63,7 @@ class FramedConnection:
             raise OSError("nothing listens there")
         self.same_machine: bool = ours[0] == theirs[0]
         self.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         # Detects a peer that disappeared without closing the connection.
         self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _KEEPALIVE:
@@ -85,7 +87,9 @@ class FramedConnection:
     def wait(self, timeout_s: float) -> bool:
         """Whether something arrives within `timeout_s`; ConnectionFailedError if this end has been closed."""
         try:
-            return _is_readable(self.sock, max(timeout_s, 0.0))
+            with _Selector() as selector:
+                selector.register(self, selectors.EVENT_READ)
+                return bool(selector.select(max(timeout_s, 0.0)))
         except (ValueError, OSError):  # closed before, or by another thread at this very moment
             raise ConnectionFailedError("this client has been closed") from None
 
@@ -139,32 +143,6 @@ class FramedConnection:
         """Close the socket."""
         self.shutdown()
         self.sock.close()
-
-
-def _connected(host: str, port: int, timeout_s: float) -> socket.socket:
-    """Connected to the first address of the host that answers; OSError of the last if none does."""
-    failed: OSError = OSError(f"{host} has no address")
-    for family, kind, protocol, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-        sock = socket.socket(family, kind, protocol)
-        try:
-            # Before connecting: else the kernel lets it grow to megabytes, and to samples of long ago.
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-            sock.settimeout(timeout_s)
-            sock.connect(address)
-        except OSError as error:
-            failed = error
-            sock.close()
-        else:
-            return sock
-    raise failed
-
-
-def _is_readable(sock: socket.socket, timeout_s: float) -> bool:
-    if not hasattr(select, "poll"):  # on Windows, whose `select` takes sockets of any number
-        return bool(select.select((sock,), (), (), timeout_s)[0])
-    poll = select.poll()
-    poll.register(sock, select.POLLIN)
-    return bool(poll.poll(timeout_s * 1e3))
 
 
 def _reason(error: OSError | UnicodeError) -> str:
