@@ -91,7 +91,7 @@ class DirectLink(Link):
         with contextlib.ExitStack() as cleanup:
             self._bus = open_bus(ifname, cleanup, allow_ip=allow_ip)
             self.clock = self._bus.clock
-            self._slave: Sdo | None = None
+            self._slave: GuardedSdo | None = None
             if slave is not None:
                 found_slave, self._slave = _find_slave(self._bus, slave)
                 self.sensors = [found_slave]
@@ -107,7 +107,7 @@ class DirectLink(Link):
 
     def sdo(self, number: int) -> GuardedSdo:
         """See `Link`."""
-        return GuardedSdo(self._slave or BlockingSdo(self._bus, number))
+        return self._slave or GuardedSdo(BlockingSdo(self._bus, number))
 
     def configure(self, number: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """See `Link`."""
@@ -274,7 +274,7 @@ def _change(sdo: Sdo, sensor: Sensor, change: Change, and_save: bool) -> Steps[N
         yield from save(sdo, sensor)
 
 
-def _find_slave(bus: Bus, wanted: str) -> tuple[Found, Sdo]:
+def _find_slave(bus: Bus, wanted: str) -> tuple[Found, GuardedSdo]:
     """The slave POSITION:NAME and its objects, through the mailboxes that its own master has set up.
 
     It stays in its state, and nothing is written but its mailbox.
@@ -294,7 +294,7 @@ def _find_slave(bus: Bus, wanted: str) -> tuple[Found, Sdo]:
         )
     rows = bus.read_surely_at(slave.position, reg.SYNC_MANAGER, 2 * reg.SYNC_MANAGER_SIZE)
     out, back = struct.unpack_from("<HH", rows), struct.unpack_from("<HH", rows, reg.SYNC_MANAGER_SIZE)
-    sdo = MailboxSdo(Mailbox(ByPosition(bus), slave.position, (out, back)))
+    sdo = GuardedSdo(MailboxSdo(Mailbox(ByPosition(bus), slave.position, (out, back))))
     serial = slave.sii["serial"] if slave.sii else 0
     return Found(slave.position, Identity(slave.name, serial, "", ""), "slave"), sdo
 
