@@ -31,14 +31,19 @@ def test_the_readme_names_every_program() -> None:
         assert name in text, name
 
 
-def test_the_files_of_the_architecture_page_exist() -> None:
+def test_the_pointers_of_the_docs_lead_somewhere() -> None:
+    """`FILE.py`: `NAME`, where NAME is a function, Class.method or table of that file."""
     named = re.findall(r"^\| .+\? \| (.+) \|$", (DOCS / "architecture.md").read_text(), re.MULTILINE)
     assert len(named) >= 20
     for row in named:
-        files = re.findall(r"`([\w./]+(?:\.py|/))`", row)
-        assert files, row
-        for name in files:
-            assert (ROOT / name).exists(), name
+        assert re.findall(r"`[\w./]+/`|`[\w./]+\.py`: `", row), row
+    text = "".join(page.read_text() for page in DOCS.glob("*.md"))
+    for name in re.findall(r"`((?:protocol|ethercat_server|ros2_bridge|clients)/[\w./]+)`", text):
+        assert (ROOT / name).exists(), name
+    for file, name in re.findall(r"`([\w./]+\.py)`: `([\w.]+)`", text):
+        code = (ROOT / file).read_text()
+        for part in name.split("."):
+            assert re.search(rf"^ *(?:def |class |){part}(?:\(|:| = )", code, re.MULTILINE), (file, name)
 
 
 def test_the_troubleshooting_page_is_one_screen_and_quotes_what_is_said() -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from tests.server.manager import Manager
 from tests.server.running import Client, Server, Veth, has_ipv6, needs_bus, server, wait_until
-from tests.simulation import reading
+from tests.simulation import check_frames
 
 pytestmark = [pytest.mark.bus, needs_bus]
 
@@ -55,14 +55,16 @@ def test_samples_of_a_chain_arrive_in_order_with_settings_of_their_own(shared: S
         assert [(s["sensor"], s["rate_hz"], s["pdo_size"]) for s in described] == [(0, 100, 61), (1, 50, 61)]
         assert all(s["settings"]["fir"] and s["name"] == "BFT-SENS-ECAT-M8" for s in described)
         frames = client.fresh(90)
-        while {frame.sensor for frame in frames if frame.wkc == 6} != {0, 1}:
+        for _ in range(20):
+            if {frame.sensor for frame in frames if frame.wkc == 6} == {0, 1}:
+                break
             frames += client.fresh(30)
-        for position in (0, 1):
+        else:
+            pytest.fail("never both slaves in one exchange, in 690 samples")
+        for position, most in ((0, 3), (1, 6)):
             own = [frame for frame in frames if frame.sensor == position]
-            instants = [reading(frame).instant_ns for frame in own]
-            assert instants == sorted(set(instants)), "a sample came twice or out of order"
-            stamps = [frame.monotonic_ns for frame in own]
-            assert stamps == sorted(set(stamps))
+            check_frames(own, complete=False)
+            assert len(own) * most > len(frames), "of three samples two are of the faster one"
 
 
 def test_status_counts_what_happened(shared: Shared) -> None:

@@ -151,6 +151,26 @@ def test_process_data_needs_the_state() -> None:
     assert master.upload(0x7000, 0) == b"\x09"
 
 
+def test_a_buffer_is_read_and_written_from_its_first_byte_on() -> None:
+    """A real controller does not count an access that begins in the middle."""
+    master = RawMaster().go(OP)
+
+    def middle() -> int:
+        return master.one(Command.APRD, 0, 0x1180 + 20, bytes(41))[1]
+
+    assert middle() == 0
+    assert master.one(Command.APRD, 0, 0x1180, bytes(20))[1] == 1
+    assert middle() == 1, "it goes on"
+    assert middle() == 0, "it was handed back with its last byte"
+
+
+def test_the_sync_unit_can_be_set_up() -> None:
+    master = RawMaster()
+    for register, value in ((0x0981, b"\3"), (0x0990, bytes(range(8))), (0x09A0, bytes(range(8)))):
+        assert master.write(register, value) == 1
+        assert master.read(register, len(value)) == value
+
+
 def test_wrong_direction_is_refused() -> None:
     master = RawMaster().go(OP)
     assert master.one(Command.APWR, 0, 0x1180, b"x")[1] == 0

@@ -102,6 +102,13 @@ class SyncManager:
         at = self.start + offset
         return bytes(self._memory[at : at + length])
 
+    def step(self, offset: int, length: int) -> bool:
+        """An access to a buffer begins with its first byte and goes on to its last; False if it does not."""
+        if offset and not self._open:
+            return False
+        self._open = offset + length < self.length
+        return True
+
     def load(self, message: bytes) -> None:
         """The firmware fills the read mailbox."""
         self._memory[self.start : self.end] = message.ljust(self.length, b"\0")[: self.length]
