@@ -41,14 +41,12 @@ from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.sensor_actions import SensorActions
 from ethercat_server.serving.transport.in_memory import InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
-from ethercat_server.simulation.machine import Machine
+from ethercat_server.simulation.machine import Machine, SimulatedClock
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
-from protocol.client import blocking
-from protocol.control import request
-from protocol.errors import ConnectionFailedError
-from protocol.framing import DataMessage, FrameDecoder, encode_json
+from protocol.client import Client, client
 from protocol.text.json_text import JsonObject
+from tests.memory_channel import MemoryChannel
 from tests.simulation import Asked, NoWatchdog
 
 PATIENCE_S = 60.0
@@ -150,7 +148,7 @@ class SimulatedServer:
     def __init__(self, bus: SimulatedBus) -> None:
         self.bus = bus
         self.events: list[JsonObject] = []
-        self.clock = _ServersClock(self)
+        self.clients_clock = _ServersClock(self)
         self.hangs = False
         """Whether it is stopped by somebody."""
         ethercat = Bus(bus.backend)
@@ -165,7 +163,8 @@ class SimulatedServer:
             ethercat, sensors, self.streams, timing, self, self.recovery, self.jobs, NoWatchdog()
         )
         actions = SensorActions(ethercat, self.hub, self.recovery, self.jobs, sensors, self.streams)
-        self.hub.start(Actions(self.hub, self.cycle, actions).handle)
+        # Here a message comes a period late, because time passes while the server serves: ages mean nothing.
+        self.hub.start(Actions(self.hub, self.cycle, actions, {"boot_id": "simulated"}).handle)
         self._stop_if: Callable[[], object] = lambda: False
 
     def publish(self, made: Sequence[Made], now_ns: int) -> None:
@@ -193,9 +192,18 @@ class SimulatedServer:
             self.cycle.run()
         return bool(condition())
 
-    def connect(self) -> _Connection:
-        """A connection for this test's own requests."""
-        return _Connection(self)
+    @property
+    def clock(self) -> SimulatedClock:
+        """The bus's."""
+        return self.bus.clock
+
+    def go_on(self, until: Callable[[], object], seconds: float) -> None:
+        """See `memory_channel.Server`."""
+        self.run_until(until, seconds)
+
+    def connect(self) -> Client:
+        """A client for this test's own requests."""
+        return Client(12001, stream=False, channel=MemoryChannel(self, buffer_size=1 << 20)).connect()
 
 
 @contextlib.contextmanager
@@ -203,8 +211,8 @@ def simulated_server(bus: SimulatedBus) -> Iterator[SimulatedServer]:
     """A server that streams from `bus`, behind every address."""
     server = SimulatedServer(bus)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(blocking, "FramedConnection", lambda *_: _Connection(server))
-        patch.setattr(ServerLink, "clock", server.clock)
+        patch.setattr(client, "TcpChannel", lambda *_: MemoryChannel(server, buffer_size=1 << 20))
+        patch.setattr(ServerLink, "clock", server.clients_clock)
         yield server
 
 
@@ -225,54 +233,6 @@ class _ServersClock:
     def sleep(self, seconds: float, /) -> None:
         """See `Clock`."""
         self._server.run_until(lambda: False, seconds)
-
-
-class _Connection:
-    """A `FramedConnection` in memory."""
-
-    same_machine = False
-    """Here a message comes a period late, because time passes while the server serves."""
-
-    def __init__(self, server: SimulatedServer) -> None:
-        self._server = server
-        self._end = server.transport.connect(buffer_size=1 << 20)
-        self._decoder = FrameDecoder()
-
-    def wait(self, timeout_s: float) -> bool:
-        """See `FramedConnection`."""
-        return self._server.run_until(lambda: self._end.readable, timeout_s)
-
-    def receive(self, *, wait: bool = True) -> bool | None:
-        """See `FramedConnection`."""
-        if self._end.at_end:
-            raise ConnectionFailedError("the server closed it")
-        self._decoder.feed(self._end.recv_all())
-        return False
-
-    def next_message(self) -> DataMessage | JsonObject | None:
-        """See `FramedConnection`."""
-        return self._decoder.next_message()
-
-    def take_description(self, description: JsonObject) -> None:
-        """See `FramedConnection`."""
-
-    def send(self, message: JsonObject) -> None:
-        """See `FramedConnection`."""
-        self._end.send(encode_json(message))
-
-    def close(self) -> None:
-        """See `FramedConnection`."""
-        self._end.close()
-
-    def ask(self, action: str, **values: object) -> JsonObject:
-        """The reply to a request; for tests that look at the server themselves."""
-        self.send(request(action, 1, **values))
-        while self.wait(PATIENCE_S):
-            self.receive()
-            while (message := self.next_message()) is not None:
-                if isinstance(message, dict) and "reply" in message:
-                    return message
-        pytest.fail(f"no reply to {action}")
 
 
 class _Receiver:

@@ -189,6 +189,11 @@ class Simulation:
             self._awaited = lambda: False
             assert met or condition(), f"{what}: not within {seconds} s; events: {self.events[-6:]}"
 
+    def go_on(self, until: Callable[[], object], seconds: float) -> None:
+        """Let the loop run until something is so, for this time at most."""
+        until_ns = self.clock.now_ns + round(seconds * 1e9)
+        self.run_until(lambda: until() or self.clock.now_ns >= until_ns, "the end of a wait", seconds + 1)
+
     def _run(self) -> None:
         self.cycle.stopping = False
         self.cycle.run()

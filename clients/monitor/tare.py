@@ -44,7 +44,7 @@ def start_tare(address: Address, position: int, say: Say, way: str = "tare") -> 
 def tare(address: Address, position: int) -> tuple[str, bool]:
     """Tare the sensor; a message, and whether it is an error."""
     try:
-        with Client(address.port, address.host) as client:
+        with Client(address.port, address.host, stream=False, reconnect=False).connect() as client:
             try:
                 reply = client.ask("tare", _TIMEOUT_S, sensor=position)
             except ConnectionFailedError as error:
@@ -80,7 +80,7 @@ def _set_offset(
     address: Address, position: int, wanted: Callable[[int, Sequence[float]], Sequence[float]], result: str
 ) -> tuple[str, bool]:
     try:
-        with Client(address.port, address.host) as client:
+        with Client(address.port, address.host, stream=False, reconnect=False).connect() as client:
             serial, before = _found(client.description, position)
             after = wanted(serial, before)
             try:

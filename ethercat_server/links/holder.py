@@ -20,7 +20,6 @@ from protocol.errors import ProtocolError
 from protocol.program.server_choice import default_server
 
 _LISTEN: Final = 0x0A
-_TIMEOUT_S: Final = 1.0
 
 
 class Holder(NamedTuple):
@@ -50,7 +49,7 @@ def _default_server(ifname: str) -> Address | None:
     """The server that is used where none is given, if it uses this interface."""
     with contextlib.suppress(ValueError, ProtocolError):
         address = default_server()
-        with Client(address.port, address.host, timeout_s=_TIMEOUT_S) as client:
+        with Client(address.port, address.host, stream=False).connect() as client:
             if client.description.get("interface") == ifname:
                 return address
     return None

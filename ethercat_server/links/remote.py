@@ -33,7 +33,6 @@ from protocol.framing import DataMessage
 from protocol.settings import SettingValue
 from protocol.text.json_text import JsonObject
 
-_CONNECT_TIMEOUT_S: Final = 5.0
 _ANSWER_TIMEOUT_S: Final = 30.0
 _SLOWEST_SAMPLE_S: Final = 1.0
 """Upper bound for the time per sample of a tare: CHOP may divide 25 Hz by 8, and a tare takes two windows."""
@@ -54,7 +53,9 @@ class ServerLink(Link):
         self._name = f"the server at {address}"
         self.used = used or self._name
         try:
-            self._client = Client(address.port, address.host, timeout_s=_CONNECT_TIMEOUT_S)
+            self._client = Client(
+                address.port, address.host, stream=False, raw=True, reconnect=False
+            ).connect()
         except UnreachableError as error:
             raise ServerError(error.at(address)) from None
         except ProtocolError as error:
@@ -127,11 +128,10 @@ class ServerLink(Link):
             if settling and asked.passed:
                 later, asked = self._settling(numbers), Deadline(self.clock, _IDLE_S)
             try:
-                frames = self._client.receive(_IDLE_S)
+                frames = self._client.poll(_IDLE_S)
             except ConnectionFailedError as error:
                 raise ServerError(f"{self._name} closed the connection ({error}): see its log") from None
-            while self._client.events:
-                event = self._client.events.popleft()
+            for event in self._events():
                 if event["event"] == Event.SHUTTING_DOWN:
                     raise ServerError(f"{self._name} is shutting down")
                 if event.get("sensor") in numbers:
@@ -146,7 +146,7 @@ class ServerLink(Link):
     @property
     def same_machine(self) -> bool:
         """Whether CLOCK_MONOTONIC is the server's."""
-        return self._client.connection.same_machine
+        return self._client.session.same_machine
 
     def listen(self, seconds: float, on_frames: Callable[[Sequence[DataMessage]], None]) -> list[JsonObject]:
         """Stream every frame of all sensors to `on_frames` for some seconds; the events meanwhile."""
@@ -154,11 +154,17 @@ class ServerLink(Link):
         end = Deadline(self.clock, seconds)
         while not end.passed:
             try:
-                on_frames(self._client.receive(_IDLE_S))
+                on_frames(self._client.poll(_IDLE_S))
             except ConnectionFailedError as error:
                 raise ServerError(f"{self._name} closed the connection ({error}): see its log") from None
         self.ask("unsubscribe")
-        return list(self._client.events)
+        return self._events()
+
+    def _events(self) -> list[JsonObject]:
+        """The server's since the last call."""
+        events = [event for event in self._client.events if isinstance(event, dict)]
+        self._client.events.clear()
+        return events
 
     def wait_settled(self, numbers: Sequence[int]) -> None:
         """See `Link`."""

@@ -3,9 +3,9 @@
 from protocol.client.client import Client, NoSampleError, connect
 from protocol.client.reading import Condition, Reading
 from protocol.client.real_time import Scheduling, make_real_time
-from protocol.client.session import Connected, Disconnected
+from protocol.client.session import ClientEvent, Connected, Disconnected
 
 __all__ = [
-    "Client", "Condition", "Connected", "Disconnected", "NoSampleError", "Reading", "Scheduling", "connect",
+    "Client", "ClientEvent", "Condition", "Connected", "Disconnected", "NoSampleError", "Reading", "Scheduling", "connect",
     "make_real_time",
 ]  # fmt: skip

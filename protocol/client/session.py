@@ -22,7 +22,13 @@ from typing import Any, Final, NamedTuple
 from protocol.address import boot_id
 from protocol.client.reading import SensorState
 from protocol.control import Event, check_version, request
-from protocol.errors import BadMessageError, ConnectionFailedError, RefusedError, RemoteProtocolError
+from protocol.errors import (
+    BadMessageError,
+    ConnectionFailedError,
+    NoReplyError,
+    RefusedError,
+    RemoteProtocolError,
+)
 from protocol.framing import DataMessage, FrameDecoder, encode_json
 from protocol.pdo import ImuUnits
 from protocol.sensor_choice import MOST_PLACES
@@ -37,7 +43,7 @@ _LASTED_NS: Final = 1_000_000_000
 _MOST_HZ: Final = 1e6
 _MOST_ITEMS: Final = 65536
 """Kept while nobody takes them; a tare of 20,000 samples needs fewer."""
-_HANDSHAKE_NS: Final = 3_000_000_000
+_HANDSHAKE_NS: Final = 5_000_000_000
 _LEAST_TIMEOUT_S: Final = 0.02
 _TIMEOUT_PERIODS: Final = 5
 
@@ -154,7 +160,7 @@ class Session:
         """
         if not count:
             if not self.connected and now_ns - self._opened_ns > _HANDSHAKE_NS:
-                raise ConnectionFailedError(f"no reply within {_HANDSHAKE_NS / 1e9:g} s")
+                raise NoReplyError(f"no reply to describe within {_HANDSHAKE_NS / 1e9:g} s")
             return b""
         self._decoder.received(count)
         batch, answer = self._batch, b""

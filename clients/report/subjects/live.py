@@ -14,7 +14,7 @@ from clients.report.subjects.recorded import event_remarks, no_sensor
 from clients.report.subjects.subject import Subject, subject
 from protocol.accounting import NOT_NEW
 from protocol.address import Address
-from protocol.client import Client, connect
+from protocol.client import Client
 from protocol.errors import ConnectionFailedError
 from protocol.framing import DataMessage
 from protocol.health.observer import p99
@@ -61,10 +61,10 @@ def subjects(
 
     ConnectionFailedError or RefusedError if there is no stream; ReportError if there is no such sensor.
     """
-    with connect(address.port, address.host, fresh_only=False) as client:
+    with Client(address.port, address.host, fresh_only=False, raw=True, reconnect=False).connect() as client:
         rows = _chosen(client.description, address, choice)
         received, ended = _listen(client, seconds, progress)
-        names = [str(event.get("event")) for event in client.events]
+        names = [str(event.get("event")) for event in client.events if isinstance(event, dict)]
         changed = "" if ended else _changed(client, rows)
     remarks = [*([ended] if ended else []), *([changed] if changed else []), *event_remarks(names)]
     return [
@@ -102,11 +102,11 @@ def _chosen(
 def _listen(client: Client, seconds: float, progress: Callable[[float], None]) -> tuple[Received, str]:
     """The frames of `seconds`, and why they ended early, if they did."""
     received = Received()
-    begin, same_clock = time.monotonic(), client.connection.same_machine
+    begin, same_clock = time.monotonic(), client.session.same_machine
     while (passed := time.monotonic() - begin) < seconds:
         progress(passed)
         try:
-            frames = client.receive(min(_BATCH_S, seconds - passed))
+            frames = client.poll(min(_BATCH_S, seconds - passed))
             received.take(frames, round(time.monotonic() * 1e9) if same_clock else None)
         except ConnectionFailedError as error:
             if not received.all:
