@@ -69,6 +69,8 @@ def test_80x24_has_the_state_of_a_sensor_that_is_lost_and_of_its_neighbors() -> 
     text = plain(replace(state, sensors=(sensor, *state.sensors[1:])))
     assert "  LOST " in text
     assert "values 30m00s old" in text
+    assert "serial 123" in text
+    assert "firmware" not in text, "it goes first"
 
 
 def test_all_warnings_are_on_a_page_of_their_own() -> None:

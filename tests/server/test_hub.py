@@ -410,7 +410,9 @@ def test_an_idle_connection_of_who_has_most_goes_first(served: Served) -> None:
     served.connect(3000)
     assert [client for client in crowd if client.fd not in served.hub.connections] == [crowd[4]]
     assert 3000 in {client.uid for client in served.hub.connections.values()}
-    crowd[3].subscription = None
+    crowd[3].subscription = crowd[2].subscription = None
+    served.connect(3000)
+    assert [client for client in crowd if client.fd not in served.hub.connections] == [crowd[2], crowd[4]]
     assert served.is_closed(served.connect(1003)), "who has most cannot push out"
 
 
