@@ -5,6 +5,8 @@ import struct
 import pytest
 
 from ethercat_server.ethercat.wire import Command
+from ethercat_server.virtual_sensor.options import ForeignOptions
+from ethercat_server.virtual_sensor.slave.al import AlState
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, RawMaster, chain, fmmu, sync_manager
 
 
@@ -42,7 +44,10 @@ def test_ports_follow_the_chain() -> None:
     assert last & 0x0C00 == 0x0400
 
 
-@pytest.mark.parametrize("register", [0x0000, 0x0008, 0x0012, 0x0110, 0x0130, 0x0134, 0x0140, 0x0220, 0x0904])
+@pytest.mark.parametrize(
+    "register",
+    [0x0000, 0x0008, 0x0012, 0x0110, 0x0130, 0x0134, 0x0140, 0x0220, 0x0904, 0x0980, 0x0990, 0x09A0],
+)
 def test_read_only_registers_ignore_writes(register: int) -> None:
     master = RawMaster()
     before = master.read(register, 2)
@@ -158,6 +163,20 @@ def test_wrong_direction_is_refused() -> None:
     # Free memory behind the buffers is anyone's.
     assert master.write(0x1F00, b"note") == 1
     assert master.read(0x1F00, 4) == b"note"
+
+
+def test_a_buffer_is_accessed_from_its_first_byte_to_its_last() -> None:
+    master = RawMaster().go(SAFEOP)
+
+    def read(at: int, length: int) -> int:
+        return master.one(Command.APRD, 0, at, bytes(length))[1]
+
+    assert [read(0x1184, 4), read(0x11BC, 1)] == [0, 0], "not opened"
+    assert [read(0x1180, 4), read(0x1184, 4), read(0x1184, 57), read(0x1184, 4)] == [1, 1, 1, 0]
+    assert [read(0x1180, 61), read(0x1184, 4)] == [1, 0]
+    drive = RawMaster(ForeignOptions("DRIVE", state=AlState.SAFEOP))
+    at = struct.unpack("<H", drive.read(0x0810, 2))[0]
+    assert [drive.write(at + n, bytes(size)) for n, size in ((1, 5), (0, 1), (1, 5), (1, 5))] == [0, 1, 1, 0]
 
 
 def test_a_disabled_sync_manager_frees_its_memory() -> None:

@@ -206,6 +206,8 @@ class Esc:
                 self._exchanged(manager)
                 self._pdi.mailbox_read()
             return data
+        if not manager.access(offset, length):
+            return None
         if manager.latches_ecat and offset + length == manager.length:
             self._exchanged(manager)
         if offset == 0:  # three buffers: the newest is handed over when the first byte is read
@@ -224,6 +226,8 @@ class Esc:
                 self._exchanged(manager)
                 self._pdi.mailbox_written()
             return True
+        if not manager.access(offset, len(data)):
+            return False
         self.memory[manager.start + offset : manager.start + offset + len(data)] = data
         if offset + len(data) == manager.length:  # handed over when the last byte is written
             self._exchanged(manager)

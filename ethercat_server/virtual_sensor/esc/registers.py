@@ -70,7 +70,6 @@ def _write_mask() -> bytes:
     allow(DC_OFFSET, 12)
     allow(DC_SPEED_START, 2)
     allow(DC_FILTERS, 2)
-    allow(DC_ACTIVATION, 2)
     allow(USER_RAM, REGISTERS_END - USER_RAM)
     return bytes(mask)
 

@@ -1,6 +1,6 @@
 """The registers through which a master reads a slave's EEPROM (SII), whose image is built in `slave.image`.
 
-Source: ETG.1000.4. It is read-only: a write command ends with the error bit "write enable".
+Source: ETG.1000.4. It is read-only: it acknowledges no write.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from typing import Final
 
 from ethercat_server.virtual_sensor.esc import registers as reg
 
+_WRITE_ENABLE = 0x0001
 _EIGHT_BYTE_READS = 0x0040
 _BUSY = 0x8000
 _ERROR_COMMAND = 0x2000
+"""Not acknowledged by the EEPROM, or no command."""
 _ERROR_WRITE_ENABLE = 0x4000
 _NO_OPERATION, _READ, _WRITE, _RELOAD = 0, 1, 2, 4
 
@@ -72,7 +74,7 @@ class SiiInterface:
             self._set_status(_BUSY)
             self.advance()
         elif operation == _WRITE:
-            self._set_status(_ERROR_WRITE_ENABLE)
+            self._set_status(_ERROR_COMMAND if control & _WRITE_ENABLE else _ERROR_WRITE_ENABLE)
         elif operation in (_NO_OPERATION, _RELOAD):
             self._set_status(0)
         else:
