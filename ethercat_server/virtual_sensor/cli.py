@@ -9,6 +9,8 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 
 from ethercat_server import __version__
+from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.nic.interface import look_up
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor import link
 from ethercat_server.virtual_sensor.control import ControlError
@@ -61,7 +63,9 @@ def build_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument("--sensors", metavar="N", help="sensors on the bus (default: as many as named, or 1)")
     parser.add_argument("--model", action="append", metavar="NAME", help=f"default {MODELS[0]}{several}")
-    parser.add_argument("--serial", action="append", metavar="N", help=f"default 1, 2, ...{several}")
+    parser.add_argument(
+        "--serial", action="append", metavar="N", help=f"default: by the interface's MAC address{several}"
+    )
     parser.add_argument(
         "--pdo", choices=[str(n) for n in LAYOUTS], default="61", help="bytes of process data"
     )
@@ -94,7 +98,15 @@ def _list(given: Sequence[str] | None) -> list[str]:
     return [word for text in given or () for word in text.split(",") if word]
 
 
-def options_from(args: argparse.Namespace) -> BusOptions:
+def _serial_of(ifname: str) -> int:
+    """A number that another interface's sensors do not have, and these have again after a restart."""
+    try:
+        return int.from_bytes(look_up(ifname).address[3:]) or 1
+    except InterfaceError:  # said when it is to be opened
+        return 1
+
+
+def options_from(args: argparse.Namespace, default_serial: int = 1) -> BusOptions:
     """The options in parsed arguments; UsageError if they are contradictory."""
     try:
         chain = None if args.chain is None else parse_chain(args.chain)
@@ -136,7 +148,7 @@ def options_from(args: argparse.Namespace) -> BusOptions:
             raise UsageError(f"model {model!r} must have at most 20 ASCII characters, such as {MODELS[0]}")
     sensors = []
     for position in range(count):
-        first_serial = serial_numbers[-1] if serial_numbers else 1
+        first_serial = serial_numbers[-1] if serial_numbers else default_serial
         given = len(serial_numbers) - 1 if serial_numbers else 0
         sensors.append(
             SensorOptions(
@@ -185,7 +197,7 @@ def main(argv: Sequence[str] | None = None, on_open: Callable[[], None] = lambda
     """
     args = build_parser().parse_args(argv)
     try:
-        options = options_from(args)
+        options = options_from(args, _serial_of(args.iface))
         if len(args.iface.encode()) > link.LONGEST_NAME:
             raise UsageError(f"interface name {args.iface!r} is longer than {link.LONGEST_NAME} characters")
     except UsageError as error:
