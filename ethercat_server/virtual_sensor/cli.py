@@ -101,7 +101,7 @@ def _list(given: Sequence[str] | None) -> list[str]:
 def _serial_of(ifname: str) -> int:
     """A number that another interface's sensors do not have, and these have again after a restart."""
     try:
-        return int.from_bytes(look_up(ifname).address[3:]) or 1
+        return int.from_bytes(look_up(ifname).address[3:]) * MOST_SLAVES or 1
     except InterfaceError:  # said when it is to be opened
         return 1
 

@@ -86,6 +86,8 @@ def test_each_interface_has_serial_numbers_of_its_own(veth: tuple[str, str], sta
         sensor.end()
         return [each["serial"] for each in answer["sensors"]]
 
+    for number, end in enumerate(veth):  # as of two ports of one card
+        subprocess.run(["ip", "link", "set", end, "address", f"02:00:00:00:00:0{number}"], check=True)
     one, other, again = (serials(ifname) for ifname in (*veth, veth[0]))
     assert len({*one, *other}) == 4
     assert again == one, "the same sensors, started again"
