@@ -117,7 +117,12 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
         table.add_row(name, value)
     Console().print(table)
     if (why := explanation(summary)) is not None:
-        print(why)
+        say(why)
+
+
+def say(sentence: str) -> None:
+    """Print it, broken between words."""
+    Console().print(sentence, markup=False, highlight=False)
 
 
 def _yes(fact: bool) -> str:
