@@ -14,6 +14,7 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("*.md"))]
 
 FUNCTIONS = r"`[\w.]+`(?:, `[\w.]+`)*"
+FILE = r"(?:protocol|ethercat_server|ros2_bridge|clients)/[\w./]+|[\w./]+/\w+\.(?:py|hpp)"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -54,7 +55,7 @@ def defined(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_files_hold_what_the_pages_say(page: Path) -> None:
-    for file, functions in re.findall(rf"`([\w./]+/\w+\.(?:py|hpp))`(?:: ({FUNCTIONS}))?", page.read_text()):
+    for file, functions in re.findall(rf"`({FILE})`(?:: ({FUNCTIONS}))?", page.read_text()):
         assert (ROOT / file).exists(), file
         for function in re.findall(r"`([\w.]+)`", functions):
             assert function in defined(ROOT / file), f"{function} is not in {file}"

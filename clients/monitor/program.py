@@ -51,12 +51,10 @@ def _has_screen() -> bool:
 def _once(options: Options, model: Model, reader: Reader) -> int:
     if not reader.wait_for_answer(_ANSWER_S):
         state = model.state(time.monotonic())
-        reason = state.server.reason or "it does not answer"
+        reason = state.server.reason or f"the server at {options.address} does not answer"
         if options.json:
             _say(json_line(state, time.time()))
-        sys.stderr.write(
-            f"ethercat-monitor: {options.address}: {reason}: start ethercat-server, or give its HOST:PORT\n"
-        )
+        sys.stderr.write(f"ethercat-monitor: {reason}, or give its HOST:PORT\n")
         return 1
     time.sleep(_ONCE_S)
     state = model.state(time.monotonic())

@@ -6,6 +6,7 @@ The queue in between is bounded. What does not fit is counted, and an event mark
 from __future__ import annotations
 
 import json
+import math
 import queue
 import threading
 import time
@@ -24,6 +25,8 @@ from protocol.framing import DataMessage
 
 FLUSH_S: Final = 0.4
 """Longest time until received frames are in the file."""
+STOP_S: Final = 5.0
+"""Longest time for what is queued when it is stopped."""
 MAX_BACKLOG: Final = 200_000
 """Maximum number of queued frames: a minute of two sensors at 1600 Hz, some 80 MB."""
 
@@ -59,7 +62,7 @@ class Recorder:
         self._disk: DiskFile
         self._writer: RecordingWriter
         self._open_part()
-        self._reason = ""
+        self._reason, self._give_up_at = "", math.inf
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
@@ -90,7 +93,7 @@ class Recorder:
         """Write what is queued and finish the file; `error` is set if that failed."""
         if self._overflow:
             self._queue.put([lost(self._overflow, "the disk did not keep up")])
-        self._reason = reason
+        self._reason, self._give_up_at = reason, time.monotonic() + STOP_S
         self._queue.put(None)
         self._thread.join()
         while not self._queue.empty():  # queued after a failure
@@ -119,6 +122,9 @@ class Recorder:
                 batch = []
             if batch is None:
                 return
+            if time.monotonic() > self._give_up_at:
+                self._leave_out(batch)
+                return
             for item in batch:
                 self._write(item)
             self._backlog -= len(batch)
@@ -130,6 +136,13 @@ class Recorder:
                     self._end_part("rotated")
                     self._finished_bytes += self._writer.size
                     self._open_part()
+
+    def _leave_out(self, batch: Batch) -> None:
+        """It is stopped, and writing takes too long: what is still queued is lost."""
+        frames = sum(isinstance(item, DataMessage) for item in batch)
+        while (more := self._queue.get()) is not None:
+            frames += sum(isinstance(item, DataMessage) for item in more)
+        self._write(lost(frames, "it was stopped before everything was written"))
 
     def _write(self, item: DataMessage | Description | Event) -> None:
         writer = self._writer

@@ -47,6 +47,11 @@ class Source:
         self._sensors = sensors
         self._client: Client | None = None
         self._retry_at = 0.0
+        self._refusal = ""
+        self._greeting: Batch = []
+        """What is to be said of a connection made anew once its subscription is granted."""
+        self._subscribed: JsonObject | None = None
+        """The latest reply that granted a subscription."""
 
     @property
     def connected(self) -> bool:
@@ -86,6 +91,13 @@ class Source:
         except ConnectionFailedError as error:
             self.close()
             batch.append(_noted("disconnected", reason=str(error)))
+        except RefusedError as error:
+            if self._subscribed is None:
+                raise
+            # A server that was started again: the sensor may be there the next time.
+            self.close()
+            known, self._refusal = self._refusal == str(error), str(error)
+            batch = [] if known else [_noted("refused", message=f"the server refused: {error}")]
         return batch
 
     def close(self) -> None:
@@ -106,10 +118,10 @@ class Source:
         if time.monotonic() < self._retry_at:
             return []
         try:
-            return self.connect()
+            self._greeting = self.connect()
         except ConnectionFailedError:
             self._retry_at = time.monotonic() + _RETRY_S
-            return []
+        return []
 
     def _take(self, client: Client, batch: Batch) -> None:
         while (message := client.connection.next_message()) is not None:
@@ -124,7 +136,10 @@ class Source:
             elif message.get("ok") is not True:
                 raise RefusedError.of(message)
             else:
-                self.description = message
+                self.description = self._subscribed = message
+                self._refusal = ""
+                batch += self._greeting
+                self._greeting = []
                 batch.append(Description(time.time_ns(), message))
 
     @staticmethod

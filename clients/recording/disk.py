@@ -111,6 +111,8 @@ class DiskFile:
             self._position = self._written
             raise DiskError(f"{self.path} cannot be written: {error.strerror}") from None
         self._written = self._position
+        if os.fstat(self._fd).st_nlink == 0:
+            raise DiskError(f"{self.path} was deleted while it was being written")
 
     def sync(self) -> None:
         """Synchronize the file to the disk; DiskError."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from clients.replay.sensors import ReplayedSensors
 from protocol.framing import DataFlag, DataMessage
+from protocol.pdo import is_finite
 
 _MISSED_NS: Final = 10_000_000
 _RECENT_NS: Final = 10_000_000_000
@@ -34,12 +35,14 @@ class Meter:
         """When a frame was sent and how late that was, ns."""
         self._missed = 0
         self._counts: defaultdict[tuple[int, int], int] = defaultdict(int)
+        self._not_finite: defaultdict[int, int] = defaultdict(int)
         self._started = time.monotonic()
 
     def count(self, frame: DataMessage, due_ns: int, now_ns: int) -> None:
         """A frame was sent; `due_ns` is when it was due, 0 if it had no time."""
         self.sent += 1
         self._counts[frame.sensor, frame.flags & (_REPEATED | _INVALID)] += 1
+        self._not_finite[frame.sensor] += not is_finite(frame.process_data)
         if due_ns:
             self._late.append((now_ns, now_ns - due_ns))
             self._missed += now_ns - due_ns > _MISSED_NS
@@ -52,8 +55,10 @@ class Meter:
         positions = range(len(self._sensors.sensors))
         return {
             "cycles": self.sent,
+            "round_trip": {"least_us": None, "usual_us": None},
             "missed_deadlines": self._missed,
             "lost_frames": 0,
+            "duplicate_frames": 0,
             "wake_us": late,
             "exchange_us": _NO_BUS,
             "last_10s": {"wake_us": recent, "exchange_us": _NO_BUS, "age_us": [recent for _ in positions]},
@@ -70,9 +75,16 @@ class Meter:
             "repeated": self._counts[position, _REPEATED],
             "invalid": self._counts[position, _INVALID] + self._counts[position, _INVALID | _REPEATED],
             "lost_samples": 0,
+            "not_finite": self._not_finite[position],
             "recoveries": 0,
-            "clock": {"mode": "locked", "period_us": period_us, "offset_ppm": 0.0, "uncertainty_us": 0.0},
-        }
+            "clock": {
+                "mode": "locked", "stamps": "polling", "period_us": period_us, "offset_ppm": 0.0,
+                "uncertainty_us": 0.0,
+            },
+            "emergencies": 0,
+            "emergency": None,
+            "settling": False,
+        }  # fmt: skip
 
 
 def _summary_us(late_ns: Iterable[int]) -> dict[str, float]:

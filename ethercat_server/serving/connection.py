@@ -89,6 +89,11 @@ class Connection:
         assert state in TRANSITIONS[self.state], f"{self}: {self.state} -> {state}"
         self.state = state
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether it has no subscription, and no request that is not answered."""
+        return self.subscription is None and self.state is State.READING and not self.outbox.waiting
+
     def find_uid(self) -> int | None:
         """The user who owns the other end; asked again if that was not known."""
         if self.uid is None:

@@ -7,6 +7,7 @@ import contextlib
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from typing import Final
 
 from ethercat_server import __version__
 from ethercat_server.errors import InterfaceError
@@ -37,6 +38,9 @@ from ethercat_server.virtual_sensor.options import (
 from protocol.pdo import LAYOUTS
 from protocol.program.completion import add_completion
 from protocol.settings import SETTINGS
+
+_SERIAL_NUMBERS: Final = 100
+"""For each bus: more than it has slaves."""
 
 
 class UsageError(Exception):
@@ -98,12 +102,12 @@ def _list(given: Sequence[str] | None) -> list[str]:
     return [word for text in given or () for word in text.split(",") if word]
 
 
-def _serial_of(ifname: str) -> int:
-    """A number that another interface's sensors do not have, and these have again after a restart."""
+def _number_of(ifname: str) -> int:
+    """Of an interface: another has another, and it is the same after a restart."""
     try:
-        return int.from_bytes(look_up(ifname).address[3:]) * MOST_SLAVES or 1
+        return int.from_bytes(look_up(ifname).address[3:])
     except InterfaceError:  # said when it is to be opened
-        return 1
+        return 0
 
 
 def options_from(args: argparse.Namespace, default_serial: int = 1) -> BusOptions:
@@ -190,14 +194,18 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def main(argv: Sequence[str] | None = None, on_open: Callable[[], None] = lambda: None) -> int:
+def main(
+    argv: Sequence[str] | None = None, on_open: Callable[[], None] = lambda: None, number: int = 0
+) -> int:
     """Run the virtual sensor: 0 when ended, 1 on failure, 2 for wrong arguments.
 
-    `on_open` is called once its interface is open, before it reads anything.
+    `on_open` is called once its interface is open, before it reads anything. The default serial numbers go by
+    `number`, or by the interface's MAC address.
     """
     args = build_parser().parse_args(argv)
     try:
-        options = options_from(args, _serial_of(args.iface))
+        first_serial = _SERIAL_NUMBERS * (number or _number_of(args.iface))
+        options = options_from(args, first_serial or 1)
         if len(args.iface.encode()) > link.LONGEST_NAME:
             raise UsageError(f"interface name {args.iface!r} is longer than {link.LONGEST_NAME} characters")
     except UsageError as error:

@@ -120,10 +120,10 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
         say(why)
 
 
-def say(sentence: str) -> None:
-    """Print it, broken between words."""
-    Console().print(sentence, markup=False, highlight=False)
-
-
 def _yes(fact: bool) -> str:
     return "yes" if fact else "NO"
+
+
+def say(text: str) -> None:
+    """Print sentences, broken between words."""
+    Console(highlight=False, markup=False).print(text)

@@ -246,6 +246,23 @@ def test_a_lost_sensor_is_told_until_it_is_back(model: Model) -> None:
     assert only(model, now(20)).verdict.level is Level.GOOD
 
 
+def test_the_computer_is_blamed_where_the_server_says_so_and_later_too(model: Model) -> None:
+    take(model, *run(0, 10))
+    said = "sensor 0 is lost: this computer stood still for 300 ms, check it with ethercat-doctor"
+    model.take_status(status(), now(10))
+    model.take_event({"event": Event.SENSOR_LOST, "sensor": 0, "message": said}, now(10))
+    assert only(model, now(10)).alerts[0].remedy == said
+    model.take_event({"event": Event.SENSOR_BACK, "sensor": 0}, now(20))
+    after = status()
+    after["missed_deadlines"] += 240
+    after["sensors"][0]["recoveries"] += 1
+    model.take_status(after, now(20))
+    back, past = only(model, now(20)).alerts
+    assert back.text == "The server lost the sensor once and has it back"
+    assert "stood still" in back.remedy
+    assert past.remedy == said
+
+
 def test_silence_is_the_sensors_only_if_the_server_speaks(model: Model) -> None:
     take(model, *run(0, 10))
     later_s = now(10) + 3

@@ -6,10 +6,12 @@ It is a process where it is stopped or killed from outside, which nothing else c
 from __future__ import annotations
 
 import contextlib
+import math
 import random
 import signal
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,11 +24,13 @@ from rosbags.rosbag2 import Reader
 
 from clients.record import cli, program
 from clients.record import parts as record_parts
+from clients.record import recorder as recorder_module
 from clients.record.parts import Parts
 from clients.record.recorder import FLUSH_S, Recorder
-from clients.record.source import BATCH_S, Source
+from clients.record.source import _RETRY_S, BATCH_S, Source
 from clients.recording.file_format import FORMAT_VERSION, frame_topic
 from clients.recording.reader import open_recording
+from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.address import Address
 from protocol.framing import DataFlag, DataMessage
 from tests.clients.recordings import frame, record
@@ -165,7 +169,78 @@ def test_it_records_across_the_restart_of_the_server(out: Path, capsys: pytest.C
         assert len(opened.descriptions) == 2
 
 
+def test_it_waits_for_a_sensor_that_a_new_server_does_not_have(
+    out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An overnight recording goes on once the sensor is back; the refusal is said once."""
+    two, one = [SensorOptions(), SensorOptions(serial=2)], [SensorOptions()]
+    with served(*two, sinc_length=512) as first, recording(out, first.port, "--sensor", "1") as recorder:
+        recorder.wait_for_frames(20)
+        first.close()
+        with served(*one, port=first.port, sinc_length=512) as second:
+            wait_until(lambda: "the server refused: " in capsys.readouterr().err, "the refusal")
+            time.sleep(2 * _RETRY_S)
+            second.close()
+        with served(*two, port=first.port, sinc_length=512):
+            recorder.wait_for_frames(20)
+            assert recorder.stop() == 0
+    with open_recording(out) as opened:
+        names = [event.name for event in opened.events]
+        assert names == ["connected", "shutting_down", "disconnected", "refused", "connected"]
+
+
 # -- what is lost
+
+
+def new_recorder(out: Path) -> Recorder:
+    parts = Parts(out, size=None, seconds=None, overwrite=False)
+    return Recorder(parts, "test", {"format": FORMAT_VERSION}, {})
+
+
+def test_each_batch_is_flushed_once_that_is_due(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "FLUSH_S", 0.0)
+    recorder = new_recorder(out)
+    try:
+        for first in (0, 10):
+            recorder.put([frame(number) for number in range(first, first + 10)])
+        wait_until(lambda: recorder.saved == 20, "both to be taken")
+        assert frames_in(out) >= 10, "the first was flushed before the second was taken"
+    finally:
+        recorder.stop("")
+
+
+def test_a_file_that_is_deleted_meanwhile_is_an_error(out: Path) -> None:
+    recorder = new_recorder(out)
+    recorder.put([frame(0)])
+    wait_until(lambda: frames_in(out) == 1, "the frame")
+    out.unlink()
+    recorder.put([frame(1)])
+    wait_until(lambda: recorder.failed, "its end")
+    recorder.stop("")
+    assert "was deleted while it was being written" in str(recorder.error)
+
+
+def test_a_backlog_does_not_hold_up_its_end(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What cannot be written in time is counted, and the file says where it is missing."""
+    monkeypatch.setattr(recorder_module, "STOP_S", 0.0)
+    recorder, gate = new_recorder(out), threading.Event()
+    write = recorder._write
+    monkeypatch.setattr(recorder, "_write", lambda item: (gate.wait(), write(item)))
+    for number in range(100):
+        recorder.put([frame(number)])
+    stopping = threading.Thread(target=recorder.stop, args=("asked to stop",))
+    stopping.start()
+    wait_until(lambda: recorder._give_up_at < math.inf, "stop")
+    gate.set()
+    stopping.join(30)
+    assert not stopping.is_alive()
+    with open_recording(out) as opened:
+        frames = list(opened.frames())
+        (missing,) = [event.event for event in opened.events if event.name == "lost"]
+        assert opened.end is not None
+        assert opened.end["reason"] == "asked to stop"
+    assert len(frames) + missing["frames"] == 100
+    assert missing["frames"] == recorder.tally.dropped > 90
 
 
 def test_what_the_server_withheld_is_said(out: Path, tmp_path: Path, run: Run) -> None:
@@ -218,9 +293,7 @@ def test_seconds_of_frames_have_room_in_the_kernel(endless: Replay) -> None:
 
 def test_frames_get_into_the_file_before_it_ends(out: Path) -> None:
     assert BATCH_S + FLUSH_S < 0.5, "a machine that is busy may double it"
-    recorder = Recorder(
-        Parts(out, size=None, seconds=None, overwrite=False), "test", {"format": FORMAT_VERSION}, {}
-    )
+    recorder = new_recorder(out)
     try:
         recorder.put([frame(number) for number in range(10)])
         wait_until(lambda: frames_in(out) == 10, "the frames, though no more come")
@@ -351,7 +424,7 @@ def test_a_refusal_is_one_sentence_and_leaves_no_file(
     ("arguments", "sentence"),
     [
         ((), "required"),
-        (("x.mcap", "localhost:99999"), "it must be HOST:PORT"),
+        (("x.mcap", "localhost:99999"), "99999 is no port: it must be from 1 to 65535"),
         (("x.mcap", "--seconds", "-1"), "a number of seconds"),
         (("x.mcap", "--seconds", "nan"), "a number of seconds"),
         (("x.mcap", "--rotate-size", "10"), "at least 100k"),

@@ -53,6 +53,7 @@ def test_samples_of_a_chain_arrive_in_order_with_settings_of_their_own(shared: S
     with shared.running.connect() as client:
         described = client.ask("subscribe")["sensors"]
         assert [(s["sensor"], s["rate_hz"], s["pdo_size"]) for s in described] == [(0, 100, 61), (1, 50, 61)]
+        assert [s["serial"] - 100 * shared.running.port for s in described] == [0, 1], "of this server alone"
         assert all(s["settings"]["fir"] and s["name"] == "BFT-SENS-ECAT-M8" for s in described)
         frames = client.collect(90)
         for _ in range(20):  # a starved sensor may be away for a moment

@@ -248,7 +248,6 @@ def test_sync_signals_that_another_master_left_are_switched_off() -> None:
     assert coupler is not None
     for life in (sensor, coupler):
         life.esc.memory[reg.DC_ACTIVATION + 1] = 3
-        life.esc._write_mask = bytes([0xFF]) * reg.REGISTERS_END  # it has a SYNC unit
     assert bring_up(Bus(backend), Asked(), lambda: None).sensors[0].streams
     assert (sensor.esc.memory[reg.DC_ACTIVATION + 1], coupler.esc.memory[reg.DC_ACTIVATION + 1]) == (0, 3)
 

@@ -99,6 +99,7 @@ class Model:
                 sensor = self._sensor(row)
                 if sensor is not None:
                     known = isinstance(ages, list) and position < len(ages)
+                    row["missed_deadlines"] = status.get("missed_deadlines")
                     sensor.take_status(row, ages[position] if known else None, now_s)
             self._take_clients(rows(status.get("clients")), now_s - self._status_s)
             self._status, self._status_s = status, now_s

@@ -83,7 +83,7 @@ class DatagramMaster:
         if managers:
             count = min(managers, reg.MOST_SYNC_MANAGERS)
             states.write(reg.SYNC_MANAGER, bytes(count * reg.SYNC_MANAGER_SIZE))
-        self._bus.write_register(number, reg.DC_ACTIVATION, b"\0\0")  # refused without a SYNC unit
+        self._bus.write_register(number, reg.DC_ACTIVATION, b"\0\0")  # a controller without DC refuses
 
     def sdo_read(self, number: int, index: int, subindex: int) -> bytes:
         """See `Master`."""

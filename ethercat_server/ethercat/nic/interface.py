@@ -5,6 +5,7 @@ Asked by netlink (linux/rtnetlink.h), not of /sys, which shows the namespace it 
 
 from __future__ import annotations
 
+import difflib
 import socket
 import struct
 import sys
@@ -57,8 +58,12 @@ def look_up(ifname: str) -> Interface:
     try:
         return _answer(socket.if_nametoindex(ifname))
     except (OSError, struct.error):
-        names = ", ".join(name for _, name in socket.if_nameindex())
-        raise InterfaceError(f"no network interface {ifname!r} on this machine: there are {names}") from None
+        names = [name for _, name in socket.if_nameindex()]
+        close = difflib.get_close_matches(ifname, [*names, "virtual"], n=1)
+        raise InterfaceError(
+            f"no network interface {ifname!r} on this machine: there are {', '.join(names)}, and 'virtual' "
+            f"for a virtual sensor{f'; did you mean {close[0]!r}?' if close else ''}"
+        ) from None
 
 
 def trouble(ifname: str) -> str | None:

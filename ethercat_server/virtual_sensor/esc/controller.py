@@ -57,6 +57,7 @@ class Esc:
     Attributes:
         fmmus: the active FMMUs.
         plans: what each logical command copies, by address and length; emptied when an FMMU changes.
+        into_ns: time from the start of a datagram until the bytes that are being copied pass.
     """
 
     def __init__(self, pdi: Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
@@ -70,6 +71,7 @@ class Esc:
         self.fmmus: list[Fmmu] = []
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
         self.has_lrw = self.has_dc = True
+        self.into_ns = 0
         self._write_mask: bytes | bytearray = reg.WRITE_MASK
         self._events = 0
 

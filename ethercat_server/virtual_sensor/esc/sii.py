@@ -1,6 +1,7 @@
 """The registers through which a master reads a slave's EEPROM (SII), whose image is built in `slave.image`.
 
-Source: ETG.1000.4. It is read-only: it acknowledges no write.
+Source: ETG.1000.4. It is read-only: a write command is not acknowledged by the EEPROM, which is bit 13; one
+without the write enable bit in the same frame never gets there, which is bit 14.
 """
 
 from __future__ import annotations
@@ -11,11 +12,9 @@ from typing import Final
 
 from ethercat_server.virtual_sensor.esc import registers as reg
 
-_WRITE_ENABLE = 0x0001
 _EIGHT_BYTE_READS = 0x0040
 _BUSY = 0x8000
 _ERROR_COMMAND = 0x2000
-"""Not acknowledged by the EEPROM, or no command."""
 _ERROR_WRITE_ENABLE = 0x4000
 _NO_OPERATION, _READ, _WRITE, _RELOAD = 0, 1, 2, 4
 
@@ -74,7 +73,7 @@ class SiiInterface:
             self._set_status(_BUSY)
             self.advance()
         elif operation == _WRITE:
-            self._set_status(_ERROR_COMMAND if control & _WRITE_ENABLE else _ERROR_WRITE_ENABLE)
+            self._set_status(_ERROR_COMMAND if control & 0x01 else _ERROR_WRITE_ENABLE)
         elif operation in (_NO_OPERATION, _RELOAD):
             self._set_status(0)
         else:
