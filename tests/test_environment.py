@@ -44,9 +44,7 @@ def test_what_failed_is_shown(tmp_path: Path) -> None:
 
 def test_without_a_network_it_is_one_sentence(tmp_path: Path) -> None:
     """Nothing listens at that port; pip tries once more, in place of five times."""
-    pip = (
-        '"$venv/bin/python" -m pip install --retries 1 --index-url http://127.0.0.1:9/ --target "$1" no-such'
-    )
+    pip = '"$venv/bin/python" -m pip install --retries 1 --index-url http://127.0.0.1:9 --target "$1" no-such'
     assert run(f'every=60; quietly {pip} || fail "$why"', tmp_path) == (
         1,
         "demo: pip cannot reach the Python package index: connect this machine to the network, "
