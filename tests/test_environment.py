@@ -42,6 +42,22 @@ def test_what_failed_is_shown(tmp_path: Path) -> None:
     assert (code, said) == (1, "out\nno space left\ndemo: see above\n")
 
 
+def test_without_a_network_it_is_one_sentence(tmp_path: Path) -> None:
+    """Nothing listens at that port; pip tries once more, in place of five times."""
+    pip = '"$venv/bin/python" -m pip install --retries 1 --index-url http://127.0.0.1:9 --target "$1" no-such'
+    assert run(f'every=60; quietly {pip} || fail "$why"', tmp_path) == (
+        1,
+        "demo: pip cannot reach the Python package index: connect this machine to the network, "
+        "or set PIP_INDEX_URL\n",
+    )
+
+
+def test_a_network_that_came_back_does_not_hide_what_failed(tmp_path: Path) -> None:
+    retried = "Retrying (Retry(total=3, connect=None)) after Failed to establish a new connection"
+    code, said = run(f'quietly bash -c \'echo "{retried}"; echo no gcc; exit 1\' || fail "$why"', tmp_path)
+    assert (code, "no gcc\n" in said) == (1, True)
+
+
 def test_the_demo_needs_no_tools_of_developers() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     (asked,) = re.findall(r"^make_owners_environment (\S+)", (ROOT / "scripts/demo").read_text(), re.M)

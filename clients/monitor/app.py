@@ -146,14 +146,15 @@ class Monitor(App[None]):
             self.repaint()
         elif self._look.question:
             self._answer((event.character or "").lower())
-        elif self._look.help:
-            self._look = replace(self._look, help=False)
+        elif self._look.help or self._look.warnings:
+            self._look = replace(self._look, help=False, warnings=False)
         else:
             action = {
                 "t": self._ask_tare,
                 "r": self._record,
                 "p": self._pause,
                 " ": self._pause,
+                "w": self._warnings,
                 "0": self._reset,
                 "n": self._next,
                 "?": self._help,
@@ -211,6 +212,9 @@ class Monitor(App[None]):
             self._say("There is only one sensor" if count else "There is no sensor")
         else:
             self._look = replace(self._look, selected=(self._look.selected + 1) % count)
+
+    def _warnings(self) -> None:
+        self._look = replace(self._look, warnings=True)
 
     def _help(self) -> None:
         self._look = replace(self._look, help=True)

@@ -87,10 +87,9 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
 
 
 def _virtual_bus(options: ServerOptions) -> VirtualBus:
-    arguments = options.virtual_arguments
-    if "--serial" not in arguments:  # two such servers have different sensors, each the same every time
-        arguments = f"--serial {options.port} {arguments}"
-    return VirtualBus(arguments, options.server["rt_priority"], options.server["user"])
+    # By the port two such servers have different sensors, each the same every time.
+    server = options.server
+    return VirtualBus(options.virtual_arguments, server["rt_priority"], server["user"], options.port)
 
 
 def _give_up_root(user: User | None, options: ServerOptions) -> None:

@@ -152,16 +152,17 @@ class Hub:
                 connection.close()
 
     def _make_room(self, uid: int | None) -> bool:
-        """Whether the user `uid` may connect once more, if need be in place of idle connections."""
+        """Whether the user `uid` may connect once more, if need be in place of an idle connection."""
         clients = self.connections.values()
-        while not self.permissions.have_room(uid, clients):
-            if (idle := self.permissions.dispensable(uid, clients)) is None:
-                return False
-            log.warning("%s closed: it is idle, and its user has most of the %d clients", idle, len(clients))
-            why = "closed in favor of another user: too many connections of yours are idle"
-            idle.send_json(error_reply(None, ErrorCode.BAD_REQUEST, why))
-            idle.close()
-            del self.connections[idle.fd]
+        if self.permissions.have_room(uid, clients):
+            return True
+        if (idle := self.permissions.dispensable(uid, clients)) is None:
+            return False
+        log.warning("%s closed: it is idle, and its user has most of the %d clients", idle, len(clients))
+        why = "closed in favor of another user: too many connections of yours are idle"
+        idle.send_json(error_reply(None, ErrorCode.BAD_REQUEST, why))
+        idle.close()
+        del self.connections[idle.fd]
         return True
 
     def _answer_some(self, until_ns: int) -> None:

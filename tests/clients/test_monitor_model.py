@@ -374,3 +374,12 @@ def test_odd_replies_are_borne(odd: Any) -> None:
     model.take_event({"event": odd, "sensor": odd, "message": odd}, START_S)
     model.take_event({"event": Event.SENSOR_LOST, "sensor": 0, "message": odd}, START_S)
     assert "\\x1b" not in repr(model.state(START_S))  # as repr would write it
+
+
+def test_a_message_goes_after_half_a_minute(model: Model) -> None:
+    model.say("Recorded 1 sample")
+    assert model.state(now(0)).message is not None
+    assert model.state(now(20 * 1000)).message is not None
+    assert model.state(now(40 * 1000)).message is None
+    model.say("Not tared")
+    assert model.state(now(41 * 1000)).message is not None

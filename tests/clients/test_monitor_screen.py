@@ -63,6 +63,26 @@ def test_80x24_has_all_warnings_with_their_remedies() -> None:
         assert fact in text, fact
 
 
+def test_80x24_has_the_state_of_a_sensor_that_is_lost_and_of_its_neighbors() -> None:
+    state = made.troubled()
+    sensor = replace(state.sensors[0], al_state="LOST", old_s=1800.0, firmware="1.3.8-dirty-R")
+    text = plain(replace(state, sensors=(sensor, *state.sensors[1:])))
+    assert "  LOST " in text
+    assert "values 30m00s old" in text
+    assert "serial 123" in text
+    assert "firmware" not in text, "it goes first"
+
+
+def test_all_warnings_are_on_a_page_of_their_own() -> None:
+    state = made.troubled()
+    few = next(sensor.alerts for sensor in state.sensors if sensor.alerts)
+    many = tuple(few[0]._replace(text=f"warning {number}") for number in range(15))
+    state = replace(state, sensors=(replace(state.sensors[0], alerts=many),))
+    assert "more: press w" in plain(state)
+    text = plain(state, Look(warnings=True), height=40)
+    assert all(f"warning {number}" in text for number in range(15))
+
+
 def test_60x15_keeps_force_torque_the_stream_and_the_worst_warning() -> None:
     text = plain(made.troubled(), width=60, height=15)
     for fact in ("Fx", "Fy", "Fz!", "Mx", "My", "Mz", "Stream", "saturated: Fz", "Reduce sensor loading"):

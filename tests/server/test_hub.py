@@ -402,15 +402,21 @@ def test_an_idle_connection_of_who_has_most_goes_first(served: Served) -> None:
     for uid in range(2000, 2000 + permissions.MAX_CLIENTS - permissions.RESERVED_FOR_CONTROL):
         served.connect(uid)
     crowd = list(served.hub.connections.values())
+
+    def gone() -> list[Connection]:
+        return [client for client in crowd if client not in served.hub.connections.values()]
+
     for client in crowd[:6]:
         client.uid = 1003
         client.subscription = Subscription(1, None, 1, fresh_only=True)
     assert served.is_closed(served.connect(3000)), "none is idle"
     crowd[4].subscription = None
     served.connect(3000)
-    assert [client for client in crowd if client.fd not in served.hub.connections] == [crowd[4]]
+    assert gone() == [crowd[4]]
     assert 3000 in {client.uid for client in served.hub.connections.values()}
-    crowd[3].subscription = None
+    crowd[3].subscription = crowd[2].subscription = None
+    served.connect(3000)
+    assert gone() == [crowd[2], crowd[4]]
     assert served.is_closed(served.connect(1003)), "who has most cannot push out"
 
 

@@ -5,6 +5,8 @@ import struct
 import pytest
 
 from ethercat_server.ethercat.wire import Command
+from ethercat_server.virtual_sensor.options import ForeignOptions
+from ethercat_server.virtual_sensor.slave.al import AlState
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, RawMaster, chain, fmmu, sync_manager
 
 
@@ -162,6 +164,9 @@ def test_a_buffer_is_read_and_written_from_its_first_byte_on() -> None:
     assert master.one(Command.APRD, 0, 0x1180, bytes(20))[1] == 1
     assert middle() == 1, "it goes on"
     assert middle() == 0, "it was handed back with its last byte"
+    drive = RawMaster(ForeignOptions("DRIVE", state=AlState.SAFEOP))
+    at = drive.read16(0x0810)
+    assert [drive.write(at + n, bytes(size)) for n, size in ((1, 5), (0, 1), (1, 5), (1, 5))] == [0, 1, 1, 0]
 
 
 def test_the_sync_unit_can_be_set_up() -> None:

@@ -24,6 +24,8 @@ from protocol.text.json_text import JsonObject
 from protocol.text.untrusted import number, rows, text, whole
 
 _POSITION: Final = attrgetter("sensor")
+_MESSAGE_S: Final = 30.0
+"""How long a message is shown."""
 
 
 class Model:
@@ -44,6 +46,8 @@ class Model:
         self._status_s = 0.0
         self._clients: tuple[Client, ...] = ()
         self._message: Message | None = None
+        self._message_ends_s = 0.0
+        """0: it has not been shown yet."""
         self._events: deque[str] = deque(maxlen=8)
 
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
@@ -130,10 +134,14 @@ class Model:
         """Set the message for the user."""
         with self._lock:
             self._message = Message(text(message), bad) if message else None
+            self._message_ends_s = 0.0
 
     def state(self, now_s: float) -> State:
         """The current state."""
         with self._lock:
+            self._message_ends_s = self._message_ends_s or now_s + _MESSAGE_S
+            if now_s > self._message_ends_s:
+                self._message = None
             server = self._server(now_s)
             speaks = server.connected and not server.silent
             return State(

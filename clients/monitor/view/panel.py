@@ -85,10 +85,15 @@ def alerts(sensor: SensorState, width: int, most: int) -> list[Row]:
         lines = _alert(alert, width)
         left = len(sensor.alerts) - number - 1
         if rows and len(rows) + len(lines) + bool(left) > most:
-            rows.append(Row(3, field("", f"and {left + 1} more")))
+            rows.append(Row(3, field("", f"and {left + 1} more: press w")))
             break
         rows.extend(Row(1 if not number else 3, line) for line in lines)
     return rows
+
+
+def all_alerts(sensor: SensorState, width: int) -> list[Text]:
+    """The whole list."""
+    return [line for alert in sensor.alerts for line in _alert(alert, width)] or [Text("none")]
 
 
 def _alert(alert: Alert, width: int) -> list[Text]:
@@ -105,7 +110,6 @@ def _alert(alert: Alert, width: int) -> list[Text]:
 
 def _identity(sensor: SensorState, others: Sequence[SensorState], width: int) -> Text:
     lost = sensor.al_state not in {"OP", ""}
-    row = Text(words.identity(sensor), BAD if lost else VALUE)
     rest = Text()
     if sensor.old_s is not None:
         rest.append(f" values {numbers.duration(sensor.old_s)} old ", ALARM)
@@ -113,8 +117,14 @@ def _identity(sensor: SensorState, others: Sequence[SensorState], width: int) ->
         level = other.verdict.level
         rest.append(f" {other.position}", LABEL)
         rest.append(f" {level.words} " if level else f" {level.words}", ALARM if level else "")
+    # The state and what is on the right are to be read at every width.
+    state = f"  {sensor.al_state}" if sensor.al_state else ""
+    room = max(0, width - len(state) - rest.cell_len - bool(rest))
+    who = words.who(sensor)
+    row = Text(who if len(who) <= room else words.who(sensor, firmware=False), BAD if lost else VALUE)
+    row.truncate(room)
+    row.append(state)
     if rest.cell_len:
-        row.truncate(max(0, width - rest.cell_len - 1))
         row.pad_right(width - rest.cell_len - row.cell_len)
     return row.append_text(rest)
 

@@ -9,15 +9,16 @@ from typing import Final
 from rich.text import Text
 
 from clients import numbers
-from clients.monitor.model.state import AXES, State
+from clients.monitor.model.state import AXES, SensorState, State
 from clients.monitor.view import words
 from clients.monitor.view.glyphs import ALARM, BAD, LABEL, NOTICE, UNICODE, VALUE, Glyphs, to_ascii
-from clients.monitor.view.panel import MOST_TALL, Row, alerts, field, panel
+from clients.monitor.view.panel import MOST_TALL, Row, alerts, all_alerts, field, panel
 
 KEYS: Final = (
     ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),
     ("r", "record", "start or stop a recording in this folder (ethercat-record)"),
     ("p", "pause", "freeze the display; samples and peaks still count"),
+    ("w", "warnings", "all warnings of this sensor"),
     ("0", "reset", "reset peaks and past warnings"),
     ("n", "next", "the next sensor of the chain"),
     ("?", "help", "this page"),
@@ -44,6 +45,8 @@ class Look:
     question: str = ""
     """The pending question."""
     help: bool = False
+    warnings: bool = False
+    """Whether the list of all warnings is asked for."""
     glyphs: Glyphs = UNICODE
 
 
@@ -53,6 +56,8 @@ def render(state: State, look: Look, width: int, height: int) -> list[Text]:
         rows = [Text(f"too small: {_LEAST_WIDTH}x{_LEAST_HEIGHT} at least")]
     elif look.help:
         rows = _help(state)
+    elif look.warnings and state.sensors:
+        rows = _warnings(state.sensors[look.selected % len(state.sensors)], width)
     else:
         rows = _overview(state, look, width, height)
     rows = rows[:height] + [Text()] * (height - len(rows))
@@ -174,6 +179,11 @@ def _keys(look: Look, width: int) -> Text:
         row.append(key, VALUE)
         row.append(f" {name}{gap}" if width >= 50 else f"{gap}", LABEL)
     return row
+
+
+def _warnings(sensor: SensorState, width: int) -> list[Text]:
+    title = Text(f"Warnings of sensor {sensor.position}; press any key to return", VALUE)
+    return [title, Text(), *all_alerts(sensor, width)]
 
 
 def _help(state: State) -> list[Text]:

@@ -45,12 +45,17 @@ def trouble(server: ServerState) -> str | None:
 
 def identity(sensor: SensorState) -> str:
     """Position, name, serial number, firmware and AL state."""
+    return "  ".join(part for part in (who(sensor), sensor.al_state) if part)
+
+
+def who(sensor: SensorState, *, firmware: bool = True) -> str:
+    """Position, name, serial number and firmware."""
     parts = [f"Sensor {sensor.position}", sensor.name]
     if sensor.serial is not None:
         parts.append(f"serial {sensor.serial}")
-    if sensor.firmware:
+    if sensor.firmware and firmware:
         parts.append(f"firmware {sensor.firmware}")
-    return "  ".join(part for part in (*parts, sensor.al_state) if part)
+    return "  ".join(part for part in parts if part)
 
 
 def rate(sensor: SensorState) -> str:

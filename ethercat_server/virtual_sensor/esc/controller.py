@@ -208,7 +208,7 @@ class Esc:
                 self._exchanged(manager)
                 self._pdi.mailbox_read()
             return data
-        if not manager.step(offset, length):
+        if not manager.access(offset, length):
             return None
         if manager.latches_ecat and offset + length == manager.length:
             self._exchanged(manager)
@@ -228,7 +228,7 @@ class Esc:
                 self._exchanged(manager)
                 self._pdi.mailbox_written()
             return True
-        if not manager.step(offset, len(data)):
+        if not manager.access(offset, len(data)):
             return False
         self.memory[manager.start + offset : manager.start + offset + len(data)] = data
         if offset + len(data) == manager.length:  # handed over when the last byte is written
