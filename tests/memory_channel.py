@@ -1,7 +1,7 @@
 """A `Channel` to a server in memory: time passes while its client waits.
 
-    server = Simulation()
-    with Client(12001, channel=MemoryChannel(server)).connect() as client: ...
+server = Simulation()
+with Client(12001, channel=MemoryChannel(server)).connect() as client: ...
 """
 
 from __future__ import annotations

@@ -80,43 +80,29 @@ def _connect(source: Source, options: RecordOptions, signals: Signals) -> Batch 
 def _record(
     source: Source, recorder: Recorder, batch: Batch, options: RecordOptions, parts: Parts, signals: Signals
 ) -> int:
-    began, reason, code, refused = time.monotonic(), "asked to stop", 0, ""
+    began, reason = time.monotonic(), "asked to stop"
     with Progress(options.path.name, options.seconds) as progress:
         progress.say(f"recording {options.address} to {parts.made[0]}; Ctrl-C ends it")
-        try:
-            while True:
-                recorder.put(batch)
-                _report(batch, progress)
-                if recorder.failed:
-                    code = 1
-                    break
-                if signals.asked:
-                    break
-                if options.seconds is not None and time.monotonic() - began >= options.seconds:
-                    reason = "time is up"
-                    break
-                if not (source.connected or options.reconnect):
-                    reason = "the server ended"
-                    break
-                progress.show(recorder, connected=source.connected)
-                batch = source.receive()
-        except ProtocolError as error:
-            reason, code = f"the server refused: {error}", 1
-            refused = reason
+        while True:
+            recorder.put(batch)
+            _report(batch, progress)
+            if recorder.failed or signals.asked:
+                break
+            if options.seconds is not None and time.monotonic() - began >= options.seconds:
+                reason = "time is up"
+                break
+            if not (source.connected or options.reconnect):
+                reason = "the server ended"
+                break
+            progress.show(recorder, connected=source.connected)
+            batch = source.receive()
         seconds = time.monotonic() - began
         source.close()
         recorder.stop(reason)
-    if refused:
-        _say(refused)
-        if not recorder.saved and recorder.error is None:
-            # An empty file would block the next attempt.
-            parts.remove()
-            return code
     if recorder.error is not None:
         _say(f"{recorder.error}; what was written before is intact")
-        code = 1
     _say(_summary(recorder, parts, seconds))
-    return code
+    return int(recorder.error is not None)
 
 
 def _stop_at_eof(signals: Signals) -> None:

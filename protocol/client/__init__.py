@@ -6,6 +6,6 @@ from protocol.client.real_time import Scheduling, make_real_time
 from protocol.client.session import ClientEvent, Connected, Disconnected
 
 __all__ = [
-    "Client", "ClientEvent", "Condition", "Connected", "Disconnected", "NoSampleError", "Reading", "Scheduling", "connect",
-    "make_real_time",
+    "Client", "ClientEvent", "Condition", "Connected", "Disconnected", "NoSampleError", "Reading",
+    "Scheduling", "connect", "make_real_time",
 ]  # fmt: skip

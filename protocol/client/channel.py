@@ -58,6 +58,10 @@ class Channel(Protocol):
     def is_near(self) -> bool:
         """Whether both ends have one address, and so probably one machine."""
 
+    @property
+    def own(self) -> tuple[str, int]:
+        """The address of this end."""
+
     def fileno(self) -> int:
         """For `poll`: readable when something has arrived; -1 without a connection."""
 

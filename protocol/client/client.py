@@ -64,8 +64,9 @@ def connect(
     UnreachableError where there is no server, RefusedError if it does not grant the subscription.
     """
     client = Client(
-        port, host, sensors=sensors, every=every, fresh_only=fresh_only, timeout_s=timeout_s, imu_units=imu_units
-    )
+        port, host, sensors=sensors, every=every, fresh_only=fresh_only, timeout_s=timeout_s,
+        imu_units=imu_units,
+    )  # fmt: skip
     try:
         client.scheduling = make_real_time(rt_priority, cpu)
         return client.connect()
@@ -225,6 +226,15 @@ class Client:
         items = list(self.session.items)
         self.session.items.clear()
         return items
+
+    def frames(self) -> Iterator[DataMessage]:
+        """The frames as they come; without end, or with `reconnect` False until the connection ends."""
+        while True:
+            try:
+                frames = self.poll(_AGAIN_S)
+            except ConnectionFailedError:
+                return
+            yield from frames
 
     def decode(self, frame: DataMessage) -> Sample:
         """The sample in `frame`."""

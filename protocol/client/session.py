@@ -3,7 +3,7 @@
 The rules it keeps:
 
 - A connection begins with `describe`: the version is checked, and of the sensors asked for, those that are
-  there are subscribed to. If none is there, the connection has failed.
+  there are subscribed to. If none is there, or at first not all are, the connection has failed.
 - Whoever has the socket passes what arrives to `received` and sends what is returned.
 - After a connection that ended the next attempt is due at `retry_at_ns`: later each time, at once after one
   that lasted.
@@ -234,8 +234,8 @@ class Session:
         if self.wanted is not None:
             found = [position for position in self.wanted if position in there]
             self._missing = tuple(position for position in self.wanted if position not in there)
-            if not found:
-                text = ", ".join(map(str, self.wanted))
+            if self._missing and not (found and self.connections):
+                text = ", ".join(map(str, self._missing))
                 has = ", ".join(map(str, there[:16])) or "none"
                 raise ConnectionFailedError(f"the server has no sensor {text} (it has: {has})")
             values["sensors"] = found

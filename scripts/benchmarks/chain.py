@@ -259,7 +259,7 @@ def start_server(running: Chain, ifname: str, module: str = SERVER) -> Client:
 
     def ready() -> bool:
         with contextlib.suppress(ProtocolError):
-            clients.append(Client(PORT))
+            clients.append(Client(PORT, stream=False, raw=True, reconnect=False).connect())
             return len(clients[-1].description["sensors"]) == setup.sensors
         return False
 

@@ -23,7 +23,7 @@ from types import FrameType
 from typing import Any, Final
 
 from protocol.client import Client
-from protocol.errors import ConnectionFailedError, ProtocolError
+from protocol.errors import ProtocolError
 from scripts.demonstration.child import Child, DemoError
 from scripts.demonstration.measure import FULL_RATE, Measurement, verdict
 from scripts.demonstration.show import Screen, print_summary, say
@@ -53,7 +53,7 @@ def wait_for_server(server: Child) -> tuple[Client, dict[str, Any]]:
     while time.monotonic() < deadline:
         server.check()
         with contextlib.suppress(ProtocolError):
-            client = Client(PORT)
+            client = Client(PORT, stream=False, reconnect=False).connect()
             if sensors := client.description["sensors"]:
                 return client, sensors[0]
             client.close()
@@ -86,16 +86,15 @@ class Ears:
             threading.Thread(target=self._hear_server, daemon=True),
             threading.Thread(target=self._spinner.run, daemon=True),
         ]
-        client.subscribe()
+        client.ask("subscribe")
         for thread in self._threads:
             thread.start()
 
     def _hear_server(self) -> None:
-        with contextlib.suppress(ConnectionFailedError):
-            for frame in self._client.frames():
-                now_ns = time.monotonic_ns()
-                with self.lock:
-                    self.measurement.take_frame(frame, now_ns)
+        for frame in self._client.frames():
+            now_ns = time.monotonic_ns()
+            with self.lock:
+                self.measurement.take_frame(frame, now_ns)
 
     def _on_message(self, message: Any) -> None:
         now_ns = time.monotonic_ns()

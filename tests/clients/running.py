@@ -12,12 +12,14 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 from clients.program import Signals
 from clients.record import program as record
 from clients.recording.reader import RecordingError, open_recording
 from clients.replay import program
+from protocol.client import Client as StreamClient
 from tests.server.running import PATIENCE_S, Client, Program, free_port, wait_until
 
 __all__ = [
@@ -100,6 +102,11 @@ class Replay:
     def _is_listening(self) -> bool:
         assert self._thread.is_alive() or "replaying" in self.said(), self.said()
         return "replaying" in self.said()
+
+
+def listen(port: int, **options: Any) -> StreamClient:
+    """A client that gets every frame, until the connection ends."""
+    return StreamClient(port, raw=True, reconnect=False, **options).connect()
 
 
 @contextlib.contextmanager

@@ -230,7 +230,7 @@ def test_a_server_of_another_machine_at_an_address_of_this_one(
                 running.connect()
                 reading = running.do("next", 60_000)
                 assert (reading["fresh"], reading["age_is_lower_bound"]) == (True, is_far)
-                assert client.connection.same_machine is not is_far
+                assert client.session.same_machine is not is_far
 
 
 # -- requests

@@ -330,7 +330,7 @@ def test_a_tare_is_undone_and_cleared() -> None:
     address = Address("localhost", 1)
 
     def offset() -> list[float]:
-        with Client(address.port) as client:
+        with Client(address.port, stream=False).connect() as client:
             found: list[float] = client.description["sensors"][0]["offset"]
             return found
 
@@ -347,7 +347,7 @@ def test_a_tare_is_undone_and_cleared() -> None:
         assert offset() == tared
         assert WAYS["clear"].do(address, 0) == ("The offset of sensor 0 was cleared", False)
         assert offset() == [0.0] * 6
-        with Client(address.port) as client:
+        with Client(address.port, stream=False).connect() as client:
             client.ask("sdo_write", sensor=0, index=0x8000, subindex=1, type="f32", value=1.0)
         assert "its offset has changed since" in WAYS["undo"].do(address, 0)[0]
         bus.command("on-write 0x8000 2 abort 0x8000 3 0x08000022")

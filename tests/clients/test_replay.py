@@ -21,12 +21,13 @@ from bridge.stream.connection import Connection
 from clients.recording.reader import Event, open_recording
 from clients.replay import cli, program
 from clients.replay.sensors import ReplayedSensors
-from protocol.client import connect
+from protocol.client import Client, connect
 from protocol.control import ErrorCode
 from protocol.errors import RefusedError
 from protocol.framing import DataMessage
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
-from tests.clients.running import Client, NoSignals, free_port, replaying, signalled
+from tests.clients.running import Client as Requests
+from tests.clients.running import NoSignals, free_port, listen, replaying, signalled
 from tests.server.running import PATIENCE_S
 from tests.simulation import Simulation
 
@@ -49,15 +50,15 @@ def frames(path: Path) -> list[DataMessage]:
 
 def play(path: Path, *arguments: str) -> list[DataMessage]:
     """All that a client gets from a replay that runs once."""
-    with replaying(*arguments, path) as served, connect(served.port, fresh_only=False) as client:
+    with replaying(*arguments, path) as served, listen(served.port, fresh_only=False) as client:
         frames = list(client.frames())
         assert served.wait() == 0
     return frames
 
 
 def samples(path: Path, *arguments: str) -> list[object]:
-    with replaying(*arguments, path) as served, connect(served.port) as client:
-        return list(client)
+    with replaying(*arguments, path) as served, Client(served.port, reconnect=False).connect() as client:
+        return [client.decode(frame) for frame in client.frames()]
 
 
 def test_the_first_client_gets_everything_from_the_first_frame_on(
@@ -86,7 +87,7 @@ def test_the_same_recording_gives_the_same_values_always(path: Path, frames: lis
 
 def test_it_keeps_the_original_timing(path: Path, frames: list[DataMessage]) -> None:
     del frames
-    with replaying(path) as served, connect(served.port) as client:
+    with replaying(path) as served, listen(served.port) as client:
         began = time.monotonic()
         list(client.frames())
         assert time.monotonic() - began >= (COUNT / 2 - 1) * PERIOD_NS / 1e9
@@ -94,7 +95,7 @@ def test_it_keeps_the_original_timing(path: Path, frames: list[DataMessage]) -> 
 
 def test_it_loops_with_numbers_that_go_on(path: Path, frames: list[DataMessage]) -> None:
     del frames
-    with replaying("--loop", "--speed", "50", path) as served, connect(served.port, sensors=[1]) as client:
+    with replaying("--loop", "--speed", "50", path) as served, listen(served.port, sensors=[1]) as client:
         played = []
         for item in client.frames():
             played.append(item)
@@ -110,7 +111,7 @@ def test_several_recordings_are_played_one_after_the_other(tmp_path: Path) -> No
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
     record(first, (frame(n) for n in range(10)))
     record(second, (frame(n, **{"force.z": 1}) for n in range(10)))
-    with replaying("--speed", "max", first, second) as served, connect(served.port) as client:
+    with replaying("--speed", "max", first, second) as served, listen(served.port) as client:
         played = list(client.frames())
         assert client.description["replay"]["files"] == ["a.mcap", "b.mcap"]
     assert [item.sequence for item in played] == list(range(20))
@@ -121,7 +122,7 @@ def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(
 ) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
-    with replaying("--original-stamps", path) as served, connect(served.port, fresh_only=False) as client:
+    with replaying("--original-stamps", path) as served, listen(served.port, fresh_only=False) as client:
         played = list(client.frames())
         assert "was cut off" in served.said()
     assert 0 < len(played) < COUNT
@@ -133,7 +134,7 @@ def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(
 
 def test_describe_says_that_it_is_a_replay(path: Path, frames: list[DataMessage]) -> None:
     del frames
-    with replaying("--speed", "2", "--loop", path) as served, Client(served.port) as client:
+    with replaying("--speed", "2", "--loop", path) as served, Requests(served.port) as client:
         reply = client.ask("describe")
     assert reply["replay"] == {
         "files": ["run.mcap"], "recorded": "?", "recorded_version": "?", "pace": 2.0, "loop": True,
@@ -215,9 +216,10 @@ def test_what_happened_happens_again(path: Path) -> None:
     made.event(START_NS, {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}})
     made.frame(frame(2))
     made.finish({})
-    with replaying(path) as served, connect(served.port, fresh_only=False) as client:
+    with replaying(path) as served, listen(served.port, fresh_only=False) as client:
         assert len(list(client.frames())) == 3
-        assert [event["event"] for event in client.events] == ["sensor_lost", "reconfigured", "shutting_down"]
+        events = [event["event"] for event in client.events if isinstance(event, dict)]
+        assert events == ["sensor_lost", "reconfigured", "shutting_down"]
 
 
 def test_describe_follows_the_events(path: Path, frames: list[DataMessage]) -> None:
@@ -298,7 +300,7 @@ def test_a_damaged_recording_ends_it_with_a_sentence(path: Path, frames: list[Da
     position = data.index(b"zstd", 4000) + 100
     data[position] ^= 0xFF
     path.write_bytes(data)
-    with replaying("--speed", "max", path) as served, connect(served.port) as client:
+    with replaying("--speed", "max", path) as served, listen(served.port) as client:
         list(client.frames())
         assert served.wait() == 1
         assert "is damaged at byte" in served.said()

@@ -96,12 +96,15 @@ def test_without_reconnection_the_last_frames_come_before_the_error(scripted: Sc
         scripted.drop()
         scripted.disconnected.wait(PATIENCE_S)
         assert [frame.sequence for frame in sensor.receive(PATIENCE_S)] == [1]
+        assert sensor.poll(PATIENCE_S) == []
+        assert isinstance(sensor.events[-1], Disconnected)
         with pytest.raises(ConnectionFailedError, match="closed"):
-            while True:
-                sensor.poll(PATIENCE_S)
+            sensor.poll(PATIENCE_S)
 
 
-def test_a_connection_that_ended_is_made_anew_and_its_first_sample_has_a_gap(scripted: ScriptedServer) -> None:
+def test_a_connection_that_ended_is_made_anew_and_its_first_sample_has_a_gap(
+    scripted: ScriptedServer,
+) -> None:
     with connect(scripted.port, timeout_s=PATIENCE_S) as sensor:
         for connections in (1, 2, 3):
             assert scripted.subscribed.wait(PATIENCE_S)
@@ -123,7 +126,10 @@ def test_nothing_new_is_an_error_that_says_why(scripted: ScriptedServer) -> None
         with pytest.raises(NoSampleError, match="no new sample of sensor 0 for 20 ms: silent") as caught:
             next(iter(sensor))
         assert caught.value.condition is Condition.SILENT
-        for flags, condition in ((DataFlag.REPEATED, Condition.REPEATED), (DataFlag.INVALID, Condition.INVALID)):
+        for flags, condition in (
+            (DataFlag.REPEATED, Condition.REPEATED),
+            (DataFlag.INVALID, Condition.INVALID),
+        ):
             scripted.send_sample(1.0)
             assert len(sensor.receive(PATIENCE_S)) == 1
             scripted.send_sample(1.0, flags)
@@ -135,9 +141,10 @@ def test_nothing_new_is_an_error_that_says_why(scripted: ScriptedServer) -> None
             sensor.receive()
         assert caught.value.condition is Condition.SENSOR_LOST
         scripted.close()
+        while sensor.session.connected:
+            sensor.poll(PATIENCE_S)
         with pytest.raises(NoSampleError, match=r"disconnected \(.+\)") as caught:
-            while True:
-                sensor.receive()
+            sensor.receive()
         assert caught.value.condition is Condition.DISCONNECTED
 
 

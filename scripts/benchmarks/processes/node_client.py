@@ -18,8 +18,7 @@ from array import array
 from pathlib import Path
 from typing import Any
 
-from protocol.client import connect
-from protocol.errors import ConnectionFailedError
+from protocol.client import Client
 from scripts.benchmarks.processes.subscriber import messages
 from scripts.benchmarks.records import began, write
 
@@ -35,14 +34,11 @@ def check_sum(force: Any, torque: Any) -> int:
 
 def tcp(port: int, note: Any) -> None:
     """Every new and valid sample of the server's, until it ends the connection."""
-    with connect(port) as sensor:
-        try:
-            for frame in sensor.frames():
-                now = time.monotonic_ns()
-                sample = sensor.decode(frame)
-                note((frame.stamp_ns, frame.monotonic_ns, check_sum(sample.force, sample.torque), now))
-        except ConnectionFailedError:
-            return
+    with Client(port, reconnect=False).connect() as sensor:
+        for frame in sensor.frames():
+            now = time.monotonic_ns()
+            sample = sensor.decode(frame)
+            note((frame.stamp_ns, frame.monotonic_ns, check_sum(sample.force, sample.torque), now))
 
 
 def ros(note: Any, depth: int) -> None:
