@@ -8,6 +8,8 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
+import pytest
+
 ROOT: Final = Path(__file__).parent.parent
 PIP: Final = """
 echo 'Collecting numpy<3,>=1.26 (from bota)'; echo '  Downloading https://example.org/numpy-2.4.whl (6.6 kB)'
@@ -56,6 +58,14 @@ def test_a_network_that_came_back_does_not_hide_what_failed(tmp_path: Path) -> N
     retried = "Retrying (Retry(total=3, connect=None)) after Failed to establish a new connection"
     code, said = run(f'quietly bash -c \'echo "{retried}"; echo no gcc; exit 1\' || fail "$why"', tmp_path)
     assert (code, "no gcc\n" in said) == (1, True)
+
+
+@pytest.mark.parametrize("function", ["make_environment", "make_owners_environment"])
+def test_a_checkout_that_cannot_be_written_to_is_one_sentence(function: str, tmp_path: Path) -> None:
+    """Not even by root, nor where another user made the lock."""
+    code, said = run(f"SUDO_USER= lock=/proc/.venv.lock; {function} demo", tmp_path)
+    sentence = f"demo: {ROOT} cannot be written to, where .venv is to be: make it yours, or copy it\n"
+    assert (code, said) == (1, sentence)
 
 
 def test_the_demo_needs_no_tools_of_developers() -> None:

@@ -164,7 +164,8 @@ class Connection:
         self._become(State.ANSWERING)
 
     def answered(self) -> None:
-        """Go on with what the client sent after the request."""
+        """Go on with what the client sent after the request; it is idle from now on."""
+        self._heard_ns = self._monotonic_ns()
         self._become(State.READY)
 
     # -- ending

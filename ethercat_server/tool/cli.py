@@ -100,7 +100,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"no command {arguments[0]!r}: there are {', '.join(COMMANDS)}{guess}")
     command = COMMANDS[parser.parse_args(arguments[: 2 if arguments[:1] == [OPTION] else 1]).command]
     args = build_command_parser(command).parse_intermixed_args(arguments[1:])
-    command.load()
     return command_line.run(_PROGRAM, lambda: command.run(args), as_json=args.json)
 
 

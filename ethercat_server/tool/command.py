@@ -25,8 +25,6 @@ class Command(NamedTuple):
     add_arguments: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int]
     """Returns the exit code; raises ServerError."""
-    load: Callable[[], object] = lambda: None
-    """Imports what takes a moment, while a signal still ends the program at once."""
 
 
 def add_link_arguments(

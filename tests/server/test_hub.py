@@ -420,6 +420,13 @@ def test_an_idle_connection_of_who_has_most_goes_first(served: Served) -> None:
     assert served.is_closed(served.connect(1003)), "who has most cannot push out"
 
 
+def test_an_idle_connection_of_who_may_control_stays(served: Served) -> None:
+    for _ in range(permissions.MAX_CLIENTS - permissions.RESERVED_FOR_CONTROL):
+        served.connect(0)
+    assert served.is_closed(served.connect(3000))
+    assert {client.uid for client in served.hub.connections.values()} == {0}
+
+
 def test_what_was_queued_and_sent_does_not_count_for_ever(served: Served) -> None:
     """80 rounds in which 4 kB of JSON wait because the client reads late: it is not full."""
     client = served.connect(buffer_size=4096)
@@ -442,6 +449,10 @@ def test_who_waits_for_an_answer_is_not_idle(served: Served) -> None:
     served.serve(800.0)
     served.hub.answer(only_connection(served), {"reply": "tare", "id": 1, "ok": True})
     assert served.read(client) == [{"reply": "tare", "id": 1, "ok": True}]
+    served.serve(59.0)
+    assert served.read(client) == [], "its idle time begins with the answer"
+    served.serve(2.0)
+    assert served.is_closed(client)
 
 
 def test_a_client_that_asks_and_never_reads_is_closed(served: Served) -> None:

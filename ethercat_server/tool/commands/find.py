@@ -27,10 +27,6 @@ class _Found(NamedTuple):
     """Slaves that are no sensors."""
 
 
-def _load() -> None:
-    import pyroute2  # noqa: F401, PLC0415
-
-
 def _no_arguments(_: argparse.ArgumentParser) -> None:
     """They have none."""
 
@@ -128,8 +124,6 @@ def _described(row: Adapter, sensors: list[dict[str, Any]], others: int, where: 
 
 
 COMMANDS = (
-    Command("adapters", "list the network adapters of this machine", _no_arguments, _adapters, _load),
-    Command(
-        "find", "look for sensors on all interfaces, without disturbing others", _no_arguments, _find, _load
-    ),
+    Command("adapters", "list the network adapters of this machine", _no_arguments, _adapters),
+    Command("find", "look for sensors on all interfaces, without disturbing others", _no_arguments, _find),
 )
