@@ -9,7 +9,7 @@ import math
 from typing import Final, NamedTuple, Protocol
 
 from bridge.parameters.compensation import CompensationParameters, Quaternion
-from ft_compensation.attitude.tilt import GyroscopeOffset, unidentified
+from ft_compensation.attitude.tilt import GyroscopeOffset
 from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
 from ft_compensation.quantities import EXACT, length
 from protocol.pdo import Sample, Vector3
@@ -99,8 +99,6 @@ class AccelerometerSource:
     def tilt(self) -> float | None:
         """The bound of the estimate's tilt that holds in 95 % of cases, rad."""
         found = self._filter.tilt_95
-        if self._correct is None:
-            found = unidentified(found)
         return found if math.isfinite(found) else None
 
     def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:  # noqa: ARG002
