@@ -24,7 +24,7 @@ COLUMNS: Final = (
 
 
 def _since(before: DataMessage | None, frame: DataMessage) -> int:
-    """By CLOCK_MONOTONIC, which nobody sets; by CLOCK_REALTIME where the machine was started again."""
+    """Time between two frames: CLOCK_REALTIME may be set meanwhile, but the other begins anew with a machine."""
     if before is None:
         return 0
     passed_ns = frame.monotonic_ns - before.monotonic_ns

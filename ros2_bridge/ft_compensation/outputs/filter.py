@@ -102,8 +102,7 @@ def check(settings: FilterSettings, rate_hz: float) -> None:
     for name, value in frequencies.items():
         if not value < half:
             raise CompensationError(
-                f"filter.{name} is {value:g} Hz, but must be below half of the sampling rate, "
-                f"{half:g} Hz: lower it"
+                f"filter.{name} is {value:g} Hz, but must be below half of the sampling rate, {half:g} Hz: lower it"
             )
 
 
