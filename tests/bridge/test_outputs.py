@@ -132,21 +132,6 @@ def test_it_can_be_configured_while_the_node_runs() -> None:
         assert "it must be 0, for none, or at least 0.05 Hz" in reason
 
 
-@pytest.mark.parametrize(("name", "value"), [("cutoff", 50.0), ("cutoff", 400.0), ("notch", 60.0)])
-def test_a_frequency_beyond_half_of_the_rate_is_refused(name: str, value: float) -> None:
-    with SimulatedNode(Sensor(), **TEN_HZ) as node:
-        got = node.hear("wrench_filtered")
-        node.run(0.2)
-        done, reason = node.set_parameter(f"filter.{name}", value)
-        assert not done
-        assert reason == (
-            f"filter.{name} is {value:g} Hz, but must be below half of the sampling rate, 50 Hz: lower it"
-        )
-        got.clear()
-        node.run(0.2)
-        assert got, "it goes on as it was"
-
-
 def test_it_follows_the_sensors_rate() -> None:
     server = Sensor()
     with SimulatedNode(server, **{"filter.cutoff": 40.0}) as node:
@@ -155,7 +140,6 @@ def test_it_follows_the_sensors_rate() -> None:
         server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS, rate_hz=50))
         words = "filter.cutoff is 40 Hz, but must be below half of the sampling rate, 25 Hz"
         node.until(f"wrench_filtered has stopped: {words}", compensation=ERROR)
-        assert node.log.count(words) == 1
         got.clear()
         node.run(0.2)
         assert not got

@@ -27,17 +27,8 @@ from bridge.stream.link import Link
 from bridge.stream.watch import Watch
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
-from ft_compensation.outputs.filter import check as check_filter
 from ft_compensation.payload_watch import PayloadWatch
-from ft_compensation.quantities import (
-    NO_WRENCH,
-    Accelerometer,
-    CompensationError,
-    Payload,
-    Wrench,
-    length,
-    wrench_text,
-)
+from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, length, wrench_text
 
 _MEASURED: Final = ("tare", "identified")
 """Where a bias comes from that is one even if it is zero."""
@@ -77,7 +68,7 @@ class CompensationControl:
         self._watch: PayloadWatch | None = None
         self._watched: object = None
         self.obstacles, self._live = Obstacles(link, watch), live
-        live.checks.append(lambda wanted: self._check(wanted.compensation))
+        live.checks.append(lambda wanted: self._choice.check(wanted.compensation))
         live.listeners.append(lambda wanted: self._apply(wanted.compensation))
         self._guard = node.create_guard_condition(self._follow_sensor)
 
@@ -193,15 +184,6 @@ class CompensationControl:
             yield
         finally:
             self._next_origin = FROM_PARAMETER
-
-    def _check(self, wanted: CompensationParameters) -> None:
-        """ParameterError for what cannot be had with this sensor or node."""
-        self._choice.check(wanted)
-        if wanted.filter != self.parameters.filter and wanted.filter.cutoff and self.link.rate_hz:
-            try:
-                check_filter(wanted.filter, self.link.rate_hz)
-            except CompensationError as error:
-                raise ParameterError(str(error)) from None
 
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted

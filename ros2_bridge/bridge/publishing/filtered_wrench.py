@@ -64,7 +64,6 @@ class FilteredTopic:
         try:
             self._filter.design(settings, rate_hz)
         except CompensationError as error:
-            self._node.get_logger().warning(f"wrench_filtered has stopped: {error}")
             return f"wrench_filtered has stopped: {error}"
         notch = f", notch {settings.notch:g} Hz" if settings.notch else ""
         self._node.get_logger().info(
