@@ -200,18 +200,3 @@ def test_the_beginning_is_no_error(arm: Arm, node: SimulatedNode) -> None:
     reports = node.hear("/diagnostics")[before:]
     levels = [s.level for report in reports for s in report.status if s.name.endswith("compensation")]
     assert set(levels) == {bytes([OK])}
-
-
-@pytest.mark.parametrize("step_s", [0.1, 0.45, -0.45, -30.0, 3600.0])
-def test_a_clock_that_is_set_is_no_force(arm: Arm, node: SimulatedNode, step_s: float) -> None:
-    """CLOCK_REALTIME steps while the sensor turns at 1 rad/s: angles are integrated over CLOCK_MONOTONIC."""
-    stages = Stages(node)
-    arm.play(scene(lambda t: (max(0.0, t - 2.0), float(t > 2.0)), 6.0, about=0))
-    node.run(3.0)
-    set_ns = round(step_s * 1e9)
-    time_ns = arm.time_ns
-    arm.time_ns = lambda: time_ns() + set_ns  # type: ignore[method-assign]
-    stages.forget()
-    node.run(2.0)
-    assert len(stages.final) > 190, "nothing is withheld"
-    assert forces(stages).max() < 0.3

@@ -23,7 +23,6 @@ from bridge.parameters.wrench_frames import parse
 from bridge.publishing.wrench_frames import make_frames
 from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
 from protocol.control import Event, event
-from protocol.framing import DataMessage
 from protocol.pdo import encode
 from tests.bridge.compensating import six, stamp_ns
 from tests.bridge.conftest import retire, wait_until
@@ -313,8 +312,7 @@ def test_tf_in_a_real_executor(server: Sensor, tf: FakeTf) -> None:
 
     def publishes() -> bool:
         assert topic.is_wanted()
-        frame = DataMessage(0, server.time_ns(), 0, 0, 0, 3, b"")
-        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), frame)
+        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), server.time_ns())
         executor.spin_once(0.01)
         return bool(heard)
 
