@@ -23,10 +23,11 @@ from bridge.parameters.wrench_frames import parse
 from bridge.publishing.wrench_frames import make_frames
 from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
 from protocol.control import Event, event
+from protocol.framing import DataMessage
 from protocol.pdo import encode
 from tests.bridge.compensating import six, stamp_ns
 from tests.bridge.conftest import retire, wait_until
-from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
+from tests.bridge.simulated_node import STEP_S, SimulatedNode, SimulatedServer
 from tests.bridge.streaming import RATE_HZ, SETTINGS
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("_ros")]
@@ -42,6 +43,11 @@ class Sensor(SimulatedServer):
         super().__init__()
         self.shakes = shakes
         self.on_step: Callable[[], None] = lambda: None
+        self.clock_step_ns = 0
+        """By how much the wall clock has been set."""
+
+    def time_ns(self) -> int:
+        return super().time_ns() + self.clock_step_ns
 
     def step(self) -> None:
         force = float(self.sent % 20) if self.shakes else 5.0
@@ -51,13 +57,13 @@ class Sensor(SimulatedServer):
 
 
 def filtered(messages: list[Any], rate_hz: float = RATE_HZ, **settings: float) -> dict[int, list[float]]:
-    """What the filter makes of these wrenches, by stamp."""
+    """What the filter makes of these wrenches, none missing, by stamp."""
     made, found = WrenchFilter(), {}
     made.design(FilterSettings(**settings), rate_hz)
-    for message in messages:
+    for number, message in enumerate(messages):
         fx, fy, fz, mx, my, mz = six(message)
-        stamp = stamp_ns(message)
-        found[stamp] = [*made.step((fx, fy, fz), (mx, my, mz), stamp).values]
+        time_ns = round(number * STEP_S * 1e9)
+        found[stamp_ns(message)] = [*made.step((fx, fy, fz), (mx, my, mz), time_ns).values]
     return found
 
 
@@ -92,6 +98,18 @@ def test_the_filter_and_its_delay() -> None:
         assert got[0].header.frame_id == "ft_sensor"
         assert six(got[0]) == pytest.approx(six(raw[0])), "no transient"
         assert node.log.count("wrench_filtered") == 1
+
+
+@pytest.mark.parametrize("set_by_s", [-3600, 3600])
+def test_setting_the_wall_clock_does_not_restart_the_filter(set_by_s: int) -> None:
+    server = Sensor()
+    with SimulatedNode(server, **TEN_HZ) as node:
+        node.run(0.3)
+        raw, got = node.hear("wrench_compensated"), node.hear("wrench_filtered")
+        node.run(0.55)
+        server.clock_step_ns = set_by_s * 10**9
+        node.run(0.45)
+        check_filtered(got, raw, 95, cutoff=10.0)
 
 
 def test_a_limit_to_the_frequency_comes_after_the_filter() -> None:
@@ -312,7 +330,7 @@ def test_tf_in_a_real_executor(server: Sensor, tf: FakeTf) -> None:
 
     def publishes() -> bool:
         assert topic.is_wanted()
-        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), server.time_ns())
+        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), DataMessage(1, server.time_ns(), 0, 0, 0, 3, b""))
         executor.spin_once(0.01)
         return bool(heard)
 

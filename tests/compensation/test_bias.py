@@ -258,3 +258,16 @@ def test_the_last_change_is_undone_once() -> None:
     assert ramp.at(11.0) == NEW
     with pytest.raises(CompensationError, match="no change of the bias to undo"):
         ramp.undo(20.0)
+
+
+def test_undoing_goes_back_to_a_bias_that_was_shifted_meanwhile() -> None:
+    """The sensor was tared: its own offset, and every bias of before with it, has changed."""
+
+    def fx(force: float) -> Wrench:
+        return Wrench.of([force, 0, 0, 0, 0, 0])
+
+    ramp = BiasRamp(fx(1.0))
+    ramp.go(fx(3.0), 0.0)
+    ramp.shift(fx(10.0))
+    assert ramp.target == fx(13.0)
+    assert ramp.undo(1.0) == ramp.at(1.0) == fx(11.0)
