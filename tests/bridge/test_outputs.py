@@ -149,6 +149,35 @@ def test_it_can_be_configured_while_the_node_runs() -> None:
         assert "it must be 0, for none, or at least 0.05 Hz" in reason
 
 
+@pytest.mark.parametrize("limit", [50.0, 50.5, 1000.0])
+def test_a_frequency_that_the_sampling_rate_does_not_allow_is_refused(limit: float) -> None:
+    server = Sensor()
+    with SimulatedNode(server, **TEN_HZ) as node:
+        got = node.hear("wrench_filtered")
+        node.run(0.3)
+        for name in ("cutoff", "notch"):
+            refused = (
+                f"filter.{name} is {limit:g} Hz, but must be below half of the sampling rate, 50 Hz: lower it"
+            )
+            assert node.set_parameter(f"filter.{name}", limit) == (False, refused)
+        assert node.set_parameter("filter.notch_width", limit) == (True, ""), "there is no notch"
+        assert not node.set_parameter("filter.notch", 20.0)[0]
+        assert node.set_parameter("filter.cutoff", 49.9) == (True, "")
+        got.clear()
+        node.run(0.1)
+        assert got
+        server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS, rate_hz=50))
+        node.run(0.1)
+        assert node.set_parameter("filter.dead_band_force", 1.0) == (True, ""), "which changes no frequency"
+        assert (
+            "must be below half of the sampling rate, 25 Hz" in node.set_parameter("filter.cutoff", 30.0)[1]
+        )
+        server.listens = False
+        server.drop()
+        node.run(0.1)
+        assert node.set_parameter("filter.cutoff", 30.0) == (True, ""), "the next sensor's rate is not known"
+
+
 def test_it_follows_the_sensors_rate() -> None:
     server = Sensor()
     with SimulatedNode(server, **{"filter.cutoff": 40.0}) as node:
@@ -157,6 +186,7 @@ def test_it_follows_the_sensors_rate() -> None:
         server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS, rate_hz=50))
         words = "filter.cutoff is 40 Hz, but must be below half of the sampling rate, 25 Hz"
         node.until(f"wrench_filtered has stopped: {words}", compensation=ERROR)
+        assert node.log.count(f"wrench_filtered has stopped: {words}") == 1
         got.clear()
         node.run(0.2)
         assert not got

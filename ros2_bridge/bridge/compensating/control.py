@@ -68,7 +68,7 @@ class CompensationControl:
         self._watch: PayloadWatch | None = None
         self._watched: object = None
         self.obstacles, self._live = Obstacles(link, watch), live
-        live.checks.append(lambda wanted: self._choice.check(wanted.compensation))
+        live.checks.append(lambda wanted: self._check(wanted.compensation))
         live.listeners.append(lambda wanted: self._apply(wanted.compensation))
         self._guard = node.create_guard_condition(self._follow_sensor)
 
@@ -184,6 +184,15 @@ class CompensationControl:
             yield
         finally:
             self._next_origin = FROM_PARAMETER
+
+    def _check(self, wanted: CompensationParameters) -> None:
+        """ParameterError if they cannot be had here."""
+        self._choice.check(wanted)
+        if self.link.connection is not None and (rate_hz := self.link.rate_hz):
+            known = self.parameters.filter.problems(rate_hz)
+            for problem in wanted.filter.problems(rate_hz):
+                if problem not in known:
+                    raise ParameterError(problem)
 
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted

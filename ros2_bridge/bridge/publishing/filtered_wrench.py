@@ -53,6 +53,8 @@ class FilteredTopic:
         if wanted != self._designed:
             self.problem = self._design(*wanted)
             self._designed = wanted
+            if self.problem:
+                self._node.get_logger().warning(self.problem)
         return not self.problem
 
     def _design(self, settings: FilterSettings, rate_hz: float) -> str:
