@@ -57,8 +57,11 @@ class Payload(NamedTuple):
         (kilograms,) = _finite((mass,), 1, "a mass")
         if kilograms < 0.0:
             raise ValueError(f"a mass cannot be negative: {kilograms:g} kg")
-        x, y, z = _finite(center, 3, "a center of gravity")
-        return cls(kilograms, (x, y, z))
+        return cls(kilograms, vector(center, "a center of gravity"))
+
+    def __str__(self) -> str:
+        """For people."""
+        return f"a tool of {self.mass:.3g} kg" if self.mass else "no tool_mass"
 
 
 AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
@@ -92,6 +95,12 @@ EXACT: Final = Accelerometer()
 def length(a: Vector3) -> float:
     """The length of a vector."""
     return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+
+
+def vector(values: object, name: str) -> Vector3:
+    """Three numbers. ValueError, a sentence with their `name`, if they are not three finite ones."""
+    x, y, z = _finite(values, 3, name)
+    return x, y, z
 
 
 def _finite(values: object, count: int, name: str) -> list[float]:

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from ft_compensation.bias import BiasRamp, estimate_bias, gravity_of
+from ft_compensation.bias import BiasRamp, Taken, estimate_bias, gravity_of
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import NO_WRENCH, CompensationError, Wrench
+from ft_compensation.quantities import NO_WRENCH, CompensationError, Payload, Wrench
 from ft_compensation.stationary import NotStationaryError, StationaryMeans, StationaryWindow
 from ft_compensation.stationary_limits import StationaryLimits
 from protocol.framing import DataFlag
@@ -271,3 +271,18 @@ def test_undoing_goes_back_to_a_bias_that_was_shifted_meanwhile() -> None:
     ramp.shift(fx(10.0))
     assert ramp.target == fx(13.0)
     assert ramp.undo(1.0) == ramp.at(1.0) == fx(11.0)
+
+
+def test_a_shift_and_another_tool_change_both_biases() -> None:
+    """The one in force was taken with gravity along -x, the one before along -z."""
+    ramp = BiasRamp(NO_WRENCH, seconds=1.0)
+    ramp.go(load((0, 0, 1)), 0.0, Taken(Payload(), gravity_for((0, 0, 1))))
+    ramp.go(load((1, 0, 0)), 5.0, Taken(Payload(), gravity_for((1, 0, 0))))
+    ramp.shift(NEW)
+    weighed = ramp.weighed(TOOL)
+    assert ramp.target == load((1, 0, 0)).plus(NEW), "it is another ramp"
+    assert weighed.target.values == pytest.approx(BIAS.plus(NEW).values)
+    started = load((0, 0, 1)).plus(NEW).plus(BIAS).plus(load((1, 0, 0)), -1.0)
+    assert weighed.at(5.0).values == pytest.approx(started.values), "which jumps as much as the weight does"
+    assert weighed.undo(10.0).values == pytest.approx(BIAS.plus(NEW).values)
+    assert weighed.taken == Taken(TOOL, gravity_for((0, 0, 1)))
