@@ -15,6 +15,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 
+from ft_compensation.quantities import Payload
 from protocol.control import Event, event
 from protocol.framing import DataFlag
 from protocol.pdo import encode
@@ -188,6 +189,18 @@ def test_a_tare_that_is_gone_back_to_is_for_the_tool_of_now(
         assert node.trigger("undo_tare")[0] is done
         hold(server, OVER, bias=BIAS)
         stages.settle(ZERO6)
+
+
+def test_a_tare_that_finds_the_same_bias_is_of_its_own_pose(
+    stages: Stages, server: SimulatedServer, node: SimulatedNode
+) -> None:
+    assert node.set_parameter("tool_mass", 0.0) == (True, "")
+    for up in (UP, SIDE):
+        hold(server, up, payload=Payload(), bias=BIAS)
+        node.run(1.0)
+        assert node.trigger("tare")[0]
+    assert node.set_parameter("tool_mass", TOOL.mass) == (True, "")
+    stages.settle(ZERO6)
 
 
 def put(node: SimulatedNode, **named: Any) -> Any:

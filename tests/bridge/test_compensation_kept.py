@@ -337,7 +337,8 @@ def test_a_kept_bias_is_for_the_tool_of_now(bench: Bench) -> None:
 
 def test_a_kept_bias_of_a_tool_whose_pose_is_not_known(bench: Bench) -> None:
     """As of an older file."""
-    bench.store.save(1, BIAS, Payload(1.5, (0.0, 0.0, 0.1)))
+    bench.store.save(1, BIAS, Payload(1.5, (0.0, 0.0, 0.1)), Wrench.of(ZERO6))
+    bench.server.description["sensors"][0]["offset"] = ZERO6
     with bench.start() as (node, stages):
         assert stages.first() == pytest.approx(ZERO6, abs=1e-5)
         told = (
@@ -345,6 +346,12 @@ def test_a_kept_bias_of_a_tool_whose_pose_is_not_known(bench: Bench) -> None:
         )
         assert node.log.count(f"{told} by 14.7 N and 1.47 Nm in every pose: tare again") == 1
         node.until(told, compensation=WARN)
+        bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": [1.0] * 6})
+        node.run(0.1)
+        stored = bench.store.load(1)
+        assert stored is not None
+        assert stored.bias == BIAS.plus(Wrench.of([1.0] * 6))
+        assert (stored.payload, stored.gravity) == (Payload(1.5, (0.0, 0.0, 0.1)), None), "as it was taken"
 
 
 def test_the_node_ends_while_a_tare_waits(bench: Bench) -> None:
