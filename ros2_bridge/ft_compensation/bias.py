@@ -7,14 +7,19 @@ payload.
 
 from __future__ import annotations
 
+import math
 import threading
 from typing import Final, NamedTuple
+
+import numpy as np
 
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
+    NORMAL_95,
     ZERO,
+    Accelerometer,
     CompensationError,
     Payload,
     Wrench,
@@ -26,6 +31,8 @@ from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 GRAVITY_TOLERANCE: Final = 0.5
 """m/s²: how much a stationary accelerometer may differ from g."""
+_ABOUT_TWO_AXES: Final = 2.45 / NORMAL_95
+"""From half of an interval of one axis to the radius that holds as often about two (Rayleigh)."""
 
 
 def gravity_of(
@@ -45,6 +52,15 @@ def gravity_of(
     scale = -magnitude / measured
     x, y, z = acceleration
     return x * scale, y * scale, z * scale
+
+
+def tilt_95(gravity: Vector3, accelerometer: Accelerometer) -> float:
+    """In 95 % of cases `gravity` (m/s²), from what it reads at rest, is tilted by less than this, rad."""
+    up = np.array(gravity) / (size := length(gravity))
+    across = np.eye(3) - np.outer(up, up)
+    half = np.hypot(accelerometer.offset_interval, np.multiply(accelerometer.scale_interval, gravity))
+    variance = np.linalg.eigvalsh(across @ np.diag(half**2) @ across)[-1]
+    return _ABOUT_TWO_AXES * math.sqrt(max(float(variance), 0.0)) / size
 
 
 def estimate_bias(

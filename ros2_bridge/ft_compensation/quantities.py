@@ -76,12 +76,26 @@ def wrench_text(wrench: Wrench) -> str:
 NO_PAYLOAD: Final = Payload()
 
 
+OFFSET_PRIOR: Final = 0.4
+"""m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered."""
+SCALE_PRIOR: Final = 0.005
+"""Likewise of an axis' sensitivity, relative; local gravity is within it."""
+NORMAL_95: Final = 1.96
+"""Half of a 95 % interval, in standard deviations."""
+
+
 class Accelerometer(NamedTuple):
-    """What an accelerometer reads: `scale` times the truth, axis by axis, plus `offset`."""
+    """What an accelerometer reads: `scale` times the truth, axis by axis, plus `offset`.
+
+    Every `..._interval` is half the width of the 95 % interval; of what is typical, unless it was identified.
+    """
 
     offset: Vector3 = ZERO
     """m/s²"""
     scale: Vector3 = (1.0, 1.0, 1.0)
+    offset_interval: Vector3 = (NORMAL_95 * OFFSET_PRIOR,) * 3
+    """m/s²"""
+    scale_interval: Vector3 = (NORMAL_95 * SCALE_PRIOR,) * 3
 
     def correct(self, acceleration: Vector3) -> Vector3:
         """The truth, m/s², of what was read."""

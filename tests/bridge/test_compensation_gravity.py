@@ -106,7 +106,7 @@ def test_the_move_that_passed_for_tilt(arm: Arm, node: SimulatedNode) -> None:
     assert left[late][moving].max() < 6.2
     assert left[100:].max() < 0.5
     told = values(node.until(compensation=OK)["compensation"])
-    assert 1.0 < float(told["gravity_tilt_deg"]) < 4.0
+    assert 5.7 < float(told["gravity_tilt_deg"]) < 7.0, "nearly all of it the accelerometer's own offset"
     tilt = math.radians(float(told["gravity_tilt_deg"]))
     assert float(told["gravity_tilt_force"]) == pytest.approx(MASS * STANDARD_GRAVITY * tilt, rel=0.02)
 
@@ -139,6 +139,28 @@ def test_a_turn_about_the_vertical_during_a_tare_does_not_tilt_another_pose(
     stages.forget()
     node.run(2.0)
     assert forces(stages).max() < MASS * STANDARD_GRAVITY * math.radians(0.5)
+
+
+def test_the_tilt_that_is_told_allows_for_the_offset_of_the_accelerometer(
+    arm: Arm, node: SimulatedNode
+) -> None:
+    """0.4 m/s², as identification expects of an axis: 2.3°. Once that is identified, its interval counts."""
+    stages = Stages(node)
+    hold(arm, UP, acceleration_x=0.4 / STANDARD_GRAVITY)
+    stages.first()
+    node.run(5.0)
+    tilt = float(values(node.statuses()["compensation"])["gravity_tilt_deg"])
+    assert math.degrees(math.atan2(0.4, STANDARD_GRAVITY)) < tilt < 7.0
+    assert "gravity may be tilted by 5.7° (95 %), 2 N of it" in node.trigger("tare")[1]
+    for name, value in (
+        ("offset", [0.4, 0.0, 0.0]),
+        ("offset_interval", [0.02] * 3),
+        ("scale_interval", [0.0] * 3),
+    ):
+        assert node.set_parameter(f"accelerometer.{name}", value) == (True, "")
+    node.run(5.0)
+    assert float(values(node.statuses()["compensation"])["gravity_tilt_deg"]) < tilt - 3.0
+    assert "gravity may be tilted by 0.1° (95 %), 0.05 N of it" in node.trigger("tare")[1]
 
 
 def test_numbers_that_are_not_finite_stop_only_what_needs_them(arm: Arm, node: SimulatedNode) -> None:

@@ -182,8 +182,7 @@ class CompensationControl:
             "bias": [*bias.values],
         }
         if accelerometer is not None:
-            values["accelerometer.offset"] = [*accelerometer.offset]
-            values["accelerometer.scale"] = [*accelerometer.scale]
+            values |= {f"accelerometer.{name}": [*part] for name, part in accelerometer._asdict().items()}
         with self._origin("identified"):
             self._live.put(**values)
 

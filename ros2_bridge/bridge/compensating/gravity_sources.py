@@ -10,10 +10,12 @@ from typing import Final, NamedTuple, Protocol
 
 from bridge.parameters.compensation import CompensationParameters, Quaternion
 from ft_compensation.attitude.tilt import GyroscopeOffset
+from ft_compensation.bias import tilt_95
 from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
 from ft_compensation.quantities import EXACT, length
-from protocol.pdo import Sample, Vector3
+from protocol.pdo import STANDARD_GRAVITY, Sample, Vector3
 
+_POSES: Final = ((STANDARD_GRAVITY, 0.0, 0.0), (0.0, STANDARD_GRAVITY, 0.0), (0.0, 0.0, STANDARD_GRAVITY))
 IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
 
 
@@ -96,12 +98,14 @@ class AccelerometerSource:
             offset=gyroscope,
         )
         self._correct = None if p.reading == EXACT else p.reading.correct
+        # In the worst of the poses: the filter does not see it.
+        self._own_tilt = max(tilt_95(pose, p.reading) for pose in _POSES)
         self._broken = ""
 
     @property
     def tilt(self) -> float | None:
         """The bound of the estimate's tilt that holds in 95 % of cases, rad."""
-        found = self._filter.tilt_95
+        found = math.hypot(self._filter.tilt_95, self._own_tilt)
         return found if math.isfinite(found) else None
 
     def gravity(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from rclpy.node import Node
 
 from bridge.compensating.control import CompensationControl
@@ -9,7 +11,7 @@ from bridge.publishing.compensated_wrench import RestWindow
 from bridge.services.triggers import create_triggers
 from bridge.services.window import take_window
 from bridge.stream.requests import Requests
-from ft_compensation.bias import Taken, estimate_bias, gravity_of
+from ft_compensation.bias import Taken, estimate_bias, gravity_of, tilt_95
 from ft_compensation.quantities import NO_WRENCH, CompensationError, length, wrench_text
 from ft_compensation.stationary import StationaryMeans
 from protocol.pdo import Vector3
@@ -35,12 +37,17 @@ class BiasServices:
                 raise
             gravity = None  # until there is a tool_mass nobody needs it
         control.set_bias(estimate_bias(means, payload, gravity), "tare", Taken(payload, gravity))
-        weight = (
-            f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
-            if payload.mass
-            else "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds "
-            "in this orientation only"
-        )
+        if not payload.mass or gravity is None:
+            weight = (
+                "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds in "
+                "this orientation only"
+            )
+        else:
+            weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
+            if window.source.is_accelerometer:
+                tilt = tilt_95(gravity, control.parameters.accelerometer.reading)
+                force = payload.mass * length(gravity) * tilt
+                weight += f"; gravity may be tilted by {math.degrees(tilt):.1f}° (95 %), {force:.1g} N of it"
         return self._said(f"bias of {means.samples} samples: {wrench_text(control.bias)}; {weight}")
 
     def _gravity(self, window: RestWindow, means: StationaryMeans) -> Vector3:
