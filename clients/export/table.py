@@ -42,6 +42,7 @@ class Table:
         """The names, then a line for each; PdoSizeError."""
         yield ",".join(COLUMNS) + "\n"
         first_ns: int | None = None
+        last_ns = stamp_ns = 0
         second, date = -1, ""
         for frame in frames:
             # A gap before a frame that is left out is before the next sample.
@@ -51,11 +52,14 @@ class Table:
                 self._gaps[frame.sensor] = flags & DataFlag.GAP
                 continue
             self.written += 1
-            first_ns = frame.stamp_ns if first_ns is None else first_ns
-            whole, ns = divmod(frame.stamp_ns, _SECOND)
+            first_ns = frame.monotonic_ns if first_ns is None else first_ns
+            if frame.monotonic_ns < last_ns - _SECOND:  # its machine was restarted: only the stamps go on
+                first_ns += frame.monotonic_ns - last_ns - max(0, frame.stamp_ns - stamp_ns)
+            last_ns, stamp_ns = frame.monotonic_ns, frame.stamp_ns
+            whole, ns = divmod(stamp_ns, _SECOND)
             if whole != second:
                 second, date = whole, f"{datetime.fromtimestamp(whole, UTC):%Y-%m-%dT%H:%M:%S}"
-            cells = [_seconds(frame.stamp_ns - first_ns), f"{date}.{ns:09d}Z", frame.sensor, frame.sequence]
+            cells = [_seconds(last_ns - first_ns), f"{date}.{ns:09d}Z", frame.sensor, frame.sequence]
             yield f"{','.join(map(str, cells))},{self._values(frame.process_data, flags)}\n"
 
     def _values(self, data: bytes, flags: int) -> str:

@@ -81,6 +81,9 @@ def test_a_wrench_in_a_configured_frame(node: SimulatedNode, server: SimulatedSe
     assert node.set_parameter("tool_mass", TOOL.mass) == (True, "")
     assert stages.are_silent()
     configure(server, coordinate_system=False)
+    node.until("in which pose is not known: with a tool of 0.8 kg", sensor=OK, compensation=WARN)
+    stages.first()
+    assert node.trigger("tare")[0]
     node.until(sensor=OK, compensation=OK)
 
 

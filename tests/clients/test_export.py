@@ -76,6 +76,23 @@ def test_what_is_no_new_sample_is_left_out_but_not_its_gap(tmp_path: Path) -> No
     assert flags == [("0", "0", "0"), ("1", "1", "0"), ("0", "0", "1"), ("0", "0", "0"), ("0", "0", "0")]
 
 
+def test_time_is_the_monotonic_clocks(tmp_path: Path) -> None:
+    """The wall clock is set back by an hour; then the machine is restarted, and its clock begins anew."""
+    path, hour_ns, second_ns = tmp_path / "run.mcap", 3600 * 10**9, 10**9
+    made = [frame(number) for number in range(8000, 8006)]
+    made[2:4] = [item._replace(stamp_ns=item.stamp_ns - hour_ns) for item in made[2:4]]
+    made[4:] = [
+        item._replace(
+            stamp_ns=item.stamp_ns - hour_ns + second_ns, monotonic_ns=item.monotonic_ns - 9 * second_ns
+        )
+        for item in made[4:]
+    ]
+    record(path, made)
+    export(path)
+    times = [0, PERIOD_NS, 2 * PERIOD_NS, 3 * PERIOD_NS, second_ns + 4 * PERIOD_NS, second_ns + 5 * PERIOD_NS]
+    assert [row["time_s"] for row in rows(path.with_suffix(".csv"))] == [f"{ns / 1e9:.9f}" for ns in times]
+
+
 def test_what_cannot_be_done_is_said_and_leaves_nothing(tmp_path: Path) -> None:
     path, out = tmp_path / "run.mcap", tmp_path / "run.csv"
     record(path, [frame(0)])

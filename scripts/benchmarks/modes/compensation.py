@@ -24,6 +24,7 @@ from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
 from ft_compensation.outputs.frames import WrenchTransform
 from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.stationary_limits import StationaryLimits
+from protocol.framing import DataMessage
 from protocol.pdo import Sample, SampleDecoder, encode
 from scripts.benchmarks.chain import Setup
 from scripts.demonstration.child import DemoError
@@ -71,6 +72,12 @@ def costs(setup: Setup) -> Costs:
     data, decoder = list(frames()), SampleDecoder(SIZE)
     samples: list[Sample] = [decoder.decode(one) for one in data]
     step_ns = 1_000_000_000 // setup.rate_hz
+
+    def frame(number: int) -> DataMessage:
+        moment = _START_NS + number * step_ns
+        return DataMessage(number, moment, moment, 0, 0, 3, data[number % SAMPLES])
+
+    messages = [frame(number) for number in range(SAMPLES)]
     found = {"decoding": took(lambda number: decoder.decode(data[number]))}
     context = Context()
     rclpy.init(args=[], context=context)
@@ -85,9 +92,9 @@ def costs(setup: Setup) -> Costs:
             )
             output.window = RestWindow(1e9, StationaryLimits(), source) if window else None
             for number in range(-setup.rate_hz, 0):  # a second, until gravity is known
-                output.follow(samples[number % SAMPLES], _START_NS + number * step_ns)
+                output.follow(samples[number % SAMPLES], frame(number))
             before = output.published
-            found[name] = took(lambda number: output.publish(samples[number], _START_NS + number * step_ns))
+            found[name] = took(lambda number: output.publish(samples[number], messages[number]))
             if output.published - before != SAMPLES:
                 raise DemoError(f"{name}: not all samples were compensated")
 
