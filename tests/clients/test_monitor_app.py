@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from clients.monitor import cli
 from clients.monitor.app import Monitor
 from clients.monitor.model.server import Model
 from clients.monitor.recorder import Recorder
@@ -188,17 +187,3 @@ def test_only_rows_that_changed_are_drawn(monkeypatch: pytest.MonkeyPatch) -> No
         assert [region.y for region in drawn] == [22]
 
     play(scene)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code"), [(["--once"], 1), (["--json", "--onc"], 1), ([], 0), (["--json"], 0)]
-)
-def test_once_that_is_stopped_while_it_loads_has_not_said_that_all_is_fine(
-    arguments: list[str], code: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("clients.monitor.options.parse", interrupted)
-    monkeypatch.setattr("signal.signal", lambda *_: None)
-    assert cli.main(arguments) == code
