@@ -241,7 +241,9 @@ private:
         } else if (event.is("reconfigured")) {
             const auto& wanted = options_.sensors;
             if (!of_a_sensor || wanted.empty() || std::memchr(wanted.data(), place, wanted.size())) ++reconfigurations_;
-            if (of_a_sensor) sensors_[place].accounting.rate_hz = 0.0;  // it may be another one now
+            double rate_hz = 0.0;
+            message["rate_hz"].get(rate_hz);
+            if (of_a_sensor) set_rate(place, rate_hz);
         } else if (event.is("shutting_down")) {
             connection_.is_shutting_down();
         }
@@ -266,11 +268,12 @@ private:
         connection_.granted();
         ++connections_;
         for (std::size_t i = 0; i < kPlaces; ++i) sensors_[i].begin(options_.every, options_.fresh_only);
-        for (std::size_t i = 0; i < description_.sensor_count; ++i) {
-            const double rate_hz = description_.sensors[i].rate_hz;
-            if (rate_hz > 0.0 && rate_hz <= kHighestRateHz)
-                sensors_[description_.sensors[i].sensor].accounting.rate_hz = rate_hz;
-        }
+        for (std::size_t i = 0; i < description_.sensor_count; ++i)
+            set_rate(description_.sensors[i].sensor, description_.sensors[i].rate_hz);
+    }
+
+    void set_rate(std::uint8_t place, double rate_hz) noexcept {
+        sensors_[place].accounting.rate_hz = rate_hz > 0.0 && rate_hz <= kHighestRateHz ? rate_hz : 0.0;
     }
 
     Reading read(std::uint8_t place) noexcept {
