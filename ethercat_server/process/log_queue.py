@@ -70,6 +70,8 @@ class QueuedHandler(logging.Handler):
             try:
                 line = line[os.write(self._fd, line) :]
             except BlockingIOError:  # another process made it non-blocking
-                select.select((), (self._fd,), ())
+                poller = select.poll()
+                poller.register(self._fd, select.POLLOUT)
+                poller.poll()
             except OSError:
                 return  # nobody is there to read it

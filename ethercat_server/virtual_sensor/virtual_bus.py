@@ -58,7 +58,9 @@ class VirtualBus:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
         assert self._process.stdout is not None
-        ready, _, _ = select.select((self._process.stdout,), (), (), _START_TIMEOUT_S)
+        poller = select.poll()
+        poller.register(self._process.stdout, select.POLLIN)
+        ready = poller.poll(1000 * _START_TIMEOUT_S)
         if not ready or not self._process.stdout.readline():
             if ready:  # its standard output has ended, and it is about to
                 with contextlib.suppress(subprocess.TimeoutExpired):

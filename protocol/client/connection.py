@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
+import selectors
 import socket
 import struct
 from typing import Final
@@ -21,6 +21,8 @@ from protocol.text.visible import printable
 CONNECT_TIMEOUT_S: Final = 2.0
 SILENCE_S: Final = 1.0
 """`receive` gives up waiting after this time, so that silence can be reported."""
+RECEIVE_BUFFER: Final = 65536
+"""SO_RCVBUF in bytes. Left to itself the kernel makes it megabytes, and samples wait in it for seconds."""
 _KEEPALIVE: Final = tuple(
     (getattr(socket, option), value)
     for option, value in (("TCP_KEEPIDLE", 2), ("TCP_KEEPALIVE", 2), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3))
@@ -28,6 +30,8 @@ _KEEPALIVE: Final = tuple(
 )
 _DONT_WAIT: Final = getattr(socket, "MSG_DONTWAIT", 0)
 """0 on Windows, where the socket's timeouts would be of another type, too: there it waits with `select`."""
+_Selector: Final = getattr(selectors, "PollSelector", selectors.SelectSelector)
+"""`select` takes no descriptor above 1023. Windows, which has nothing else, limits their number only."""
 
 
 class FramedConnection:
@@ -59,6 +63,7 @@ class FramedConnection:
             raise OSError("nothing listens there")
         self.same_machine: bool = ours[0] == theirs[0]
         self.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         # Detects a peer that disappeared without closing the connection.
         self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _KEEPALIVE:
@@ -82,7 +87,9 @@ class FramedConnection:
     def wait(self, timeout_s: float) -> bool:
         """Whether something arrives within `timeout_s`; ConnectionFailedError if this end has been closed."""
         try:
-            return bool(select.select((self,), (), (), max(timeout_s, 0.0))[0])
+            with _Selector() as selector:
+                selector.register(self, selectors.EVENT_READ)
+                return bool(selector.select(max(timeout_s, 0.0)))
         except (ValueError, OSError):  # closed before, or by another thread at this very moment
             raise ConnectionFailedError("this client has been closed") from None
 

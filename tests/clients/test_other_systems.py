@@ -18,12 +18,13 @@ CLIENTS: Final = {name: entry for name, entry in PROJECT["scripts"].items() if e
 ELSEWHERE: Final = """
 import importlib, sys, threading
 # Python on Linux needs what Windows lacks, and so do some of the packages.
-import asyncio, os, select, signal, socket, subprocess, tempfile, time
+import asyncio, os, select, selectors, signal, socket, subprocess, tempfile, time
 import mcap.writer, mcap.reader, numpy, rich.live, zstandard
 
 missing = {
     os: "O_CLOEXEC O_DIRECTORY O_NONBLOCK chown fork geteuid getuid pread pwrite sched_setscheduler uname",
     select: "epoll poll",
+    selectors: "DefaultSelector EpollSelector PollSelector",
     signal: "SIGHUP SIGKILL SIGUSR1 pthread_sigmask sigtimedwait",
     socket: "AF_NETLINK AF_PACKET AF_UNIX MSG_DONTWAIT TCP_KEEPIDLE SO_REUSEPORT",
     time: "CLOCK_MONOTONIC CLOCK_REALTIME clock_gettime",

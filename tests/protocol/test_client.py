@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import resource
 import socket
 import subprocess
 import sys
@@ -16,6 +18,7 @@ from bridge.stream.connection import Connection
 from protocol import address
 from protocol.address import boot_id
 from protocol.client import Client, connect
+from protocol.client.connection import FramedConnection
 from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
 from protocol.framing import DataFlag
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
@@ -238,6 +241,48 @@ def test_another_thread_may_close_it_in_the_very_moment_of_waiting(scripted: Scr
     with pytest.raises(ConnectionFailedError, match=r"closed|Bad file descriptor"):
         client.receive(1.0)
     client.connection.sock.detach()
+
+
+@pytest.fixture
+def descriptors_to_1024() -> Iterator[None]:
+    """Everything that is opened from now on has a descriptor that `select` does not take."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, limits[1]), limits[1]))
+    taken = [os.open(os.devnull, os.O_RDONLY)]
+    while taken[-1] < 1024:
+        taken.append(os.dup(taken[0]))
+    yield
+    for descriptor in taken:
+        os.close(descriptor)
+    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def test_a_program_with_more_than_1024_descriptors_receives(
+    scripted: ScriptedServer, descriptors_to_1024: None
+) -> None:
+    with connect(scripted.port) as sensor:
+        assert sensor.fileno() > 1024
+        scripted.send_sample(1.0)
+        assert [frame.sequence for frame in sensor.receive(PATIENCE_S)] == [1]
+
+
+@pytest.mark.parametrize("connection", [FramedConnection, Connection])
+def test_what_waits_for_a_slow_reader_is_bounded(connection: type[FramedConnection]) -> None:
+    """Left to itself the kernel makes room for ever more, up to 32 MB, the longer a connection is read."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        reader = connection("127.0.0.1", listener.getsockname()[1])
+        writer, _ = listener.accept()
+    writer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)  # as the server's
+    writer.setblocking(False)
+    waiting = most = 0
+    with writer, contextlib.closing(reader):
+        for _ in range(3000):
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    waiting += writer.send(bytes(856))  # eight frames
+            most = max(most, waiting)
+            waiting -= len(reader.sock.recv(65536))
+    assert most < 340_000, "a second of two sensors at 1600 Hz"
 
 
 def test_every_sample_of_a_whole_server_once_and_in_order() -> None:
