@@ -11,6 +11,7 @@ import numpy as np
 
 from clients.replay.sensors import ReplayedSensors
 from protocol.framing import DataFlag, DataMessage
+from protocol.pdo import is_finite
 
 _MISSED_NS: Final = 10_000_000
 _RECENT_NS: Final = 10_000_000_000
@@ -34,12 +35,15 @@ class Meter:
         """When a frame was sent and how late that was, ns."""
         self._missed = 0
         self._counts: defaultdict[tuple[int, int], int] = defaultdict(int)
+        self._not_finite: defaultdict[int, int] = defaultdict(int)
         self._started = time.monotonic()
 
     def count(self, frame: DataMessage, due_ns: int, now_ns: int) -> None:
         """A frame was sent; `due_ns` is when it was due, 0 if it had no time."""
         self.sent += 1
-        self._counts[frame.sensor, frame.flags & (_REPEATED | _INVALID)] += 1
+        old = frame.flags & (_REPEATED | _INVALID)
+        self._counts[frame.sensor, old] += 1
+        self._not_finite[frame.sensor] += not old and not is_finite(frame.process_data)
         if due_ns:
             self._late.append((now_ns, now_ns - due_ns))
             self._missed += now_ns - due_ns > _MISSED_NS
@@ -52,6 +56,7 @@ class Meter:
         positions = range(len(self._sensors.sensors))
         return {
             "cycles": self.sent,
+            "round_trip": {"least_us": None, "usual_us": None},
             "missed_deadlines": self._missed,
             "lost_frames": 0,
             "wake_us": late,
@@ -62,7 +67,8 @@ class Meter:
         }
 
     def _of_sensor(self, position: int) -> dict[str, Any]:
-        rate_hz = self._sensors.sensors[position].row.get("rate_hz")
+        sensor = self._sensors.sensors[position]
+        rate_hz = sensor.row.get("rate_hz")
         period_us = 1e6 / rate_hz if isinstance(rate_hz, int | float) and rate_hz > 0 else None
         return {
             "sensor": position,
@@ -70,8 +76,17 @@ class Meter:
             "repeated": self._counts[position, _REPEATED],
             "invalid": self._counts[position, _INVALID] + self._counts[position, _INVALID | _REPEATED],
             "lost_samples": 0,
+            "not_finite": self._not_finite[position],
             "recoveries": 0,
-            "clock": {"mode": "locked", "period_us": period_us, "offset_ppm": 0.0, "uncertainty_us": 0.0},
+            **sensor.emergencies(),
+            "settling": False,
+            "clock": {
+                "mode": "locked",
+                "stamps": "polling",
+                "period_us": period_us,
+                "offset_ppm": 0.0,
+                "uncertainty_us": 0.0,
+            },
         }
 
 
