@@ -6,6 +6,7 @@ The queue in between is bounded. What does not fit is counted, and an event mark
 from __future__ import annotations
 
 import json
+import math
 import queue
 import threading
 import time
@@ -26,6 +27,8 @@ FLUSH_S: Final = 0.4
 """Longest time until received frames are in the file."""
 MAX_BACKLOG: Final = 200_000
 """Maximum number of queued frames: a minute of two sensors at 1600 Hz, some 80 MB."""
+_END_S: Final = 3.0
+"""Longest time for writing what is queued when it is to stop: ros2 launch sends the next signal after 5 s."""
 
 
 class Recorder:
@@ -60,6 +63,7 @@ class Recorder:
         self._writer: RecordingWriter
         self._open_part()
         self._reason = ""
+        self._end_by = math.inf
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
@@ -87,10 +91,11 @@ class Recorder:
         self._queue.put(batch)
 
     def stop(self, reason: str) -> None:
-        """Write what is queued and finish the file; `error` is set if that failed."""
+        """Write what is queued, for a bounded time, and finish the file; `error` is set if that failed."""
         if self._overflow:
             self._queue.put([lost(self._overflow, "the disk did not keep up")])
         self._reason = reason
+        self._end_by = time.monotonic() + _END_S
         self._queue.put(None)
         self._thread.join()
         while not self._queue.empty():  # queued after a failure
@@ -104,24 +109,31 @@ class Recorder:
             self._end_part(self._reason)
         except DiskError as error:
             self.error = error
-            # The failed flush was truncated.
-            self.tally.dropped += self._unflushed
-            self.saved -= self._unflushed
+            # The failed flush was truncated; of a file that was removed nothing is left.
+            missing = self._writer.frames if self._disk.removed else self._unflushed
+            self.tally.dropped += missing
+            self.saved -= missing
         finally:
             self._disk.close()
 
     def _record(self) -> None:
         self._flush_at = time.monotonic() + FLUSH_S
+        too_late = 0
         while True:
             try:
                 batch = self._queue.get(timeout=max(0.0, self._flush_at - time.monotonic()))
             except queue.Empty:
                 batch = []
             if batch is None:
+                if too_late:
+                    self._write(lost(too_late, "there was no time left to write them"))
                 return
+            self._backlog -= len(batch)
+            if time.monotonic() >= self._end_by:
+                too_late += sum(isinstance(item, DataMessage) for item in batch)
+                batch = [item for item in batch if not isinstance(item, DataMessage)]
             for item in batch:
                 self._write(item)
-            self._backlog -= len(batch)
             if time.monotonic() >= self._flush_at:
                 self._flush_at = time.monotonic() + FLUSH_S
                 self._writer.flush()

@@ -6,6 +6,8 @@ It is a process where it is stopped or killed from outside, which nothing else c
 from __future__ import annotations
 
 import contextlib
+import itertools
+import queue
 import random
 import signal
 import socket
@@ -20,15 +22,17 @@ import pytest
 from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
-from clients.record import cli, program
+from clients.record import cli, program, recorder
 from clients.record import parts as record_parts
 from clients.record.parts import Parts
-from clients.record.recorder import FLUSH_S, Recorder
-from clients.record.source import BATCH_S, Source
+from clients.record.recorder import FLUSH_S, MAX_BACKLOG, Recorder
+from clients.record.source import BATCH_S, Batch, Source
 from clients.recording.file_format import FORMAT_VERSION, frame_topic
 from clients.recording.reader import open_recording
+from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.address import Address
 from protocol.framing import DataFlag, DataMessage
+from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.recordings import frame, record
 from tests.clients.running import (
     NoSignals,
@@ -42,7 +46,7 @@ from tests.clients.running import (
     wait_until,
 )
 from tests.served_simulation import served
-from tests.server.running import needs_bus, server
+from tests.server.running import PATIENCE_S, needs_bus, server
 
 Run = Callable[..., tuple[int, str]]
 SECOND = 800
@@ -165,6 +169,40 @@ def test_it_records_across_the_restart_of_the_server(out: Path, capsys: pytest.C
         assert len(opened.descriptions) == 2
 
 
+def test_it_records_on_without_a_sensor_that_the_restarted_server_lacks(
+    out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with (
+        served(SensorOptions(), SensorOptions(), sinc_length=512) as first,
+        recording(out, first.port, "--sensor", "0", "--sensor", "1") as recorder,
+    ):
+        recorder.wait_for_frames(20)
+        first.close()
+        with served(port=first.port, sinc_length=512) as second:
+            recorder.wait_for_frames(20)
+            second.close()
+        with served(SensorOptions(), SensorOptions(), port=first.port, sinc_length=512):
+            wait_until(lambda: read(out)[-1].sensor == 1, "a frame of the sensor that is back")
+            assert recorder.stop() == 0
+    assert "connected: without sensor 1" in capsys.readouterr().err
+    with open_recording(out) as opened:
+        said = [event.event.get("message") for event in opened.events if event.name == "connected"]
+        assert said == [None, "without sensor 1", None]
+
+
+def test_a_refusal_does_not_end_a_recording_that_runs(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with ScriptedServer() as server, recording(out, server.port) as recorder:
+        assert server.subscribed.wait(PATIENCE_S)
+        server.answers["subscribe"] = lambda _: {"ok": False, "error": {"code": "busy", "message": "not now"}}
+        server.drop()
+        wait_until(lambda: "disconnected: not now" in capsys.readouterr().err, "the refusal")
+        server.answers.clear()
+        assert server.subscribed.wait(PATIENCE_S)
+        server.send_sample(1.0)
+        recorder.wait_for_frames(1)
+        assert recorder.stop() == 0
+
+
 # -- what is lost
 
 
@@ -216,16 +254,72 @@ def test_seconds_of_frames_have_room_in_the_kernel(endless: Replay) -> None:
     assert room >= min(4 * 1024 * 1024, 2 * most)
 
 
-def test_frames_get_into_the_file_before_it_ends(out: Path) -> None:
-    assert BATCH_S + FLUSH_S < 0.5, "a machine that is busy may double it"
-    recorder = Recorder(
+def new_recorder(out: Path) -> Recorder:
+    return Recorder(
         Parts(out, size=None, seconds=None, overwrite=False), "test", {"format": FORMAT_VERSION}, {}
     )
-    try:
-        recorder.put([frame(number) for number in range(10)])
-        wait_until(lambda: frames_in(out) == 10, "the frames, though no more come")
-    finally:
-        recorder.stop("")
+
+
+def test_frames_get_into_the_file_before_it_ends(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert BATCH_S + FLUSH_S < 0.5, "a machine that is busy may double it"
+    now_s, in_file = [0.0], []
+
+    def batches() -> Iterator[Batch | None]:
+        yield [frame(number) for number in range(10)]
+        now_s[0] += FLUSH_S
+        yield []
+        in_file.append(frames_in(out))
+        yield None
+
+    queued = batches()
+    played = SimpleNamespace(get=lambda timeout: next(queued), put=lambda batch: None, empty=lambda: True)
+    monkeypatch.setattr(recorder, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr(recorder, "queue", SimpleNamespace(SimpleQueue=lambda: played, Empty=queue.Empty))
+    new_recorder(out).stop("")
+    assert in_file == [10], "though no more come"
+
+
+def test_a_backlog_does_not_delay_its_end(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a machine so loaded that writing all of it would take minutes."""
+    calls = itertools.count()
+    monkeypatch.setattr(recorder, "time", SimpleNamespace(monotonic=lambda: next(calls) * 0.1))
+    slow = new_recorder(out)
+    for first in range(0, MAX_BACKLOG, 64):
+        slow.put([frame(number) for number in range(first, min(first + 64, MAX_BACKLOG))])
+    slow.stop("asked to stop")
+    assert slow.error is None
+    with open_recording(out) as opened:
+        frames = list(opened.frames())
+        assert opened.cut_off is None
+        (lost,) = (event.event for event in opened.events)
+        assert opened.end is not None
+        assert (lost["frames"], opened.end["dropped"]) == (slow.tally.dropped, str(slow.tally.dropped))
+    assert is_whole(frames)
+    assert (len(frames), len(frames) + slow.tally.dropped) == (slow.saved, MAX_BACKLOG)
+    assert slow.saved < MAX_BACKLOG // 2
+
+
+def test_of_a_file_that_is_removed_nothing_is_said_to_be_there(out: Path) -> None:
+    removed = new_recorder(out)
+    removed.put([frame(number) for number in range(10)])
+    wait_until(lambda: frames_in(out) == 10, "the frames")
+    out.unlink()
+    removed.put([frame(10)])
+    removed.stop("asked to stop")
+    assert str(removed.error) == f"{out} was removed while it was written: nothing of it is left"
+    assert (removed.saved, removed.tally.dropped) == (0, 11)
+
+
+def test_a_part_that_was_taken_away_is_none_of_its_business(
+    endless: Replay, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record_parts, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic()))
+    part = out.with_name("out_0.mcap")
+    with recording(out, endless.port, "--rotate-seconds", "1") as recorder:
+        wait_until(out.with_name("out_1.mcap").exists, "the second file")
+        part.unlink()
+        wait_until(out.with_name("out_3.mcap").exists, "the fourth file")
+        assert recorder.stop() == 0
 
 
 def killed(endless: Replay, out: Path, frames: int) -> None:
