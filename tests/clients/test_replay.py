@@ -157,7 +157,7 @@ def test_status_has_all_that_a_server_s_has(path: Path) -> None:
     made.describe(START_NS, describe(0))
     made.event(START_NS, {"event": "emergency", **EMERGENCY, "sensor": 0, "count": 4, "message": "over"})
     for number in range(100):
-        made.frame(frame(number, **{"torque.x": 0.0 if number else math.nan}))
+        made.frame(frame(number, temperature=30.0 if number else math.nan))
     made.finish({})
     with served() as server, connect(server.port) as client:
         server.command("emergency 0xFF01 0x81 0102030405")

@@ -37,19 +37,22 @@ class Batch(NamedTuple):
     """A message to the page, as the page reads it."""
 
     sensor: int
+    skipped: bool
     times: list[float]
     newest: list[float]
     columns: list[list[float]]
 
 
 def decode(message: bytes) -> Batch:
-    kind, sensor, count, _, start = HEADER.unpack_from(message)
+    kind, sensor, count, skipped, start = HEADER.unpack_from(message)
     assert kind == 1
     values = array("f", message[HEADER.size :])
     assert len(values) == len(CHANNELS) + count * (1 + len(CHANNELS))
     body = values[len(CHANNELS) :].tolist()
     parts = [body[k : k + count] for k in range(0, len(body), count)]
-    return Batch(sensor, [start + t for t in parts[0]], values[: len(CHANNELS)].tolist(), parts[1:])
+    return Batch(
+        sensor, bool(skipped), [start + t for t in parts[0]], values[: len(CHANNELS)].tolist(), parts[1:]
+    )
 
 
 def batch(feed: Feed, frames: list[DataMessage]) -> Batch:
@@ -220,9 +223,11 @@ def test_a_page_that_lags_misses_what_came_and_goes_on_with_the_newest(web: Harn
     assert [pages for pages, _ in web.hub.points(START_S + 1)] == [["quick"]]
     web.hear("page", seen=MOST_BEHIND)
     assert web.states()["page"]["state"] == 31, "the newest"
-    web.model.take([frame(k) for k in range(100, 200)], START_S + 1)
-    [(pages, _)] = web.hub.points(START_S + 2)
-    assert set(pages) == {"page", "quick"}
+    for first, expected in ((100, {"quick": False, "page": True}), (200, {"quick": False, "page": False})):
+        web.model.take([frame(k) for k in range(first, first + 100)], START_S + 1)
+        sent = web.hub.points(START_S + 2)
+        skipped = {page: decode(text).skipped for pages, text in sent for page in pages}
+        assert skipped == expected, "it is told where it was that missed something, not the sensor"
 
 
 def test_an_acknowledgement_of_what_was_not_sent_buys_nothing() -> None:

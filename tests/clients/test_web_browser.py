@@ -18,6 +18,10 @@ from tests.server.running import wait_until
 
 pytestmark = needs_chromium
 
+COLOR = (
+    "(e => (document.body.append(e), e.style.color = 'var(--{})', getComputedStyle(e).color))"
+    "(document.createElement('i'))"
+)
 SPIKE = 501
 COUNT = 800
 
@@ -116,6 +120,44 @@ def test_a_lost_server_is_said_and_comes_back(page: Page, web: Web) -> None:
     hole = [k for k, value in enumerate(force) if value is None]
     assert len(hole) == 1, "no line over what did not come"
     assert times[hole[0] + 1] - times[hole[0] - 1] > 0.7  # type: ignore[operator]
+
+
+def test_labels_are_as_large_on_a_screen_of_three_pixels_in_one(page: Page) -> None:
+    page.size(1280, 900, ratio=3)
+    page.wait_for("document.querySelector('#force').plot.ctx.canvas.width > 1280")
+    fonts = "[...document.querySelectorAll('.trace')].flatMap(e => e.plot.axes.map(axis => axis.font[0]))"
+    for font in page.value(fonts):
+        assert 3 * 10 <= int(font.split("px")[0]) <= 3 * 16, "device pixels"
+
+
+def test_what_a_slow_page_missed_is_told_from_what_was_lost(page: Page, web: Web) -> None:
+    feed(web, 160)
+    page.wait_for("document.querySelector('#force').plot.data[0].length > 30")
+    web.now_s = made.now(400)
+    viewer = next(iter(web.hub._viewers.values()))
+    viewer.missed = True
+    web.feed(*(frame(k) for k in range(400, 560)))
+    page.wait_for("document.querySelector('#force').plot.skipped?.length > 0")
+    web.feed(*(frame(k) for k in range(720, 880)))
+    page.wait_for("document.querySelector('#force').plot.data[1].filter(each => each === null).length == 2")
+    ((start, end),) = page.value("document.querySelector('#force').plot.skipped")
+    assert 0.25 < end - start < 0.35
+
+
+def test_warnings_alone_are_amber(page: Page, web: Web) -> None:
+    def edge() -> str:
+        return str(page.value("getComputedStyle(document.querySelector('#warnings')).borderColor"))
+
+    colors = {name: page.value(COLOR.format(name)) for name in ("warn", "bad")}
+    for start, bits, said, color in (
+        (0, 0b0100000, ".look.present", "warn"),
+        (1600, 0b1100000, ".trouble.present", "bad"),
+    ):
+        for first in range(start, start + 1600, 80):
+            web.feed(*(frame(k, {**moving(k), "warnings": bits}) for k in range(first, first + 80)))
+        page.wait_for(f"document.querySelectorAll('#warnings .present').length === {bits.bit_count()}")
+        assert page.text(f"#warnings {said}")
+        assert edge() == colors[color]
 
 
 @pytest.mark.long

@@ -13,7 +13,7 @@ from clients.monitor.model.server import Model, clock_text
 from clients.monitor.tare import WAYS, Say
 from clients.monitor.web.access import Token
 from clients.monitor.web.message import state_text
-from clients.monitor.web.points import Feed, start_s
+from clients.monitor.web.points import Feed, after_skipped, start_s
 from clients.monitor.web.viewer import Viewer, Wish
 from protocol.framing import DataMessage
 from protocol.pdo import ImuUnits
@@ -101,14 +101,19 @@ class Hub(Generic[Page]):
                 yield them, state_text(state, position, self._number)
 
     def points(self, now_s: float) -> Iterator[tuple[list[Page], bytes]]:
-        """The points that are due, for the pages that keep up: whoever lags misses them."""
+        """The points that are due, for the pages that keep up: whoever lags misses them, and is told so."""
         silent = now_s - self._points_s > _SILENT_S
         for position, batch in self._model.feed.batches(silent=silent).items():
             self._points_s = now_s
             self._keep(position, batch)
-            pages = [p for p, v in self._viewers.items() if v.sensor == position and not v.behind]
-            if pages:
-                yield pages, batch
+            pages: dict[bool, list[Page]] = {}
+            for page, viewer in self._viewers.items():
+                if viewer.sensor == position:
+                    if not viewer.behind:
+                        pages.setdefault(viewer.missed, []).append(page)
+                    viewer.missed = viewer.behind
+            for missed, them in pages.items():
+                yield them, after_skipped(batch) if missed else batch
 
     def kept(self, page: Page) -> list[bytes]:
         """The points of the last minute of the sensor that a page shows, for one that has just begun to."""

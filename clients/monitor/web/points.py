@@ -1,9 +1,9 @@
 """Frames as points of the page's traces: the extremes of every 10 ms, so that no peak is lost.
 
 A message to the page, little-endian: u8 kind (1), u8 position of the sensor, u16 number of points n,
-u32 unused, f64 time t0; then f32: 13 values of the newest sample, n times after t0, and n values of each of
-the 13 channels. Times are the server's CLOCK_MONOTONIC in seconds, values in SI units or counts; NaN: not a
-finite number.
+u32 1 if the page was not sent the points before because it was slow, else 0, f64 time t0; then f32: 13 values
+of the newest sample, n times after t0, and n values of each of the 13 channels. Times are the server's
+CLOCK_MONOTONIC in seconds, values in SI units or counts; NaN: not a finite number.
 """
 
 from __future__ import annotations
@@ -36,6 +36,12 @@ Values = tuple[float, ...]
 def start_s(batch: bytes) -> float:
     """The time of its first point."""
     return float(HEADER.unpack_from(batch)[4])
+
+
+def after_skipped(batch: bytes) -> bytes:
+    """The same for a page that was not sent the points before."""
+    kind, position, count, _, start = HEADER.unpack_from(batch)
+    return HEADER.pack(kind, position, count, 1, start) + batch[HEADER.size :]
 
 
 def scales(imu_units: ImuUnits) -> Values:

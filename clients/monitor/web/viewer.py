@@ -38,6 +38,7 @@ class Viewer:
     Attributes:
         sensor: position of the sensor that it shows.
         control: whether it has shown the token.
+        missed: whether it was not sent the last points, because it was behind.
         end: why its connection must be closed; empty if not.
     """
 
@@ -45,6 +46,7 @@ class Viewer:
         self._token = token
         self.sensor = 0
         self.control = False
+        self.missed = False
         self.end = ""
         self._unseen: deque[int] = deque()
         """Numbers of the states that it has been sent and has not acknowledged."""

@@ -74,7 +74,10 @@ function showState(state) {
 function showSensor(found) {
   setText(byId("identity"), found.identity);
   fill(byId("warnings").lastElementChild, [found.alerts, found.has_sample], warnings);
-  byId("warnings").classList.toggle("bad", found.alerts.some((alert) => alert.present));
+  const present = found.alerts.filter((alert) => alert.present);
+  const bad = present.some((alert) => alert.severity === "trouble");
+  byId("warnings").classList.toggle("bad", bad);
+  byId("warnings").classList.toggle("warn", present.length > 0 && !bad);
   fill(byId("stream").lastElementChild, found.stream, pairs);
   fill(byId("lost").lastElementChild, found.losses, (losses) =>
     losses.map(([text, bad]) => element("li", { class: bad ? "bad" : "" }, text)));

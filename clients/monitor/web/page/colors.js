@@ -2,7 +2,7 @@
 
 export const colors = {};
 
-const NAMES = ["paper", "raised", "ink", "muted", "grid", "x", "y", "z", "torque"];
+const NAMES = ["paper", "raised", "ink", "muted", "grid", "missed", "x", "y", "z", "torque"];
 
 export function renew() {
   const style = getComputedStyle(document.documentElement);

@@ -15,6 +15,7 @@ export function decode(buffer) {
   const start = head.getFloat64(8, true);
   return {
     sensor: head.getUint8(1),
+    skipped: head.getUint32(4, true) === 1,
     newest: values.subarray(0, CHANNELS),
     times: Float64Array.from(part(0), (after) => start + after),
     columns: Array.from({ length: CHANNELS }, (_, channel) => part(1 + channel)),

@@ -18,15 +18,19 @@ export class History {
 
   clear() {
     this.times = [];
+    this.skipped = []; // where this page was too slow: [from, to]
     this.columns = Array.from({ length: CHANNELS }, () => []);
     this.offset = null;
   }
 
   /** `period`: of the samples, in seconds. */
-  add({ times, columns }, period) {
+  add({ skipped, times, columns }, period) {
     const last = this.times.at(-1);
     if (last !== undefined && times[0] <= last) this.clear(); // another server, or a restarted machine
-    else if (last !== undefined && times[0] - last > 2.5 * Math.max(STEP_S, period)) this.#push(last + 1e-4);
+    else if (last !== undefined && times[0] - last > 2.5 * Math.max(STEP_S, period)) {
+      this.#push(last + 1e-4);
+      if (skipped) this.skipped.push([last, times[0]]);
+    }
     for (let i = 0; i < times.length; i++) {
       if (i && times[i] - times[i - 1] > 2.5 * Math.max(STEP_S, period)) this.#push(times[i - 1] + 1e-4);
       this.#push(times[i], columns, i);
@@ -46,6 +50,7 @@ export class History {
   copy() {
     const made = new History();
     made.times = this.times.slice();
+    made.skipped = this.skipped.slice();
     made.columns = this.columns.map((column) => column.slice());
     return made;
   }
@@ -61,6 +66,7 @@ export class History {
   #trim(before) {
     const count = this.times.findIndex((time) => time >= before);
     this.times.splice(0, count);
+    this.skipped = this.skipped.filter(([, to]) => to >= before);
     for (const column of this.columns) column.splice(0, count);
   }
 }
@@ -101,7 +107,8 @@ export class Trace {
 
   /** Once it is in the page. */
   start() {
-    const em = 0.78 * parseFloat(getComputedStyle(document.documentElement).fontSize);
+    // Whole pixels: uPlot takes the digits before "px" and multiplies them by the device pixel ratio.
+    const em = Math.round(0.78 * parseFloat(getComputedStyle(document.documentElement).fontSize));
     const axis = { stroke: () => colors.muted, font: `${em}px system-ui, sans-serif`,
       grid: { stroke: () => colors.grid, width: 1 }, ticks: { show: false } };
     this.plot = new uPlot({
@@ -116,14 +123,16 @@ export class Trace {
       ],
       series: [{}, ...["x", "y", "z"].map((name) => (
         { stroke: () => colors[name], width: 1, points: { show: false }, spanGaps: false }))],
-      hooks: { setCursor: [(u) => this.#point(u)] },
+      hooks: { setCursor: [(u) => this.#point(u)], drawClear: [(u) => this.#missed(u)] },
     }, [[], [], [], []], this.box);
+    this.plot.skipped = [];
     this.card.plot = this.plot;
     new ResizeObserver(() => this.plot.setSize(this.#size())).observe(this.box);
   }
 
   draw(history, edge) {
     const { first } = this.group;
+    this.plot.skipped = history.skipped;
     this.plot.batch(() => {
       this.plot.setData([history.times, ...history.columns.slice(first, first + 3)], false);
       this.plot.setScale("x", { min: edge - this.span, max: edge });
@@ -162,8 +171,29 @@ export class Trace {
     return this.unit === "counts" ? 1000 : this.group.least;
   }
 
+  /** What this page missed is shaded: nothing was lost there. */
+  #missed({ ctx, axes, bbox, skipped, valToPos }) {
+    ctx.save();
+    ctx.font = axes[0].font[0];
+    ctx.textAlign = "center";
+    ctx.textBaseline = "top";
+    for (const [from, to] of skipped ?? []) {
+      const [left, right] = [from, to].map((time) => Math.min(Math.max(valToPos(time, "x", true), bbox.left), bbox.left + bbox.width));
+      ctx.fillStyle = colors.missed;
+      ctx.fillRect(left, bbox.top, right - left, bbox.height);
+      ctx.fillStyle = colors.muted;
+      if (ctx.measureText("page was slow").width < right - left) ctx.fillText("page was slow", (left + right) / 2, bbox.top);
+    }
+    ctx.restore();
+  }
+
   #point(u) {
     const at = u.cursor.idx;
+    const time = u.posToVal(u.cursor.left, "x");
+    if (u.cursor.left >= 0 && u.skipped.some(([from, to]) => from < time && time < to)) {
+      this.at.textContent = "this page was too slow to show what came here";
+      return;
+    }
     if (at === null || at === undefined || u.data[1][at] === null || !(u.cursor.left >= 0)) {
       this.at.textContent = "";
       return;
