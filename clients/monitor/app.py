@@ -148,6 +148,8 @@ class Monitor(App[None]):
             self._answer((event.character or "").lower())
         elif self._look.help:
             self._look = replace(self._look, help=False)
+        elif self._look.warnings and event.character != "w":
+            self._look = replace(self._look, warnings=0)
         else:
             action = {
                 "t": self._ask_tare,
@@ -156,6 +158,7 @@ class Monitor(App[None]):
                 " ": self._pause,
                 "0": self._reset,
                 "n": self._next,
+                "w": self._warnings,
                 "?": self._help,
                 "h": self._help,
                 "q": self.exit,
@@ -211,6 +214,9 @@ class Monitor(App[None]):
             self._say("There is only one sensor" if count else "There is no sensor")
         else:
             self._look = replace(self._look, selected=(self._look.selected + 1) % count)
+
+    def _warnings(self) -> None:
+        self._look = replace(self._look, warnings=self._look.warnings + 1)
 
     def _help(self) -> None:
         self._look = replace(self._look, help=True)

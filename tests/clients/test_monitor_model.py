@@ -213,6 +213,17 @@ def test_values_that_only_the_server_saw_are_told_too(model: Model) -> None:
         assert texts(only(model, now(0))) == told
 
 
+def test_what_was_said_makes_room_for_the_latest_event_after_half_a_minute(model: Model) -> None:
+    for start in (START_S, START_S + 100):
+        model.say("Recorded a.mcap")
+        for later in (0, 29.9):
+            said = model.state(start + later).message
+            assert said is not None
+            assert said.text == "Recorded a.mcap"
+        assert model.state(start + 30.1).message is None
+        assert model.state(start + 90).message is None
+
+
 def test_the_last_emergency_is_told_until_it_is_over_or_reset(model: Model) -> None:
     def after(count: int, code: int, at_s: float) -> list[str]:
         reply = status()

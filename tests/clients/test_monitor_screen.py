@@ -73,6 +73,33 @@ def test_what_does_not_fit_of_the_warnings_is_counted() -> None:
     assert re.search(r"and \d more", plain(made.troubled(), width=60, height=15))
 
 
+def test_every_warning_can_be_reached() -> None:
+    state = made.troubled()
+    alert = state.sensors[0].alerts[0]
+    many = tuple(alert._replace(text=f"warning {n:02}", remedy="a remedy " * 8) for n in range(30))
+    state = replace(state, sensors=(replace(state.sensors[0], alerts=many), *state.sensors[1:]))
+    assert re.search(r"and \d+ more: w", plain(state))
+    pages = [plain(state, Look(warnings=number)) for number in range(1, 5)]
+    for page in pages:
+        assert "Sensor 0" in page
+        assert "w: next page" in page
+    assert sorted(set(re.findall(r"warning \d\d", "".join(pages)))) == [f"warning {n:02}" for n in range(30)]
+    assert pages[3] == pages[0], "round and round"
+    assert "no warnings" in plain(made.healthy(), Look(warnings=1))
+
+
+def test_a_lost_sensor_s_state_is_whole_at_80x24() -> None:
+    state = made.troubled()
+    lost = replace(state.sensors[0], al_state="LOST", old_s=31.0)
+    state = replace(state, sensors=(lost, *state.sensors[1:]))
+    (row,) = (row for row in plain(state).splitlines() if row.startswith("Sensor 0  "))
+    assert re.fullmatch(
+        r"Sensor 0  BFT-SENS-ECAT-M8  serial 1234  LOST +values 31 s old +1 worth a look *", row
+    )
+    for width in range(50, 110):
+        assert "  LOST " in plain(state, width=width)
+
+
 def test_two_sensors_stand_one_below_the_other_where_there_is_room() -> None:
     assert "ROKS" not in plain(made.troubled())
     tall = plain(made.troubled(), height=48)

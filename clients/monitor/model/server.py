@@ -24,6 +24,8 @@ from protocol.text.json_text import JsonObject
 from protocol.text.untrusted import number, rows, text, whole
 
 _POSITION: Final = attrgetter("sensor")
+_SAID_S: Final = 30.0
+"""How long a message is shown, as on the page in a browser."""
 
 
 class Model:
@@ -44,6 +46,8 @@ class Model:
         self._status_s = 0.0
         self._clients: tuple[Client, ...] = ()
         self._message: Message | None = None
+        self._shown_s: float | None = None
+        """When the message was first in a state."""
         self._events: deque[str] = deque(maxlen=8)
 
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
@@ -128,11 +132,15 @@ class Model:
     def say(self, message: str, *, bad: bool = False) -> None:
         """Set the message for the user."""
         with self._lock:
-            self._message = Message(text(message), bad) if message else None
+            self._message, self._shown_s = Message(text(message), bad) if message else None, None
 
     def state(self, now_s: float) -> State:
         """The current state."""
         with self._lock:
+            if self._shown_s is None:
+                self._shown_s = now_s
+            if now_s - self._shown_s > _SAID_S:
+                self._message = None
             server = self._server(now_s)
             speaks = server.connected and not server.silent
             return State(

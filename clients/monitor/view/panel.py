@@ -82,16 +82,17 @@ def alerts(sensor: SensorState, width: int, most: int) -> list[Row]:
         return [Row(1, field("Warnings", none))]
     rows: list[Row] = []
     for number, alert in enumerate(sensor.alerts):
-        lines = _alert(alert, width)
+        lines = alert_lines(alert, width)
         left = len(sensor.alerts) - number - 1
         if rows and len(rows) + len(lines) + bool(left) > most:
-            rows.append(Row(3, field("", f"and {left + 1} more")))
+            rows.append(Row(3, field("", f"and {left + 1} more: w")))
             break
         rows.extend(Row(1 if not number else 3, line) for line in lines)
     return rows
 
 
-def _alert(alert: Alert, width: int) -> list[Text]:
+def alert_lines(alert: Alert, width: int) -> list[Text]:
+    """It and its remedy, on one line or two."""
     present = alert.ago_s is None
     head = Text.assemble(
         (f" {alert.level.words} " if present else alert.level.words, ALARM if present else BAD),
@@ -105,7 +106,6 @@ def _alert(alert: Alert, width: int) -> list[Text]:
 
 def _identity(sensor: SensorState, others: Sequence[SensorState], width: int) -> Text:
     lost = sensor.al_state not in {"OP", ""}
-    row = Text(words.identity(sensor), BAD if lost else VALUE)
     rest = Text()
     if sensor.old_s is not None:
         rest.append(f" values {numbers.duration(sensor.old_s)} old ", ALARM)
@@ -113,8 +113,10 @@ def _identity(sensor: SensorState, others: Sequence[SensorState], width: int) ->
         level = other.verdict.level
         rest.append(f" {other.position}", LABEL)
         rest.append(f" {level.words} " if level else f" {level.words}", ALARM if level else "")
+    room = width - rest.cell_len - bool(rest)
+    row = Text(words.identity(sensor, room), BAD if lost else VALUE)
     if rest.cell_len:
-        row.truncate(max(0, width - rest.cell_len - 1))
+        row.truncate(max(0, room))
         row.pad_right(width - rest.cell_len - row.cell_len)
     return row.append_text(rest)
 

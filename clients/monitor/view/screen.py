@@ -12,7 +12,7 @@ from clients import numbers
 from clients.monitor.model.state import AXES, State
 from clients.monitor.view import words
 from clients.monitor.view.glyphs import ALARM, BAD, LABEL, NOTICE, UNICODE, VALUE, Glyphs, to_ascii
-from clients.monitor.view.panel import MOST_TALL, Row, alerts, field, panel
+from clients.monitor.view.panel import MOST_TALL, Row, alert_lines, alerts, field, panel
 
 KEYS: Final = (
     ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),
@@ -20,6 +20,7 @@ KEYS: Final = (
     ("p", "pause", "freeze the display; samples and peaks still count"),
     ("0", "reset", "reset peaks and past warnings"),
     ("n", "next", "the next sensor of the chain"),
+    ("w", "warn", "all warnings of this sensor"),
     ("?", "help", "this page"),
     ("q", "quit", "also Ctrl-C; Ctrl-L redraws the screen"),
 )
@@ -44,6 +45,8 @@ class Look:
     question: str = ""
     """The pending question."""
     help: bool = False
+    warnings: int = 0
+    """The page of all warnings that is shown, from 1; 0: none. After the last comes the first."""
     glyphs: Glyphs = UNICODE
 
 
@@ -53,6 +56,8 @@ def render(state: State, look: Look, width: int, height: int) -> list[Text]:
         rows = [Text(f"too small: {_LEAST_WIDTH}x{_LEAST_HEIGHT} at least")]
     elif look.help:
         rows = _help(state)
+    elif look.warnings:
+        rows = _warnings(state, look, width, height)
     else:
         rows = _overview(state, look, width, height)
     rows = rows[:height] + [Text()] * (height - len(rows))
@@ -169,10 +174,10 @@ def _keys(look: Look, width: int) -> Text:
     if look.paused:
         names["p"] = "resume"
     row = Text()
-    gap = "  " if width >= 60 else " "
+    gap = "  " if width >= 68 else " "
     for key, name in names.items():
         row.append(key, VALUE)
-        row.append(f" {name}{gap}" if width >= 50 else f"{gap}", LABEL)
+        row.append(f" {name}{gap}" if width >= 60 else f"{gap}", LABEL)
     return row
 
 
@@ -195,6 +200,21 @@ def _help(state: State) -> list[Text]:
         )
     ]
     return rows
+
+
+def _warnings(state: State, look: Look, width: int, height: int) -> list[Text]:
+    """All warnings of the selected sensor, a page of them."""
+    lines: list[Text] = []
+    if state.sensors:
+        sensor = state.sensors[look.selected % len(state.sensors)]
+        lines = [line for alert in sensor.alerts for line in alert_lines(alert, width)]
+        identity = Text(words.identity(sensor, width), VALUE)
+    room = height - 4
+    pages = [lines[start : start + room] for start in range(0, len(lines), room)] or [[Text("no warnings")]]
+    number = (look.warnings - 1) % len(pages)
+    shown = pages[number] + [Text()] * (room - len(pages[number]))
+    hint = Text(f"{number + 1} of {len(pages)}   w: next page, any other key: return", LABEL)
+    return [_title(state, look, width), identity if state.sensors else Text(), *shown, Text(), hint]
 
 
 def _fitted(row: Text, width: int, glyphs: Glyphs) -> Text:
