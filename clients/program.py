@@ -66,6 +66,12 @@ def discard_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def interrupt_on_signals() -> None:
+    """SIGINT and SIGTERM raise KeyboardInterrupt: for when everything is imported, see `start`."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+
+
 def call_on(loop: AbstractEventLoop, stop: Callable[[], object], *names: str) -> None:
     """Have these signals call `stop`; those that nohup ignores do not, nor any on Windows."""
     for name in names:

@@ -16,8 +16,8 @@ withheld: sequence numbers missing before a frame with GAP, except `every` - 1 o
     `fresh_only` no GAP is needed
 lost: samples that the sensor produced and the server never had, so they have no number: at least one for a
     GAP with nothing withheld, and, where the sensor's rate is known, as many as fit between this frame and
-    the last new one. GAP is also set when the server cannot rule a loss out; `lost_samples` in `status` is
-    exact
+    the last new one. GAP is also set when the server cannot rule a loss out; `lost_samples` in `status` says
+    how many there were
 skipped: other missing sequence numbers: the subscription left them out (`every`, `fresh_only`)
 """
 

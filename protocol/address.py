@@ -32,7 +32,9 @@ class Address(NamedTuple):
         bracketed = host.startswith("[") and host.endswith("]")
         if ":" in host and not bracketed:
             raise ValueError(f"{text!r}: write an IPv6 address in brackets, for example [::1]:{DEFAULT_PORT}")
-        if not port.isdecimal() or not port.isascii() or not 1 <= int(port) <= 65535:
+        if port.isdecimal() and port.isascii() and not 1 <= int(port) <= 65535:
+            raise ValueError(f"{text!r}: {port} is no port: it must be from 1 to 65535")
+        if not port.isdecimal() or not port.isascii():
             raise ValueError(f"{text!r}: it must be HOST:PORT, for example {DEFAULT_HOST}:{DEFAULT_PORT}")
         return cls(host.strip("[]") or DEFAULT_HOST, int(port))
 

@@ -66,6 +66,10 @@ class ConnectionFailedError(ProtocolError):
 class UnreachableError(ConnectionFailedError):
     """Nothing answers at that address."""
 
+    def at(self, address: object) -> str:
+        """The one sentence about it."""
+        return f"no server at {address} ({self}): start ethercat-server"
+
 
 class NoReplyError(ConnectionFailedError):
     """A request was not answered in time; it may have been carried out."""

@@ -21,6 +21,7 @@ from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock
 
 SECOND: Final = 1e9
 _SEND_NS: Final = 8_000.0
+_DISTRIBUTED: Final = DistributedClock(0, 0, 20_000)
 _HAND_OUT_NS: Final = 30_000.0
 """What the program needs for a poll, and for an answer."""
 
@@ -48,6 +49,10 @@ class Card:
     """Standard deviation of the logarithm of the round trip; 0: it is constant,"""
     jitter_ns: float = 0.0
     """but for up to so much on top; uniformly distributed."""
+    excess_ns: float = 0.0
+    """So much comes on top of all but one in 1000, which find everybody awake,"""
+    outward: float = 0.5
+    """and this part of it before the sensor looks."""
     lost: float = 0.0
     """Chance that an exchange does not come back."""
 
@@ -57,7 +62,9 @@ class Card:
             took_ns = self.round_trip_ns * math.exp(chance.gauss(0, self.spread))
             return took_ns * chance.uniform(1 / 3, 2 / 3), took_ns
         extra_ns = chance.uniform(0, self.jitter_ns)
-        return self.round_trip_ns / 2 + extra_ns * chance.random(), self.round_trip_ns + extra_ns
+        excess_ns = self.excess_ns if chance.random() > 1 / 1000 else 0.0
+        outward_ns = self.round_trip_ns / 2 + extra_ns * chance.random() + excess_ns * self.outward
+        return outward_ns, self.round_trip_ns + extra_ns + excess_ns
 
 
 @dataclass(frozen=True)
@@ -123,7 +130,9 @@ class Controller:
     counter: int = 1
     """Working counter of its registers."""
     lies_from_s: float = 0.0
-    """When all this begins, in s from the start."""
+    """When all this begins, in s from the start,"""
+    lies_until_s: float = math.inf
+    """and ends, but for a local time that was another meanwhile."""
 
     def local(self, at_ns: float) -> int:
         """The local time then."""
@@ -140,7 +149,7 @@ class Controller:
         """What a frame reads that is at the slave at `look_ns`, when the sample `number` is the newest."""
         change = 0
         if number >= 0:
-            if look_ns < self.lies_from_s * SECOND:
+            if not self.lies_from_s * SECOND <= look_ns < self.lies_until_s * SECOND:
                 change = self.local(instants_ns[number])
             else:
                 event_ns = instants_ns[max(0, number - self.lags)] + self.late_ns
@@ -226,7 +235,7 @@ class ClockSimulation:
         self.machine = machine
         self.controller = controller
         self.timing = ExchangeTiming()
-        events = EventTimes(DistributedClock(0, 0, 20_000), self.timing) if controller else None
+        events = EventTimes(_DISTRIBUTED, self.timing, 0) if controller else None
         self.clock = SampleClock(SECOND / sensor.rate_hz, self.timing, events)
         self.now_ns = 1.0
         self.polls_ns: list[float] = []
@@ -286,7 +295,7 @@ class ClockSimulation:
         sent, arrived, back = int(exchange.sent_ns), int(exchange.back_ns), int(self.now_ns)
         fresh = number > (self.samples[-1].number if self.samples else -1)
         if clock.events is not None and exchange.latched is not None:
-            clock.events.took(exchange.latched, sent, back, fresh)
+            clock.events.took(exchange.latched, sent, back, fresh, clock.period_ns)
         if fresh:
             clock.predict(sent, back)
             told = clock.uncertainty_ns, clock.locked, clock.steps, clock.uncertain
@@ -295,6 +304,8 @@ class ClockSimulation:
         clock.observe(sent, arrived, fresh)
         if clock.events is not None and exchange.latched is not None:
             clock.events.learn(sent, arrived)
+            if clock.events.trust.is_due(back):
+                clock.events.retry(_DISTRIBUTED)
         if not clock.locked:
             self.unlocked_ns.append(back)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import tomllib
 from pathlib import Path
@@ -11,6 +12,9 @@ import pytest
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("*.md"))]
+
+FUNCTIONS = r"`[\w.]+`(?:, `[\w.]+`)*"
+FILE = r"(?:protocol|ethercat_server|ros2_bridge|clients)/[\w./]+|[\w./]+/\w+\.(?:py|hpp)"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -31,14 +35,38 @@ def test_the_readme_names_every_program() -> None:
         assert name in text, name
 
 
-def test_the_files_of_the_architecture_page_exist() -> None:
+def defined(path: Path) -> set[str]:
+    """The functions, classes, methods and constants in a file."""
+    text = path.read_text()
+    if path.suffix != ".py":
+        return set(re.findall(r"^(?:class|struct|inline \w+) (\w+)", text, re.MULTILINE))
+    names = set()
+    for node in ast.parse(text).body:
+        match node:
+            case ast.FunctionDef(name=name):
+                names.add(name)
+            case ast.ClassDef(name=name, body=body):
+                methods = {each.name for each in body if isinstance(each, ast.FunctionDef)}
+                names |= {name} | {f"{name}.{method}" for method in methods}
+            case ast.AnnAssign(target=ast.Name(id=name)):
+                names.add(name)
+    return names
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_hold_what_the_pages_say(page: Path) -> None:
+    for file, functions in re.findall(rf"`({FILE})`(?:: ({FUNCTIONS}))?", page.read_text()):
+        assert (ROOT / file).exists(), file
+        for function in re.findall(r"`([\w.]+)`", functions):
+            assert function in defined(ROOT / file), f"{function} is not in {file}"
+
+
+def test_the_architecture_page_names_the_functions() -> None:
     named = re.findall(r"^\| .+\? \| (.+) \|$", (DOCS / "architecture.md").read_text(), re.MULTILINE)
     assert len(named) >= 20
     for row in named:
-        files = re.findall(r"`([\w./]+(?:\.py|/))`", row)
-        assert files, row
-        for name in files:
-            assert (ROOT / name).exists(), name
+        for entry in row.split("; "):
+            assert re.fullmatch(rf"`[\w./]+`: {FUNCTIONS}", entry), entry
 
 
 def test_the_troubleshooting_page_is_one_screen_and_quotes_what_is_said() -> None:

@@ -8,6 +8,8 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
+import pytest
+
 ROOT: Final = Path(__file__).parent.parent
 PIP: Final = """
 echo 'Collecting numpy<3,>=1.26 (from bota)'; echo '  Downloading https://example.org/numpy-2.4.whl (6.6 kB)'
@@ -40,6 +42,30 @@ def test_what_failed_is_shown(tmp_path: Path) -> None:
     script = "quietly bash -c 'echo out; echo no space left >&2; exit 3' || fail 'see above'"
     code, said = run(script, tmp_path)
     assert (code, said) == (1, "out\nno space left\ndemo: see above\n")
+
+
+def test_without_a_network_it_is_one_sentence(tmp_path: Path) -> None:
+    """Nothing listens at that port; pip tries once more, in place of five times."""
+    pip = '"$venv/bin/python" -m pip install --retries 1 --index-url http://127.0.0.1:9 --target "$1" no-such'
+    assert run(f'every=60; quietly {pip} || fail "$why"', tmp_path) == (
+        1,
+        "demo: pip cannot reach the Python package index: connect this machine to the network, "
+        "or set PIP_INDEX_URL\n",
+    )
+
+
+def test_a_network_that_came_back_does_not_hide_what_failed(tmp_path: Path) -> None:
+    retried = "Retrying (Retry(total=3, connect=None)) after Failed to establish a new connection"
+    code, said = run(f'quietly bash -c \'echo "{retried}"; echo no gcc; exit 1\' || fail "$why"', tmp_path)
+    assert (code, "no gcc\n" in said) == (1, True)
+
+
+@pytest.mark.parametrize("function", ["make_environment", "make_owners_environment"])
+def test_a_checkout_that_cannot_be_written_to_is_one_sentence(function: str, tmp_path: Path) -> None:
+    """Not even by root, nor where another user made the lock."""
+    code, said = run(f"SUDO_USER= lock=/proc/.venv.lock; {function} demo", tmp_path)
+    sentence = f"demo: {ROOT} cannot be written to, where .venv is to be: make it yours, or copy it\n"
+    assert (code, said) == (1, sentence)
 
 
 def test_the_demo_needs_no_tools_of_developers() -> None:

@@ -127,17 +127,22 @@ def test_a_gap_without_numbers_is_as_long_as_the_rate_has_it() -> None:
     assert measurement.summary(stops).lost_in_stops == 49
 
 
-def test_the_live_figure_of_what_is_lost_is_the_summarys(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_live_figure_of_what_is_lost_is_the_summarys(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     measurement = measured()
     measurement.take_frame(frame(805, DataFlag.GAP), 805 * PERIOD_NS)
     measurement.take_frame(frame(806), 806 * PERIOD_NS)
     measurement.take_message(values(806), 806 * PERIOD_NS)
     sensor = {"name": "BFT-SENS-ECAT-M8", "serial": 1, "rate_hz": 800}
     Screen(sensor).show(measurement)
+    assert "lost 5 " in capsys.readouterr().out
     print_summary(measurement.summary(), sensor)
     shown = capsys.readouterr().out
-    assert "lost 5 " in shown
     assert re.search(r"Lost +│ +5 ", shown)
+    assert max(map(len, shown.splitlines())) <= 80, "the terminal would break words"
+    assert " ".join(shown.split()).endswith(str(explanation(measurement.summary())))
 
 
 def test_counting_begins_anew() -> None:

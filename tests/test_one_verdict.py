@@ -31,7 +31,7 @@ from ethercat_server.doctor.finding import Level as Found
 from protocol.accounting import NOT_NEW
 from protocol.address import Address
 from protocol.framing import DataFlag, DataMessage
-from protocol.health.judge import judge
+from protocol.health.judge import Observation, judge
 from protocol.health.limits import LIMITS
 from protocol.health.observer import p99
 from protocol.health.verdict import Level
@@ -170,7 +170,7 @@ def monitor(stream: Stream) -> Said:
     return verdict.level, verdict.sentence
 
 
-def doctor(stream: Stream) -> Said:
+def doctor(stream: Stream, after: Mapping[str, Any] = STATUS) -> Said:
     clock = SimpleNamespace(now_ns=stream.start_ns)
     clock.monotonic_ns = lambda: clock.now_ns
 
@@ -181,9 +181,10 @@ def doctor(stream: Stream) -> Said:
         clock.now_ns = stream.end_ns
         return []
 
+    statuses = iter((STATUS, after))
     link = SimpleNamespace(
         clock=clock, listen=listen, same_machine=True, close=lambda: None,
-        ask=lambda action: {"describe": {"sensors": [ROW]}, "status": STATUS}[action],
+        ask=lambda action: {"sensors": [ROW]} if action == "describe" else next(statuses),
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(through_server, "ServerLink", lambda _: link)
@@ -239,6 +240,32 @@ def node(stream: Stream) -> Said:
     said = " ".join(status.message for status in judge_node(snapshot, LIMITS))
     assert not verdict.findings or verdict.sentence in said
     return verdict.level, verdict.sentence
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        Observation(silent_s=1.0, invalid=5),
+        Observation(is_lost=True),
+        Observation(samples=800, invalid=2),
+        Observation(samples=800, recoveries=1),
+    ],
+)
+def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable(seen: Observation) -> None:
+    for missed, cable in ((0, True), (8, True), (24, False)):
+        verdict = judge(seen._replace(nominal_hz=800.0, missed_deadlines=missed))
+        assert ("its cable" in verdict.sentence) is cable
+        assert ("computer stood still" in verdict.sentence) is not cable
+
+
+def test_the_doctor_knows_whether_it_stood_still() -> None:
+    [row] = cast(list[dict[str, Any]], STATUS["sensors"])
+    row = {**row, "recoveries": 1}
+    level, said = doctor(Stream(second()), {**STATUS, "missed_deadlines": 24, "sensors": [row]})
+    assert level is Level.LOOK
+    assert said.startswith(
+        "The server lost the sensor once and has it back: the server's computer stood still"
+    )
 
 
 def test_the_documented_verdicts_are_these() -> None:

@@ -31,35 +31,58 @@ UNKNOWN: Final = "numpy is not installed: in this project's folder run PIP '.[cl
 EXTRA: Final = ("jinja2", "matplotlib", "mcap", "numpy", "rich", "textual", "zstandard")
 
 INTERRUPTED: Final = """
-import os, signal, sys
+import os, sys
 def interrupt(event, arguments):
-    if event == "import" and arguments[0] == {module!r}:
-        os.kill(os.getpid(), signal.SIGINT)
+    if event == "import" and arguments[0] == {at!r} or event == {at!r} and "pyroute2" in sys.modules:
+        os.kill(os.getpid(), {number})
 sys.addaudithook(interrupt)
-sys.argv = ["program", "--help"]
+sys.stdin.isatty = sys.stdout.isatty = lambda: True
+sys.argv = ["program", *{arguments!r}.split()]
 from {package} import {entry}
-{entry}()
+sys.exit({entry}())
 """
 
 
+def interrupted(name: str, number: int, at: str, arguments: str) -> tuple[int, str, str]:
+    """A process, which gets the signal where it imports a module, or at an event once pyroute2 is loaded."""
+    package, _, entry = PROGRAMS[name].partition(":")
+    script = INTERRUPTED.format(at=at, number=number, arguments=arguments, package=package, entry=entry)
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "TERM": "xterm"}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stderr, done.stdout
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(
-    ("name", "module"),
+    ("name", "module", "arguments"),
     [
-        ("ethercat-server", "ethercat_server.process.signals"),
-        ("ethercat-sensor", "argparse"),
-        ("ethercat-sensor", "ethercat_server.links.reach"),
-        ("ethercat-doctor", "ethercat_server.daemon.options"),
-        ("ethercat-virtual-sensor", "argparse"),
-        ("ethercat-identify", "clients.program"),
-        ("ethercat-record", "clients.record.options"),
+        ("ethercat-sensor", "argparse", "--help"),
+        ("ethercat-sensor", "ethercat_server.links.reach", "--help"),
+        ("ethercat-doctor", "ethercat_server.daemon.options", "--help"),
+        ("ethercat-virtual-sensor", "argparse", "--help"),
+        ("ethercat-identify", "clients.program", "--help"),
+        ("ethercat-record", "clients.record.options", "--help"),
+        ("ethercat-report", "jinja2", "--seconds 1"),
+        ("ethercat-monitor", "clients.monitor.options", "--help"),
+        ("ethercat-monitor", "clients.monitor.program", "--once"),
+        ("ethercat-monitor", "textual.app", ""),
+        ("ethercat-server", "ethercat_server.process.signals", "--help"),
     ],
 )
-def test_ctrl_c_while_it_is_imported_is_no_traceback(name: str, module: str) -> None:
-    """A process: the signal comes where a module is imported, and a signal's default ends it."""
-    package, _, entry = PROGRAMS[name].partition(":")
-    script = INTERRUPTED.format(module=module, package=package, entry=entry)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr, done.stdout) == (-signal.SIGINT, "", "")
+def test_a_signal_while_it_is_imported_is_no_traceback(
+    name: str, module: str, arguments: str, number: signal.Signals
+) -> None:
+    """Its default ends the program."""
+    assert interrupted(name, number, module, arguments) == (-number, "", "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_interfaces_are_listed_is_no_traceback(number: int) -> None:
+    """Where pyroute2 makes its event loop, which is then half-made."""
+    code, said, found = interrupted("ethercat-sensor", number, "socket.__new__", "find")
+    assert (code, said, found) == (1, "ethercat-sensor: stopped\n", "")
 
 
 @pytest.mark.parametrize("name", PROGRAMS)

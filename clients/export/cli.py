@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Sequence
 
 from clients.export.options import parse_options
-from clients.program import not_installed, say
+from clients.program import interrupt_on_signals, not_installed, say
 
 _PROGRAM = "ethercat-export"
 
@@ -20,8 +19,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ImportError as error:
         return not_installed(_PROGRAM, error)
     try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.default_int_handler)
+        interrupt_on_signals()
         return run(options)
     except KeyboardInterrupt:
         say(_PROGRAM, "stopped: nothing was written")

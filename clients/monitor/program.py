@@ -16,6 +16,7 @@ from clients.monitor.view.glyphs import ASCII, UNICODE, can_show, to_ascii
 from clients.monitor.view.json_line import json_line
 from clients.monitor.view.table import line, table, verdict
 from clients.monitor.view.words import trouble
+from clients.program import interrupt_on_signals
 from protocol.health.verdict import Level
 
 _PERIOD_S: Final = 1.0
@@ -29,6 +30,10 @@ def run(options: Options) -> int:
         from clients.monitor.web.program import run_web  # noqa: PLC0415 - not needed otherwise
 
         return run_web(options, options.web)
+    live = not options.once and not options.json and _has_screen()
+    if live:
+        import clients.monitor.app  # noqa: F401, PLC0415 - slow to import
+    interrupt_on_signals()  # the live view replaces the handler of SIGTERM
     model = Model(str(options.address), options.imu_units)
     reader = Reader(options.address, model)
     reader.start()
@@ -37,9 +42,9 @@ def run(options: Options) -> int:
             return _once(options, model, reader)
         if options.json:
             return _every_second(options, reader, lambda: _json(model))
-        if not _has_screen():
-            return _every_second(options, reader, _Lines(options, model).show)
-        return _live(options, model)
+        if live:
+            return _live(options, model)
+        return _every_second(options, reader, _Lines(options, model).show)
     finally:
         reader.close()
 
@@ -51,12 +56,10 @@ def _has_screen() -> bool:
 def _once(options: Options, model: Model, reader: Reader) -> int:
     if not reader.wait_for_answer(_ANSWER_S):
         state = model.state(time.monotonic())
-        reason = state.server.reason or "it does not answer"
+        reason = state.server.reason or f"the server at {options.address} does not answer"
         if options.json:
             _say(json_line(state, time.time()))
-        sys.stderr.write(
-            f"ethercat-monitor: {options.address}: {reason}: start ethercat-server, or give its HOST:PORT\n"
-        )
+        sys.stderr.write(f"ethercat-monitor: {reason}, or give its HOST:PORT\n")
         return 1
     time.sleep(_ONCE_S)
     state = model.state(time.monotonic())
@@ -68,7 +71,7 @@ def _once(options: Options, model: Model, reader: Reader) -> int:
 
 
 def _live(options: Options, model: Model) -> int:
-    from clients.monitor.app import Monitor  # noqa: PLC0415 - slow to import
+    from clients.monitor.app import Monitor  # noqa: PLC0415 - needs the extra
 
     app = Monitor(model, options.address, ASCII if _spelled(options) else UNICODE, seconds=options.seconds)
     try:

@@ -67,7 +67,7 @@ class Reader:
             try:
                 self._read()
             except UnreachableError as error:
-                self._failed(f"no server answers ({error})")
+                self._failed(error.at(self._address))
             except ProtocolError as error:
                 self._failed(f"the connection ended: {error}")
             self._closing.wait(_AGAIN_S)

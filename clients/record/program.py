@@ -22,7 +22,7 @@ from clients.record.source import Batch, Source
 from clients.recording.file_format import FORMAT_VERSION
 from clients.recording.reader import Event
 from clients.recording.ros_messages import RosTopics
-from protocol.errors import ConnectionFailedError, ProtocolError, RefusedError
+from protocol.errors import ConnectionFailedError, ProtocolError, RefusedError, UnreachableError
 from protocol.program.version import VERSION
 from protocol.text.untrusted import rows
 from protocol.text.visible import printable
@@ -43,8 +43,8 @@ def run(argv: Sequence[str] | None, signals: Signals) -> int:
     try:
         with contextlib.closing(source):
             return _run(source, parts, options, signals)
-    except ConnectionFailedError as error:
-        _say(f"no server at {options.address}: {error}; start ethercat-server, or use --wait")
+    except UnreachableError as error:
+        _say(f"{error.at(options.address)}, or use --wait")
     except RefusedError as error:
         _say(f"the server refused: {error}")
     except (RecordingError, ProtocolError) as error:

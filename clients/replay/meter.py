@@ -59,6 +59,7 @@ class Meter:
             "round_trip": {"least_us": None, "usual_us": None},
             "missed_deadlines": self._missed,
             "lost_frames": 0,
+            "duplicate_frames": 0,
             "wake_us": late,
             "exchange_us": _NO_BUS,
             "last_10s": {"wake_us": recent, "exchange_us": _NO_BUS, "age_us": [recent for _ in positions]},

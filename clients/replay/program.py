@@ -19,7 +19,7 @@ from clients.replay.timeline import Timeline
 from ethercat_server.errors import ServerError
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.permissions import controlling_uids
+from ethercat_server.serving.permissions import controlling_uids, local_names
 from ethercat_server.serving.transport.sockets import SocketTransport
 from protocol.control import Event, event
 
@@ -55,6 +55,7 @@ def _play(
     hub = Hub(SocketTransport(options.hosts, options.port))
     cleanup.callback(hub.close)
     hub.permissions.control_uids = controlling_uids(options.control_users, options.control_groups)
+    hub.permissions.names = local_names()
     timeline = Timeline(
         options.speed,
         original=options.original,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Callable, Sequence
 
 from clients.errors import ReportError
-from clients.program import discard_output, not_installed
+from clients.program import discard_output, interrupt_on_signals, not_installed
 from clients.report.options import parse_options
 
 
@@ -15,11 +14,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Make a report; returns the exit code."""
     options = parse_options(argv)
     try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.default_int_handler)
-        # Slow to import; Ctrl-C must not end in a traceback meanwhile.
-        from clients.report import program  # noqa: PLC0415
+        from clients.report import program  # noqa: PLC0415 - needs the extra
 
+        interrupt_on_signals()
         with _Progress(options.seconds) as progress:
             outcome = program.make(options, progress)
     except KeyboardInterrupt:

@@ -35,8 +35,7 @@ def make(options: ReportOptions, progress: Callable[[float], None]) -> Outcome:
         with NewFile(options.output, force=options.force) as file:
             return _make(options, progress, file)
     except UnreachableError as error:
-        hint = "start ethercat-server, or give its HOST:PORT"
-        raise ReportError(f"no server at {options.server}: {error}; {hint}") from None
+        raise ReportError(f"{error.at(options.server)}, or give its HOST:PORT") from None
     except ConnectionFailedError as error:
         raise ReportError(f"the server at {options.server} cannot be used: {error}") from None
     except (RecordingError, ProtocolError) as error:

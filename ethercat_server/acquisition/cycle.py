@@ -26,6 +26,8 @@ _SERVE_EVERY_NS: Final = 10_000_000
 """Sockets are served this often even if every deadline has passed."""
 _SERVE_IN_FLIGHT_NS: Final = 2_000_000
 """Sockets are served this often, without waiting, while an exchange is on its way."""
+_REALTIME_EVERY_NS: Final = 20_000_000
+"""Interval between looks at whether CLOCK_REALTIME was set."""
 _RECOVERY_STEP_NS: Final = 500_000
 """Time between two exchanges while all sensors are lost."""
 _SUMMARY_NS: Final = 200_000_000
@@ -85,7 +87,7 @@ class Cycle:
         self._missed_deadlines = 0
         self._timing = timing
         self._schedule = Schedule(streams, timing)
-        self._wire_ns = bus.process_data.wire_ns
+        self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
         timing.wire_ns = max(self._wire_ns)
         self._round_trip = RoundTripHealth(timing, bus.ifname)
         carried = bus.process_data.inputs
@@ -115,7 +117,8 @@ class Cycle:
     def _run(self) -> None:
         bus, hub, recovery, jobs, watchdog = self._bus, self._hub, self._recovery, self._jobs, self._watchdog
         timing, monotonic_ns, sleep = self._timing, bus.clock.monotonic_ns, bus.clock.sleep
-        serve_by = roll_at = feed_at = 0
+        realtime_offset = self._streams[0].realtime_offset
+        serve_by = roll_at = feed_at = look_at = 0
         while not self.stopping:
             due = self._due_ns()
             if jobs.waiting:
@@ -142,6 +145,9 @@ class Cycle:
             if now >= roll_at:
                 roll_at = now + SLOT_NS
                 self._roll()
+            if now >= look_at:
+                look_at = now + _REALTIME_EVERY_NS
+                realtime_offset.follow()
             if now >= feed_at:
                 feed_at = now + watchdog.feed_every_ns
                 watchdog.feed()
@@ -180,6 +186,8 @@ class Cycle:
             slept = slept or wait > 0
         if (late := now - due) > self._schedule.shortest_ns:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
+            if slept:  # else the answer was held up, and what is due was past when it came
+                self._recovery.causes.stood_still(late, now)
         timing.sends(sent := bus.process_data.send())
         self._cycles += 1
         if slept:
@@ -199,7 +207,17 @@ class Cycle:
         bus = self._bus
         frame = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0)
         back = bus.clock.monotonic_ns()
-        if frame is None or not (sent := bus.process_data.take(frame)):
+        if frame is None:
+            return None
+        while (sent := bus.process_data.take(frame)) < 0:
+            # The answer may be behind duplicates of others: they must not pile up.
+            if back > self._timing.sent_ns + _SERVE_EVERY_NS:
+                return None
+            frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
+            if frame is None:
+                return None
+        if not sent:
+            self._recovery.causes.stray(frame, back)
             return frame
         self._hand_out(sent, back)
         self._learn(sent, back)
@@ -216,6 +234,7 @@ class Cycle:
         arrived = max(sent, arrived - self._wire_ns[which])
         if (late := back - sent - timing.usual_ns) > self._schedule.shortest_ns:  # the computer stood still
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
+            self._recovery.causes.stood_still(back - arrived - self._wire_ns[which], back)
         timing.took(sent, arrived)
         self._exchange.record(back - sent)
         for stream in self._streams_of[which]:
@@ -227,7 +246,7 @@ class Cycle:
         process_data = self._bus.process_data
         frame, wkc, which = process_data.frame, process_data.wkc, process_data.which
         self._answered = True
-        self._complete = complete = wkc >= self._recovery.alive_wkc[which]
+        self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
         new: list[Made] = []
         for number, start, end, untouched, at, sensor, stream in self._carried[which]:
             if back < stream.clock.quiet_until_ns:
@@ -247,6 +266,7 @@ class Cycle:
         self._exchange.roll()
         self._schedule.roll()
         self._round_trip.check()
+        self._recovery.check()
         for stream in self._streams:
             stream.age.roll()
             stream.check()
@@ -267,6 +287,7 @@ class Cycle:
             "round_trip": self._timing.describe(),
             "missed_deadlines": self._missed_deadlines,
             "lost_frames": self._bus.process_data.lost,
+            "duplicate_frames": self._bus.process_data.duplicates,
             "wake_us": wake,
             "exchange_us": exchange,
             "last_10s": {

@@ -58,6 +58,8 @@ class Ladder:
         self.mailbox = Mailbox(bus, sensor.number, (out, back))
         self.sdo = GuardedSdo(MailboxSdo(self.mailbox))
         """SDO transfers in steps."""
+        self._left_op = False
+        """Whether the sensor was out of OP since the last time it was back: also if the steps began anew."""
 
     def bring_back(self, pause_s: float = 0.0) -> Steps[bool]:
         """Returns once the sensor is in OP: True if it had left it, False if it had only been out of reach.
@@ -65,21 +67,24 @@ class Ladder:
         Raises GoneError, DifferentSensorError, or BusError if the sensor refuses something.
         """
         yield from self._pause(pause_s)
-        left_op = False
         while True:
             status = self.states.status()
             if status is None:
                 if not (yield from self._restore_station()):
                     yield from self._pause(_ABSENT_PAUSE_S)
             elif status.is_op:
+                if not self._left_op:
+                    self.latch_events()
                 if self._sensor.unsettled:
                     yield from put_right(self.sdo, self._sensor)
+                left_op, self._left_op = self._left_op, False
                 return left_op
             elif status.state is AlState.SAFEOP:
-                left_op = True
+                self._left_op = True
+                self.latch_events()
                 yield from self.states.go(AlState.OP)
             else:
-                left_op = True
+                self._left_op = True
                 yield from self._set_up_anew()
             yield
 
@@ -93,9 +98,11 @@ class Ladder:
 
     def reconfigure(self) -> Steps[bool]:
         """Take the sensor to PREOP, write what is wanted, and back to OP; raises as `bring_back`."""
+        self._left_op = True
         yield from self.states.go(AlState.PREOP)
         yield from set_up(self.sdo, self._sensor)
         yield from self._go_op()
+        self._left_op = False
         return True
 
     def _restore_station(self) -> Steps[bool]:
@@ -144,6 +151,12 @@ class Ladder:
         self.states.write(reg.FMMU, self._bus.fmmus[self._sensor.number])
         yield from self.states.go(AlState.SAFEOP)
         yield from self.states.go(AlState.OP)
+
+    def latch_events(self) -> None:
+        """Have the controller latch again when samples come to be: another master may have ended that."""
+        for at in range(reg.SM_ACTIVATE, len(self._sync_managers), reg.SYNC_MANAGER_SIZE):
+            if self._sync_managers[at] & reg.SM_LATCH_PDI:
+                self.states.write(reg.SYNC_MANAGER + at, self._sync_managers[at : at + 1])
 
     def _pause(self, seconds: float) -> Steps[None]:
         """Steps that take at least `seconds`."""

@@ -9,12 +9,14 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
+from ethercat_server.acquisition.health.causes import Causes
 from ethercat_server.acquisition.health.mailboxes import Mailboxes
 from ethercat_server.acquisition.ladder import DifferentSensorError, Ladder
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError, extended
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.nic.interface import CHECK_CABLE
 from ethercat_server.ethercat.slave import times
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import Steps
@@ -72,6 +74,7 @@ class Recovery:
         self._ladders = [Ladder(bus, sensor) for sensor in sensors]
         self._mailboxes = Mailboxes(bus, sensors, [ladder.mailbox for ladder in self._ladders], announce)
         self._clock = bus.clock
+        self.causes = Causes(bus.ifname)
         self._work: dict[int, Steps[bool]] = {}
         """What is under way to bring back those that do not stream."""
         self._lost_at_ns: dict[int, int] = {}
@@ -105,6 +108,19 @@ class Recovery:
     def sdo(self, number: int) -> GuardedSdo:
         """SDO transfers to a sensor that is not lost, in steps."""
         return self._ladders[number].sdo
+
+    def check(self) -> None:
+        """To be called once a second: name another master, and try refused event times again when it is time.
+
+        Another master may have changed what they need.
+        """
+        self.causes.check()
+        for number, stream in enumerate(self._streams):
+            events = stream.clock.events
+            if events and self._sensors[number].streams and events.trust.is_due(self._clock.monotonic_ns()):
+                self._ladders[number].latch_events()
+                if (clock := self._bus.read_clock(number)) is not None:
+                    events.retry(clock)
 
     def attend(self, complete: bool, now_ns: int) -> None:
         """To be called after every exchange that is back; almost always it has nothing to do.
@@ -146,7 +162,13 @@ class Recovery:
                     self._lose_in_change(number, self._silence())
 
     def _silence(self) -> str:
-        return f"no frame comes back: {self._bus.backend.why_silent()}"
+        why = self._bus.backend.why_silent()
+        return (
+            self._explain("no frame comes back", why) if why == CHECK_CABLE else f"no frame comes back: {why}"
+        )
+
+    def _explain(self, reason: str, otherwise: str = "") -> str:
+        return self.causes.explain(reason, self._clock.monotonic_ns(), otherwise)
 
     def _watch_next(self) -> None:
         if alive := self._alive():
@@ -165,9 +187,9 @@ class Recovery:
                 return  # as long as the working counter is right, one datagram got lost
             status = self._ladders[number].states.status()
         if status is None:
-            self._lose(number, "it does not answer")
+            self._lose(number, self._explain("it does not answer"))
         elif not status.is_op:
-            self._lose(number, f"it is in {status}")
+            self._lose(number, self._explain(f"it is in {status}"))
 
     def _alive(self) -> list[int]:
         return [sensor.number for sensor in self._sensors if sensor.streams]
@@ -207,7 +229,7 @@ class Recovery:
         try:
             next(self._work[number])
             if change is not None and change.until is not None and change.until.passed:
-                self._lose_in_change(number, "it does not come back to OP")
+                self._lose_in_change(number, self._explain("it does not come back to OP"))
         except StopIteration as stop:
             self._bring_back(number, left_op=stop.value)
         except GoneError:
@@ -225,7 +247,7 @@ class Recovery:
                 self._work[number] = self._ladders[number].bring_back()
                 self._revert(number, error)
                 if self._ladders[number].states.status() is None:
-                    self._lose_in_change(number, "it does not answer any more")
+                    self._lose_in_change(number, self._explain("it does not answer any more"))
         except DifferentSensorError as error:
             self._refuse(number, error.found)
 
@@ -254,14 +276,15 @@ class Recovery:
     def _bring_back(self, number: int, *, left_op: bool) -> None:
         sensor, stream = self._sensors[number], self._streams[number]
         del self._work[number]
-        sensor.enter(SensorState.STREAMING)
-        if left_op:
-            sensor.settle(self._clock)
-        self._count_alive()
+        # Exchanges go on while the clock is read: none may bring a sample before the stream begins anew.
         latching = self._bus.read_clock(number) if left_op else None
         stream.recover(
             sensor.period_ns if left_op else None, lost=number in self._lost_at_ns, latching=latching
         )
+        sensor.enter(SensorState.STREAMING)
+        if left_op:
+            sensor.settle(self._clock)
+        self._count_alive()
         if (change := self._changing.pop(number, None)) is not None:
             if change.failed is None:
                 self._announce(event(Event.RECONFIGURED, sensor=number, **sensor.in_force()))

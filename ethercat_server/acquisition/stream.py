@@ -12,14 +12,14 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from ethercat_server.acquisition.hardware.event_times import EventTimes
-from ethercat_server.acquisition.hardware.trust import Verdict
 from ethercat_server.acquisition.health.samples import SampleHealth
 from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.timing.sample_clock import SILENT_PERIODS, SampleClock
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, RealtimeOffset
 from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
+from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.sensor.sensor import Sensor
 from protocol.framing import DataFlag, encode_data
 from protocol.pdo import is_finite
@@ -43,12 +43,19 @@ class SensorStream:
         timing: ExchangeTiming,
         clock: Clock = SYSTEM_CLOCK,
         latching: DistributedClock | None = None,
+        realtime_offset: RealtimeOffset | None = None,
+        passing_ns: int = 0,
     ) -> None:
-        """`latching` is the clock of the slave controller, if that latches when samples come to be."""
+        """`latching` is the clock of the slave controller, if that latches when samples come to be.
+
+        Its process data passes the slave `passing_ns` after the frame has arrived there.
+        """
         self.number = number
-        self._monotonic_ns, self._time_ns = clock.monotonic_ns, clock.time_ns
+        self._monotonic_ns = clock.monotonic_ns
+        self.realtime_offset = realtime_offset or RealtimeOffset(clock)
         self._timing = timing
-        self.clock = SampleClock(period_ns, timing, latching and EventTimes(latching, timing))
+        self._passing_ns = passing_ns
+        self.clock = self._new_clock(period_ns, latching)
         self.process_data = b""
         """The newest valid process data."""
         self._handed_out = b""
@@ -80,6 +87,10 @@ class SensorStream:
         self.idle_at_ns = 0.0
         """`idle` is to be called from then on."""
 
+    def _new_clock(self, period_ns: float, latching: DistributedClock | None) -> SampleClock:
+        events = latching and EventTimes(latching, self._timing, self._passing_ns)
+        return SampleClock(period_ns, self._timing, events, self._passing_ns)
+
     def take(
         self, data: bytes, wkc: int, sent_ns: int, back_ns: int, latched: Latched | None = None
     ) -> tuple[bytes, int] | None:
@@ -96,7 +107,7 @@ class SensorStream:
         self._wkc, self._valid_ns = wkc, back_ns
         self.learns = True
         if latched is not None and clock.events is not None:
-            clock.events.took(latched, sent_ns, back_ns, fresh)
+            clock.events.took(latched, sent_ns, back_ns, fresh, clock.period_ns)
         if not fresh:
             return None
         self.process_data = data
@@ -140,13 +151,13 @@ class SensorStream:
         if not self.process_data:
             return None
         self._silent = True
-        self._discard = 0  # a sensor that is stuck from the start is to be seen too
         self._handed_out = self._handed_out or self.process_data
         period_ns = self.clock.period_ns
         # The next slot is counted from this one, but a stall makes one frame, not a burst.
         self.idle_at_ns = max(self.idle_at_ns + period_ns, float(now_ns))
         # One lost frame is no news: INVALID is what nothing valid came for in two periods.
         if now_ns - self._valid_ns < max(2 * period_ns, self._timing.patience_ns):
+            self._discard = 0  # what was to be discarded has passed: a sensor that is stuck is to be seen too
             self.repeated += 1
             return self._frame(now_ns, REPEATED, self._wkc)
         self.invalid_frames += 1
@@ -154,8 +165,7 @@ class SensorStream:
         return self._frame(now_ns, INVALID, wkc)
 
     def _frame(self, moment_ns: int, flags: int, wkc: int) -> tuple[bytes, int]:
-        stamp_ns = self._time_ns() - (self._monotonic_ns() - moment_ns)
-        sequence = self.sequence
+        stamp_ns, sequence = moment_ns + self.realtime_offset.ns, self.sequence
         self.sequence += 1
         made = encode_data(sequence, stamp_ns, moment_ns, self.number, flags, wkc, self._handed_out)
         return made, flags
@@ -177,7 +187,7 @@ class SensorStream:
         """To be called once a second: log what the samples show of the sensor."""
         self.health.check(self.fresh, self.repeated, self.clock)
         events = self.clock.events
-        if events is not None and events.trust.verdict is Verdict.REFUSED:
+        if events is not None and events.trust.is_final:
             self.clock.events = None
 
     def recover(
@@ -186,10 +196,12 @@ class SensorStream:
         """The sensor is back after it was out; `period_ns` if it entered OP anew, None if it never left."""
         self.recoveries += lost
         if period_ns is not None:
-            events = latching and EventTimes(latching, self._timing)
-            self.clock = SampleClock(period_ns, self._timing, events)
+            before, self.clock = self.clock.events, self._new_clock(period_ns, latching)
+            if before is not None and self.clock.events is not None:
+                self.clock.events.trust.was_trusted = before.trust.was_trusted
             self._discard = DISCARDED_AT_START
             self._gap = True
+            self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
 
     def status(self) -> dict[str, Any]:
         """The sensor's part of the `status` reply, but for the age."""
@@ -214,7 +226,11 @@ class SensorStream:
 
 def make_streams(bus: Bus, sensors: Sequence[Sensor], timing: ExchangeTiming) -> list[SensorStream]:
     """Those of the sensors on a bus in OP."""
+    offset = RealtimeOffset(bus.clock)
+    passing_ns = {at.number: at.start * BYTE_NS for inputs in bus.process_data.inputs for at in inputs}
     return [
-        SensorStream(sensor.number, sensor.period_ns, timing, bus.clock, bus.read_clock(sensor.number))
-        for sensor in sensors
+        SensorStream(
+            number, each.period_ns, timing, bus.clock, bus.read_clock(number), offset, passing_ns[number]
+        )
+        for number, each in enumerate(sensors)
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import sys
 from collections.abc import Sequence
@@ -27,6 +28,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ServerError as error:
         log.error("%s", error)
         return error.exit_code
+    except OSError as error:
+        if error.errno not in (errno.EMFILE, errno.ENFILE):
+            raise
+        log.error("the server may open too few files (ulimit -n): allow it 256 at least")
+        return 1
     return 0
 
 

@@ -64,7 +64,9 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         service = Service(argv, policy, hub, on_sensors, notifier)
         cycle.every_second = service.every_second
         signals.call(cycle.stop, service.reload)
-        hub.start(Actions(hub, cycle, on_sensors, {"others": others.rows}).handle)
+        hub.start(
+            Actions(hub, cycle, on_sensors, {"others": others.rows, "interface": options.ifname}).handle
+        )
         for sensor in sensors:
             log.info(
                 "sensor %d: %s, serial %d, firmware %s, %d bytes at %d Hz",
@@ -85,7 +87,9 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
 
 
 def _virtual_bus(options: ServerOptions) -> VirtualBus:
-    return VirtualBus(options.virtual_arguments, options.server["rt_priority"], options.server["user"])
+    # By the port two such servers have different sensors, each the same every time.
+    server = options.server
+    return VirtualBus(options.virtual_arguments, server["rt_priority"], server["user"], options.port)
 
 
 def _give_up_root(user: User | None, options: ServerOptions) -> None:

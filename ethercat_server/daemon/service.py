@@ -20,7 +20,7 @@ from ethercat_server.process.notify import Notifier
 from ethercat_server.sensor.sensor import Sensor
 from ethercat_server.serving.connection import Limits
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.permissions import controlling_uids
+from ethercat_server.serving.permissions import controlling_uids, local_names
 from ethercat_server.serving.sensor_actions import SensorActions
 from protocol.errors import RequestError
 from protocol.settings import SettingValue
@@ -37,11 +37,13 @@ class Policy:
         server = options.server
         self.options = options
         self.control_uids = controlling_uids(server["control_users"], server["control_groups"])
+        self.names = local_names()
         self.limits = Limits(server["stall_timeout_s"] * _NANO, server["idle_timeout_s"] * _NANO)
 
     def apply(self, hub: Hub) -> None:
         """Apply it."""
         hub.permissions.control_uids = self.control_uids | {os.geteuid()}
+        hub.permissions.names = self.names
         hub.limits = self.limits
 
 

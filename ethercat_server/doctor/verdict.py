@@ -47,7 +47,13 @@ def wake_ups(measured: Measured) -> Iterator[Finding]:
         cannot_look("nothing was measured")
     summary = summary_us(measured.late)
     late = sum(value > PERIOD_NS for value in measured.late)
-    yield wake_finding(summary, late, len(measured.late))
+    yield _as_measured(measured, wake_finding(summary, late, len(measured.late)))
+
+
+def _as_measured(measured: Measured, finding: Finding) -> Finding:
+    """Without the scheduling that a server has it says how this user's programs fare, and no more."""
+    denied = measured.priority and not measured.real_time
+    return replace(finding, level=min(finding.level, Level.NOTE)) if denied else finding
 
 
 def wake_finding(summary: Mapping[str, Any], late: int, count: int) -> Finding:
@@ -111,7 +117,7 @@ def messages(measured: Measured) -> Iterator[Finding]:
     missing = len(measured.late) - len(measured.messages)
     if summary["p99"] > _MESSAGE_NOTE_US or missing:
         why = "clients have ordinary scheduling, so other programs preempt them: reduce the load"
-        yield _by_age(summary["p99"])(text, why, missing=missing, **summary)
+        yield _as_measured(measured, _by_age(summary["p99"])(text, why, missing=missing, **summary))
     else:
         yield ok(text, missing=missing, **summary)
 

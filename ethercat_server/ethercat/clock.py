@@ -6,6 +6,7 @@ import time
 from typing import Final, Protocol
 
 _NS: Final = 1_000_000_000
+_READS: Final = 5
 
 
 class Clock(Protocol):
@@ -33,6 +34,32 @@ class SystemClock:
 
 
 SYSTEM_CLOCK: Final = SystemClock()
+
+
+class RealtimeOffset:
+    """CLOCK_REALTIME less CLOCK_MONOTONIC, in ns.
+
+    It is constant until CLOCK_REALTIME is set: the kernel slews both alike. So that it does not depend on
+    what comes between two clock reads, CLOCK_REALTIME is read between two reads of CLOCK_MONOTONIC.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._monotonic_ns, self._time_ns = clock.monotonic_ns, clock.time_ns
+        self.ns = self._middle()
+
+    def follow(self) -> None:
+        """To be called now and then: notice that CLOCK_REALTIME was set."""
+        least, most = self._bounds()
+        if not least <= self.ns <= most:
+            self.ns = self._middle()
+
+    def _bounds(self) -> tuple[int, int]:
+        before_ns, time_ns, after_ns = self._monotonic_ns(), self._time_ns(), self._monotonic_ns()
+        return time_ns - after_ns, time_ns - before_ns
+
+    def _middle(self) -> int:
+        least, most = min((self._bounds() for _ in range(_READS)), key=lambda bounds: bounds[1] - bounds[0])
+        return (least + most) // 2
 
 
 class Deadline:

@@ -16,7 +16,7 @@ from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.late_answers import LateAnswers
 from ethercat_server.ethercat.wire import FIRST_DATA, SHORTEST_FRAME, Command, build, is_answer
 
-_FIRST_INDEX: Final = 0x80
+FIRST_INDEX: Final = 0x80
 """SOEM uses the indices below, and the exchange of process data those from `process_data.FIRST_INDEX` on."""
 _INDICES: Final = 0x10
 _TIMEOUT_S: Final = 0.02
@@ -34,7 +34,7 @@ class Datagrams:
         self._send, self._receive = backend.send, backend.receive
         self._monotonic_ns = backend.clock.monotonic_ns
         self._index = 0
-        self._late = LateAnswers(backend.clock, _FIRST_INDEX, _INDICES)
+        self._late = LateAnswers(backend.clock, FIRST_INDEX, _INDICES)
         self._pending_ns = self._late.pending_ns
         self.next_frame = self.next_on_wire
         """Returns the next frame before an instant in ns, None for none; the loop that exchanges process data
@@ -120,14 +120,13 @@ class Datagrams:
     ) -> tuple[int, bytes] | None:
         """Send one datagram and wait for it: its working counter and data; None if it does not come back."""
         self._index = (self._index + 1) % len(self._pending_ns)
-        index = self._index + _FIRST_INDEX
-        frame = build((command, adp, ado, data), first_index=index)
+        frame = build((command, adp, ado, data), first_index=self._index + FIRST_INDEX)
         self._pending_ns[self._index] = now_ns = self._monotonic_ns()
         until_ns = now_ns + int(max(timeout_s, self._late.timeout_s) * 1e9)
         self._send(frame.ljust(SHORTEST_FRAME, b"\0"))
         end = FIRST_DATA + len(data)
         while (answer := self.next_frame(until_ns)) is not None:
-            if is_answer(answer, command, index, len(data)):
+            if is_answer(answer, frame, len(data)):
                 if self._late.timeout_s:
                     self._late.in_time(self._index)
                 self._pending_ns[self._index] = 0

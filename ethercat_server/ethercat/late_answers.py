@@ -37,7 +37,7 @@ class LateAnswers:
 
     def in_time(self, index: int) -> None:
         """The answer that is waited for: wait less from now on, if it came sooner."""
-        timeout_s = max(self.timeout_s / 2, _LATE_FACTOR * self._took_s(index))
+        timeout_s = min(max(self.timeout_s / 2, _LATE_FACTOR * self._took_s(index)), _LONGEST_TIMEOUT_S)
         self.timeout_s = timeout_s if timeout_s > _SHORTEST_TIMEOUT_S else 0.0
 
     def _took_s(self, index: int) -> float:

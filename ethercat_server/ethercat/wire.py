@@ -19,6 +19,8 @@ DATAGRAM_HEADER: Final = 10
 COUNTER_SIZE: Final = 2
 TYPE_DATAGRAMS: Final = 1
 SOURCE_ADDRESS: Final = 6
+SOURCE: Final = b"\x01" * 6
+"""The address that frames of this project come from, SOEM's too."""
 DATAGRAM_INDEX: Final = FRAME_HEADER + 1
 """Offset of the first datagram's index in a frame."""
 FIRST_DATA: Final = FRAME_HEADER + DATAGRAM_HEADER
@@ -54,6 +56,9 @@ class Command(IntEnum):
     LRW = 12
     ARMW = 13
     FRMW = 14
+
+
+_BY_STATION: Final = (Command.FPRD, Command.FPWR, Command.FPRW)
 
 
 class Datagram(NamedTuple):
@@ -109,7 +114,7 @@ def parse(frame: bytes | bytearray | memoryview, size: int) -> list[Datagram]:
 
 def build(
     *datagrams: tuple[int, int, int, bytes],
-    source: bytes = b"\x01\x01\x01\x01\x01\x01",
+    source: bytes = SOURCE,
     first_index: int = 0,
 ) -> bytearray:
     """A frame of (command, ADP, ADO, data) datagrams.
@@ -131,12 +136,17 @@ def build(
     return bytearray(b"\xff" * 6 + source + _ETHERTYPE_BYTES + header + body)
 
 
-def is_answer(frame: bytes, command: int, index: int, size: int) -> bool:
-    """Whether `frame` begins with the datagram that was sent as `command` under `index`, of `size` bytes."""
+def is_answer(frame: bytes, sent: bytes | bytearray, size: int) -> bool:
+    """Whether `frame` begins with the datagram of `size` bytes that `sent` begins with.
+
+    Slaves count up the position in it, but leave a station address, and the register's, alone.
+    """
     if len(frame) < FIRST_DATA + size + COUNTER_SIZE or frame[12:14] != _ETHERTYPE_BYTES:
         return False
-    its_command, its_index, _, _, length, _ = _DATAGRAM.unpack_from(frame, FRAME_HEADER)
-    return (its_command, its_index, length & _LENGTH_MASK) == (command, index, size)
+    command, index, adp, ado, length, _ = _DATAGRAM.unpack_from(frame, FRAME_HEADER)
+    asked = _DATAGRAM.unpack_from(sent, FRAME_HEADER)
+    same_station = adp == asked[2] or command not in _BY_STATION
+    return same_station and (command, index, ado, length & _LENGTH_MASK) == (*asked[:2], asked[3], size)
 
 
 def working_counter(frame: bytes | bytearray | memoryview, datagram: Datagram) -> int:

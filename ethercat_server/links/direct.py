@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, TypeVar
 
@@ -15,9 +16,13 @@ from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.errors import BusError, ServerError, UsageError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.mailbox.mailbox import Mailbox
 from ethercat_server.ethercat.master.soem import SoemBackend
 from ethercat_server.ethercat.nic.claim import claimed
-from ethercat_server.ethercat.slave.coe import BlockingSdo, Sdo, Steps, finish
+from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.slave.coe import BlockingSdo, MailboxSdo, Sdo, Steps, finish
+from ethercat_server.ethercat.slave.sii import ByPosition
 from ethercat_server.links.link import (
     Found,
     Link,
@@ -33,9 +38,9 @@ from ethercat_server.sensor import look
 from ethercat_server.sensor.configuration import Change, save
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.others import Others
-from ethercat_server.sensor.scan import look_safely, scan
+from ethercat_server.sensor.scan import look_safely
 from ethercat_server.sensor.sensor import Identity, Sensor
-from ethercat_server.sensor.set_up import identify, set_up
+from ethercat_server.sensor.set_up import set_up
 from ethercat_server.sensor.tare import LATER, tare
 from ethercat_server.virtual_sensor.virtual_bus import VIRTUAL_INTERFACE, VirtualBus
 from protocol.control import ErrorCode
@@ -80,13 +85,16 @@ class DirectLink(Link):
     """All sensors in PREOP; `watch` and `tare` take them to OP with their present settings."""
 
     def __init__(
-        self, ifname: str, *, any_slave: bool = False, force: bool = False, allow_ip: bool = False
+        self, ifname: str, *, slave: str | None = None, force: bool = False, allow_ip: bool = False
     ) -> None:
+        """`slave`: the foreign slave POSITION:NAME instead, in the state that it is in."""
         with contextlib.ExitStack() as cleanup:
             self._bus = open_bus(ifname, cleanup, allow_ip=allow_ip)
             self.clock = self._bus.clock
-            if any_slave:
-                self.sensors = _identify_all(self._bus, force=force)
+            self._slave: GuardedSdo | None = None
+            if slave is not None:
+                found_slave, self._slave = _find_slave(self._bus, slave)
+                self.sensors = [found_slave]
             else:
                 found = find_sensors(self._bus, AsFound(force=force), _no_check).sensors
                 self.sensors = [Found(sensor.number, sensor.identity) for sensor in found]
@@ -99,7 +107,7 @@ class DirectLink(Link):
 
     def sdo(self, number: int) -> GuardedSdo:
         """See `Link`."""
-        return GuardedSdo(BlockingSdo(self._bus, number))
+        return self._slave or GuardedSdo(BlockingSdo(self._bus, number))
 
     def configure(self, number: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """See `Link`."""
@@ -266,19 +274,29 @@ def _change(sdo: Sdo, sensor: Sensor, change: Change, and_save: bool) -> Steps[N
         yield from save(sdo, sensor)
 
 
-def _identify_all(bus: Bus, *, force: bool) -> list[Found]:
-    """The sensors, or all slaves of any vendor if there are none, with what they say of themselves."""
-    found = []
-    slaves = look_safely(bus, _no_check, force=force)
-    scan(bus, slaves, _no_check)
-    for number, position in enumerate(bus.positions):
-        slave = slaves[position]
-        if slave.has_coe:
-            sdo = GuardedSdo(BlockingSdo(bus, number))
-            found.append(Found(number, finish(identify(sdo, slave.name), clock=bus.clock)))
-        else:
-            found.append(Found(number, Identity(slave.name, 0, "", ""), has_objects=False))
-    return found
+def _find_slave(bus: Bus, wanted: str) -> tuple[Found, GuardedSdo]:
+    """The slave POSITION:NAME and its objects, through the mailboxes that its own master has set up.
+
+    It stays in its state, and nothing is written but its mailbox.
+    """
+    place, _, name = wanted.partition(":")
+    slaves = look_safely(bus, _no_check)
+    there = "; ".join(f"{slave.position}:{slave.name}" for slave in slaves)
+    slave = next((each for each in slaves if (str(each.position), each.name) == (place, name)), None)
+    if slave is None:
+        raise UsageError(f"no slave is {wanted!r}, as POSITION:NAME: there are {there}")
+    if not slave.has_coe:
+        raise UsageError(f"slave {wanted} has no CoE mailbox, and so no objects")
+    if slave.status.state in (AlState.INIT, AlState.BOOT):
+        raise BusError(
+            f"slave {wanted} is in {slave.status.state.name}, where its objects cannot be read: have its own "
+            "master take it to PREOP"
+        )
+    rows = bus.read_surely_at(slave.position, reg.SYNC_MANAGER, 2 * reg.SYNC_MANAGER_SIZE)
+    out, back = struct.unpack_from("<HH", rows), struct.unpack_from("<HH", rows, reg.SYNC_MANAGER_SIZE)
+    sdo = GuardedSdo(MailboxSdo(Mailbox(ByPosition(bus), slave.position, (out, back))))
+    serial = slave.sii["serial"] if slave.sii else 0
+    return Found(slave.position, Identity(slave.name, serial, "", ""), "slave"), sdo
 
 
 def _check_rate_known(sensor: Sensor) -> None:

@@ -1,6 +1,7 @@
 """Which process uses a network interface as an EtherCAT master, and the TCP port it listens on.
 
-See `packet_sockets`; listening TCP sockets are in /proc/net too.
+See `packet_sockets`; listening TCP sockets are in /proc/net too. Of another user's process neither is
+visible: then the server that programs use by default is asked which interface it uses.
 """
 
 from __future__ import annotations
@@ -14,8 +15,12 @@ from typing import Final, NamedTuple
 
 from ethercat_server.ethercat.nic.packet_sockets import master_sockets, table, users_of
 from protocol.address import Address
+from protocol.client import Client
+from protocol.errors import ProtocolError
+from protocol.program.server_choice import default_server
 
 _LISTEN: Final = 0x0A
+_TIMEOUT_S: Final = 1.0
 
 
 class Holder(NamedTuple):
@@ -29,13 +34,26 @@ class Holder(NamedTuple):
 
     def __str__(self) -> str:
         """Its description in messages."""
-        return "another EtherCAT master" if self.pid is None else f"process {self.pid} ({self.name})"
+        if self.pid is not None:
+            return f"process {self.pid} ({self.name})"
+        return "another EtherCAT master" if self.address is None else self.name
 
 
 def find_holder(ifname: str) -> Holder | None:
     """The process with the EtherCAT socket on `ifname`; None if there is none, or no such interface."""
-    inodes = master_sockets(ifname)
-    return next(iter(owners(inodes)), Holder(None, "", None)) if inodes else None
+    if not (inodes := master_sockets(ifname)):
+        return None
+    return next(iter(owners(inodes)), None) or Holder(None, "ethercat-server", _default_server(ifname))
+
+
+def _default_server(ifname: str) -> Address | None:
+    """The server that is used where none is given, if it uses this interface."""
+    with contextlib.suppress(ValueError, ProtocolError):
+        address = default_server()
+        with Client(address.port, address.host, timeout_s=_TIMEOUT_S) as client:
+            if client.description.get("interface") == ifname:
+                return address
+    return None
 
 
 def owners(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Holder]:

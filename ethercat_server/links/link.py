@@ -22,20 +22,19 @@ from protocol.settings import SettingValue
 
 
 class Found(NamedTuple):
-    """A sensor reached through a link."""
+    """A sensor reached through a link, or the foreign slave that was asked for."""
 
     number: int
     identity: Identity
-    has_objects: bool = True
-    """False for a slave without a CoE mailbox."""
+    what: str = "sensor"
 
     def __str__(self) -> str:
         """Its description in messages."""
-        return f"sensor {self.number}: {self.identity.name}, serial {self.identity.serial}"
+        return f"{self.what} {self.number}: {self.identity.name}, serial {self.identity.serial}"
 
     def as_json(self) -> dict[str, Any]:
         """Its JSON form."""
-        return {"sensor": self.number, **self.identity._asdict()}
+        return {self.what: self.number, **self.identity._asdict()}
 
 
 OnFrame = Callable[[DataMessage], bool]
@@ -64,6 +63,8 @@ class Link(ABC):
 
     used: str
     """Description of the interface or server."""
+    restores = False
+    """Whether settings and offsets are written again when a sensor was powered off."""
     sensors: list[Found]
     clock: Clock
     """The time that passes on the bus, and waiting."""

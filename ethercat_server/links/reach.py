@@ -15,21 +15,24 @@ def open_link(
     ifname: str | None,
     server: str | None,
     *,
-    any_slave: bool = False,
+    slave: str | None = None,
     force: bool = False,
     allow_ip: bool = False,
 ) -> Link:
     """The link to the sensors on `ifname`, or behind `server`; UsageError if both are given.
 
-    If a server uses the interface, the link goes through that server, with a note. With `any_slave`, slaves
-    that are not sensors are included, for read-only commands; with `force`, a bus in use is taken over, with
-    `allow_ip`, an interface of the machine's network is used.
+    If a server uses the interface, the link goes through that server, with a note. With `slave`, to that
+    foreign slave instead, to be read only; with `force`, a bus in use is taken over, with `allow_ip`, an
+    interface of the machine's network is used.
     """
     link = find_server(ifname, server)
     if link is not None:
+        if slave is not None:
+            link.close()
+            raise UsageError("a server reads the objects of sensors only: stop it to read those of a slave")
         return link
     assert ifname is not None
-    return DirectLink(ifname, any_slave=any_slave, force=force, allow_ip=allow_ip)
+    return DirectLink(ifname, slave=slave, force=force, allow_ip=allow_ip)
 
 
 def find_server(ifname: str | None, server: str | None) -> ServerLink | None:

@@ -48,6 +48,7 @@ class ServerLink(Link):
     """One framed connection to the server."""
 
     clock: Clock = SYSTEM_CLOCK
+    restores = True
 
     def __init__(self, address: Address, used: str | None = None) -> None:
         self._name = f"the server at {address}"
@@ -55,7 +56,7 @@ class ServerLink(Link):
         try:
             self._client = Client(address.port, address.host, timeout_s=_CONNECT_TIMEOUT_S)
         except UnreachableError as error:
-            raise ServerError(f"no server at {address} ({error}): start ethercat-server") from None
+            raise ServerError(error.at(address)) from None
         except ProtocolError as error:
             raise ServerError(
                 f"the program at {address} is not a compatible ethercat-server ({error}): "

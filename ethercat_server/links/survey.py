@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 from ethercat_server.ethercat.nic.ip import Routes, find_routes
 from ethercat_server.links import direct
 from ethercat_server.links.holder import Holder, find_holder
+from ethercat_server.links.interfaces import is_local, kind, open_routes
 from ethercat_server.links.promiscuity import promiscuity_kept
 from ethercat_server.sensor.look import Slave
 from ethercat_server.sensor.scan import look_safely
@@ -58,11 +59,9 @@ class Adapter(NamedTuple):
 
 def adapters() -> list[Adapter]:
     """All interfaces of this machine. Nothing is sent on them."""
-    from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
-
-    with IPRoute() as route:
+    with open_routes() as route:
         rows = list(route.get_links())
-    carrying = {row.get_attr("IFLA_LINK") for row in rows if _is_local(row)}
+    carrying = {row.get_attr("IFLA_LINK") for row in rows if is_local(row)}
     return [_adapter(row, carrying) for row in rows]
 
 
@@ -75,7 +74,7 @@ def _adapter(row: Any, carrying: set[int]) -> Adapter:
     wireless = any(Path(f"/sys/class/net/{name}/{mark}").exists() for mark in ("wireless", "phy80211"))
     return Adapter(
         name,
-        kind=_kind(row),
+        kind=kind(row),
         address=row.get_attr("IFLA_ADDRESS"),
         up=up,
         carrier=up and row.get_attr("IFLA_CARRIER") == 1,
@@ -85,16 +84,6 @@ def _adapter(row: Any, carrying: set[int]) -> Adapter:
         routes=routes,
         holder=find_holder(name),
     )
-
-
-def _kind(row: Any) -> str:
-    info = row.get_attr("IFLA_LINKINFO")
-    return (info.get_attr("IFLA_INFO_KIND") if info else None) or ""
-
-
-def _is_local(row: Any) -> bool:
-    """Whether what it stands on is an interface of this namespace: a veth's other end is not below it."""
-    return row.get_attr("IFLA_LINK_NETNSID") is None and _kind(row) != "veth"
 
 
 def look_on(ifname: str) -> list[Slave]:

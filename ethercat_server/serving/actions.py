@@ -95,7 +95,9 @@ class Actions:
         if action.controls and not self._hub.permissions.may_control(connection):
             kind = f"{connection.uid} {request.action}"
             log.warning("%s: %s denied", connection, request.action, extra={"kind": kind})
-            raise RequestError(ErrorCode.DENIED, _denial(request.action, connection.uid))
+            uid = connection.uid
+            who = None if uid is None else self._hub.permissions.name(uid)
+            raise RequestError(ErrorCode.DENIED, _denial(request.action, who))
         if request.action in self._on_sensors.handlers:
             self._on_sensors.handle(connection, request)
             return None
@@ -139,13 +141,13 @@ class Actions:
         return reply(request)
 
 
-def _denial(action: str, uid: int | None) -> str:
-    if uid is None:
+def _denial(action: str, who: str | None) -> str:
+    if who is None:
         return (
             f"{action} is denied because your user is not known: connect from this machine and keep the "
             "connection open until the reply has arrived"
         )
     return (
-        f"{action} is denied to uid {uid}: only root, the server's own user, the user who ran sudo and those "
+        f"{action} is denied to {who}: only root, the server's own user, the user who ran sudo and those "
         "named with --control-user or --control-group may do that"
     )

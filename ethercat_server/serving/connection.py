@@ -89,6 +89,11 @@ class Connection:
         assert state in TRANSITIONS[self.state], f"{self}: {self.state} -> {state}"
         self.state = state
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether it has no subscription, and no request that is not answered."""
+        return self.subscription is None and self.state is State.READING and not self.outbox.waiting
+
     def find_uid(self) -> int | None:
         """The user who owns the other end; asked again if that was not known."""
         if self.uid is None:
@@ -159,7 +164,8 @@ class Connection:
         self._become(State.ANSWERING)
 
     def answered(self) -> None:
-        """Go on with what the client sent after the request."""
+        """Go on with what the client sent after the request; it is idle from now on."""
+        self._heard_ns = self._monotonic_ns()
         self._become(State.READY)
 
     # -- ending

@@ -145,11 +145,25 @@ class Hub:
             if (stream := self._transport.accept(fd)) is None:
                 return
             connection = Connection(stream, stream.peer_uid(), self._monotonic_ns)
-            if self.permissions.have_room(connection.uid, self.connections.values()):
+            if self._make_room(connection.uid):
                 self.connections[connection.fd] = connection
             else:
                 log.warning("%s refused: there are %d clients already", connection, len(self.connections))
                 connection.close()
+
+    def _make_room(self, uid: int | None) -> bool:
+        """Whether the user `uid` may connect once more, if need be in place of an idle connection."""
+        clients = self.connections.values()
+        if self.permissions.have_room(uid, clients):
+            return True
+        if (idle := self.permissions.dispensable(uid, clients)) is None:
+            return False
+        log.warning("%s closed: it is idle, and its user has most of the %d clients", idle, len(clients))
+        why = "closed in favor of another user: too many connections of yours are idle"
+        idle.send_json(error_reply(None, ErrorCode.BAD_REQUEST, why))
+        idle.close()
+        del self.connections[idle.fd]
+        return True
 
     def _answer_some(self, until_ns: int) -> None:
         """One request of each that has sent some, until the time is up; the others are first next time."""

@@ -6,7 +6,9 @@ Names are looked up when they are read, never in the loop: a directory service c
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
 from typing import Final
 
 from ethercat_server.errors import UsageError
@@ -17,6 +19,8 @@ RESERVED_FOR_CONTROL: Final = 16
 """Clients among them that must be of users who may control, so that the others cannot use all of them up."""
 MAX_CLIENTS_PER_USER: Final = 16
 """Clients of one user who may not control."""
+RESERVED_FOR_THE_FIRST: Final = 16
+"""Clients of those users that must be the first of theirs: the bridge's is such a user."""
 
 
 class Permissions:
@@ -24,17 +28,38 @@ class Permissions:
 
     Attributes:
         control_uids: users who may configure, tare, write objects and shut the server down.
+        names: of this machine's users, by their numbers.
     """
 
     def __init__(self) -> None:
         self.control_uids: frozenset[int] = frozenset({0})
+        self.names: Mapping[int, str] = {}
 
     def have_room(self, uid: int | None, clients: Collection[Connection]) -> bool:
         """Whether the user `uid` may connect once more beside these clients."""
         if uid in self.control_uids:
             return len(clients) < MAX_CLIENTS
         of_this_user = sum(client.uid == uid for client in clients)
-        return of_this_user < MAX_CLIENTS_PER_USER and len(clients) < MAX_CLIENTS - RESERVED_FOR_CONTROL
+        reserved = RESERVED_FOR_CONTROL + (RESERVED_FOR_THE_FIRST if of_this_user else 0)
+        return of_this_user < MAX_CLIENTS_PER_USER and len(clients) < MAX_CLIENTS - reserved
+
+    def dispensable(self, uid: int | None, clients: Collection[Connection]) -> Connection | None:
+        """The connection to close so that the user `uid` may connect, where there is no room; None for none.
+
+        One that does nothing, of those who have most and at least two more than this user.
+        """
+        counts = Counter(client.uid for client in clients if client.uid not in self.control_uids)
+        for holder, count in counts.most_common():
+            if count < counts[uid] + 2:
+                break
+            for client in clients:
+                if client.uid == holder and client.is_idle:
+                    return client
+        return None
+
+    def name(self, uid: int) -> str:
+        """The user's name and number, for messages; looked up before the loop."""
+        return f"{self.names[uid]} (uid {uid})" if uid in self.names else f"uid {uid}"
 
     def may_control(self, client: Connection) -> bool:
         """Whether the user at the other end may control; an unknown user may not."""
@@ -52,6 +77,15 @@ def controlling_uids(users: Iterable[str], groups: Iterable[str]) -> frozenset[i
     for name in groups:
         found |= _members(name)
     return frozenset(found)
+
+
+def local_names() -> dict[int, str]:
+    """The names of this machine's own users: no directory service is asked."""
+    try:
+        rows = [line.split(":") for line in Path("/etc/passwd").read_text(errors="replace").splitlines()]
+    except OSError:
+        return {}
+    return {int(row[2]): row[0] for row in rows if len(row) > 2 and row[2].isdecimal()}
 
 
 def _uid(name: str, option: str) -> int:

@@ -71,6 +71,11 @@ class MemoryBackend:
             back_ns = arrives_ns + passes_ns + hops_ns + round_trip_ns - outward_ns
             heapq.heappush(self._on_the_wire, (back_ns, self._sent, bytes(answer)))
 
+    def put_on_the_wire(self, frame: bytes) -> None:
+        """Have a frame of somebody else arrive now."""
+        self._sent += 1
+        heapq.heappush(self._on_the_wire, (self.clock.now_ns, self._sent, frame))
+
     def receive(self, timeout_s: float) -> bytes | None:
         """See `Backend`."""
         clock, until_ns = self.clock, self.clock.now_ns + round(max(timeout_s, 0) * 1e9)

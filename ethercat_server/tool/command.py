@@ -55,11 +55,9 @@ def add_link_arguments(
 
 
 @contextlib.contextmanager
-def link(args: argparse.Namespace, *, any_slave: bool = False) -> Iterator[Link]:
+def link(args: argparse.Namespace, *, slave: str | None = None) -> Iterator[Link]:
     """The link given by the arguments (see `open_link`); closed at the end."""
-    opened = open_link(
-        args.iface, args.server, any_slave=any_slave, force=args.take_over, allow_ip=args.allow_ip
-    )
+    opened = open_link(args.iface, args.server, slave=slave, force=args.take_over, allow_ip=args.allow_ip)
     try:
         yield opened
     finally:

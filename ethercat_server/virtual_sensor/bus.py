@@ -165,7 +165,7 @@ class Bus:
             if datagram.command:  # a NOP passes unchanged
                 # What it reads is of the moment at which it passes, not of the start of its frame. Frames of
                 # a simulated wire may overlap.
-                self.now = max(self.now, now + (datagram.header - wire.FRAME_HEADER) * wire.BYTE_NS)
+                self.now = max(self.now, now + datagram.header * wire.BYTE_NS)
                 pass_through(intact, frame, datagram)
         if position is not None:  # the network card of the master throws it away
             self.frames_lost += 1

@@ -7,8 +7,11 @@ import contextlib
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from typing import Final
 
 from ethercat_server import __version__
+from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.nic.interface import look_up
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor import link
 from ethercat_server.virtual_sensor.control import ControlError
@@ -36,6 +39,9 @@ from protocol.pdo import LAYOUTS
 from protocol.program.completion import add_completion
 from protocol.settings import SETTINGS
 
+_SERIAL_NUMBERS: Final = 100
+"""For each bus: more than it has slaves."""
+
 
 class UsageError(Exception):
     """Contradictory arguments."""
@@ -61,7 +67,9 @@ def build_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument("--sensors", metavar="N", help="sensors on the bus (default: as many as named, or 1)")
     parser.add_argument("--model", action="append", metavar="NAME", help=f"default {MODELS[0]}{several}")
-    parser.add_argument("--serial", action="append", metavar="N", help=f"default 1, 2, ...{several}")
+    parser.add_argument(
+        "--serial", action="append", metavar="N", help=f"default: by the interface's MAC address{several}"
+    )
     parser.add_argument(
         "--pdo", choices=[str(n) for n in LAYOUTS], default="61", help="bytes of process data"
     )
@@ -94,7 +102,15 @@ def _list(given: Sequence[str] | None) -> list[str]:
     return [word for text in given or () for word in text.split(",") if word]
 
 
-def options_from(args: argparse.Namespace) -> BusOptions:
+def _number_of(ifname: str) -> int:
+    """Of an interface: another has another, and it is the same after a restart."""
+    try:
+        return int.from_bytes(look_up(ifname).address[3:])
+    except InterfaceError:  # said when it is to be opened
+        return 0
+
+
+def options_from(args: argparse.Namespace, default_serial: int = 1) -> BusOptions:
     """The options in parsed arguments; UsageError if they are contradictory."""
     try:
         chain = None if args.chain is None else parse_chain(args.chain)
@@ -136,7 +152,7 @@ def options_from(args: argparse.Namespace) -> BusOptions:
             raise UsageError(f"model {model!r} must have at most 20 ASCII characters, such as {MODELS[0]}")
     sensors = []
     for position in range(count):
-        first_serial = serial_numbers[-1] if serial_numbers else 1
+        first_serial = serial_numbers[-1] if serial_numbers else default_serial
         given = len(serial_numbers) - 1 if serial_numbers else 0
         sensors.append(
             SensorOptions(
@@ -178,14 +194,18 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def main(argv: Sequence[str] | None = None, on_open: Callable[[], None] = lambda: None) -> int:
+def main(
+    argv: Sequence[str] | None = None, on_open: Callable[[], None] = lambda: None, number: int = 0
+) -> int:
     """Run the virtual sensor: 0 when ended, 1 on failure, 2 for wrong arguments.
 
-    `on_open` is called once its interface is open, before it reads anything.
+    `on_open` is called once its interface is open, before it reads anything. The default serial numbers go by
+    `number`, or by the interface's MAC address.
     """
     args = build_parser().parse_args(argv)
     try:
-        options = options_from(args)
+        first_serial = _SERIAL_NUMBERS * (number or _number_of(args.iface))
+        options = options_from(args, first_serial or 1)
         if len(args.iface.encode()) > link.LONGEST_NAME:
             raise UsageError(f"interface name {args.iface!r} is longer than {link.LONGEST_NAME} characters")
     except UsageError as error:

@@ -10,6 +10,7 @@ import errno
 import gc
 import select
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable
@@ -26,6 +27,12 @@ from ethercat_server.virtual_sensor.options import BusOptions
 LONGEST_NAME: Final = 15
 """Characters in the name of a network interface."""
 _BUFFER = 2048
+_SOL_PACKET, _PACKET_AUXDATA, _ETH_P_ALL = 263, 8, 3
+_AUXDATA: Final = struct.Struct("=I12xHH")
+"""Status, VLAN tag: control information and type."""
+_VLAN_VALID: Final = 0x10
+_ADDRESSES: Final = 12
+"""Bytes of an Ethernet frame before its VLAN tag."""
 _IDLE_MS = 10
 _FRAMES_PER_TURN = 64
 _FIRST_HALF_NS: Final = 20_000.0
@@ -41,8 +48,11 @@ class LinkError(Exception):
     """The interface cannot be used, or no longer."""
 
 
-def open_interface(ifname: str) -> socket.socket:
-    """A raw socket for EtherCAT frames on `ifname`; LinkError if it cannot be opened."""
+def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
+    """A raw socket for frames on `ifname`; LinkError if it cannot be opened.
+
+    The kernel removes VLAN tags; what they were it says only to sockets for all protocols.
+    """
     if not ifname or len(ifname.encode()) > LONGEST_NAME:
         raise LinkError(f"interface name {ifname!r}: it must have 1 to {LONGEST_NAME} characters")
     _index(ifname)
@@ -56,7 +66,8 @@ def open_interface(ifname: str) -> socket.socket:
     try:
         if not look_up(ifname).is_up:
             raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
-        raw.bind((ifname, ETHERTYPE))
+        raw.setsockopt(_SOL_PACKET, _PACKET_AUXDATA, 1)
+        raw.bind((ifname, protocol))
         raw.setblocking(False)
     except OSError as error:
         raw.close()
@@ -94,6 +105,9 @@ def run(
     stop = should_stop.is_set if isinstance(should_stop, threading.Event) else should_stop
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
+        # By it others see that the interface is in use for EtherCAT; nobody reads it.
+        shown = stack.enter_context(open_interface(ifname, ETHERTYPE))
+        shown.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
         on_open()
         bus = Bus(options, time.monotonic_ns())
         poller = select.poll()
@@ -152,17 +166,19 @@ class _Answers:
     def waiting(self) -> bool:
         """Answer a bounded number of waiting frames; False if the interface is down."""
         raw, bus, buffer = self._raw, self._bus, self._buffer
-        view, descriptor = memoryview(buffer), raw.fileno()
+        view, descriptor, space = memoryview(buffer), raw.fileno(), socket.CMSG_SPACE(_AUXDATA.size)
         for _ in range(_FRAMES_PER_TURN):
             try:
-                size = raw.recv_into(buffer)
+                size, messages, _, _ = raw.recvmsg_into((buffer,), space)
                 arrived, now = arrived_ns(descriptor), time.monotonic_ns()
                 if not now - _LONGEST_WAIT_NS < arrived < now:
                     arrived = now
                 middle = (arrived + now) // 2 + int(self._half_ns)
                 if bus.process(buffer, size, middle - size * BYTE_NS // 2):
                     half_ns = (time.monotonic_ns() - now) / 2
-                    raw.send(view[:size])
+                    status, control, kind = _AUXDATA.unpack(messages[0][2])
+                    tag = struct.pack("!HH", kind, control) if status & _VLAN_VALID else b""
+                    raw.sendmsg((view[:_ADDRESSES], tag, view[_ADDRESSES:size]))
                     self._half_ns *= 1 + _STEP if half_ns > self._half_ns else 1 - _STEP / _QUICK
             except BlockingIOError:
                 bus.prepare()

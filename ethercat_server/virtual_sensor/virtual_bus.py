@@ -35,23 +35,26 @@ _FAR_END: Final = "sensor"
 class VirtualBus:
     """Brings a virtual bus up and down; `ifname` is the end for the master."""
 
-    def __init__(self, arguments: str = "", master_priority: int = 0, user: str | None = None) -> None:
+    def __init__(
+        self, arguments: str = "", master_priority: int = 0, user: str | None = None, number: int = 0
+    ) -> None:
         """`arguments` are `ethercat-virtual-sensor`'s own options, as on a command line.
 
         The sensor gets a real-time priority above `master_priority`: real sensors do not wait for a CPU. Once
         its interface is open its process becomes `user`, or who ran sudo, as the master does, which could not
-        end it otherwise.
+        end it otherwise. The default serial numbers go by `number`, unless it is 0.
         """
         self._priority = min(99, master_priority + 1) if master_priority else 0
         self.ifname = f"ecat{os.getpid()}"
         self._arguments = shlex.split(arguments)
         self._user = user or ""
+        self._number = number
         self._process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> VirtualBus:
         """Start the sensor's process and wait until it answers; ServerError if it does not."""
         command = [sys.executable, "-P", "-m", "ethercat_server.virtual_sensor.virtual_bus"]
-        command += [self.ifname, str(self._priority), self._user, *self._arguments]
+        command += [self.ifname, str(self._priority), self._user, str(self._number), *self._arguments]
         # A session of its own: Ctrl-C is for the server, which then ends the sensor. Its standard input
         # closes when this process ends, in any way, and ends it too.
         self._process = subprocess.Popen(
@@ -121,12 +124,12 @@ def veth_pair(near: str) -> Iterator[str]:
 
 
 def main(argv: Sequence[str]) -> int:
-    """The sensor's process: `argv` is the near end's name, a priority, a user or "", the sensor's options."""
+    """The sensor's process: near end's name, priority, user or "", number, the sensor's options."""
     from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - only this process needs it
 
     from ethercat_server.virtual_sensor import cli  # noqa: PLC0415 - likewise
 
-    near, priority, user, *arguments = argv
+    near, priority, user, number, *arguments = argv
     with contextlib.ExitStack() as made:
         try:
             far = made.enter_context(veth_pair(near))
@@ -144,7 +147,7 @@ def main(argv: Sequence[str]) -> int:
                 become(found)
 
         try:
-            return cli.main([far, "--exit-on-eof", *arguments], on_open=give_up_root)
+            return cli.main([far, "--exit-on-eof", *arguments], give_up_root, int(number))
         except ServerError as error:
             sys.stderr.write(f"ethercat-virtual-sensor: {error}\n")
             return 1

@@ -45,6 +45,8 @@ class Observation(NamedTuple):
     locked: bool | None = None
     """Whether the server follows the sensor's clock."""
     recoveries: int = 0
+    missed_deadlines: int = 0
+    """By the server's loop, in sampling periods."""
     reconnects: int = 0
     is_lost: bool = False
     """The server says that it has lost the sensor."""
@@ -78,6 +80,9 @@ _ERROR_CLASS: Final = 0xFF00
 _STREAMING: Final = frozenset({"OP", "?", ""})
 """AL states that are, or may be, those of a sensor that streams."""
 _CABLE: Final = "Check its cable and power"
+_STOOD_STILL: Final = "The server's computer stood still meanwhile, check it with ethercat-doctor"
+_STANDSTILL_S: Final = 0.02
+"""Missed deadlines that amount to this time explain why a sensor did not answer, or left OP."""
 
 
 def judge(seen: Observation, limits: Limits = LIMITS) -> Verdict:
@@ -87,7 +92,7 @@ def judge(seen: Observation, limits: Limits = LIMITS) -> Verdict:
     if silent:
         findings.append(_silence(seen))
     elif seen.is_lost:
-        findings.append(_trouble("silence", "The server has lost the sensor", _CABLE))
+        findings.append(_trouble("silence", "The server has lost the sensor", _advice(seen)))
     elif not seen.samples and seen.state not in _STREAMING:
         findings.append(
             _trouble("silence", f"The sensor is in state {seen.state}, not OP", "See the server's log")
@@ -108,9 +113,15 @@ def _look(key: str, found: str, remedy: str, about: About = About.STREAM, size: 
     return Finding(Level.LOOK, about, key, found, remedy, size)
 
 
+def _advice(seen: Observation) -> str:
+    """Where to look for the reason why a sensor did not answer."""
+    stood_still = seen.missed_deadlines > _STANDSTILL_S * seen.nominal_hz > 0
+    return _STOOD_STILL if stood_still else _CABLE
+
+
 def _silence(seen: Observation) -> Finding:
     if seen.is_lost or seen.invalid:
-        why, remedy = "the sensor does not answer the bus", _CABLE
+        why, remedy = "the sensor does not answer the bus", _advice(seen)
     elif seen.repeated:
         why, remedy = "the sensor repeats the same sample again and again", "Power-cycle it"
     elif seen.server_silent:
@@ -176,7 +187,7 @@ def _losses(seen: Observation, limits: Limits) -> Iterator[Finding]:
         yield Finding(level, About.STREAM, "lost", found, remedy, seen.lost)
     if seen.recoveries:
         times = "once" if seen.recoveries == 1 else f"{seen.recoveries} times"
-        yield _look("recoveries", f"The server lost the sensor {times} and has it back", _CABLE)
+        yield _look("recoveries", f"The server lost the sensor {times} and has it back", _advice(seen))
 
 
 def _many(count: int, total: int, seen: Observation, limits: Limits) -> Level:
@@ -197,9 +208,8 @@ def _arrival(seen: Observation, limits: Limits) -> Iterator[Finding]:
         total = seen.samples + seen.invalid
         frames = "1 frame was" if seen.invalid == 1 else f"{seen.invalid} frames were"
         found = f"{frames} invalid, the sensor did not answer the bus"
-        yield Finding(
-            _many(seen.invalid, total, seen, limits), About.STREAM, "invalid", found, _CABLE, seen.invalid
-        )
+        level = _many(seen.invalid, total, seen, limits)
+        yield Finding(level, About.STREAM, "invalid", found, _advice(seen), seen.invalid)
     if seen.repeated >= limits.lost_warn:
         frames = "1 frame was" if seen.repeated == 1 else f"{seen.repeated} frames were"
         found = f"{frames} repeated, the sensor had nothing new"

@@ -1,6 +1,7 @@
 """Starts a program: Ctrl-C is never a traceback, whatever is being imported, and output never fails.
 
-Few imports, for Python's own handler raises KeyboardInterrupt in the middle of them.
+Few imports, for Python's own handler raises KeyboardInterrupt in the middle of them. While a program loads,
+SIGINT and SIGTERM have their default action; what raises KeyboardInterrupt is installed when all is loaded.
 """
 
 import signal

@@ -57,13 +57,14 @@ def estimate_bias(
         payload: what hangs on the sensor; its weight is not counted as bias. Without one everything is.
         gravity: in the sensor's frame, m/s². None: from the window's own accelerometer.
     """
-    if payload.mass:
-        weight = (
-            Compensator(payload).compensate(ZERO, ZERO, gravity or gravity_of(means.acceleration)).gravity
-        )
-    else:
-        weight = NO_WRENCH
-    return Wrench.of([m - w for m, w in zip(means.wrench.values, weight.values, strict=True)])
+    if not payload.mass:
+        return means.wrench
+    return means.wrench.plus(weight(payload, gravity or gravity_of(means.acceleration)), -1.0)
+
+
+def weight(payload: Payload, gravity: Vector3) -> Wrench:
+    """What a payload weighs with this gravity in the sensor's frame, m/s²."""
+    return Compensator(payload).compensate(ZERO, ZERO, gravity).gravity
 
 
 _EARLY_S: Final = 0.1
@@ -115,6 +116,10 @@ class BiasRamp:
             self._course = _Course(start.plus(change), target.plus(change), begin_s, seconds)
             if self._before not in {None, NO_WRENCH}:  # none stays none
                 self._before = self._before.plus(change)
+
+    def forget(self) -> None:
+        """There is nothing to undo any more."""
+        self._before = None
 
     def undo(self, now_s: float) -> Wrench:
         """Go back to the target before the last `go` and return it. CompensationError if there is none."""

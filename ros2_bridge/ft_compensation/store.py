@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from ft_compensation.quantities import CompensationError, Payload, Wrench
+from protocol.pdo import Vector3
 
 _FORMAT: Final = "bota-ethercat-bridge compensation"
 _VERSION: Final = 1
@@ -35,6 +36,8 @@ class Stored(NamedTuple):
     """When, ISO 8601 in UTC."""
     offset: Wrench | None = None
     """The sensor's own offset, which the bias was taken with; None if not known or not needed."""
+    gravity: Vector3 | None = None
+    """Gravity in the sensor's frame when the bias was measured, m/s²; None if it was not, or is not known."""
 
 
 def default_directory() -> Path:
@@ -61,7 +64,12 @@ class CompensationStore:
         return self.directory / f"sensor-{int(serial)}.json"
 
     def save(
-        self, serial: int, bias: Wrench, payload: Payload | None = None, offset: Wrench | None = None
+        self,
+        serial: int,
+        bias: Wrench,
+        payload: Payload | None = None,
+        offset: Wrench | None = None,
+        gravity: Vector3 | None = None,
     ) -> Path:
         """Keep them, in place of what was kept before; returns the file. StoreError if that fails."""
         path = self.path(serial)
@@ -77,6 +85,8 @@ class CompensationStore:
             content["tool_center_of_gravity"] = list(payload.center)
         if offset is not None:
             content["sensor_offset"] = list(offset.values)
+        if gravity is not None:
+            content["gravity"] = list(gravity)
         try:
             self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
             _replace(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
@@ -119,14 +129,16 @@ def _parse(data: bytes, serial: int) -> Stored:
         raise _ContentError(f"it belongs to sensor {content.get('serial')!r:.20}, not {serial}")
     try:
         bias = Wrench.of(content.get("bias"))
-        payload = offset = None
+        payload = offset = gravity = None
         if "sensor_offset" in content:
             offset = Wrench.of(content["sensor_offset"])
         if "tool_mass" in content:
             payload = Payload.of(content["tool_mass"], content.get("tool_center_of_gravity"))
-    except ValueError as error:
+        if "gravity" in content:
+            gravity = Wrench.of([*content["gravity"], 0, 0, 0]).force
+    except (ValueError, TypeError) as error:
         raise _ContentError(str(error)) from None
-    return Stored(bias, payload, str(content.get("saved", ""))[:40], offset)
+    return Stored(bias, payload, str(content.get("saved", ""))[:40], offset, gravity)
 
 
 def _replace(path: Path, text: str) -> None:

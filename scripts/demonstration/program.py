@@ -26,7 +26,7 @@ from protocol.client import Client
 from protocol.errors import ConnectionFailedError, ProtocolError
 from scripts.demonstration.child import Child, DemoError
 from scripts.demonstration.measure import FULL_RATE, Measurement, verdict
-from scripts.demonstration.show import Screen, print_summary
+from scripts.demonstration.show import Screen, print_summary, say
 from scripts.demonstration.stops import Canaries
 
 PORT: Final = 12001
@@ -157,7 +157,7 @@ def run(seconds: float | None, directory: Path) -> int:
     if trouble is not None:
         raise DemoError(trouble)
     if summary.rate_hz < FULL_RATE * float(sensor["rate_hz"]):
-        print(f"Only {summary.rate_hz:.0f} messages/s arrived: this machine was too busy to keep up.")
+        say(f"Only {summary.rate_hz:.0f} messages/s arrived: this machine was too busy to keep up.")
     return 0
 
 

@@ -117,8 +117,13 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
         table.add_row(name, value)
     Console().print(table)
     if (why := explanation(summary)) is not None:
-        print(why)
+        say(why)
 
 
 def _yes(fact: bool) -> str:
     return "yes" if fact else "NO"
+
+
+def say(text: str) -> None:
+    """Print sentences, broken between words."""
+    Console(highlight=False, markup=False).print(text)

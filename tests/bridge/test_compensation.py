@@ -98,6 +98,36 @@ def test_gravity_goes_along_with_the_pose(stages: Stages, server: SimulatedServe
     stages.settle([3.0, 0.0, 0.0, 0.0, 0.25, 0.0])  # what the environment does is left as it is
 
 
+@pytest.mark.parametrize("up", [UP, SIDE, (1, 1, 1)])
+def test_a_payload_that_is_set_after_the_tare_is_not_subtracted_twice(
+    stages: Stages, server: SimulatedServer, node: SimulatedNode, up: tuple[int, int, int]
+) -> None:
+    """A tare without a payload holds its weight in that pose; with the payload it holds in every pose."""
+    hold(server, up, bias=BIAS)
+    assert node.set_parameter("tool_mass", 0.0) == (True, "")
+    assert node.trigger("tare")[0]
+    stages.settle(ZERO6)
+    stages.forget()
+    assert node.set_parameter("tool_mass", TOOL.mass) == (True, "")
+    node.run(0.2)
+    assert all(is_near(message, ZERO6, 0.02) for message in stages.final[2:]), "nor in between"
+    assert list(node.parameters("bias")[0]) == pytest.approx(BIAS.values, abs=0.02)
+    hold(server, OVER, bias=BIAS)
+    stages.settle(ZERO6, 0.02)
+    assert "no change of the bias to undo" in node.trigger("undo_tare")[1]
+
+
+def test_a_payload_that_is_changed_after_a_tare_of_unknown_gravity_is_a_warning(
+    stages: Stages, server: SimulatedServer, node: SimulatedNode
+) -> None:
+    stages.settle(ZERO6)
+    assert node.set_parameter("tool_mass", 0.0) == (True, "")
+    hold(server, UP, acceleration_z=-0.5)  # an accelerometer that reads nothing like g
+    assert node.trigger("tare")[0]
+    assert node.set_parameter("tool_mass", 1.5) == (True, "")
+    assert "wrench_compensated may be wrong by 14.7 N and " in node.log
+
+
 def test_a_tare_takes_the_offset_and_leaves_the_tool(
     stages: Stages, server: SimulatedServer, node: SimulatedNode
 ) -> None:

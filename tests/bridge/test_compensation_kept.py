@@ -17,7 +17,7 @@ from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.store import CompensationStore
 from tests.bridge.compensating import QUICK, UP, ZERO6, Stages, hold, six
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
-from tests.compensation.making import BIAS
+from tests.compensation.making import BIAS, TOOL
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("_ros")]
 OK, WARN, ERROR, STALE = range(4)
@@ -317,6 +317,19 @@ def test_a_kept_bias_that_was_taken_with_another_tool(bench: Bench) -> None:
     with bench.start() as (node, stages):
         assert stages.first() == pytest.approx(ZERO6, abs=1e-5)
         assert "was taken with a tool of 1.5 kg, and now there is no tool_mass: tare again" in node.log
+
+
+def test_a_kept_tare_is_worked_out_anew_for_another_payload(bench: Bench) -> None:
+    hold(bench.server, UP, bias=BIAS)
+    tool = {"tool_mass": TOOL.mass, "tool_center_of_gravity": [*TOOL.center]}
+    with bench.start() as (node, _):
+        assert node.trigger("tare")[0]
+    for given, wanted in ((tool, list(BIAS.values)), ({}, None)):
+        with bench.start(**given) as (node, stages):
+            node.run(0.3)
+            stages.settle(ZERO6, 0.02)
+            assert "the bias was worked out anew from its tare" in node.log
+            assert wanted is None or bench.kept() == pytest.approx(wanted, abs=0.02)
 
 
 def test_the_node_ends_while_a_tare_waits(bench: Bench) -> None:

@@ -94,6 +94,8 @@ def test_good_is_good() -> None:
         ("stream", Level.ERROR, "50 of 800", {"new": FrameCounts(new=750, lost=50), "rate_hz": 750.0}),
         ("stream", Level.WARN, "1 frame was invalid", {"new": FrameCounts(new=799, invalid=1)}),
         ("stream", Level.WARN, "has it back", {"new_server": ServerCounts(recoveries=1)}),
+        ("stream", Level.WARN, "has it back: the server's computer stood still",
+         {"new_server": ServerCounts(recoveries=1, missed_deadlines=24)}),
         ("stream", Level.WARN, "5 old samples skipped", {"new": FrameCounts(stale=5)}),
         ("stream", Level.ERROR, "not finite: power-cycle", {"new_not_finite": 1}),
         ("stream", Level.ERROR, "not finite", {"new_server": ServerCounts(not_finite=2)}),

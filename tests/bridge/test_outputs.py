@@ -23,6 +23,7 @@ from bridge.parameters.wrench_frames import parse
 from bridge.publishing.wrench_frames import make_frames
 from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
 from protocol.control import Event, event
+from protocol.framing import DataMessage
 from protocol.pdo import encode
 from tests.bridge.compensating import six, stamp_ns
 from tests.bridge.conftest import retire, wait_until
@@ -131,6 +132,21 @@ def test_it_can_be_configured_while_the_node_runs() -> None:
         assert "it must be 0, for none, or at least 0.05 Hz" in reason
 
 
+@pytest.mark.parametrize(("name", "value"), [("cutoff", 50.0), ("cutoff", 400.0), ("notch", 60.0)])
+def test_a_frequency_beyond_half_of_the_rate_is_refused(name: str, value: float) -> None:
+    with SimulatedNode(Sensor(), **TEN_HZ) as node:
+        got = node.hear("wrench_filtered")
+        node.run(0.2)
+        done, reason = node.set_parameter(f"filter.{name}", value)
+        assert not done
+        assert reason == (
+            f"filter.{name} is {value:g} Hz, but must be below half of the sampling rate, 50 Hz: lower it"
+        )
+        got.clear()
+        node.run(0.2)
+        assert got, "it goes on as it was"
+
+
 def test_it_follows_the_sensors_rate() -> None:
     server = Sensor()
     with SimulatedNode(server, **{"filter.cutoff": 40.0}) as node:
@@ -139,6 +155,7 @@ def test_it_follows_the_sensors_rate() -> None:
         server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS, rate_hz=50))
         words = "filter.cutoff is 40 Hz, but must be below half of the sampling rate, 25 Hz"
         node.until(f"wrench_filtered has stopped: {words}", compensation=ERROR)
+        assert node.log.count(words) == 1
         got.clear()
         node.run(0.2)
         assert not got
@@ -312,7 +329,8 @@ def test_tf_in_a_real_executor(server: Sensor, tf: FakeTf) -> None:
 
     def publishes() -> bool:
         assert topic.is_wanted()
-        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), server.time_ns())
+        frame = DataMessage(0, server.time_ns(), 0, 0, 0, 3, b"")
+        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), frame)
         executor.spin_once(0.01)
         return bool(heard)
 

@@ -99,10 +99,10 @@ class Output:
         self.samples: list[tuple[float, int]] = []
         self.followed: list[float] = []
 
-    def publish(self, sample: Sample, stamp_ns: int) -> None:
-        self.samples.append((sample.force[0], stamp_ns))
+    def publish(self, sample: Sample, frame: DataMessage) -> None:
+        self.samples.append((sample.force[0], frame.stamp_ns))
 
-    def follow(self, sample: Sample, stamp_ns: int) -> None:
+    def follow(self, sample: Sample, frame: DataMessage) -> None:
         self.followed.append(sample.force[0])
 
 
@@ -114,7 +114,7 @@ class Outputs:
         self.wanted = (self.output,)
         self.partly: list[Sample] = []
 
-    def publish_finite(self, sample: Sample, stamp_ns: int) -> None:
+    def publish_finite(self, sample: Sample, frame: DataMessage) -> None:
         self.partly.append(sample)
 
 

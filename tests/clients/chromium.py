@@ -27,7 +27,8 @@ def run(page: Path, scratch: Path, *options: str) -> str:
     command = [PROGRAM, *always, *options, page.as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
     assert done.returncode == 0, done.stderr
-    return "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
+    said = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    return "\n".join(line for line in said if "source: chrome://" not in line)  # its own pages
 
 
 def screenshot(page: Path, picture: Path, width: int, height: int, *options: str) -> str:

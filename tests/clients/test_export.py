@@ -58,6 +58,15 @@ def test_a_line_is_a_sample_in_si_units(tmp_path: Path) -> None:
     assert (third_row["orientation_x"], third_row["orientation_w"], third_row["warnings"]) == ("0", "1", "3")
 
 
+def test_time_passes_evenly_while_the_clock_is_set(tmp_path: Path) -> None:
+    path, out = tmp_path / "run.mcap", tmp_path / "run.csv"
+    set_s = (0, 0, -300_000_000, -300_000_000, 3_600_000_000_000)
+    moved = [frame(n)._replace(stamp_ns=frame(n).stamp_ns + by) for n, by in enumerate(set_s)]
+    record(path, moved)
+    export(path)
+    assert [row["time_s"] for row in rows(out)] == [f"0.{n * PERIOD_NS:09d}" for n in range(len(set_s))]
+
+
 def test_what_is_no_new_sample_is_left_out_but_not_its_gap(tmp_path: Path) -> None:
     path, out = tmp_path / "run.mcap", tmp_path / "out.csv"
     gap, repeated, invalid = DataFlag.GAP, DataFlag.REPEATED, DataFlag.INVALID

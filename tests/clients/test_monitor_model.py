@@ -213,17 +213,6 @@ def test_values_that_only_the_server_saw_are_told_too(model: Model) -> None:
         assert texts(only(model, now(0))) == told
 
 
-def test_what_was_said_makes_room_for_the_latest_event_after_half_a_minute(model: Model) -> None:
-    for start in (START_S, START_S + 100):
-        model.say("Recorded a.mcap")
-        for later in (0, 29.9):
-            said = model.state(start + later).message
-            assert said is not None
-            assert said.text == "Recorded a.mcap"
-        assert model.state(start + 30.1).message is None
-        assert model.state(start + 90).message is None
-
-
 def test_the_last_emergency_is_told_until_it_is_over_or_reset(model: Model) -> None:
     def after(count: int, code: int, at_s: float) -> list[str]:
         reply = status()
@@ -255,6 +244,23 @@ def test_a_lost_sensor_is_told_until_it_is_back(model: Model) -> None:
     model.take_event({"event": Event.SENSOR_BACK, "sensor": 0}, now(20))
     assert only(model, now(20)).al_state == "OP"
     assert only(model, now(20)).verdict.level is Level.GOOD
+
+
+def test_the_computer_is_blamed_where_the_server_says_so_and_later_too(model: Model) -> None:
+    take(model, *run(0, 10))
+    said = "sensor 0 is lost: this computer stood still for 300 ms, check it with ethercat-doctor"
+    model.take_status(status(), now(10))
+    model.take_event({"event": Event.SENSOR_LOST, "sensor": 0, "message": said}, now(10))
+    assert only(model, now(10)).alerts[0].remedy == said
+    model.take_event({"event": Event.SENSOR_BACK, "sensor": 0}, now(20))
+    after = status()
+    after["missed_deadlines"] += 240
+    after["sensors"][0]["recoveries"] += 1
+    model.take_status(after, now(20))
+    back, past = only(model, now(20)).alerts
+    assert back.text == "The server lost the sensor once and has it back"
+    assert "stood still" in back.remedy
+    assert past.remedy == said
 
 
 def test_silence_is_the_sensors_only_if_the_server_speaks(model: Model) -> None:
@@ -368,3 +374,12 @@ def test_odd_replies_are_borne(odd: Any) -> None:
     model.take_event({"event": odd, "sensor": odd, "message": odd}, START_S)
     model.take_event({"event": Event.SENSOR_LOST, "sensor": 0, "message": odd}, START_S)
     assert "\\x1b" not in repr(model.state(START_S))  # as repr would write it
+
+
+def test_a_message_goes_after_half_a_minute(model: Model) -> None:
+    model.say("Recorded 1 sample")
+    assert model.state(now(0)).message is not None
+    assert model.state(now(20 * 1000)).message is not None
+    assert model.state(now(40 * 1000)).message is None
+    model.say("Not tared")
+    assert model.state(now(41 * 1000)).message is not None

@@ -63,6 +63,16 @@ def test_80x24_has_all_warnings_with_their_remedies() -> None:
         assert fact in text, fact
 
 
+def test_80x24_has_the_state_of_a_sensor_that_is_lost_and_of_its_neighbors() -> None:
+    state = made.troubled()
+    sensor = replace(state.sensors[0], al_state="LOST", old_s=1800.0, firmware="1.3.8-dirty-R")
+    text = plain(replace(state, sensors=(sensor, *state.sensors[1:])))
+    assert "  LOST " in text
+    assert "values 30m00s old" in text
+    assert "serial 123" in text
+    assert "firmware" not in text, "it goes first"
+
+
 def test_60x15_keeps_force_torque_the_stream_and_the_worst_warning() -> None:
     text = plain(made.troubled(), width=60, height=15)
     for fact in ("Fx", "Fy", "Fz!", "Mx", "My", "Mz", "Stream", "saturated: Fz", "Reduce sensor loading"):
@@ -78,26 +88,14 @@ def test_every_warning_can_be_reached() -> None:
     alert = state.sensors[0].alerts[0]
     many = tuple(alert._replace(text=f"warning {n:02}", remedy="a remedy " * 8) for n in range(30))
     state = replace(state, sensors=(replace(state.sensors[0], alerts=many), *state.sensors[1:]))
-    assert re.search(r"and \d+ more: w", plain(state))
+    assert re.search(r"and \d+ more: press w", plain(state))
     pages = [plain(state, Look(warnings=number)) for number in range(1, 5)]
     for page in pages:
-        assert "Sensor 0" in page
+        assert "Warnings of sensor 0" in page
         assert "w: next page" in page
     assert sorted(set(re.findall(r"warning \d\d", "".join(pages)))) == [f"warning {n:02}" for n in range(30)]
     assert pages[3] == pages[0], "round and round"
-    assert "no warnings" in plain(made.healthy(), Look(warnings=1))
-
-
-def test_a_lost_sensor_s_state_is_whole_at_80x24() -> None:
-    state = made.troubled()
-    lost = replace(state.sensors[0], al_state="LOST", old_s=31.0)
-    state = replace(state, sensors=(lost, *state.sensors[1:]))
-    (row,) = (row for row in plain(state).splitlines() if row.startswith("Sensor 0  "))
-    assert re.fullmatch(
-        r"Sensor 0  BFT-SENS-ECAT-M8  serial 1234  LOST +values 31 s old +1 worth a look *", row
-    )
-    for width in range(50, 110):
-        assert "  LOST " in plain(state, width=width)
+    assert "none" in plain(made.healthy(), Look(warnings=1))
 
 
 def test_two_sensors_stand_one_below_the_other_where_there_is_room() -> None:

@@ -149,8 +149,8 @@ def test_once_without_a_server_is_exit_1_and_one_sentence(run: Run) -> None:
     code, out, err = run("--once", f"localhost:{port}")
     assert (code, out) == (1, "")
     assert err == (
-        f"ethercat-monitor: localhost:{port}: no server answers (Connection refused): "
-        "start ethercat-server, or give its HOST:PORT\n"
+        f"ethercat-monitor: no server at localhost:{port} (Connection refused): start ethercat-server, "
+        "or give its HOST:PORT\n"
     )
 
 

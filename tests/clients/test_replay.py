@@ -278,7 +278,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     ("arguments", "sentence"),
     [
         ((), "required"),
-        (("x.mcap", "99999"), "it must be HOST:PORT"),
+        (("x.mcap", "99999"), "99999 is no port: it must be from 1 to 65535"),
         (("x.mcap", "--speed", "0"), "it must be a number"),
         (("x.mcap", "--speed", "nan"), "it must be a number"),
         (("x.mcap", "--host", "nowhere"), "an IP address of this machine"),

@@ -449,7 +449,7 @@ def test_the_port_is_one_of_this_machine(argv: list[str], where: str | None) -> 
     ("argv", "sentence"),
     [(["--web", "0.0.0.0:8000"], "'0.0.0.0:8000': the page is for this machine only: give a port, and "
       "reach it from elsewhere over ssh -L"),
-     (["--web", "70000"], "'70000': it must be HOST:PORT"), (["--web", "--once"], "cannot be combined"),
+     (["--web", "70000"], "'70000': 70000 is no port"), (["--web", "--once"], "cannot be combined"),
      (["--web", "--json"], "cannot be combined")],
 )  # fmt: skip
 def test_wrong_usage_is_one_sentence(

@@ -258,3 +258,14 @@ def test_the_last_change_is_undone_once() -> None:
     assert ramp.at(11.0) == NEW
     with pytest.raises(CompensationError, match="no change of the bias to undo"):
         ramp.undo(20.0)
+
+
+def test_an_undone_change_follows_a_shift_of_the_sensors_own_offset() -> None:
+    def number(value: float) -> Wrench:
+        return Wrench.of([value] * 6)
+
+    ramp = BiasRamp(number(1))
+    ramp.go(number(3), 0.0)
+    ramp.shift(number(10))
+    assert ramp.target == number(13)
+    assert ramp.undo(1.0) == ramp.target == number(11)

@@ -43,6 +43,15 @@ def test_late_wake_ups_matter_by_what_they_cost() -> None:
         wake([])
 
 
+def test_without_the_scheduling_of_a_server_nothing_measured_is_trouble() -> None:
+    measured = of([20] * 990 + [3000] * 10, message_us=3000)
+    for real_time in (True, False):
+        measured.real_time = real_time
+        levels = [finding.level for finding in (*verdict.wake_ups(measured), *verdict.messages(measured))]
+        assert (max(levels) is Level.BAD) is real_time
+        assert real_time or max(levels) is Level.NOTE
+
+
 def test_exchanges_matter_by_their_losses_and_their_time() -> None:
     assert exchange([80] * 1000).level is Level.OK
     assert exchange([80] * 900 + [300] * 100).level is Level.NOTE

@@ -62,6 +62,15 @@ def test_the_owner_of_a_connection_is_found(diagnostics: socket.socket, host: st
             assert peer_uid(diagnostics, accepted) == os.geteuid()
 
 
+def test_the_owner_of_a_socket_of_ipv6_with_an_address_of_ipv4_is_found(diagnostics: socket.socket) -> None:
+    """What dual-stack clients connect to 127.0.0.1 with."""
+    with listener("127.0.0.1") as waiting, socket.socket(socket.AF_INET6) as client:
+        client.connect(("::ffff:127.0.0.1", waiting.getsockname()[1]))
+        accepted, _ = waiting.accept()
+        with accepted:
+            assert peer_uid(diagnostics, accepted) == os.geteuid()
+
+
 @AS_NOBODY
 def test_another_user_is_told_apart(diagnostics: socket.socket) -> None:
     bash = shutil.which("bash")

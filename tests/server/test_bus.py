@@ -10,9 +10,11 @@ import pytest
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.wire import Command, build, parse, working_counter
+from ethercat_server.ethercat.exchange.process_data import FIRST_INDEX
+from ethercat_server.ethercat.late_answers import LateAnswers
+from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build, parse, working_counter
 from ethercat_server.simulation.backend import MemoryBackend
-from ethercat_server.simulation.machine import Machine, SimulatedClock
+from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.pdo import LAYOUTS
@@ -20,6 +22,7 @@ from tests.exchanging import Exchange
 from tests.simulation import Asked
 
 STATION = 0x1001
+INDICES = 0x100 - FIRST_INDEX
 Answer = Callable[[bytearray], list[bytes]]
 
 
@@ -108,6 +111,23 @@ def test_neither_late_nor_foreign_frames_are_taken_for_the_answer() -> None:
     assert [bus.read_register(0, 0x0130, 2) for _ in range(5)] == [b"\x02\x00"] * 5
 
 
+def test_duplicates_of_answers_are_not_taken_for_those_of_other_registers() -> None:
+    """However late: when the index is in use again."""
+    duplicates: list[bytes] = []
+
+    def answer(frame: bytearray) -> list[bytes]:
+        duplicates.append(done(frame, bytes(frame[18:22])))
+        return [*duplicates[-20:], duplicates[-1]]
+
+    bus, wire = scripted(answer)
+    bus.stations += [STATION + 1]
+    for ado in range(0x0100, 0x0180, 2):
+        for number in (0, 1):
+            found = bus.read_register(number, ado, 4)
+            assert found == (STATION + number).to_bytes(2, "little") + ado.to_bytes(2, "little")
+    assert len(wire.sent) == 128
+
+
 def test_indices_are_none_of_soems() -> None:
     bus, wire = scripted()
     for _ in range(300):
@@ -192,6 +212,68 @@ def test_a_frame_that_comes_too_late_is_never_taken_for_the_next_ones(late: floa
         backend.clock.sleep(0.00125)
     assert len(seen) > 10
     assert len(set(seen)) > 0.9 * len(seen), "each brought what the sensor had then"
+
+
+def answers(bus: Bus, backend: MemoryBackend) -> bytes:
+    """The answer to an exchange of `bus`, not taken yet."""
+    bus.process_data.send()
+    answer = backend.receive(0.01)
+    assert answer is not None
+    return answer
+
+
+def test_an_answer_that_comes_again_is_a_duplicate_until_its_index_is_in_use_again() -> None:
+    bus, backend = operational()
+    process_data, backend.wire = bus.process_data, Wire(Machine(frame_jitter_ns=0))
+    answer = answers(bus, backend)
+    assert process_data.take(answer) > 0
+    assert process_data.take(answer) == process_data.take(answer) == -1
+    for _ in range(INDICES):
+        later = answers(bus, backend)
+        assert process_data.take(answer) in (-1, 0)
+        assert process_data.take(later) > 0
+        assert process_data.take(later) == -1
+    assert process_data.in_flight == process_data.lost == 0
+
+
+def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() -> None:
+    bus, backend = operational()
+    process_data, backend.wire = bus.process_data, Wire(Machine(frame_jitter_ns=0))
+    late = answers(bus, backend)
+    backend.clock.sleep(0.2)
+    assert process_data.lost == 1
+    for _ in range(INDICES - 1):
+        assert process_data.take(answers(bus, backend)) > 0
+    current = answers(bus, backend)
+    assert current[DATAGRAM_INDEX] == late[DATAGRAM_INDEX]
+    assert process_data.take(late) == 0
+    assert process_data.take(current) > 0
+    assert process_data.frame == current
+    assert process_data.duplicates == 0, "it was given up, not taken"
+
+
+@pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
+def test_a_working_counter_that_cannot_be_is_above_the_highest(lrw: bool) -> None:
+    bus, backend = operational(SensorOptions(), SensorOptions(serial=2), lrw=lrw)
+    process_data = bus.process_data
+    assert process_data.most_wkc == [6]
+    for counters in [(7, 0), (0xFFFF, 0)] if lrw else [(6, 0), (0, 3), (4, 1), (0xFFFF, 0xFFFF), (2, 0xFFFF)]:
+        answer = bytearray(answers(bus, backend))
+        for datagram, counter in zip(parse(answer, len(answer)), counters, strict=False):
+            answer[datagram.end : datagram.end + 2] = counter.to_bytes(2, "little")
+        assert process_data.take(bytes(answer)) > 0
+        assert 6 < process_data.wkc <= 0xFFFF
+
+
+def test_a_late_answer_makes_datagrams_wait_longer_but_never_long() -> None:
+    late, pending = LateAnswers(clock := SimulatedClock(Machine()), 0x80, 16), 0x80 + 3
+    for stall_s in (0.01, 10.0):
+        late.pending_ns[3] = clock.now_ns
+        clock.sleep(stall_s)
+        late.in_time(3)
+        assert 0.02 <= late.timeout_s <= 0.25
+        late.note(done(build((Command.NOP, 0, 0, b""), first_index=pending)))
+        assert 0.02 <= late.timeout_s <= 0.25
 
 
 def test_a_frame_that_is_cut_short_is_a_miss() -> None:

@@ -139,6 +139,89 @@ def test_wrong_event_times_are_refused_and_polling_goes_on(wrong: tuple[str, flo
     assert percentile(after.errors_ns, 99) < 20e3
 
 
+@pytest.mark.parametrize("late_ns", [-200e3, -100e3, 100e3, 200e3])
+@pytest.mark.parametrize("since_s", [0.0, LIES_FROM_S])
+def test_no_lie_costs_a_sample_on_a_slow_card(late_ns: float, since_s: float) -> None:
+    """Of a long round trip so much may be on one side, so such event times are believed."""
+    for rate_hz, jitter_ns in ((800.0, 5e4), (800.0, 4e5), (1600.0, 5e4), (1600.0, 4e5)):
+        lying = Controller(late_ns=late_ns, lies_from_s=since_s)
+        card = Card(2.2e6, spread=0, jitter_ns=jitter_ns)
+        simulation = run(lying, Sensor(rate_hz, ppm=150.0), card, seconds=5.0)
+        outcome = simulation.outcome(1.0)
+        assert (outcome.lost, outcome.counted, outcome.unflagged, outcome.unlocked) == (0, 0, 0, 0)
+        assert outcome.outside == 0
+        assert outcome.exchanges < 1.05
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [
+        Controller(jitter_ns=10e3),
+        Controller(jitter_ns=20e3),
+        Controller(late_ns=18e3, lies_from_s=LIES_FROM_S),
+    ],
+    ids=["10 µs", "20 µs", "late within the frame"],
+)
+def test_event_times_that_are_worse_than_polling_are_not_used(controller: Controller) -> None:
+    simulation = run(controller, seconds=12.0)
+    assert verdict(simulation) is Verdict.REFUSED
+    outcome = simulation.outcome(4.0)
+    assert percentile(outcome.errors_ns, 99) < 12e3
+    by_polling = run(None, seconds=12.0).outcome(4.0)
+    assert percentile(outcome.errors_ns, 99) < percentile(by_polling.errors_ns, 99) + 3e3
+
+
+def test_event_times_are_trusted_again_once_they_are_right() -> None:
+    lying = Controller(jitter_ns=50e3, lies_from_s=LIES_FROM_S, lies_until_s=9.0)
+    simulation = run(lying, seconds=9.0)
+    assert verdict(simulation) is Verdict.REFUSED
+    simulation.run(17.0)
+    assert verdict(simulation) is Verdict.TRUSTED
+    assert_right(simulation.outcome(16.5))
+
+
+def test_pauses_between_trials_double_until_event_times_have_proved_right_for_long() -> None:
+    """So those that are hardly right do not switch stamps on and off."""
+    simulation, lying = run(HONEST, Sensor(150.0), seconds=3.0), Controller(jitter_ns=50e3)
+
+    def run_until(wanted: Verdict) -> float:
+        since_s = simulation.now_ns / 1e9
+        while verdict(simulation) is not wanted:
+            simulation.run(simulation.now_ns / 1e9 + 0.1)
+        return simulation.now_ns / 1e9 - since_s
+
+    def pause_s() -> float:
+        run_until(Verdict.REFUSED)
+        return run_until(Verdict.TRIAL)
+
+    simulation.controller = lying
+    assert [pause_s() for _ in range(3)] == pytest.approx([10, 20, 40], abs=0.5)
+    simulation.controller = HONEST
+    run_until(Verdict.TRUSTED)
+    simulation.run(simulation.now_ns / 1e9 + 61.0)
+    simulation.controller = lying
+    assert pause_s() == pytest.approx(10, abs=0.5)
+
+
+@pytest.mark.parametrize("seconds", [0.8, 3.0], ids=["on trial", "trusted"])
+def test_what_does_not_fit_while_the_machine_is_busy_is_not_held_against_event_times(seconds: float) -> None:
+    """An exchange was away for long then: who knows what has held up what."""
+    for took_ns, counts in ((20e6, False), (100e3, True)):
+        simulation = run(HONEST, seconds=seconds)
+        events = simulation.clock.events
+        assert events is not None
+        for number in range(300):
+            sent = int(simulation.now_ns + number * 30e6)
+            back = sent + int(took_ns)
+            long_ago = HONEST.local(sent - 1e9)
+            events.took((HONEST.local(sent), 1, long_ago, 1), sent, back, True, simulation.clock.period_ns)
+            if events.are_trusted:
+                events.date(sent, simulation.clock.period_ns, 1e6, sent, back)
+            else:
+                events.compare(0.0, 1e6, back)
+        assert bool(why(simulation)) is counts
+
+
 def test_registers_that_nobody_has_are_refused_within_a_second() -> None:
     for controller in (Controller(counter=0), Controller(stuck=True)):
         assert verdict(run(controller, seconds=1.0)) is Verdict.REFUSED
@@ -158,6 +241,22 @@ def test_a_change_of_the_clocks_rate_is_followed() -> None:
     assert verdict(simulation) is Verdict.TRUSTED
     assert simulation.outcome(1.0).outside == 0
     assert percentile(simulation.outcome(7.0).errors_ns, 99) < 10e3
+
+
+@pytest.mark.parametrize("controller", [None, HONEST], ids=["polling", "events"])
+@pytest.mark.parametrize("excess_ns", [0.0, 30e3])
+@pytest.mark.parametrize("outward", [0.0, 0.5, 1.0])
+def test_the_uncertainty_covers_an_excess_on_one_side(
+    controller: Controller | None, excess_ns: float, outward: float
+) -> None:
+    """Which side cannot be told; the shortest round trip is a rare one."""
+    card = Card(16e3, spread=0, jitter_ns=2e3, excess_ns=excess_ns, outward=outward)
+    simulation = run(controller, card=card, seconds=8.0)
+    outcome = simulation.outcome(3.0)
+    assert simulation.clock.by_events is bool(controller)
+    assert outcome.outside == 0
+    told = percentile(sorted(sample.uncertainty_ns for sample in outcome.samples), 99)
+    assert told < (16e3 + excess_ns) / 2 + 12e3
 
 
 def test_the_uncertainty_covers_the_stamps_of_a_lopsided_round_trip() -> None:

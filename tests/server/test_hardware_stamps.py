@@ -6,7 +6,9 @@ How event times are judged is in test_event_times.py.
 from __future__ import annotations
 
 import logging
+import random
 import struct
+from itertools import pairwise
 
 import pytest
 
@@ -15,7 +17,9 @@ from ethercat_server.ethercat.exchange.distributed_clock import LATCHED, latched
 from ethercat_server.ethercat.exchange.frames import Area, fit_a_frame, make_frames
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import Command, Datagram, parse
+from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
+from protocol.framing import DataFlag
 from tests.simulation import Simulation, fresh, reading
 
 SETTLED_S = 3.0
@@ -106,6 +110,69 @@ def test_what_another_master_has_written_to_the_clock_is_taken_into_account() ->
     running.run(SETTLED_S)
     assert stamps(running) == "hardware"
     assert max(map(abs, errors_ns(running)[-400:])) < 10_000
+
+
+@pytest.mark.parametrize("seed", range(1, 7))
+def test_lost_frames_at_the_start_do_not_cost_event_times(seed: int) -> None:
+    running = Simulation(SensorOptions(signal="clock"), machine=Machine(seed=seed, lost=0.1))
+    running.backend.become(Machine())
+    running.run(SETTLED_S / 2)
+    assert stamps(running) == "hardware"
+
+
+@pytest.mark.parametrize("leaves_op", [False, True])
+@pytest.mark.parametrize("change", ["offset", "latch"])
+def test_what_another_master_writes_meanwhile_ends_event_times_for_a_while_only(
+    change: str, leaves_op: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It has gone: nobody else puts right what it has left in the controller."""
+    caplog.set_level(logging.INFO)
+    running = simulation("")
+    running.run(SETTLED_S)
+    life = running.backend.sensors.sensors[0].life
+    assert life is not None
+    esc, at = life.esc, reg.SYNC_MANAGER + 3 * reg.SYNC_MANAGER_SIZE + reg.SM_ACTIVATE
+
+    def write() -> None:
+        if change == "offset":
+            esc.write(reg.DC_OFFSET, struct.pack("<QI", 10**18 + 2**31, 350))
+        else:
+            esc.write(at, bytes([esc.memory[at] & ~reg.SM_LATCH_PDI]))
+
+    if leaves_op:
+        esc.write(reg.AL_CONTROL, bytes([1, 0]))
+        while running.status()["sensors"][0]["recoveries"] == 0:
+            running.run(0.01)
+    write()
+    running.run(8.0)
+    assert stamps(running) == "polling"
+    running.run(10.0)
+    assert stamps(running) == "hardware"
+    assert max(map(abs, errors_ns(running)[-400:])) < 10_000
+    assert running.status()["sensors"][0]["lost_samples"] == 0
+    assert caplog.text.count("by the distributed clock of its slave controller again") == 1
+
+
+@pytest.mark.parametrize(("sensors", "sinc_length"), [(1, 32), (1, 64), (8, 32), (8, 64)])
+def test_a_stop_of_the_machine_costs_neither_stamps_nor_the_count(sensors: int, sinc_length: int) -> None:
+    """The next sample may come between the pass of the process data and that of its event."""
+    options = [SensorOptions(serial=n, signal="clock", ppm=150.0 - 37 * n) for n in range(sensors)]
+    running = Simulation(*options, settings={"sinc_length": sinc_length})
+    running.run(SETTLED_S / 2)
+    assert {stamps(running, number) for number in range(sensors)} == {"hardware"}
+    chance, count, at_s = random.Random(1), len(running.frames), 0.0
+    seconds = 8.0 / sensors
+    while (at_s := at_s + chance.uniform(0.005, 0.05)) < seconds:
+        running.at(at_s, lambda: running.clock.stall(chance.uniform(0.5e6, 5e6)))
+    running.run(seconds)
+    wrong = 0
+    for number in range(sensors):
+        frames = [frame for frame in fresh(running.frames[count:]) if frame.sensor == number]
+        for before, after in pairwise(frames):
+            missing = reading(after).number - reading(before).number - 1
+            assert bool(after.flags & DataFlag.GAP) is (missing > 0)
+            wrong += abs(after.monotonic_ns - reading(after).instant_ns) > 10_000
+    assert wrong == 0
 
 
 def areas(count: int, size: int = 61) -> list[list[Area]]:

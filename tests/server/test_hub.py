@@ -11,7 +11,7 @@ from itertools import pairwise
 import pytest
 
 from ethercat_server.serving import permissions
-from ethercat_server.serving.connection import MAX_REQUEST_LENGTH, Connection, Limits
+from ethercat_server.serving.connection import MAX_REQUEST_LENGTH, Connection, Limits, Subscription
 from ethercat_server.serving.outbox import MAX_QUEUED_DATA
 from ethercat_server.serving.state import State
 from ethercat_server.serving.transport.in_memory import InMemoryStream
@@ -381,6 +381,78 @@ def test_one_user_cannot_use_up_the_connections_of_others(served: Served, uid: i
     assert len(served.hub.connections) == permissions.MAX_CLIENTS_PER_USER
     served.connect(4712)
     assert len(served.hub.connections) == permissions.MAX_CLIENTS_PER_USER + 1
+
+
+def test_those_who_have_most_cannot_keep_out_who_has_none(served: Served) -> None:
+    """Three users hold all that they can get; a fourth connects, and connects again."""
+    for uid in (1001, 1002, 1003):
+        for _ in range(permissions.MAX_CLIENTS_PER_USER):
+            if not (client := served.connect(uid)).at_end:
+                client.send(encode_json({"action": "subscribe"}))
+    for _ in range(3):
+        bridge = served.connect(998)
+        bridge.send(encode_json({"action": "subscribe"}))
+        assert served.read(bridge) == [{"reply": "subscribe", "ok": True}]
+        bridge.close()
+        served.publish()
+        served.serve(0.1)
+
+
+def test_an_idle_connection_of_who_has_most_goes_first(served: Served) -> None:
+    for uid in range(2000, 2000 + permissions.MAX_CLIENTS - permissions.RESERVED_FOR_CONTROL):
+        served.connect(uid)
+    crowd = list(served.hub.connections.values())
+
+    def gone() -> list[Connection]:
+        return [client for client in crowd if client not in served.hub.connections.values()]
+
+    for client in crowd[:6]:
+        client.uid = 1003
+        client.subscription = Subscription(1, None, 1, fresh_only=True)
+    assert served.is_closed(served.connect(3000)), "none is idle"
+    crowd[4].subscription = None
+    served.connect(3000)
+    assert gone() == [crowd[4]]
+    assert 3000 in {client.uid for client in served.hub.connections.values()}
+    crowd[3].subscription = crowd[2].subscription = None
+    served.connect(3000)
+    assert gone() == [crowd[2], crowd[4]]
+    assert served.is_closed(served.connect(1003)), "who has most cannot push out"
+
+
+def test_an_idle_connection_of_who_may_control_stays(served: Served) -> None:
+    for _ in range(permissions.MAX_CLIENTS - permissions.RESERVED_FOR_CONTROL):
+        served.connect(0)
+    assert served.is_closed(served.connect(3000))
+    assert {client.uid for client in served.hub.connections.values()} == {0}
+
+
+def test_what_was_queued_and_sent_does_not_count_for_ever(served: Served) -> None:
+    """80 rounds in which 4 kB of JSON wait because the client reads late: it is not full."""
+    client = served.connect(buffer_size=4096)
+    for _ in range(80):
+        only_connection(served).send_json({"event": "x" * 4000})
+        only_connection(served).send_json({"event": "x" * 4000})
+        for _ in range(3):
+            client.recv_all()
+            served.serve()
+    assert not only_connection(served).outbox.full
+    assert not client.at_end
+
+
+def test_who_waits_for_an_answer_is_not_idle(served: Served) -> None:
+    """A tare of 20,000 samples at 25 Hz takes longer than the idle timeout."""
+    served.hub.limits = Limits(idle_ns=60e9)
+    served.hub.start(lambda _connection, _message: None)
+    client = served.connect()
+    client.send(encode_json({"action": "tare", "id": 1}))
+    served.serve(800.0)
+    served.hub.answer(only_connection(served), {"reply": "tare", "id": 1, "ok": True})
+    assert served.read(client) == [{"reply": "tare", "id": 1, "ok": True}]
+    served.serve(59.0)
+    assert served.read(client) == [], "its idle time begins with the answer"
+    served.serve(2.0)
+    assert served.is_closed(client)
 
 
 def test_a_client_that_asks_and_never_reads_is_closed(served: Served) -> None:

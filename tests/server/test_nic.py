@@ -94,6 +94,7 @@ def test_an_interface_that_is_down_or_gone_is_why_nothing_comes_back(veth: Veth)
     veth.ip("link", "set", veth.far, "up")
     wait_until(lambda: look_up(veth.near).has_carrier, "the carrier")
     assert "no network interface 'nothing0'" in why_silent("nothing0")
+    assert why_silent("virtaul").endswith("; did you mean 'virtual'?")
 
 
 # -- an interface of the machine's network

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 import random
 from typing import Any
 
 import pytest
 
+from ethercat_server.ethercat.wire import PROCESSED_BIT, SHORTEST_FRAME, SOURCE_ADDRESS, Command, build
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.firmware import firmware
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.framing import DataFlag
 from protocol.settings import sampling_rate_hz
-from tests.simulation import OLD, Client, Simulation, check_frames, more_if_long, reading
+from tests.simulation import OLD, Client, Simulation, check_frames, fresh, more_if_long, reading
 
 CLOCK = SensorOptions(signal="clock", ppm=150.0)
 WANTED = {"acceleration_range_g": 8}
@@ -392,6 +395,25 @@ def test_what_is_lost_is_flagged_or_counted_through_recoveries(seed: int) -> Non
     assert client.ask("status")["sensors"][0]["recoveries"] == 30
 
 
+@pytest.mark.parametrize("dc", ["", "none"])
+@pytest.mark.parametrize("wire", [Machine(), Machine(lost=0.1)])
+def test_time_out_of_op_is_no_lost_samples(dc: str, wire: Machine) -> None:
+    """Exchanges go on while it comes back, and bring samples as soon as it is in OP; steps are repeated."""
+    simulation, client = streaming(SensorOptions(signal="clock", ppm=150.0, dc=dc))
+    stream = simulation.streams[0]
+    for recovery in range(20):
+        simulation.backend.become(wire)
+        simulation.run(0.2)
+        simulation.command("safeop 0x1B" if recovery % 3 else f"power cycle {0.03 * recovery}")
+        client.wait_event("sensor_lost")
+        missed, before = stream.lost_samples, len(simulation.frames)
+        client.wait_event("sensor_back")
+        simulation.backend.become(Machine())
+        client.fresh(1)
+        assert fresh(simulation.frames[before:])[0].flags & DataFlag.GAP
+        assert stream.lost_samples == missed
+
+
 @pytest.mark.parametrize("most", more_if_long([5], [5, 20]))
 @pytest.mark.parametrize("seed", more_if_long([0], range(5)))
 def test_one_that_returns_with_a_slow_eeprom_costs_the_other_nothing(seed: int, most: int) -> None:
@@ -429,3 +451,79 @@ def test_one_that_is_on_its_way_back_is_not_counted_in_place_of_another() -> Non
     simulation.run(0.2)
     check_frames([frame for frame in simulation.frames if frame.sensor == 1], complete=False)
     assert [sensor.streams for sensor in simulation.sensors] == [True, False]
+
+
+def test_a_busy_computer_is_named_where_it_explains_the_loss() -> None:
+    """And only there: the same AL error without a stall, or a second after it, is the sensor's."""
+    simulation, client = streaming()
+    for stall_ns, later_s, named in (
+        (300e6, 0.0, True),
+        (0.0, 0.0, False),
+        (150e6, 1.5, False),
+        (5e6, 0.0, False),
+    ):
+        simulation.at(0.005, functools.partial(simulation.clock.stall, stall_ns))
+        simulation.run(0.01 + later_s)
+        if not (lost := [event for event in client.events if event["event"] == "sensor_lost"]):
+            simulation.command("safeop 0x1B")
+            lost = [client.wait_event("sensor_lost")]
+        assert ("this computer stood still for" in lost[0]["message"]) is named
+        client.events.clear()
+        simulation.run(1.5)
+        client.events.clear()
+
+
+def test_a_busy_computer_is_named_in_place_of_the_cable_but_not_of_the_interface(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for why, said in (
+        ("check cable and power", "this computer stood still for"),
+        ("ens5 is down", "ens5 is down"),
+    ):
+        simulation, client = streaming()
+        monkeypatch.setattr(simulation.backend, "why_silent", lambda why=why: why)
+        simulation.at(0.005, functools.partial(simulation.clock.stall, 60e6))
+        simulation.run(0.01)
+        simulation.command("power off")
+        reason = client.wait_event("sensor_lost")["reason"]
+        assert reason.startswith(f"no frame comes back: {said}")
+        assert "cable" not in reason
+        assert ("stood still" in reason) is ("stood still" in said)
+
+
+@pytest.mark.parametrize(
+    ("source", "index"), [("021011223344", 0x95), ("010101010101", 3)], ids=["IgH", "SOEM"]
+)
+def test_another_master_on_the_wire_is_named_and_so_is_its_end(
+    source: str, index: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    simulation, client = streaming()
+    caplog.set_level(logging.INFO)
+    on = True
+    simulation.backend.become(Machine(late=0.1, late_ns=150e6))
+    simulation.run(2.0)
+    assert "no frame comes back: check cable and power" in caplog.text
+    assert "another" not in caplog.text, "late answers are its own"
+    assert "stood still" not in caplog.text
+    simulation.backend.become(Machine())
+    client.wait_event("sensor_back")
+    simulation.run(1.0)
+    client.events.clear()
+
+    def send() -> None:
+        """Its frames are seen, too, once the slaves have processed them."""
+        theirs = build((Command.BRD, 0, 0x130, bytes(2)), source=bytes.fromhex(source), first_index=index)
+        theirs[SOURCE_ADDRESS] |= PROCESSED_BIT
+        simulation.backend.put_on_the_wire(bytes(theirs.ljust(SHORTEST_FRAME, b"\0")))
+        if on:
+            simulation.at(0.01, send)
+
+    send()
+    simulation.run(1.5)
+    simulation.command("disconnect")
+    lost = client.wait_event("sensor_lost")["message"]
+    assert lost.endswith("check for another EtherCAT master, whose frames arrive on memory")
+    assert caplog.text.count("another EtherCAT master is sending on memory") == 1
+    on = False
+    simulation.run(15.0)
+    assert caplog.text.count("the other EtherCAT master on memory has stopped sending") == 1

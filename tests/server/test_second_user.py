@@ -104,7 +104,8 @@ def test_they_may_not_touch_whatever_they_claim_to_be(shared: Server) -> None:
         codes = [reply["error"]["code"] for reply in denied]
         assert codes == ["denied"] * 2 + ["bad_request"] * 3 + ["denied"]
         assert denied[0]["reply"] == action
-        assert str(NOBODY.pw_uid) in denied[0]["error"]["message"], "it says as whom they were seen"
+        seen = f"denied to {NOBODY.pw_name} (uid {NOBODY.pw_uid}): "
+        assert seen in denied[0]["error"]["message"], "it says as whom they were seen"
         assert described["ok"]
     assert what_can_be_changed(shared) == before
     assert f"(uid {NOBODY.pw_uid}): " in shared.said(), "the administrator can see who tried"

@@ -94,6 +94,14 @@ def test_port_taken(caplog: pytest.LogCaptureFixture) -> None:
     assert f"port {port} on 127.0.0.1 is in use by another program" in said
 
 
+def test_too_few_open_files() -> None:
+    """A process, whose listening sockets are too many."""
+    command = f"ulimit -n 6; exec {sys.executable} -m ethercat_server.daemon.cli lo {free_port()}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False, timeout=60)
+    sentence = "the server may open too few files (ulimit -n): allow it 256 at least"
+    assert (done.returncode, done.stderr) == (1, f"ethercat-server: {sentence}\n")
+
+
 @pytest.mark.bus
 @needs_bus
 def test_interfaces_without_a_sensor(

@@ -28,6 +28,8 @@ _ERROR_BIT = 0x10
 class GivenBus:
     """Two sensors in the AL states given; None does not answer."""
 
+    ifname = "given"
+
     backend = SimpleNamespace(check_present=lambda: None, why_silent=lambda: "check cable and power")
     stations = (1, 2)
     fmmus = (b"", b"")

@@ -12,9 +12,10 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from tests.server.as_another_user import NO_OTHER_USER
-from tests.systemd.staging import ROOT, Stage, install_service, need_systemd, stage
+from tests.systemd.staging import ROOT, UNITS, Stage, install_service, need_systemd, stage
 
 __all__ = ["stage"]
 
@@ -107,6 +108,7 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(copied: Stage, tmp_p
     said = fresh.run("--dry-run", "--keep-environment", "--bridge", "ens5")
     assert fresh.files() == {}
     assert "would write /etc/systemd/system/ethercat-bridge.service\n" in said
+    assert "next: systemctl enable --now 'ethercat-server@ens5' ethercat-bridge " in said.splitlines()[-2]
     before = copied.files()
     (copied.prefix / "pyvenv.cfg").touch()
     edited = copied.path / CONFIGURATION[1:]
@@ -243,6 +245,19 @@ def test_every_package_is_in_the_copy_that_is_built() -> None:
     copied = re.search(r'"\$root"/\{(.*?)\}', (ROOT / "scripts" / "install-service").read_text())
     assert copied is not None
     assert folders <= set(copied[1].split(","))
+
+
+@pytest.mark.parametrize(("file", "extra"), [("requirements.txt", ""), ("requirements-bridge.txt", "ros")])
+def test_the_lock_files_have_what_the_package_needs_with_hashes(file: str, extra: str) -> None:
+    """scripts/lock renews them."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    needed = project["build-system"]["requires"] + project["project"]["dependencies"]
+    needed += project["project"]["optional-dependencies"].get(extra, [])
+    pins = (UNITS / file).read_text().replace("\\\n", "").splitlines()
+    locked = {pin.split("==")[0]: pin.split("==")[1].split()[0] for pin in pins}
+    assert all("--hash=sha256:" in pin for pin in pins)
+    for requirement in map(Requirement, needed):
+        assert requirement.specifier.contains(locked[requirement.name.lower()]), requirement
 
 
 @pytest.mark.long

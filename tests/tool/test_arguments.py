@@ -11,11 +11,13 @@ import pytest
 from ethercat_server.errors import ForbiddenWriteError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.slave.coe import Steps, finish
+from ethercat_server.links import holder
 from ethercat_server.links.holder import find_holder
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
 from ethercat_server.tool.snapshot_file import RESTORABLE
 from protocol.settings import sinc_length_of
+from tests.bridge.scripted_server import ScriptedServer, description
 from tests.server.running import needs_bus
 from tests.tool.running import one_sentence, tool_here
 
@@ -119,7 +121,7 @@ def test_of_lengths_with_one_rate_it_is_the_one_read_or_asked_for(
     [
         (["objects", "ens5", "--server", "localhost:12001"], "either an interface"),
         (["objects", "--server", "localhost:port"], "HOST:PORT"),
-        (["objects", "--server", "localhost:0"], "HOST:PORT"),
+        (["objects", "--server", "localhost:0"], "0 is no port"),
         (["plan", "ens5"], "no settings given"),
         (["plan", "ens5", "--set", "sinc_length"], "NAME=VALUE"),
         (["apply", "ens5", "--set", "colour=1"], "no setting 'colour'"),
@@ -207,6 +209,20 @@ def test_a_file_that_is_no_snapshot(tmp_path: Path, text: str, named: str) -> No
 
 def test_nobody_holds_an_interface_that_is_not_there() -> None:
     assert find_holder("nosuch0") is None
+
+
+def test_a_server_of_another_user_says_itself_which_interface_it_uses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What it listens on cannot be seen; only what it says of the interface in question counts."""
+    monkeypatch.setattr(holder, "master_sockets", lambda _: {1})
+    monkeypatch.setattr(holder, "users_of", lambda *_: [])
+    with ScriptedServer() as server:
+        server.description = description(interface="ens5")
+        monkeypatch.setenv("BOTA_SERVER", f"127.0.0.1:{server.port}")
+        assert str(find_holder("ens5")) == "ethercat-server"
+        assert find_holder("ens5") == (None, "ethercat-server", ("127.0.0.1", server.port))
+        assert str(find_holder("ens6")) == "another EtherCAT master"
 
 
 @pytest.mark.parametrize(

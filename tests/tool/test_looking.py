@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import re
 import signal
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.wire import DATAGRAM_HEADER, FRAME_HEADER, Command
 from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, NOTE_NAMES
+from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.tool.cli import COMMANDS
 from tests.simulated_links import SimulatedBus, registers, simulated_bus
-from tests.tool.odd_firmware import FOREIGN_LACKS, FOREIGN_VENDOR, foreign, no_mailbox
+from tests.tool.odd_firmware import FOREIGN_VENDOR, foreign, no_mailbox
 from tests.tool.running import complaints, one_sentence, tool_here
 
 
@@ -97,27 +101,21 @@ def test_the_full_dump_has_a_line_for_every_object(size: str, missing: int) -> N
     assert sum("this firmware does not have it" in line for line in lines) == missing
 
 
-def test_a_foreign_slave_is_dumped_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_foreign_slave_is_no_sensor_to_anybody(monkeypatch: pytest.MonkeyPatch) -> None:
     foreign(monkeypatch)
     with simulated_bus() as bus:
-        rows = tool_here("objects", bus.near, "--json").json["sensors"][0]["objects"]
-        lacking = {int(row["index"], 16) for row in rows if "error" in row}
-        assert lacking >= FOREIGN_LACKS
-        assert [row["value"] for row in rows if row["index"] == "0x8011"] == [800]
-        assert len(tool_here("objects", bus.near).out.splitlines()) == 2 + len(KNOWN_OBJECTS)
-        assert "800" in tool_here("read", bus.near, "sampling rate").out
         assert tool_here("eeprom", bus.near, "--json").json["slaves"][0]["vendor"] == FOREIGN_VENDOR
         assert "no Bota Gen-0 sensor" in one_sentence(tool_here("watch", bus.near, code=1))
         assert bus.written() == []
 
 
-def test_a_slave_without_a_mailbox_has_no_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sensor_without_a_mailbox_has_no_objects(monkeypatch: pytest.MonkeyPatch) -> None:
     no_mailbox(monkeypatch)
     with simulated_bus() as bus:
-        assert "no CoE mailbox, so no objects" in tool_here("objects", bus.near).out
         assert tool_here("eeprom", bus.near, "--json").json["slaves"][0]["protocols"] == []
-        refused = tool_here("plan", bus.near, "--set", "fir=on", code=1)
-        assert "has no CoE mailbox" in one_sentence(refused)
+        for command in (["objects"], ["plan", "--set", "fir=on"]):
+            refused = tool_here(command[0], bus.near, *command[1:], code=1)
+            assert "has no CoE mailbox" in one_sentence(refused)
 
 
 def test_an_eeprom_that_cannot_be_read_says_so(bench: SimulatedBus) -> None:
@@ -206,17 +204,88 @@ def test_a_bus_that_is_silent_is_one_sentence(bench: SimulatedBus) -> None:
         assert "no EtherCAT slave answers on " in one_sentence(tool_here(command, bench.near, code=1))
 
 
-@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("adapters", "find")])
-def test_a_drive_at_work_is_not_touched_by(command: str, tmp_path: Path) -> None:
-    further: dict[str, list[object]] = {
-        "read": ["sampling rate"], "snapshot": [tmp_path / "new"], "restore": [tmp_path / "old"],
-        "plan": ["--set", "chop=on"], "apply": ["--set", "chop=on"],
-    }  # fmt: skip
+FURTHER: dict[str, list[object]] = {
+    "read": ["sampling rate"], "snapshot": ["new"], "restore": ["old"],
+    "plan": ["--set", "chop=on"], "apply": ["--set", "chop=on"],
+}  # fmt: skip
+"""Arguments of commands on a bus of others."""
+SII_ACCESS = set(range(reg.SII_OWNER, reg.SII_OWNER + 8))
+"""Registers that are written to read an SII; its owner gets it back."""
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("adapters", "find", "eeprom")])
+def test_a_bus_without_a_sensor_is_not_touched_by(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     with simulated_bus() as bus:
-        tool_here("snapshot", bus.near, tmp_path / "old")
+        tool_here("snapshot", bus.near, "old")
+    with simulated_bus("--chain", "EK1100,DRIVE:PREOP") as bus:
+        before, sent = [state(each) for each in registers(bus.backend)], writes(bus.backend)
+        result = tool_here(command, bus.near, *FURTHER.get(command, []), code=1)
+        assert "no Bota Gen-0 sensor" in one_sentence(result)
+        assert [state(each) for each in registers(bus.backend)] == before
+        assert {address for _, address in sent} <= SII_ACCESS
+
+
+def test_the_standard_objects_of_a_foreign_slave_in_the_state_it_is_in() -> None:
+    with simulated_bus("--chain", "EK1100,DRIVE:PREOP,DRIVE") as bus:
+        before, sent = [state(each) for each in registers(bus.backend)], writes(bus.backend)
+        (slave,) = tool_here("objects", bus.near, "--slave", "1:DRIVE", "--json").json["sensors"]
+        assert (slave["slave"], slave["name"]) == (1, "DRIVE")
+        found = {(row["index"], row["subindex"]): row.get("value") for row in slave["objects"]}
+        assert (found["0x1018", 1], found["0x1018", 2]) == (0x7E57, 402)
+        assert [state(each) for each in registers(bus.backend)] == before
+        assert len({address for _, address in sent} - SII_ACCESS) == 1, "its mailbox"
+        for wanted, why in (
+            ("1", "there are 0:EK1100; 1:DRIVE; 2:DRIVE"), ("0:DRIVE", "no slave is '0:DRIVE'"),
+            ("0:EK1100", "has no CoE mailbox"),
+        ):  # fmt: skip
+            assert why in one_sentence(tool_here("objects", bus.near, "--slave", wanted, code=2))
+        assert "is in INIT" in one_sentence(tool_here("objects", bus.near, "--slave", "2:DRIVE", code=1))
+
+
+def state(registers: bytes) -> bytes:
+    """What its own master has set up: station address, AL state, FMMUs, sync managers' layout."""
+    managers = registers[reg.SYNC_MANAGER : reg.SYNC_MANAGER + 4 * reg.SYNC_MANAGER_SIZE]
+    layout = b"".join(managers[at : at + 5] for at in range(0, len(managers), reg.SYNC_MANAGER_SIZE))
+    return (
+        registers[0x10:0x12]
+        + registers[reg.AL_STATUS : reg.AL_STATUS + 1]
+        + registers[reg.FMMU : reg.FMMU + 64]
+        + layout
+    )
+
+
+def writes(backend: MemoryBackend) -> list[tuple[Command, int]]:
+    """Filled with every datagram from now on that is not a read: command and register."""
+    found: list[tuple[Command, int]] = []
+    send = backend.send
+
+    def note(frame: bytes | bytearray) -> None:
+        at, more = FRAME_HEADER, True
+        while more:
+            command, _, _, address, length = struct.unpack_from("<BBHHH", frame, at)
+            if command not in (Command.APRD, Command.FPRD, Command.BRD):
+                found.append((Command(command), address))
+            at += DATAGRAM_HEADER + (length & 0x7FF) + 2
+            more = bool(length & 0x8000)
+        send(frame)
+
+    backend.send = note  # type: ignore[method-assign]
+    return found
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("adapters", "find")])
+def test_a_drive_at_work_is_not_touched_by(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with simulated_bus() as bus:
+        tool_here("snapshot", bus.near, "old")
     with simulated_bus("--chain", "BOTA:OP,DRIVE:OP") as bus:
         before = registers(bus.backend)
-        result = tool_here(command, bus.near, *further.get(command, []), code=1)
+        result = tool_here(command, bus.near, *FURTHER.get(command, []), code=1)
         assert "has slaves at work that are no Bota sensors (position 1 in OP)" in one_sentence(result)
         option = "--take-over" if command in {"snapshot", "restore"} else "--force"
         assert f"; {option} takes them to PREOP" in one_sentence(result)

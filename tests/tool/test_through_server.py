@@ -66,6 +66,14 @@ def test_objects_are_read_by_name() -> None:
 
 
 @pytest.mark.usefixtures("bench")
+def test_the_first_name_is_no_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BOTA_SERVER", SimulatedServer.address)
+    found = tool_here("read", "Sampling rate", "fir", "--json").json["sensors"][0]["objects"]
+    assert [row["name"] for row in found] == ["Sampling rate", "FIR disable"]
+    assert len(tool_here("read", "fir", "--json").json["sensors"][0]["objects"]) == 1
+
+
+@pytest.mark.usefixtures("bench")
 def test_objects_and_watch() -> None:
     sensors = tool_here("objects", *SERVER, "--json").json["sensors"]
     assert [row["serial"] for row in sensors] == [10, 20]
@@ -88,6 +96,21 @@ def test_plan_apply_save(bench: Bench) -> None:
     tool_here("save", "--sensor", 1, *SERVER)
     assert ("0x8030", 1, "01") in bus.written(1)
     assert [row["rate_hz"] for row in server.connect().ask("describe")["sensors"]] == [RATE_HZ, 400]
+
+
+def test_what_is_said_to_last_outlasts_the_sensors_power(bench: Bench) -> None:
+    bus, server = bench
+    applied = tool_here("apply", "--sensor", 0, "--set", "sinc_length=128", *SERVER).out
+    assert applied.splitlines()[-1].startswith("in force until the server is started again, also after")
+    tared = tool_here("tare", "--sensor", 0, "--samples", 20, *SERVER).out
+    assert "in force while the server runs, then until the sensor is powered off" in tared
+    before = server.connect().ask("describe")["sensors"][0]
+    bus.power_cycle()
+    assert server.run_until(lambda: any(event["event"] == "sensor_back" for event in server.events))
+    after = server.connect().ask("describe")["sensors"][0]
+    assert (after["settings"]["sinc_length"], after["offset"]) == (128, before["offset"])
+    assert any(after["offset"])
+    assert "nothing to change" in tool_here("plan", "--sensor", 0, "--set", "sinc_length=128", *SERVER).out
 
 
 def test_apply_that_fails_half_way_takes_everything_back(

@@ -187,7 +187,7 @@ def test_the_next_sample_may_come_within_the_frame() -> None:
     after = 4 * PERIOD - 11_500  # its write has begun
     master.wait(instant + after - master.now)
     assert look(master)[3:] == (instant + 4 * PERIOD - WRITE - START, instant + 3 * PERIOD - START)
-    master.wait(instant + 4 * PERIOD - 3000 - master.now)
+    master.wait(instant + 4 * PERIOD - 4000 - master.now)
     shown, _, ecat, _, change = look(master)
     assert (shown, change) == (instant + 3 * PERIOD, instant + 4 * PERIOD - START)
     assert ecat < change
@@ -238,7 +238,8 @@ def test_outputs_and_mailboxes_latch_too() -> None:
     assert 0 < struct.unpack("<I", master.read(0x09F0, 4))[0] < master.now - START
     assert master.write(0x0816, bytes([LATCH])) == 1
     frame = look(master)
-    assert frame[2:] == (frame[1],) * 3, "all is of the frame that brought the outputs"
+    assert frame[2] == frame[1]
+    assert all(0 < taken - frame[1] < 5000 for taken in frame[3:]), "within the frame that brought them"
 
 
 def test_a_skipped_sample_is_no_event_and_a_repeated_one_is() -> None:

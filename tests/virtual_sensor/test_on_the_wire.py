@@ -6,6 +6,7 @@ What does not depend on SOEM or the kernel is tested in memory, in the other fil
 from __future__ import annotations
 
 import functools
+import socket
 import struct
 import subprocess
 import time
@@ -15,6 +16,8 @@ from typing import Any, TypeVar
 import pysoem
 import pytest
 
+from ethercat_server.ethercat import wire
+from ethercat_server.ethercat.wire import Command
 from ethercat_server.sensor.objects.dictionary import Access
 from ethercat_server.virtual_sensor.firmware.dictionary import entries_of
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
@@ -25,6 +28,7 @@ pytestmark = pytest.mark.bus
 
 Start = Callable[..., SensorProcess]
 _PATIENCE = 20.0
+SOL_PACKET, PACKET_AUXDATA, ETH_P_ALL = 263, 8, 3
 
 
 @pytest.fixture
@@ -186,7 +190,7 @@ def test_a_chain_of_three(veth: tuple[str, str], start: Start, open_master: Call
     assert exchange(master) == master.expected_wkc == 9
     assert len({slave.input for slave in master.slaves}) == 1
     serials = [struct.unpack("<I", read(slave, 0x1018, 4))[0] for slave in master.slaves]
-    assert serials == [1, 2, 3]
+    assert serials == [serials[0] + n for n in range(3)]
 
 
 @pytest.mark.parametrize("chain", ["EK1100,BOTA,EL3102,DRIVE", "EK1100:OP,BOTA:OP,EL3102:OP,DRIVE:OP"])
@@ -253,6 +257,31 @@ def test_pysoem_reports_an_emergency(
     assert sensor.command("emergency 0x8131") == "ok"
     patiently(master.config_map)
     assert master.state_check(pysoem.SAFEOP_STATE, 2_000_000) == pysoem.SAFEOP_STATE
+
+
+def test_an_eeprom_write_fails(veth: tuple[str, str], start: Start, open_master: Callable[[], Any]) -> None:
+    start(veth[0])
+    master = open_master()
+    find(master, 1)
+    with pytest.raises(pysoem.EepromError):
+        master.slaves[0].eeprom_write(0x08, b"\xde\xad")
+
+
+@pytest.mark.parametrize("tag", ["8100e000", "81006005", "88a80005"])
+def test_an_answer_has_the_vlan_tag_of_its_frame(tag: str, veth: tuple[str, str], start: Start) -> None:
+    start(veth[0])
+    frame = wire.build((Command.BRD, 0, 0x0000, bytes(34)))
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as raw:
+        raw.setsockopt(SOL_PACKET, PACKET_AUXDATA, 1)
+        raw.bind((veth[1], ETH_P_ALL))
+        raw.settimeout(_PATIENCE)
+        raw.send(frame[:12] + bytes.fromhex(tag) + frame[12:])
+        while (answer := raw.recvmsg(2048, 64))[0][12:14] != frame[12:14]:
+            pass
+    data, [(_, _, auxiliary)], *_ = answer
+    assert wire.working_counter(data, wire.parse(data, len(data))[0]) == 1
+    *_, control, kind = struct.unpack("=IIIHHHH", auxiliary)
+    assert f"{kind:04x}{control:04x}" == tag
 
 
 def test_an_interface_down_for_a_while(

@@ -79,6 +79,21 @@ def test_it_says_when_it_is_ready_and_ends_on_sigterm(veth: tuple[str, str], sta
 
 
 @pytest.mark.bus
+def test_each_interface_has_serial_numbers_of_its_own(veth: tuple[str, str], start: Start) -> None:
+    def serials(ifname: str) -> list[int]:
+        sensor = start(ifname, "--sensors", "2")
+        answer = json.loads(sensor.command("stats").removeprefix("ok "))
+        sensor.end()
+        return [each["serial"] for each in answer["sensors"]]
+
+    for number, end in enumerate(veth):  # as of two ports of one card
+        subprocess.run(["ip", "link", "set", end, "address", f"02:00:00:00:00:0{number}"], check=True)
+    one, other, again = (serials(ifname) for ifname in (*veth, veth[0]))
+    assert len({*one, *other}) == 4
+    assert again == one, "the same sensors, started again"
+
+
+@pytest.mark.bus
 def test_quit_and_end_of_input(veth: tuple[str, str], start: Start) -> None:
     sensor = start(veth[0])
     assert sensor.process.stdin is not None

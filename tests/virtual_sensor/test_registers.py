@@ -5,6 +5,8 @@ import struct
 import pytest
 
 from ethercat_server.ethercat.wire import Command
+from ethercat_server.virtual_sensor.options import ForeignOptions
+from ethercat_server.virtual_sensor.slave.al import AlState
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, RawMaster, chain, fmmu, sync_manager
 
 
@@ -149,6 +151,29 @@ def test_process_data_needs_the_state() -> None:
     master.request(OP)
     assert master.cycle(output=9)[1] == 3
     assert master.upload(0x7000, 0) == b"\x09"
+
+
+def test_a_buffer_is_read_and_written_from_its_first_byte_on() -> None:
+    """A real controller does not count an access that begins in the middle."""
+    master = RawMaster().go(OP)
+
+    def middle() -> int:
+        return master.one(Command.APRD, 0, 0x1180 + 20, bytes(41))[1]
+
+    assert middle() == 0
+    assert master.one(Command.APRD, 0, 0x1180, bytes(20))[1] == 1
+    assert middle() == 1, "it goes on"
+    assert middle() == 0, "it was handed back with its last byte"
+    drive = RawMaster(ForeignOptions("DRIVE", state=AlState.SAFEOP))
+    at = drive.read16(0x0810)
+    assert [drive.write(at + n, bytes(size)) for n, size in ((1, 5), (0, 1), (1, 5), (1, 5))] == [0, 1, 1, 0]
+
+
+def test_the_sync_unit_can_be_set_up() -> None:
+    master = RawMaster()
+    for register, value in ((0x0981, b"\3"), (0x0990, bytes(range(8))), (0x09A0, bytes(range(8)))):
+        assert master.write(register, value) == 1
+        assert master.read(register, len(value)) == value
 
 
 def test_wrong_direction_is_refused() -> None:

@@ -79,7 +79,9 @@ def test_it_cannot_be_written() -> None:
     before = read_words(master, 0x08)[1]
     master.write(0x0508, b"\xde\xad\xbe\xef")
     status, _ = read_words(master, 0x08, 0x0201)
-    assert status & 0x4000
+    assert status & 0x6000 == 0x2000, "the EEPROM does not acknowledge: what masters look at"
+    status, _ = read_words(master, 0x08, 0x0200)
+    assert status & 0x6000 == 0x4000, "write enable is missing"
     assert read_words(master, 0x08) == (0x0040, before)
 
 

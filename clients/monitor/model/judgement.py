@@ -29,8 +29,10 @@ class Judgement:
         self._status: JsonObject = {}
         self._observer: StreamObserver | None = None
         """None before the first description."""
-        self._at_s: dict[str, float] = {}
-        """When what `status` counts last grew, and when the connection was last interrupted."""
+        self._grown: dict[str, tuple[int, float]] = {}
+        """By how much and when what `status` counts last grew; when the connection was last interrupted."""
+        self._now: tuple[Finding, ...] = ()
+        """The findings of the newest verdict, with the server's words."""
         self._emergency = "", 0.0
         self._emergencies: int | None = 0
         """How many the sensor had sent when `_emergency` was the last one."""
@@ -39,7 +41,7 @@ class Judgement:
 
     def reset(self) -> None:
         """Forget what is past."""
-        self._seen, self._at_s, self._emergency = {}, {}, ("", 0.0)
+        self._seen, self._grown, self._emergency = {}, {}, ("", 0.0)
         if self._observer is not None:
             self._observer.forget()
 
@@ -56,57 +58,59 @@ class Judgement:
         self._status = {}
         self._begin(now_s)
         if again:
-            self._at_s["reconnects"] = now_s
+            self._grown["reconnects"] = 1, now_s
 
     def _begin(self, now_s: float) -> None:
         rate_hz = number(self._row.get("rate_hz")) or 0.0
         self._observer = StreamObserver(rate_hz, _ns(now_s), window_ns=_ns(WINDOW_S))
 
     def take_status(self, row: JsonObject, now_s: float) -> None:
-        """Take the sensor's row of `status`."""
-        for name in ("not_finite", "recoveries"):
+        """Take the sensor's row of `status`, with the server's missed deadlines."""
+        for name in ("not_finite", "recoveries", "missed_deadlines"):
             before, after = whole(self._status.get(name)), whole(row.get(name))
             if before is not None and after is not None and after > before:
-                self._at_s[name] = now_s
+                self._grown[name] = after - before, now_s
         count, last = whole(row.get("emergencies")), row.get("emergency")
         if count != self._emergencies and isinstance(last, dict):
             ago_s = number(last.get("ago_s")) or 0.0
             self._emergencies, self._emergency = count, (emergency(last), now_s - ago_s)
         self._status = row
 
-    def take(self, frames: Sequence[DataMessage], now_s: float, *, is_lost: bool) -> None:
+    def take(self, frames: Sequence[DataMessage], now_s: float, *, lost: str | None) -> None:
         """Frames of this sensor as they came, oldest first."""
         if self._observer is not None:
             self._observer.take(frames, _ns(now_s))
-        self.judge(now_s, is_lost=is_lost)
+        self.judge(now_s, lost=lost)
 
     def note_age(self, frame: DataMessage, now_ns: int) -> None:
         """This frame arrived exactly at this CLOCK_MONOTONIC."""
         if self._observer is not None:
             self._observer.note_age(frame, now_ns)
 
-    def judge(self, now_s: float, *, is_lost: bool) -> None:
-        """Judge the second up to now."""
-        seen = self._observation(now_s, is_lost)
+    def judge(self, now_s: float, *, lost: str | None) -> None:
+        """Judge the second up to now. `lost`: the server's words of why it has lost the sensor, if it has."""
+        seen = self._observation(now_s, is_lost=lost is not None)
         self.verdict = judge(seen)
         self.saturated = [axis for axes in saturated_axes(seen).values() for axis in axes]
-        for finding in self.verdict.findings:
+        self._now = tuple(_explained(finding, lost) for finding in self.verdict.findings)
+        for finding in self._now:
             known, _ = self._seen.get(finding.key, (finding, 0.0))
             worst = max(finding, known, key=lambda one: (one.level, one.size))
             self._seen[finding.key] = worst, now_s
 
-    def _observation(self, now_s: float, is_lost: bool) -> Observation:
+    def _observation(self, now_s: float, *, is_lost: bool) -> Observation:
         if self._observer is None:
             return Observation()
         clock: Any = self._status.get("clock")
         mode = clock.get("mode") if isinstance(clock, dict) else None
         settings = self._row.get("settings")
         said, at_s = self._emergency
-        grown = {name for name, then_s in self._at_s.items() if now_s - then_s < WINDOW_S}
+        grown = {name: by for name, (by, then_s) in self._grown.items() if now_s - then_s < WINDOW_S}
         seen = self._observer.observation(_ns(now_s))
         return seen._replace(
             not_finite=seen.not_finite + ("not_finite" in grown),
             recoveries=int("recoveries" in grown),
+            missed_deadlines=grown.get("missed_deadlines", 0),
             reconnects=int("reconnects" in grown),
             locked=None if mode is None else mode == "locked",
             is_lost=is_lost,
@@ -115,17 +119,9 @@ class Judgement:
             settings=settings if isinstance(settings, dict) else {},
         )
 
-    def alerts(self, now_s: float, *, present: bool, lost: str | None) -> list[Alert]:
-        """What is there now, if `present`, the worst first; then what is past, the latest first.
-
-        `lost`: the server's words of why it has lost the sensor, if it has.
-        """
-        now = self.verdict.findings if present else ()
-        if lost is not None:
-            now = tuple(
-                finding._replace(remedy=f"{finding.remedy} ({lost})") if finding.key == "silence" else finding
-                for finding in now
-            )
+    def alerts(self, now_s: float, *, present: bool) -> list[Alert]:
+        """What is there now, if `present`, the worst first; then what is past, the latest first."""
+        now = self._now if present else ()
         keys = {finding.key for finding in now}
         past = [entry for key, entry in self._seen.items() if key not in keys]
         past.sort(key=lambda entry: -entry[1])
@@ -133,6 +129,13 @@ class Judgement:
             *(Alert(finding.level, finding.found, finding.remedy, None) for finding in now),
             *(Alert(finding.level, finding.found, finding.remedy, now_s - at_s) for finding, at_s in past),
         ]
+
+
+def _explained(finding: Finding, lost: str | None) -> Finding:
+    """With the server's words of why it has lost the sensor, which may say what to do."""
+    if lost is None or finding.key != "silence":
+        return finding
+    return finding._replace(remedy=lost if "check " in lost else f"{finding.remedy} ({lost})")
 
 
 def _ns(seconds: float) -> int:

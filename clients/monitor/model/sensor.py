@@ -86,7 +86,7 @@ class SensorModel:
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
         """Frames of this sensor as they came, oldest first."""
         fresh = self.meter.take(frames, now_s)
-        self.judgement.take(frames, now_s, is_lost=self._lost is not None)
+        self.judgement.take(frames, now_s, lost=self._lost)
         if not fresh:
             return
         self._newest = fresh[-1]
@@ -118,7 +118,7 @@ class SensorModel:
         stream = self.meter.state(now_s)
         silent_s = 0.0 if stream.silent_s is None else stream.silent_s
         if server_speaks:
-            self.judgement.judge(now_s, is_lost=self._lost is not None)
+            self.judgement.judge(now_s, lost=self._lost)
         return SensorState(
             position=self.position,
             name=text(row.get("name")),
@@ -134,7 +134,7 @@ class SensorModel:
             traces=self._traces(now_s),
             saturated=frozenset(self.judgement.saturated),
             verdict=self.judgement.verdict,
-            alerts=tuple(self.judgement.alerts(now_s, present=server_speaks, lost=self._lost)),
+            alerts=tuple(self.judgement.alerts(now_s, present=server_speaks)),
             stream=stream,
             clock=_clock(clock) if isinstance(clock, dict) else None,
             bus_lost=whole(self._status.get("lost_samples")),

@@ -24,8 +24,8 @@ from protocol.text.json_text import JsonObject
 from protocol.text.untrusted import number, rows, text, whole
 
 _POSITION: Final = attrgetter("sensor")
-_SAID_S: Final = 30.0
-"""How long a message is shown, as on the page in a browser."""
+_MESSAGE_S: Final = 30.0
+"""How long a message is shown."""
 
 
 class Model:
@@ -46,8 +46,8 @@ class Model:
         self._status_s = 0.0
         self._clients: tuple[Client, ...] = ()
         self._message: Message | None = None
-        self._shown_s: float | None = None
-        """When the message was first in a state."""
+        self._message_ends_s = 0.0
+        """0: it has not been shown yet."""
         self._events: deque[str] = deque(maxlen=8)
 
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
@@ -103,6 +103,7 @@ class Model:
                 sensor = self._sensor(row)
                 if sensor is not None:
                     known = isinstance(ages, list) and position < len(ages)
+                    row["missed_deadlines"] = status.get("missed_deadlines")
                     sensor.take_status(row, ages[position] if known else None, now_s)
             self._take_clients(rows(status.get("clients")), now_s - self._status_s)
             self._status, self._status_s = status, now_s
@@ -132,14 +133,14 @@ class Model:
     def say(self, message: str, *, bad: bool = False) -> None:
         """Set the message for the user."""
         with self._lock:
-            self._message, self._shown_s = Message(text(message), bad) if message else None, None
+            self._message = Message(text(message), bad) if message else None
+            self._message_ends_s = 0.0
 
     def state(self, now_s: float) -> State:
         """The current state."""
         with self._lock:
-            if self._shown_s is None:
-                self._shown_s = now_s
-            if now_s - self._shown_s > _SAID_S:
+            self._message_ends_s = self._message_ends_s or now_s + _MESSAGE_S
+            if now_s > self._message_ends_s:
                 self._message = None
             server = self._server(now_s)
             speaks = server.connected and not server.silent

@@ -82,17 +82,21 @@ def alerts(sensor: SensorState, width: int, most: int) -> list[Row]:
         return [Row(1, field("Warnings", none))]
     rows: list[Row] = []
     for number, alert in enumerate(sensor.alerts):
-        lines = alert_lines(alert, width)
+        lines = _alert(alert, width)
         left = len(sensor.alerts) - number - 1
         if rows and len(rows) + len(lines) + bool(left) > most:
-            rows.append(Row(3, field("", f"and {left + 1} more: w")))
+            rows.append(Row(3, field("", f"and {left + 1} more: press w")))
             break
         rows.extend(Row(1 if not number else 3, line) for line in lines)
     return rows
 
 
-def alert_lines(alert: Alert, width: int) -> list[Text]:
-    """It and its remedy, on one line or two."""
+def all_alerts(sensor: SensorState, width: int) -> list[Text]:
+    """The whole list."""
+    return [line for alert in sensor.alerts for line in _alert(alert, width)] or [Text("none")]
+
+
+def _alert(alert: Alert, width: int) -> list[Text]:
     present = alert.ago_s is None
     head = Text.assemble(
         (f" {alert.level.words} " if present else alert.level.words, ALARM if present else BAD),
@@ -113,10 +117,14 @@ def _identity(sensor: SensorState, others: Sequence[SensorState], width: int) ->
         level = other.verdict.level
         rest.append(f" {other.position}", LABEL)
         rest.append(f" {level.words} " if level else f" {level.words}", ALARM if level else "")
-    room = width - rest.cell_len - bool(rest)
-    row = Text(words.identity(sensor, room), BAD if lost else VALUE)
+    # The state and what is on the right are to be read at every width.
+    state = f"  {sensor.al_state}" if sensor.al_state else ""
+    room = max(0, width - len(state) - rest.cell_len - bool(rest))
+    who = words.who(sensor)
+    row = Text(who if len(who) <= room else words.who(sensor, firmware=False), BAD if lost else VALUE)
+    row.truncate(room)
+    row.append(state)
     if rest.cell_len:
-        row.truncate(max(0, room))
         row.pad_right(width - rest.cell_len - row.cell_len)
     return row.append_text(rest)
 

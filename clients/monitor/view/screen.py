@@ -12,7 +12,7 @@ from clients import numbers
 from clients.monitor.model.state import AXES, State
 from clients.monitor.view import words
 from clients.monitor.view.glyphs import ALARM, BAD, LABEL, NOTICE, UNICODE, VALUE, Glyphs, to_ascii
-from clients.monitor.view.panel import MOST_TALL, Row, alert_lines, alerts, field, panel
+from clients.monitor.view.panel import MOST_TALL, Row, alerts, all_alerts, field, panel
 
 KEYS: Final = (
     ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),
@@ -56,7 +56,7 @@ def render(state: State, look: Look, width: int, height: int) -> list[Text]:
         rows = [Text(f"too small: {_LEAST_WIDTH}x{_LEAST_HEIGHT} at least")]
     elif look.help:
         rows = _help(state)
-    elif look.warnings:
+    elif look.warnings and state.sensors:
         rows = _warnings(state, look, width, height)
     else:
         rows = _overview(state, look, width, height)
@@ -204,17 +204,14 @@ def _help(state: State) -> list[Text]:
 
 def _warnings(state: State, look: Look, width: int, height: int) -> list[Text]:
     """All warnings of the selected sensor, a page of them."""
-    lines: list[Text] = []
-    if state.sensors:
-        sensor = state.sensors[look.selected % len(state.sensors)]
-        lines = [line for alert in sensor.alerts for line in alert_lines(alert, width)]
-        identity = Text(words.identity(sensor, width), VALUE)
+    sensor = state.sensors[look.selected % len(state.sensors)]
+    lines = all_alerts(sensor, width)
     room = height - 4
-    pages = [lines[start : start + room] for start in range(0, len(lines), room)] or [[Text("no warnings")]]
+    pages = [lines[start : start + room] for start in range(0, len(lines), room)]
     number = (look.warnings - 1) % len(pages)
     shown = pages[number] + [Text()] * (room - len(pages[number]))
-    hint = Text(f"{number + 1} of {len(pages)}   w: next page, any other key: return", LABEL)
-    return [_title(state, look, width), identity if state.sensors else Text(), *shown, Text(), hint]
+    title = Text(f"Warnings of sensor {sensor.position}: page {number + 1} of {len(pages)}", VALUE)
+    return [title, Text(), *shown, Text(), Text("w: next page, any other key: return", LABEL)]
 
 
 def _fitted(row: Text, width: int, glyphs: Glyphs) -> Text:

@@ -43,16 +43,19 @@ def trouble(server: ServerState) -> str | None:
     return None
 
 
-def identity(sensor: SensorState, width: int = 200) -> str:
-    """Position, name, serial number, firmware and AL state; what is too wide loses its last but the state."""
+def identity(sensor: SensorState) -> str:
+    """Position, name, serial number, firmware and AL state."""
+    return "  ".join(part for part in (who(sensor), sensor.al_state) if part)
+
+
+def who(sensor: SensorState, *, firmware: bool = True) -> str:
+    """Position, name, serial number and firmware."""
     parts = [f"Sensor {sensor.position}", sensor.name]
     if sensor.serial is not None:
         parts.append(f"serial {sensor.serial}")
-    if sensor.firmware:
+    if sensor.firmware and firmware:
         parts.append(f"firmware {sensor.firmware}")
-    while len("  ".join((*parts, sensor.al_state))) > width and len(parts) > 1:
-        parts.pop()
-    return "  ".join(part for part in (*parts, sensor.al_state) if part)
+    return "  ".join(part for part in parts if part)
 
 
 def rate(sensor: SensorState) -> str:

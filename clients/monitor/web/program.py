@@ -46,7 +46,7 @@ async def _serve(options: Options, where: Address) -> None:
     async with WebServer(hub, model).serving(*where) as port:
         sys.stdout.write(
             f"Open http://{Address(where.host, port)}/#token={token.text}\n"
-            "This link allows to tare; without #token=... the page only shows. Ctrl-C ends it.\n"
+            "With this link the page can tare the sensor; without #token=... it only shows. Ctrl-C ends it.\n"
         )
         sys.stdout.flush()
         reader.start()

@@ -179,8 +179,8 @@ def check_stamps(timing: Timing, findings: Findings) -> Check:
         remedies.append("Wait for chrony or NTP to converge before recording.")
     off = np.abs(timing.deviations)
     usually = (
-        f"95 % of the intervals are within {seconds(timing.usual_deviation)} of {seconds(series.period)}, "
-        f"all within {seconds(float(off.max()) if len(off) else 0.0)}."
+        f"95 % of the intervals are within {_bound(timing.usual_deviation)} of {seconds(series.period)}, "
+        f"all within {_bound(float(off.max()) if len(off) else 0.0)}."
     )
     for finding in findings:
         wrong += [f"{finding.found}.", usually]
@@ -217,3 +217,8 @@ def too_few(name: str, samples: int) -> Check:
         else "There are no samples."
     )
     return Check(name, Level.NOT_POSSIBLE, found, "", "Record for at least 10 s.")
+
+
+def _bound(deviation_s: float) -> str:
+    """No finer than stamps mean anything."""
+    return seconds(max(deviation_s, 1e-7))

@@ -3,6 +3,7 @@
 A controller with distributed clocks keeps its local time of the moment when the sensor's processor had
 written a sample (PDI buffer change event). The frame that reads the sample reads that, too. Which sample an
 event belongs to is certain: it came after the frame before, which did not bring the sample, and before this.
+Where the next sample came between the pass of the process data and that of the event, its event says when.
 """
 
 from __future__ import annotations
@@ -24,8 +25,6 @@ _OUTLIER: Final = 5.0
 """Standard deviations from the estimate beyond which an instant is not used."""
 _OLDEST: Final = 1.5
 """Age of the newest event, in periods, beyond which samples have come without events."""
-_PASSING: Final = 0.5
-"""Weight, as a contradiction, of an event that came while the frame passed."""
 _LEAST_VARIANCE: Final = 3_000.0**2
 _ASYMMETRY: Final = 1 / 24
 """Standard deviation of the outward part of a round trip, as part of the shortest one."""
@@ -36,12 +35,16 @@ class EventTimes:
     then `learn`."""
 
     __slots__ = (
-        "_answers", "_event", "_half_behind_ns", "_is_passing", "_local", "_moved", "_offset", "_reading_ns",
-        "_timing", "_took_ns", "are_trusted", "instant_ns", "is_doubtful", "local_clock", "trust",
+        "_answers", "_event", "_half_behind_ns", "_is_next", "_local", "_moved", "_offset", "_passing_ns",
+        "_reading_ns", "_timing", "_took_ns", "are_trusted", "instant_ns", "is_doubtful", "local_clock",
+        "trust",
     )  # fmt: skip
 
-    def __init__(self, clock: DistributedClock, timing: ExchangeTiming) -> None:
-        """`clock` is the slave controller's; `timing` that of the bus."""
+    def __init__(self, clock: DistributedClock, timing: ExchangeTiming, passing_ns: int) -> None:
+        """`clock` is the slave controller's; `timing` that of the bus.
+
+        The process data passes so long after the frame has arrived.
+        """
         self.local_clock = LocalClock(timing)
         self.trust = Trust()
         self.are_trusted = False
@@ -49,20 +52,36 @@ class EventTimes:
         self.instant_ns = 0.0
         """CLOCK_MONOTONIC of the new sample of the newest exchange; 0 if its event does not say."""
         self._timing = timing
-        self._offset = clock.offset
-        self._half_behind_ns = clock.behind_ns / 2
-        self._reading_ns = clock.reading_ns
+        self._use(clock)
+        self._passing_ns = passing_ns
         self._local = self._event = _LONG_AGO
         """Local times of the newest exchange and of the newest sample's event."""
         self._took_ns = 0
         """By the newest exchange."""
         self.is_doubtful = False
         """Whether samples may have been lost before it that nobody knows of."""
-        self._is_passing = False
-        """Whether that event came while the frame passed: it may be this sample's or the next one's."""
+        self._is_next = False
+        """Whether that event is the next sample's, which came while the frame passed."""
         self._moved = 0
         self._answers = False
         """Whether the controller knows the registers."""
+
+    def _use(self, clock: DistributedClock) -> None:
+        self._offset = clock.offset
+        self._half_behind_ns = clock.behind_ns / 2
+        self._reading_ns = clock.reading_ns
+
+    def retry(self, clock: DistributedClock) -> None:
+        """Try them again: another master may have changed the controller's clock, which now is `clock`."""
+        if clock.offset != self._offset:
+            self.local_clock = LocalClock(self._timing)
+        self._use(clock)
+        self.trust.retry()
+
+    @property
+    def _is_in_time(self) -> bool:
+        """Whether the newest exchange was no longer away than usual: else the machine was busy meanwhile."""
+        return self._took_ns < self._timing.patience_ns
 
     @property
     def variance(self) -> float:
@@ -70,17 +89,23 @@ class EventTimes:
         return self.local_clock.variance + _LEAST_VARIANCE
 
     @property
+    def way_ns(self) -> float:
+        """Of the round trips by which the local clock is known, what is not spent behind the slave."""
+        return self._timing.least_ns + self.local_clock.excess_ns - 2 * self._half_behind_ns
+
+    @property
     def has_none(self) -> bool:
         """Whether the new sample of the newest exchange has none, although one would be known."""
         return self._answers and self.local_clock.is_known and not self.instant_ns
 
-    def took(self, latched: Latched, sent_ns: int, back_ns: int, fresh: bool) -> None:
+    def took(self, latched: Latched, sent_ns: int, back_ns: int, fresh: bool, period_ns: float) -> None:
         """Take what was latched when a frame passed that was sent and back then.
 
         `fresh`: it brought a new sample. Exchanges come in the order in which they were sent.
         """
-        self.instant_ns, self._is_passing, self.is_doubtful = 0.0, False, False
+        self.instant_ns, self._is_next, self.is_doubtful = 0.0, False, False
         system, counted, change, counted_too = latched
+        self._took_ns = back_ns - sent_ns
         self._answers = counted == counted_too == 1
         if not self._answers:
             return
@@ -92,10 +117,12 @@ class EventTimes:
         event = local - ((local - change + _HALF) % _WRAP - _HALF)
         self._moved += event != self._event
         self._event = event
-        if before - _SLACK_NS < event <= local and clock.is_known and clock.fits(sent_ns, back_ns):
-            self.instant_ns = clock.time(event) - self._half_behind_ns
-            self._took_ns = back_ns - sent_ns
-        self._is_passing = local < event < local + self._reading_ns
+        # Between these the process data passed: in the frame before, and in this one.
+        oldest, newest = before + self._passing_ns - _SLACK_NS, local + self._passing_ns
+        self._is_next = newest < event < local + self._reading_ns and event - period_ns > oldest
+        fits = self._is_next or oldest < event <= newest + _SLACK_NS
+        if fits and clock.is_known and clock.fits(sent_ns, back_ns):
+            self.instant_ns = clock.time(event) - self._half_behind_ns - self._is_next * period_ns
 
     def learn(self, sent_ns: int, arrived_ns: int) -> None:
         """Learn from the exchange that `took` was about: sent, and begun to arrive, then."""
@@ -116,15 +143,17 @@ class EventTimes:
             doubt_ns = _OUTLIER * math.sqrt(variance + self.variance)
             self.is_doubtful = off_ns > doubt_ns or doubt_ns > period_ns / 2
             is_old = sent_ns - self.instant_ns > _OLDEST * period_ns
+            # If the process data had passed when this sample's own event came, that is late: it lies.
+            is_late = self._is_next and late < -0.5
             # A jump of the local clock by more than half a round trip is noticed by `fits`: a larger
             # difference means that the sensor's own sampling clock has changed.
-            if not is_old and not doubt_ns < off_ns < self._took_ns / 2:
+            if not (is_old or is_late) and not doubt_ns < off_ns < self._took_ns / 2:
                 trust.confirmed()
                 return late
-            trust.contradicted(not is_old)
+            trust.contradicted(self._is_in_time and not is_old)
         else:
-            trust.contradicted(_PASSING if self._is_passing else 1.0)
-        self.is_doubtful = not self._is_passing
+            trust.contradicted(self._is_in_time)
+        self.is_doubtful = True
         trust.reconsider(self._evidence, back_ns)
         self.are_trusted = trust.verdict is Verdict.TRUSTED
         return None
@@ -136,11 +165,11 @@ class EventTimes:
         Returns the variance of the differences once they are trusted from here on, else 0.
         """
         trust = self.trust
-        if trust.verdict is Verdict.REFUSED:
-            return 0.0
-        if self.instant_ns:
+        if self._is_next:
+            pass
+        elif self.instant_ns:
             trust.compare(difference_ns)
-        elif not (self._is_passing or (self._answers and not self.local_clock.is_known)):
+        elif self._is_in_time and not (self._answers and not self.local_clock.is_known):
             trust.unfit()
         # Polling does not tell where on its way a round trip takes its time.
         asymmetry_ns = _ASYMMETRY * self._timing.least_ns

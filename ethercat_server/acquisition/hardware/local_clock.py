@@ -27,6 +27,7 @@ _JITTER: Final = 1e-4
 """Variance that the phase gains, ns² in each ns: 10 ns in a ms."""
 _DRIFT: Final = 1.7e-23
 """Variance that the rate gains in each ns: 1 ppm in a minute."""
+_EXCESS_GAIN: Final = 1 / 8
 _CONTRADICTS: Final = 5.0
 _CONTRADICTIONS: Final = 3
 """Consecutive blocks beyond `_CONTRADICTS` standard deviations after which the clock has jumped."""
@@ -48,7 +49,7 @@ class LocalClock:
     __slots__ = (
         "_back_ns", "_best_local", "_best_ns", "_best_took_ns", "_block", "_blocks", "_contradictions",
         "_covariance", "_doubt_ns", "_left", "_local_at", "_low", "_pull", "_rate_variance", "_time_at",
-        "_timing", "is_known", "local", "rate", "restarts", "variance",
+        "_timing", "excess_ns", "is_known", "local", "rate", "restarts", "variance",
     )  # fmt: skip
 
     def __init__(self, timing: ExchangeTiming) -> None:
@@ -56,6 +57,8 @@ class LocalClock:
         self._timing = timing
         self.local = 0
         """Local time of the newest exchange."""
+        self.excess_ns = 0.0
+        """What the exchanges that count usually take beyond the shortest."""
         self._low = self._back_ns = 0
         self.restarts = -1
         """How often it turned out to have jumped, or not to run like a clock."""
@@ -100,6 +103,7 @@ class LocalClock:
             self._block = self._left = min(_BLOCK, self._block + _FIRST_BLOCK)
             excess_ns = self._best_took_ns - self._timing.least_ns
             self._best_took_ns = math.inf
+            self.excess_ns += _EXCESS_GAIN * (excess_ns - self.excess_ns)
             # Where within the excess the slave was is unknown, and the bias may be the same every time.
             self._correct(excess_ns * excess_ns / 4 + _LEAST_VARIANCE)
 

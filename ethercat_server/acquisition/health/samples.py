@@ -31,9 +31,8 @@ class SampleHealth:
         self._silent_s = 0
         self._finite_s = _FINITE_SECONDS
         self._rate_reported = False
-        self._trusted = False
-        """Whether it was reported that event times date the samples."""
-        self._distrust_reported = False
+        self._trusted = self._distrusted = False
+        """Whether it was reported last that event times date the samples; that they do not."""
         self._deviating_s = 0
 
     def check(self, fresh: int, repeated: int, clock: SampleClock) -> None:
@@ -89,7 +88,7 @@ class SampleHealth:
             )  # fmt: skip
 
     def _check_events(self, clock: SampleClock) -> None:
-        """Say once whether the slave controller time-stamps the samples, and once if it no longer does."""
+        """Say when the slave controller time-stamps the samples, and when it no longer does."""
         if clock.events is None:
             return
         trust = clock.events.trust
@@ -97,15 +96,15 @@ class SampleHealth:
             if not self._trusted:
                 log.info(
                     "sensor %d: its samples are time-stamped by the distributed clock of its slave "
-                    "controller",
-                    self._number,
-                )
-            self._trusted = True
-        elif trust.why and not self._distrust_reported:
-            self._distrust_reported = True
+                    "controller%s",
+                    self._number, " again" if self._distrusted else "",
+                )  # fmt: skip
+            self._trusted, self._distrusted = True, False
+        elif trust.verdict is Verdict.REFUSED and not self._distrusted:
             log.log(
                 logging.WARNING if self._trusted else logging.INFO,
                 "sensor %d: its samples are time-stamped by polling, for its slave controller's event times "
                 "are unusable: %s",
                 self._number, trust.why,
             )  # fmt: skip
+            self._trusted, self._distrusted = False, True

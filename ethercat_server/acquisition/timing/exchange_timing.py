@@ -20,6 +20,8 @@ _FIRST_GUESS_NS: Final = 100_000.0
 _FIRST_EXCESS_NS: Final = 20_000.0
 _FIRST_LATE_NS: Final = 15_000.0
 _LEAST_VARIANCE: Final = 1_000.0**2
+_MOVED_NS: Final = 20_000.0
+"""The shortest round trip has become another if it changes by this; below, it is jitter."""
 _OUTLIER: Final = 4.0
 """What lies further out than so many standard deviations counts as that far: a stall is no jitter."""
 _ROOM_NS: Final = 10_000.0
@@ -32,7 +34,8 @@ class ExchangeTiming:
     __slots__ = (
         "_excess_square", "_late_variance", "_least_now_ns", "_most_excess_ns", "_most_late_ns",
         "_roll_at_ns", "_turn", "excess_ns", "in_flight", "late_ns", "least_ns", "look_ns", "look_variance",
-        "patience_ns", "sent_ns", "unanswered", "unanswered_since_ns", "usual_ns", "variance", "wire_ns",
+        "moved_ns", "patience_ns", "sent_ns", "unanswered", "unanswered_since_ns", "usual_ns", "variance",
+        "wire_ns",
     )  # fmt: skip
 
     def __init__(self, now_ns: int = 0) -> None:
@@ -46,6 +49,8 @@ class ExchangeTiming:
         """When the first of them was sent."""
         self.least_ns = math.inf
         """The shortest recent round trip."""
+        self.moved_ns = 0.0
+        """By how much instants less the outward part of it are later than they were at first."""
         self.wire_ns = 0
         """What the bytes of the longest frame take on the wire."""
         self.late_ns = 0.0
@@ -87,6 +92,7 @@ class ExchangeTiming:
         if sent_ns >= self.sent_ns:
             self.in_flight = False
         self.unanswered = 0
+        before_ns = self.least_ns
         if arrived_ns >= self._roll_at_ns:
             self._roll_at_ns = arrived_ns + _WINDOW_NS
             if self._least_now_ns < math.inf:
@@ -95,6 +101,13 @@ class ExchangeTiming:
         if took_ns < self._least_now_ns:
             self._least_now_ns = took_ns
             self.least_ns = min(self.least_ns, took_ns)
+        more_ns = before_ns - self.least_ns
+        if not -_MOVED_NS < more_ns < _MOVED_NS and before_ns < math.inf:
+            # Round trips take what they took before: the excess is another, and where phases count from.
+            more_ns = max(more_ns, -self.excess_ns)
+            self._excess_square = max(self._excess_square + more_ns * (2 * self.excess_ns + more_ns), 0.0)
+            self.excess_ns += more_ns
+            self.moved_ns += more_ns / 2
         excess_ns = took_ns - self.least_ns
         excess_ns = min(excess_ns, self._most_excess_ns)
         self.excess_ns += _GAIN * (excess_ns - self.excess_ns)

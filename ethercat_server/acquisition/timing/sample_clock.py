@@ -41,6 +41,7 @@ _LONGEST_LOOK: Final = 0.5
 """The sensor looks at its data within this part of a period after the frame usually has reached it."""
 _EARLY: Final = -0.25
 """A sample so much before the expected one, in periods, is the one that was watched for before."""
+_BIAS_GAIN: Final = 1 / 64
 _ONE_ONLY, _MISSABLE = 0.8, 1.25
 """Only one sample can have come in this part of a period; more may have in this."""
 
@@ -54,17 +55,28 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_absent", "_aim_ns", "_begun", "_by_event", "_caution", "_doubtful", "_hits",
-        "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_newest", "_overdue",
-        "_probed_above", "_probing", "_single", "_timing", "_turn", "_usual_margin_ns", "estimate", "events",
-        "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
+        "_absent", "_aim_ns", "_begun", "_bias_ns", "_by_event", "_caution", "_doubtful", "_hits",
+        "_least_variance", "_looked_ns", "_margin_ns", "_most_variance", "_moved_ns", "_newest", "_overdue",
+        "_passing_ns", "_probed_above", "_probing", "_seen_by_ns", "_single", "_timing", "_turn",
+        "_usual_margin_ns",
+        "estimate", "events", "instant_ns", "locked", "quiet_until_ns", "steps", "uncertain",
     )  # fmt: skip
 
-    def __init__(self, period_ns: float, timing: ExchangeTiming, events: EventTimes | None = None) -> None:
-        """`period_ns` is the nominal sample period; `timing` that of the bus."""
+    def __init__(
+        self,
+        period_ns: float,
+        timing: ExchangeTiming,
+        events: EventTimes | None = None,
+        passing_ns: int = 0,
+    ) -> None:
+        """`period_ns` is the nominal sample period; `timing` that of the bus.
+
+        The process data passes the slave `passing_ns` after the frame has arrived there.
+        """
         self.events = events
         self.estimate = Estimate(period_ns)
         """Its phase is the next sample's instant less the outward part of the shortest round trip."""
+        self._passing_ns = passing_ns
         self._timing = timing
         self.locked = False
         self.instant_ns = 0.0
@@ -81,8 +93,13 @@ class SampleClock:
         """Instant of the newest sample as its event has it, less the outward part; 0: it says nothing."""
         self._looked_ns = 0
         """When the last valid exchange was sent."""
+        self._moved_ns = timing.moved_ns
+        self._bias_ns = 0.0
+        """By how much events are later than polls show, where both are followed."""
         self._newest = 1
         """Number of the newest sample, counted from the one before it by the phase alone."""
+        self._seen_by_ns = 0.0
+        """When the sensor had certainly looked in the exchange that brought the newest sample."""
         self._absent = 0
         """Samples in a row that were watched for and did not come."""
         self._begun = False
@@ -113,15 +130,31 @@ class SampleClock:
 
     @property
     def uncertainty_ns(self) -> float:
-        """How far `instant_ns` may be off: two standard deviations, and where the slave is on the way."""
-        events = self.events
-        variance = events.variance if events is not None and events.are_trusted else self.estimate.variance
-        return 2 * math.sqrt(variance) + self._timing.least_ns / 2
+        """How far `instant_ns` may be off: two standard deviations, and where the slave is on the way.
+
+        What a round trip usually takes beyond the shortest may be on one side of it, which none can tell. A
+        sample that may be another one than thought may be off by a period.
+        """
+        events, timing = self.events, self._timing
+        if events is not None and events.are_trusted:
+            variance, way_ns = events.variance, events.way_ns
+        else:
+            variance, way_ns = self.estimate.variance, timing.least_ns + timing.excess_ns
+        return 2 * math.sqrt(variance) + way_ns / 2 + (self.estimate.period_ns if self.uncertain else 0.0)
 
     @property
     def by_events(self) -> bool:
         """Whether samples are dated by the slave controller."""
         return self.events is not None and self.events.are_trusted
+
+    @property
+    def _follows_events(self) -> bool:
+        """Whether phase and period are learned from events.
+
+        Where an early poll costs a sample, only polls tell when to poll: event times may be off by more than
+        polls stand, and agree with polling as far as the long round trip tells.
+        """
+        return self.by_events and not self._single
 
     @property
     def one_by_one(self) -> bool:
@@ -163,12 +196,12 @@ class SampleClock:
             self._turn = _TURNS
             self._least_variance, self._most_variance = variance / _CHANGED, variance * _CHANGED
             self._single = has_no_time_for_two(timing, period_ns)
-            self._usual_margin_ns = margin_ns(timing, period_ns, variance, by_events=self.by_events)
+            self._usual_margin_ns = margin_ns(timing, period_ns, variance, by_events=self._follows_events)
             self._probed_above = (timing.look_variance + _PROBE_BELOW) / 4
         self._margin_ns = self._usual_margin_ns * (1.0 if self._single or self.by_events else self._caution)
-        self._probing = self._hits > _UNPROBED or (variance > self._probed_above and not self.by_events)
+        self._probing = self._hits > _UNPROBED or (variance > self._probed_above and not self._follows_events)
         self._aim_ns = estimate.phase_ns + self._margin_ns - timing.look_ns
-        if self._probing and not self._single and self.by_events:
+        if self._probing and self._follows_events:
             self._aim_ns -= 2 * self._margin_ns
         self.quiet_until_ns = estimate.phase_ns - CERTAIN * deviation_ns if self.locked else 0.0
 
@@ -181,31 +214,41 @@ class SampleClock:
         """
         phase_ns, period_ns = self.estimate.phase_ns, self.estimate.period_ns
         looked_ns, least_ns = self._looked_ns, self._timing.least_ns
+        outward_ns = least_ns / 2 + self._passing_ns
         unwatched_ns = back_ns - looked_ns
         if not self._begun:
             self._newest = 1
-            # Only what fell into the time the sensor was not watched can have been lost.
-            self.steps = 1 + int(unwatched_ns // period_ns)
+            # Only what fell into the time the sensor was not watched can have been lost; before the first
+            # exchange there was none to lose.
+            self.steps = 1 + int(unwatched_ns // period_ns) if looked_ns else 1
             self.uncertain = unwatched_ns >= period_ns
             self.instant_ns = min(back_ns, sent_ns + period_ns)
             return
         self.uncertain = False
         events, self._by_event = self.events, 0.0
         if events is not None and events.are_trusted:
-            late = events.date(phase_ns + least_ns / 2, period_ns, self.estimate.variance, sent_ns, back_ns)
+            bias_ns = self._bias_ns if self._single else 0.0
+            expected_ns = phase_ns + outward_ns + bias_ns
+            late = events.date(expected_ns, period_ns, self.estimate.variance, sent_ns, back_ns)
             if late is not None:
-                self._by_event, self.uncertain = events.instant_ns - least_ns / 2, events.is_doubtful
-                self._count(1 + round(late), late)
+                if self._single:
+                    self._bias_ns += _BIAS_GAIN * (late - round(late)) * period_ns
+                else:
+                    self._by_event = events.instant_ns - outward_ns
+                self.uncertain = events.is_doubtful
+                self._count(1 + round(late), late, looked_ns - self._seen_by_ns)
                 self.instant_ns = min(events.instant_ns, back_ns)
                 return
         excess_ns = max(0.0, back_ns - sent_ns - least_ns)
+        watched_ns, self._seen_by_ns = looked_ns - self._seen_by_ns, sent_ns + excess_ns
         # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought is
         # dated from before, never as younger than it may be.
         looked_at_ns = sent_ns + (excess_ns / 2 if excess_ns < _LONGEST_LOOK * period_ns else 0.0)
         late = (looked_at_ns - phase_ns) / period_ns
         if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
             # It was seen coming: whichever it was expected next to.
-            newest = 1 + round(((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns)
+            late = ((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns
+            newest = 1 + round(late)
         else:
             newest = 1 + math.floor(late)
             doubt_ns = CERTAIN * math.sqrt(self.estimate.variance)
@@ -215,21 +258,27 @@ class SampleClock:
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
             lost_track = events is not None and events.is_doubtful and unwatched_ns > _MISSABLE * period_ns
             self.uncertain = self._doubtful or lost_track or (most > 0 and least < most)
-        self._count(newest, late)
-        instant_ns = max(phase_ns + (self._newest - 1) * period_ns, looked_ns) + least_ns / 2
+        self._count(newest, late, watched_ns)
+        instant_ns = max(phase_ns + (self._newest - 1) * period_ns, looked_ns) + outward_ns
         # After a stall in the exchange its end says nothing of when the sample came to be.
         self.instant_ns = min(instant_ns if self.locked else sent_ns + period_ns, back_ns)
         if events is not None and self.locked and not (events.are_trusted or self.uncertain):
             difference_ns = events.instant_ns - instant_ns
             if variance := events.compare(difference_ns, self.estimate.variance, back_ns):
-                self.estimate.expect(variance)
+                self._bias_ns = events.trust.mean_ns
+                if not self._single:
+                    self.estimate.expect(variance)
 
-    def _count(self, newest: int, late: float) -> None:
-        """The new sample is this one by the estimate, and so late there, in periods."""
+    def _count(self, newest: int, late: float, watched_ns: float) -> None:
+        """The new sample is this one by the estimate, and so late there, in periods.
+
+        `watched_ns`: for so long exchanges brought nothing new that were sent after it was certain which
+        sample is the newest. What does not come while the sensor itself is held up exists all the same.
+        """
         if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
             newest = 0 if self._doubtful and late < -0.5 else 1
         self._newest = self.steps = newest
-        if self._absent >= SILENT_PERIODS:
+        if self._absent >= SILENT_PERIODS and watched_ns > (SILENT_PERIODS - 1) * self.period_ns:
             self.steps = 1  # a silent sensor is told as such
         elif late > _EARLY:
             self.steps += self._absent  # those that did not come are missing, too
@@ -246,7 +295,9 @@ class SampleClock:
 
     def observe(self, sent_ns: int, arrived_ns: int, fresh: bool) -> None:
         """Learn from one valid exchange whether it brought a new sample (`fresh`: after `predict`)."""
-        estimate = self.estimate
+        estimate, moved_ns = self.estimate, self._timing.moved_ns
+        estimate.phase_ns += moved_ns - self._moved_ns
+        self._moved_ns = moved_ns
         if self._turn > 0 and fresh and self._by_event and self._goes_on and not estimate.restless:
             # A steady clock need not be learned from every sample.
             self._turn -= 1
@@ -289,10 +340,10 @@ class SampleClock:
             self._overdue = look_ns > estimate.phase_ns + _OVERDUE * math.sqrt(estimate.variance + variance)
             # One in doubt may have been seen already; one that is late may be missing. The next one tells.
             if self.locked and not (self._doubtful or self._is_late(look_ns, variance)):
-                if not self.by_events:
+                if not self._follows_events:
                     estimate.learn_bit(look_ns, variance, -1)
-                if look_ns > estimate.phase_ns - doubt_ns - self._margin_ns * (1 + self.by_events):
-                    if self._hits and not self.by_events:
+                if look_ns > estimate.phase_ns - doubt_ns - self._margin_ns * (1 + self._follows_events):
+                    if self._hits and not self._follows_events:
                         self._caution += _CAUTION_GAIN * self._caution
                         self._caution = min(self._caution, 1.0)
                     self._hits = 0

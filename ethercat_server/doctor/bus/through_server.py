@@ -70,6 +70,7 @@ class ServerView:
             ._replace(
                 locked=after["clock"]["mode"] == "locked",
                 recoveries=max(0, int(after["recoveries"]) - int(before["recoveries"])),
+                missed_deadlines=self.grown("missed_deadlines"),
                 is_lost=[fate for fate in fates if fate in _FATES][-1:] == [Event.SENSOR_LOST],
                 state=str(described["state"]),
                 emergency=emergency(after.get("emergency")),

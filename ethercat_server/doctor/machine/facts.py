@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from ethercat_server.doctor.finding import cannot_look
 from ethercat_server.ethercat.nic.ip import Routes, find_routes
+from ethercat_server.links.interfaces import is_local, kind, open_routes
 
 _IFF_UP, _IFF_LOOPBACK = 0x1, 0x8
 _NO_SUPPORT: Final = "the driver does not support it"
@@ -152,22 +153,20 @@ def _request(ifname: str, command: int, layout: struct.Struct) -> tuple[Any, ...
 
 
 def _links() -> dict[int, Any]:
-    from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
-
-    with IPRoute() as route:
+    with open_routes() as route:
         return {row["index"]: row for row in route.get_links()}
 
 
 def _link(ifname: str) -> Link:
     everyone, index = _links(), socket.if_nametoindex(ifname)
     own = everyone[index]
-    upper = [r for r in everyone.values() if r.get_attr("IFLA_LINK") == index and _is_local(r)]
+    upper = [r for r in everyone.values() if r.get_attr("IFLA_LINK") == index and is_local(r)]
     master = everyone.get(own.get_attr("IFLA_MASTER"))
     up = bool(own["flags"] & _IFF_UP)
     stats = own.get_attr("IFLA_STATS64") or own.get_attr("IFLA_STATS") or {}
     return Link(
         index=index,
-        kind=_kind(own),
+        kind=kind(own),
         up=up,
         carrier=up and own.get_attr("IFLA_CARRIER") == 1,
         loopback=bool(own["flags"] & _IFF_LOOPBACK),
@@ -177,16 +176,6 @@ def _link(ifname: str) -> Link:
         counters={name: int(stats[name]) for name in stats.keys() if isinstance(stats[name], int)},  # noqa: SIM118
         carrier_changes=own.get_attr("IFLA_CARRIER_CHANGES"),
     )
-
-
-def _kind(row: Any) -> str:
-    info = row.get_attr("IFLA_LINKINFO")
-    return (info.get_attr("IFLA_INFO_KIND") if info else None) or ""
-
-
-def _is_local(row: Any) -> bool:
-    """Whether it may depend on an interface of this namespace: a veth's other end does not."""
-    return row.get_attr("IFLA_LINK_NETNSID") is None and _kind(row) != "veth"
 
 
 def read_counters(ifname: str) -> dict[str, int]:

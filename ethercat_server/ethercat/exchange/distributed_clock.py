@@ -23,6 +23,8 @@ _MOST_BEHIND_NS: Final = 1_000_000
 _WRAP: Final = 1 << 32
 _TIME_SIZE: Final = 4
 _SLACK_NS: Final = 10_000
+_ATTEMPTS: Final = 3
+"""One lost frame is no reason to do without event times; many would hold up the loop."""
 
 Latched = tuple[int, int, int, int]
 """System time when the frame arrived, a working counter; local time of the event PDI buffer change, a working
@@ -61,7 +63,8 @@ def latch_events(bus: Datagrams, number: int, sync_manager: int) -> bool:
     """Have a sensor's controller latch when it writes samples, to this sync manager; False if it does not."""
     address = reg.SYNC_MANAGER + sync_manager * reg.SYNC_MANAGER_SIZE + reg.SM_ACTIVATE
     active = bus.read_surely(number, address, 1)[0]
-    return bus.write_register(number, address, bytes([active | reg.SM_LATCH_PDI]))
+    latches = bytes([active | reg.SM_LATCH_PDI])
+    return any(bus.write_register(number, address, latches) for _ in range(_ATTEMPTS))
 
 
 def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
@@ -69,8 +72,8 @@ def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
 
     `at` is where frames read what is latched.
     """
-    data = bus.read_register(number, reg.DC_OFFSET, _U64_U32.size)
-    if data is None:
+    tries = (bus.read_register(number, reg.DC_OFFSET, _U64_U32.size) for _ in range(_ATTEMPTS))
+    if (data := next(filter(None, tries), None)) is None:
         return None
     offset, delay = _U64_U32.unpack(data)
     return DistributedClock((offset - delay) % _WRAP, _behind_ns(bus, number), at * BYTE_NS + _SLACK_NS)

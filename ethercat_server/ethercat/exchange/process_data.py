@@ -20,6 +20,7 @@ _LOST_NS: Final = 100_000_000
 """A frame that is not back after this time counts as lost: its index is used again."""
 _TAG: Final = struct.Struct("<I")
 _NOTHING: Final = (0, 0, 0)
+_IMPOSSIBLE: Final = 0xFFFF
 
 
 class ProcessData:
@@ -47,18 +48,28 @@ class ProcessData:
         """By frame: the sensors whose inputs it carries."""
         self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
         """What each sensor adds to the working counter of each frame."""
+        self.most_wkc = [sum(frame.counters) for frame in frames]
+        """The highest working counter of each frame that there can be."""
+        self._most = [
+            (sum(each & 1 for each in frame.counters), sum(each >> 1 for each in frame.counters))
+            for frame in frames
+        ]
+        """By frame: the highest counters of LRD and LWR."""
         self._index = self._number = 0
         self._sent = [_NOTHING] * _INDICES
-        """By index less the first: when a frame was sent that is not back, else 0; which it was; its tag."""
+        """By index less the first: when a frame was sent that is not back, else 0; which it was; its tag, 0
+        once it is lost."""
         self.in_flight = 0
         """Frames in flight: not back, and not known to be lost."""
         self._lost = 0
+        self.duplicates = 0
+        """Answers that came once more."""
         self.blocked_until_ns = 0
         """Nothing can be sent before, as long as nothing comes back."""
         self.frame = b""
         """The answer that `take` took last."""
         self.wkc = 0
-        """Its working counter."""
+        """Its working counter; 0xFFFF if it cannot be."""
         self.which = 0
         """Which frame of the exchange it is."""
 
@@ -95,7 +106,10 @@ class ProcessData:
         return now_ns
 
     def take(self, frame: bytes) -> int:
-        """Take a frame that has arrived: returns when it was sent; 0 if it is no answer that is awaited."""
+        """Take a frame that has arrived: returns when it was sent.
+
+        0 if it is no answer that is awaited, -1 if it is one that was taken before.
+        """
         if (
             len(frame) <= DATAGRAM_INDEX
             or frame[DATAGRAM_INDEX] < FIRST_INDEX
@@ -104,12 +118,13 @@ class ProcessData:
             return 0
         index = frame[DATAGRAM_INDEX] - FIRST_INDEX
         sent_ns, which, number = self._sent[index]
-        if not sent_ns:
-            return 0
         at = self._tags[which]
         if len(frame) < at + _TAG.size or _TAG.unpack_from(frame, at)[0] != number:  # an older one
             return 0
-        self._sent[index] = _NOTHING
+        if not sent_ns:
+            self.duplicates += 1
+            return -1
+        self._sent[index] = 0, which, number
         self.blocked_until_ns = 0
         self.in_flight -= 1
         self.frame, self.which = frame, which
@@ -117,7 +132,9 @@ class ProcessData:
         self.wkc = frame[end] | frame[end + 1] << 8
         if not self._lrw:  # an LRW would have counted 2
             end = self._written[which]
-            self.wkc += 2 * (frame[end] | frame[end + 1] << 8)
+            written = frame[end] | frame[end + 1] << 8
+            reads, writes = self._most[which]
+            self.wkc = self.wkc + 2 * written if self.wkc <= reads and written <= writes else _IMPOSSIBLE
         return sent_ns
 
     @property

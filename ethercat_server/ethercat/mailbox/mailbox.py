@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from typing import Final
+from typing import Final, Protocol
 
 from ethercat_server.errors import BusError
-from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.clock import Clock
+from ethercat_server.ethercat.mailbox.emergencies import Emergencies
 from ethercat_server.ethercat.mailbox.emergency import Emergency
 from ethercat_server.ethercat.slave.registers import MAILBOX_FULL, MAILBOX_IN_STATUS
 
@@ -24,13 +25,35 @@ class MessageLostError(Exception):
     """A message was taken from the mailbox and lost on its way."""
 
 
+class Slaves(Protocol):
+    """A `Bus`, or its slaves by their positions: `ByPosition`."""
+
+    @property
+    def clock(self) -> Clock:
+        """Of the bus."""
+        ...
+
+    @property
+    def emergencies(self) -> Emergencies:
+        """Where they go."""
+        ...
+
+    def read_register(self, number: int, address: int, size: int, /) -> bytes | None:
+        """See `Datagrams`."""
+        ...
+
+    def write_register(self, number: int, address: int, data: bytes, /) -> bool:
+        """See `Datagrams`."""
+        ...
+
+
 class Mailbox:
     """Of the sensor `number`. `areas`: offset and size of the one to the slave and the one from it.
 
     A sensor has one, whoever uses it: the slave drops a request that reuses the last counter.
     """
 
-    def __init__(self, bus: Bus, number: int, areas: tuple[tuple[int, int], tuple[int, int]]) -> None:
+    def __init__(self, bus: Slaves, number: int, areas: tuple[tuple[int, int], tuple[int, int]]) -> None:
         self._bus, self.number = bus, number
         self.clock = bus.clock
         (self._out, self._out_size), (self._in, self._in_size) = areas

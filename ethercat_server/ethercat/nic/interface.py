@@ -5,6 +5,7 @@ Asked by netlink (linux/rtnetlink.h), not of /sys, which shows the namespace it 
 
 from __future__ import annotations
 
+import difflib
 import socket
 import struct
 import sys
@@ -17,7 +18,7 @@ LEAST_MTU: Final = 1500
 """Bytes: an EtherCAT frame may be as long as any Ethernet frame."""
 CHECK_CABLE: Final = "check cable and power"
 
-_IFLA_MTU, _IFLA_MASTER, _IFLA_CARRIER = 4, 10, 33
+_IFLA_ADDRESS, _IFLA_MTU, _IFLA_MASTER, _IFLA_CARRIER = 1, 4, 10, 33
 _LINK: Final = struct.Struct("=BxHiII")
 """Family, type, index, flags, change mask."""
 _IFF_UP, _IFF_LOOPBACK, _IFF_RUNNING = 0x1, 0x8, 0x40
@@ -33,6 +34,8 @@ class Interface(NamedTuple):
     """Index of the bridge or bond that it is part of, 0 if none."""
     carrier: bool
     """What the driver says of the link."""
+    address: bytes
+    """Of the hardware."""
 
     @property
     def is_up(self) -> bool:
@@ -55,8 +58,12 @@ def look_up(ifname: str) -> Interface:
     try:
         return _answer(socket.if_nametoindex(ifname))
     except (OSError, struct.error):
-        names = ", ".join(name for _, name in socket.if_nameindex())
-        raise InterfaceError(f"no network interface {ifname!r} on this machine: there are {names}") from None
+        names = [name for _, name in socket.if_nameindex()]
+        close = difflib.get_close_matches(ifname, [*names, "virtual"], n=1)
+        raise InterfaceError(
+            f"no network interface {ifname!r} on this machine: there are {', '.join(names)}, and 'virtual' "
+            f"for a virtual sensor{f'; did you mean {close[0]!r}?' if close else ''}"
+        ) from None
 
 
 def trouble(ifname: str) -> str | None:
@@ -107,4 +114,4 @@ def _answer(index: int) -> Interface:
         int.from_bytes(found.get(name, b""), sys.byteorder)
         for name in (_IFLA_MTU, _IFLA_MASTER, _IFLA_CARRIER)
     )
-    return Interface(index, flags, mtu, master, bool(carrier))
+    return Interface(index, flags, mtu, master, bool(carrier), found.get(_IFLA_ADDRESS, b""))

@@ -51,7 +51,7 @@ class ByPosition:
     """The registers of slaves that have no station address, in place of those of a `Bus`."""
 
     def __init__(self, bus: Bus) -> None:
-        self.clock = bus.clock
+        self.clock, self.emergencies = bus.clock, bus.emergencies
         self.read_register, self.write_register = bus.read_at, bus.write_at
 
 

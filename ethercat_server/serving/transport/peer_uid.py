@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import struct
+from collections.abc import Collection
 from typing import Final
 
 _NETLINK_SOCK_DIAG: Final = 4
@@ -59,11 +60,17 @@ def peer_uid(diagnostics: socket.socket, sock: socket.socket) -> int | None:
         answer = diagnostics.recv(4096)
     except OSError:
         return None
-    return _owner(answer, _connection(peer, own))
+    # A client's socket of IPv6 can have this connection too, with addresses such as ::ffff:127.0.0.1.
+    mapped = {_mapped(peer, own)} if sock.family == socket.AF_INET else set()
+    return _owner(answer, {_connection(peer, own), *mapped})
 
 
 def _connection(local: Address, remote: Address) -> bytes:
     return _CONNECTION.pack(local[1], remote[1], _packed(local[0]), _packed(remote[0]))
+
+
+def _mapped(local: Address, remote: Address) -> bytes:
+    return _connection((f"::ffff:{local[0]}", local[1]), (f"::ffff:{remote[0]}", remote[1]))
 
 
 def _packed(host: str) -> bytes:
@@ -81,10 +88,10 @@ def _question(family: int, local: Address, remote: Address) -> bytes:
     return _HEADER.pack(_HEADER.size + len(body), _SOCK_DIAG_BY_FAMILY, _NLM_F_REQUEST, 0, 0) + body
 
 
-def _owner(answer: bytes, connection: bytes) -> int | None:
+def _owner(answer: bytes, connections: Collection[bytes]) -> int | None:
     if len(answer) < _HEADER.size + _ANSWER.size or _HEADER.unpack_from(answer)[1] != _SOCK_DIAG_BY_FAMILY:
         return None  # an error: there is no such socket
     _, state, _, _, its_connection, _, _, _, _, uid, inode = _ANSWER.unpack_from(answer, _HEADER.size)
-    if state not in _LIVE_STATES or its_connection != connection or inode == 0:
+    if state not in _LIVE_STATES or its_connection not in connections or inode == 0:
         return None
     return int(uid)

@@ -69,8 +69,8 @@ def _eeprom(args: argparse.Namespace) -> int:
     else:
         for n, row in decoded.items():
             say(f"slave {n}: {row['name'] or 'nameless'}")
-            say("\n".join(sii_content.raw_lines(read[n])))
             say(columns(_rows(row), indent=2))
+            say("\n".join(sii_content.raw_lines(read[n])))
     for error in errors.values():
         note(str(error))
     return FAILED if errors else DONE
@@ -99,5 +99,5 @@ def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 COMMANDS = (
-    Command("eeprom", "read the slaves' SII (EEPROM): raw words, and decoded", _eeprom_arguments, _eeprom),
+    Command("eeprom", "read the slaves' SII (EEPROM): decoded, and raw words", _eeprom_arguments, _eeprom),
 )

@@ -21,6 +21,8 @@ from protocol.sensor.meaning import value_meaning
 
 _MOST_SILENT: Final = 3
 """Number of consecutive timeouts after which the other objects are skipped."""
+_STANDARD: Final = range(0x1000, 0x1019)
+"""Objects that a slave of any vendor may have."""
 _HEAD: Final = ("object", "name", "value", "access", "meaning")
 
 
@@ -79,8 +81,7 @@ def _read_sensor(opened: Link, found: Found, rows: Sequence[ObjectEntry]) -> _Se
     try:
         if any(row.index == INPUT_OBJECT for row in rows):
             opened.wait_settled([found.number])
-        if found.has_objects:
-            objects.extend(_read_rows(opened.sdo(found.number), rows))
+        objects.extend(_read_rows(opened.sdo(found.number), rows))
     except BusError as error:
         return _Sensor(found, objects, error)
     return _Sensor(found, objects, None)
@@ -102,6 +103,10 @@ def _read_rows(sdo: Sdo, rows: Sequence[ObjectEntry]) -> Iterator[tuple[ObjectEn
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add_link_arguments(parser, all_if_none=True)
+    parser.add_argument(
+        "--slave", metavar="POSITION:NAME",
+        help="the standard objects of a slave that is no sensor, such as 1:EL3102, in the state it is in",
+    )  # fmt: skip
 
 
 def _read_arguments(parser: argparse.ArgumentParser) -> None:
@@ -114,12 +119,12 @@ def _read_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _read(args: argparse.Namespace) -> int:
     names: list[str] = args.names
-    if args.server is None and args.iface is None:
+    if args.server is None and args.iface is None and not find_objects(names[0]):
         raise UsageError(
             f"a NAME is missing, or the interface beside {names[0]!r}: for example read ens5 'Sampling rate'"
         )
-    if args.server is not None and args.iface is not None:
-        # With --server there is no interface: the first argument is a name too.
+    if args.iface is not None and (args.server is not None or find_objects(args.iface)):
+        # No interface, but the first name: of the server that was given, or the default one.
         names, args.iface = [args.iface, *names], None
     rows: dict[tuple[int, int], ObjectEntry] = {}
     for name in names:
@@ -133,12 +138,22 @@ def _read(args: argparse.Namespace) -> int:
 
 
 def _objects(args: argparse.Namespace) -> int:
-    return _show(args, KNOWN_OBJECTS)
+    # Calibration last: 87 rows that nobody sets.
+    rows = sorted(KNOWN_OBJECTS, key=lambda row: row.index == FACTORY_CALIBRATION)
+    if args.slave is not None:
+        rows = [row for row in rows if row.index in _STANDARD]
+    return _show(args, rows, slave=args.slave)
 
 
-def _show(args: argparse.Namespace, rows: Sequence[ObjectEntry], *, all_wanted: bool = False) -> int:
+def _show(
+    args: argparse.Namespace,
+    rows: Sequence[ObjectEntry],
+    *,
+    all_wanted: bool = False,
+    slave: str | None = None,
+) -> int:
     """`all_wanted`: an object that cannot be read is a failure, also where the firmware does not have it."""
-    with link(args, any_slave=True) as opened:
+    with link(args, slave=slave) as opened:
         sensors = [_read_sensor(opened, found, rows) for found in opened.chosen(args.sensor)]
     errors = [sensor.error for sensor in sensors if sensor.error]
     if len(errors) == len(sensors):
@@ -167,8 +182,6 @@ def _say_sensor(sensor: _Sensor) -> None:
     say(str(sensor.found))
     if sensor.objects:
         say(columns([_HEAD, *(_line(row, read) for row, read in sensor.objects)], indent=2))
-    elif not sensor.error:
-        say("  no CoE mailbox, so no objects")
     if sensor.error:
         say(f"  {sensor.error}")
 

@@ -22,6 +22,10 @@ from protocol.sensor.meaning import meaning, value_meaning
 from protocol.settings import SETTINGS, SettingValue
 
 UNSAVED = "in force until the sensor is powered off: use --save, or the command save, to keep it"
+UNSAVED_IN_SERVER = (
+    "in force until the server is started again, also after the sensor was powered off: set the same in the "
+    "server's configuration to keep it"
+)
 SAVED = (
     "saved to the sensor's flash; a server writes its own settings at start: set the same there, or "
     "--unset-settings keep"
@@ -145,13 +149,14 @@ def _apply(args: argparse.Namespace) -> int:
         "meaning": in_force.as_json(),
     }  # fmt: skip
     lines = [change_lines(changed), "in force:\n  " + "\n  ".join(in_force.lines())]
-    report(args.json, opened, found, values, *lines, *saving_lines(bool(changed), args.save))
+    report(args.json, opened, found, values, *lines, *saving_lines(opened, bool(changed), args.save))
     return DONE
 
 
-def saving_lines(changed: bool, saved: bool) -> list[str]:
+def saving_lines(link: Link, changed: bool, saved: bool) -> list[str]:
     """How long a change lasts."""
-    return [SAVED] if saved else [UNSAVED] if changed else []
+    unsaved = UNSAVED_IN_SERVER if link.restores else UNSAVED
+    return [SAVED] if saved else [unsaved] if changed else []
 
 
 def verify(sensor: Sensor, settings: Mapping[str, SettingValue]) -> None:

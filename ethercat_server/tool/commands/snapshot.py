@@ -122,7 +122,7 @@ def _restore(args: argparse.Namespace) -> int:
     if not changed and not differing:
         lines.append("  nothing to restore: the sensor already matches the file")
     values = {"changes": changed, "objects": written, "left_alone": missing, "saved": args.save}
-    lines += saving_lines(bool(changed or differing), args.save)
+    lines += saving_lines(opened, bool(changed or differing), args.save)
     report(args.json, opened, found, values, *lines)
     return DONE
 

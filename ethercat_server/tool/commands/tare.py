@@ -9,7 +9,7 @@ from typing import Final
 
 from ethercat_server.errors import BusError, UsageError
 from ethercat_server.ethercat.slave.coe import finish
-from ethercat_server.links.link import Found, note, signals_held_back
+from ethercat_server.links.link import Found, Link, note, signals_held_back
 from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
 from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
 from ethercat_server.tool.commands.settings import UNSAVED
@@ -19,6 +19,9 @@ from protocol.program.tare_memory import Tared, recall, remember
 
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _UNSAVED: Final = UNSAVED.replace("--save, or the command save,", "the command save")
+_UNSAVED_IN_SERVER: Final = (
+    "in force while the server runs, then until the sensor is powered off: use the command save to keep it"
+)
 _DEFAULT_SAMPLES: Final = ACTIONS["tare"].parameters["samples"].default
 
 
@@ -56,8 +59,14 @@ def _tare(args: argparse.Namespace) -> int:
     rows: list[tuple[str, ...]] = [("", "old offset", "new offset", "residual", "deviation", "")]
     for n, axis in enumerate(_AXES):
         rows.append((axis, *(f"{tared[key][n]:.4f}" for key in keys), "N" if n < 3 else "Nm"))
-    report(args.json, opened, found, {key: tared[key] for key in keys}, columns(rows, indent=2), _UNSAVED)
+    report(
+        args.json, opened, found, {key: tared[key] for key in keys}, columns(rows, indent=2), _lasts(opened)
+    )
     return DONE
+
+
+def _lasts(opened: Link) -> str:
+    return _UNSAVED_IN_SERVER if opened.restores else _UNSAVED
 
 
 def _take_back(args: argparse.Namespace) -> int:
@@ -78,7 +87,7 @@ def _take_back(args: argparse.Namespace) -> int:
     for n, axis in enumerate(_AXES):
         rows.append((axis, f"{before[n]:.4f}", f"{after[n]:.4f}", "N" if n < 3 else "Nm"))
     values = {"old_offset": list(before), "new_offset": list(after)}
-    report(args.json, opened, found, values, columns(rows, indent=2), _UNSAVED)
+    report(args.json, opened, found, values, columns(rows, indent=2), _lasts(opened))
     return DONE
 
 

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-from ethercat_server.ethercat.wire import Command, Datagram
+from ethercat_server.ethercat.wire import BYTE_NS, Command, Datagram
 from ethercat_server.virtual_sensor.esc import registers as reg
 from ethercat_server.virtual_sensor.esc.controller import Esc
 
@@ -136,6 +136,7 @@ def _logical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
     reads, writes = datagram.command != Command.LWR, datagram.command != Command.LRD
     for fmmu, offset, length, at in plan:
         start, end = base + offset, base + offset + length
+        esc.into_ns = (start - datagram.header) * BYTE_NS
         if writes and fmmu.writes:
             data = incoming[offset : offset + length]
             if fmmu.bitwise:
@@ -152,4 +153,5 @@ def _logical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
                 if current is not None:
                     frame[start:end] = current
                     read = True
+    esc.into_ns = 0
     return read + (2 * written if datagram.command == Command.LRW else written)

@@ -57,6 +57,7 @@ class Esc:
     Attributes:
         fmmus: the active FMMUs.
         plans: what each logical command copies, by address and length; emptied when an FMMU changes.
+        into_ns: time from the start of a datagram until the bytes that are being copied pass.
     """
 
     def __init__(self, pdi: Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
@@ -70,6 +71,7 @@ class Esc:
         self.fmmus: list[Fmmu] = []
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
         self.has_lrw = self.has_dc = True
+        self.into_ns = 0
         self._write_mask: bytes | bytearray = reg.WRITE_MASK
         self._events = 0
 
@@ -206,6 +208,8 @@ class Esc:
                 self._exchanged(manager)
                 self._pdi.mailbox_read()
             return data
+        if not manager.access(offset, length):
+            return None
         if manager.latches_ecat and offset + length == manager.length:
             self._exchanged(manager)
         if offset == 0:  # three buffers: the newest is handed over when the first byte is read
@@ -224,6 +228,8 @@ class Esc:
                 self._exchanged(manager)
                 self._pdi.mailbox_written()
             return True
+        if not manager.access(offset, len(data)):
+            return False
         self.memory[manager.start + offset : manager.start + offset + len(data)] = data
         if offset + len(data) == manager.length:  # handed over when the last byte is written
             self._exchanged(manager)

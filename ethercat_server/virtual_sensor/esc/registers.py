@@ -1,7 +1,8 @@
 """Registers of the virtual sensor's slave controller: what a master may write, power-on values.
 
 The addresses are those of `ethercat_server.ethercat.slave.registers`. The controller has two ports, 3 FMMUs,
-4 sync managers, 4 KB of process data memory, and a distributed clock of 64 bits without SYNC signals.
+4 sync managers, 4 KB of process data memory, and a distributed clock of 64 bits, whose SYNC unit can be set
+up but gives no signals.
 """
 # ruff: noqa: F403, F405
 
@@ -20,6 +21,10 @@ MEMORY_END: Final = REGISTERS_END + MEMORY_KB * 1024
 
 REPEAT: Final = 0x02
 """Repeat request in a sync manager's activate register, repeat acknowledge in its PDI control register."""
+
+DC_SYNC_START: Final = 0x0990
+DC_SYNC_CYCLES: Final = 0x09A0
+"""Of SYNC0, then SYNC1, four bytes each."""
 
 EVENT_DL_STATUS: Final = 1 << 2
 EVENT_AL_STATUS: Final = 1 << 3
@@ -71,6 +76,8 @@ def _write_mask() -> bytes:
     allow(DC_SPEED_START, 2)
     allow(DC_FILTERS, 2)
     allow(DC_ACTIVATION, 2)
+    allow(DC_SYNC_START, 8)
+    allow(DC_SYNC_CYCLES, 8)
     allow(USER_RAM, REGISTERS_END - USER_RAM)
     return bytes(mask)
 

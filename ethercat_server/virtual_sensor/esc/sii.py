@@ -1,6 +1,7 @@
 """The registers through which a master reads a slave's EEPROM (SII), whose image is built in `slave.image`.
 
-Source: ETG.1000.4. It is read-only: a write command ends with the error bit "write enable".
+Source: ETG.1000.4. It is read-only: a write command is not acknowledged by the EEPROM, which is bit 13; one
+without the write enable bit in the same frame never gets there, which is bit 14.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class SiiInterface:
             self._set_status(_BUSY)
             self.advance()
         elif operation == _WRITE:
-            self._set_status(_ERROR_WRITE_ENABLE)
+            self._set_status(_ERROR_COMMAND if control & 0x01 else _ERROR_WRITE_ENABLE)
         elif operation in (_NO_OPERATION, _RELOAD):
             self._set_status(0)
         else:

@@ -1,7 +1,7 @@
 """One sync manager: who may touch its piece of memory, and the mailbox handshake.
 
-Source: ETG.1000.4. A mailbox is opened by an access to its first byte and handed over by one to its last;
-an access out of turn is refused and changes nothing.
+Source: ETG.1000.4. A buffer is opened by an access to its first byte and handed over by one to its last; an
+access out of turn is refused and changes nothing.
 """
 
 from __future__ import annotations
@@ -83,21 +83,25 @@ class SyncManager:
         """Whether the mailbox is full, and its reader has not begun to take it."""
         return self.full and not self._open
 
+    def access(self, offset: int, length: int) -> bool:
+        """The master accesses its buffer; False if it may not now."""
+        may = self._open or offset == 0
+        self._open = may and offset + length < self.length
+        return may
+
     def put(self, offset: int, data: bytes) -> bool:
         """The master writes into its write mailbox; False if it may not now."""
-        if self.full or not (self._open or offset == 0):
+        if self.full or not self.access(offset, len(data)):
             return False
         at = self.start + offset
         self._memory[at : at + len(data)] = data
-        self._open = offset + len(data) < self.length
         self.full = not self._open
         return True
 
     def take(self, offset: int, length: int) -> bytes | None:
         """The master reads from its read mailbox; None if it may not now."""
-        if not self.full or not (self._open or offset == 0):
+        if not self.full or not self.access(offset, length):
             return None
-        self._open = offset + length < self.length
         self.full = self._open
         at = self.start + offset
         return bytes(self._memory[at : at + length])

@@ -54,8 +54,8 @@ class Firmware(Application):
             action()
 
     def inputs(self) -> bytes:
-        """The newest process data."""
-        return self.sampler.newest(self.esc.clock.way_ns)
+        """The newest process data when its first byte passes."""
+        return self.sampler.newest(self.esc.clock.way_ns + self.esc.into_ns)
 
     def prepare(self, expected: int) -> None:
         """Compute the sample that a frame at the time `expected` will read."""

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from bridge.parameters.compensation import AUTO, CompensationParameters
+from ft_compensation.bias import weight
 from ft_compensation.quantities import NO_WRENCH, Payload, Wrench, wrench_text
 from ft_compensation.store import CompensationStore, Stored, StoreError, default_directory
+from protocol.pdo import Vector3
 
 FROM_PARAMETER: Final = "parameter"
 
@@ -23,6 +25,8 @@ class Beginning(NamedTuple):
     """Where it comes from."""
     is_one: bool
     """Whether there is a bias: a zero that was not measured is none."""
+    gravity: Vector3 | None = None
+    """In the sensor's frame when it was measured; None: not known."""
 
 
 class BiasKeeper:
@@ -36,28 +40,35 @@ class BiasKeeper:
     def __init__(self, log: Any) -> None:
         self.serial: str | None = None
         self.problem = ""
-        self._kept: tuple[Wrench, Wrench | None] | None = None
-        """The content of the file: a bias, and the sensor's own offset at that time."""
+        self._kept: tuple[object, ...] | None = None
+        """The content of the file."""
         self._log = log
 
     def forget(self) -> None:
         """Store the bias again, whatever the file has."""
         self._kept = None
 
-    def keep(self, bias: Wrench, parameters: CompensationParameters, offset: Wrench | None) -> None:
-        """Store `bias`, taken with the sensor's own `offset`, for the connected sensor, if enabled and
-        changed. `offset` is None if it is unknown, or if there is no bias."""
+    def keep(
+        self,
+        bias: Wrench,
+        parameters: CompensationParameters,
+        offset: Wrench | None,
+        gravity: Vector3 | None,
+    ) -> None:
+        """Store `bias`, taken with the sensor's own `offset` and `gravity` in its frame, for the connected
+        sensor, if enabled and changed. `offset` is None if it is unknown, or if there is no bias."""
         if not parameters.bias_keep:
             self.problem = ""
             return
-        if self.serial is None or (bias, offset) == self._kept:
+        content = bias, offset, gravity, parameters.payload
+        if self.serial is None or content == self._kept:
             return
         try:
-            path = _store(parameters).save(_number(self.serial), bias, parameters.payload, offset)
+            path = _store(parameters).save(_number(self.serial), bias, parameters.payload, offset, gravity)
         except StoreError as error:
             self._say_not_kept(str(error))
             return
-        self._kept, self.problem = (bias, offset), ""
+        self._kept, self.problem = content, ""
         self._log.info(f"the bias is kept in {path}")
 
     def take(
@@ -88,15 +99,19 @@ class BiasKeeper:
             )
             return None
         if stored.offset == offset:
-            self._kept = stored.bias, offset
+            self._kept = stored.bias, offset, stored.gravity, stored.payload
         self._log.info(f"the sensor with serial number {serial} has the bias that was kept at {stored.saved}")
-        if stored.payload is not None and stored.payload != parameters.payload:
+        bias = stored.bias
+        if stored.payload is not None and stored.payload != parameters.payload and stored.gravity is not None:
+            bias = rework(bias, stored.payload, parameters.payload, stored.gravity)
+            self._log.info(anew(parameters.payload))
+        elif stored.payload is not None and stored.payload != parameters.payload:
             self._log.warning(
                 f"the kept bias was taken with {_payload_text(stored.payload)}, and now there is "
                 f"{_payload_text(parameters.payload)}: tare again"
             )
         is_one = stored.bias != NO_WRENCH or stored.offset is not None
-        return Beginning(stored.bias, f"kept since {stored.saved}", is_one)
+        return Beginning(bias, f"kept since {stored.saved}", is_one, stored.gravity)
 
     def _look_up(
         self, serial: str, parameters: CompensationParameters, offset: Wrench | None
@@ -129,6 +144,19 @@ class BiasKeeper:
     def _say_not_kept(self, problem: str) -> None:
         self.problem = problem
         self._log.warning(problem)
+
+
+def rework(bias: Wrench, was: Payload, payload: Payload, gravity: Vector3) -> Wrench:
+    """The bias of the same measurement, with `gravity` in the sensor's frame, for another payload."""
+    return bias.plus(weight(was, gravity)).plus(weight(payload, gravity), -1.0)
+
+
+def anew(payload: Payload) -> str:
+    """The sentence about that."""
+    return (
+        f"the bias was worked out anew from its tare, for {_payload_text(payload)}: if it is another tool "
+        "than then, tare again"
+    )
 
 
 def _payload_text(payload: Payload) -> str:

@@ -7,12 +7,13 @@ change goes through it, so that it always shows what is in force, or ramped in.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 from typing import Final
 
 from rclpy.node import Node
 
-from bridge.compensating.bias_keeper import FROM_PARAMETER, BiasKeeper
+from bridge.compensating.bias_keeper import FROM_PARAMETER, BiasKeeper, anew, rework
 from bridge.compensating.gravity_sources import NoSource, Source
 from bridge.compensating.obstacles import Obstacles
 from bridge.compensating.own_offset import OwnOffset
@@ -27,8 +28,18 @@ from bridge.stream.link import Link
 from bridge.stream.watch import Watch
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
+from ft_compensation.outputs.filter import check as check_filter
 from ft_compensation.payload_watch import PayloadWatch
-from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, length, wrench_text
+from ft_compensation.quantities import (
+    NO_WRENCH,
+    Accelerometer,
+    CompensationError,
+    Payload,
+    Wrench,
+    length,
+    wrench_text,
+)
+from protocol.pdo import Vector3
 
 _MEASURED: Final = ("tare", "identified")
 """Where a bias comes from that is one even if it is zero."""
@@ -63,12 +74,14 @@ class CompensationControl:
         self.count_not_finite = count_not_finite
         """Samples so far that were not finite somewhere."""
         self._next_origin = FROM_PARAMETER
+        self._gravity: Vector3 | None = None
+        """In the sensor's frame when the bias in force was measured; None: it was not, or it is not known."""
         self._choice.check(self.parameters)
         self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
         self._watch: PayloadWatch | None = None
         self._watched: object = None
         self.obstacles, self._live = Obstacles(link, watch), live
-        live.checks.append(lambda wanted: self._choice.check(wanted.compensation))
+        live.checks.append(lambda wanted: self._check(wanted.compensation))
         live.listeners.append(lambda wanted: self._apply(wanted.compensation))
         self._guard = node.create_guard_condition(self._follow_sensor)
 
@@ -151,9 +164,10 @@ class CompensationControl:
         """Whether it is on the way to `bias`, as of the latest sample."""
         return not self._ramp.arrived(self.output.time_s)
 
-    def set_bias(self, bias: Wrench, origin: str) -> None:
-        """Put a bias in force, and keep it if that is asked for."""
+    def set_bias(self, bias: Wrench, origin: str, gravity: Vector3 | None = None) -> None:
+        """Put a bias in force, measured with `gravity` in the sensor's frame, and keep it if asked to."""
         self._own_offset.begin(bias, is_measured=origin in _MEASURED)
+        self._gravity = gravity
         with self._origin(origin):
             self._live.put(bias=[*bias.values])
 
@@ -185,6 +199,15 @@ class CompensationControl:
         finally:
             self._next_origin = FROM_PARAMETER
 
+    def _check(self, wanted: CompensationParameters) -> None:
+        """ParameterError for what cannot be had with this sensor or node."""
+        self._choice.check(wanted)
+        if wanted.filter != self.parameters.filter and wanted.filter.cutoff and self.link.rate_hz:
+            try:
+                check_filter(wanted.filter, self.link.rate_hz)
+            except CompensationError as error:
+                raise ParameterError(str(error)) from None
+
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted
         if not is_same_source(wanted, was):
@@ -195,8 +218,12 @@ class CompensationControl:
                 self._choice.source = NoSource(str(error))
         self.output.tune(wanted)
         self._ramp.seconds = wanted.bias_ramp_time
+        if wanted.payload != was.payload and wanted.bias == was.bias:
+            self._rework(was.payload, wanted.payload)
         # A parameter that the shift of the bias has not reached yet is no wish.
         if wanted.bias not in (was.bias, self.bias):
+            if self._next_origin == FROM_PARAMETER:
+                self._gravity = None
             self._ramp.go(wanted.bias, self.output.time_s)
             self._own_offset.begin(wanted.bias, is_measured=self._next_origin in _MEASURED)
             self.origin = self._next_origin
@@ -206,7 +233,29 @@ class CompensationControl:
             self.obstacles.hold(self.parameters, self.output)
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
             self._keeper.forget()
-        self._keeper.keep(self.bias, wanted, self._own_offset.to_keep)
+        self._keep(wanted)
+
+    def _keep(self, wanted: CompensationParameters) -> None:
+        self._keeper.keep(self.bias, wanted, self._own_offset.to_keep, self._gravity)
+
+    def _rework(self, was: Payload, payload: Payload) -> None:
+        """The payload was corrected: work the bias out anew from what the tare measured, or warn."""
+        if not self._own_offset.has_bias or self.origin in (FROM_PARAMETER, "identified"):
+            return
+        if self._gravity is not None:
+            self._ramp.shift(rework(self.bias, was, payload, self._gravity).plus(self.bias, -1.0))
+            self._ramp.forget()
+            self._log.info(anew(payload))
+            self._guard.trigger()
+            return
+        g = length(self.parameters.gravity)
+        centers = zip(payload.center, was.center, strict=True)
+        moment = math.hypot(*(payload.mass * now - was.mass * then for now, then in centers)) * g
+        self._log.warning(
+            "the bias is of before tool_mass or tool_center_of_gravity was changed, and where gravity was "
+            f"then is unknown: wrench_compensated may be wrong by {abs(payload.mass - was.mass) * g:.1f} N "
+            f"and {moment:.2f} Nm until the next tare"
+        )
 
     def _make_plan(self) -> None:
         wanted = self.parameters
@@ -237,7 +286,7 @@ class CompensationControl:
             offset = self._own_offset.begin(self.bias)
             begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters, offset)
             if begin is not None:
-                self._own_offset.has_bias = begin.is_one
+                self._own_offset.has_bias, self._gravity = begin.is_one, begin.gravity
                 self._begin_with(begin.bias, begin.origin)
             elif is_another:
                 # What was before in its history was the other's too.
@@ -248,7 +297,7 @@ class CompensationControl:
                 self._make_plan()
                 self.sensors += 1
             if not self.keeping and self.bias != NO_WRENCH:
-                self._keeper.keep(self.bias, self.parameters, self._own_offset.to_keep)
+                self._keep(self.parameters)
         self._follow_offset()
         if self.bias != self.parameters.bias:
             self._live.put(bias=[*self.bias.values])  # shifted

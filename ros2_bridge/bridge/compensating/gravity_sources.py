@@ -9,7 +9,7 @@ import math
 from typing import Final, NamedTuple, Protocol
 
 from bridge.parameters.compensation import CompensationParameters, Quaternion
-from ft_compensation.attitude.tilt import GyroscopeOffset
+from ft_compensation.attitude.tilt import GyroscopeOffset, unidentified
 from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
 from ft_compensation.quantities import EXACT, length
 from protocol.pdo import Sample, Vector3
@@ -36,8 +36,11 @@ class Source(Protocol):
     def tilt(self) -> float | None:
         """The error of the direction that is not exceeded in 95 % of cases, rad; None if unknown."""
 
-    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
-        """m/s², for this sample; None if what is known is too old, or nothing is."""
+    def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:
+        """m/s², for the sample of this CLOCK_MONOTONIC; None if what is known is too old, or nothing is.
+
+        `epoch_s`: by how much its CLOCK_REALTIME, which orientations of others are stamped by, is later.
+        """
 
     def why_none(self, time_s: float) -> str:
         """The reason for None, a sentence."""
@@ -56,7 +59,7 @@ class NoSource:
     def __init__(self, why: str = "orientation_source is none") -> None:
         self._why = why
 
-    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:  # noqa: ARG002
+    def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:  # noqa: ARG002
         """None."""
         return None
 
@@ -96,9 +99,11 @@ class AccelerometerSource:
     def tilt(self) -> float | None:
         """The bound of the estimate's tilt that holds in 95 % of cases, rad."""
         found = self._filter.tilt_95
+        if self._correct is None:
+            found = unidentified(found)
         return found if math.isfinite(found) else None
 
-    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
+    def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:  # noqa: ARG002
         """From this sample and those before it."""
         acceleration = sample.acceleration
         if not (any(acceleration) or any(sample.angular_rate)):
@@ -149,7 +154,7 @@ class SensorSource:
     def __init__(self, parameters: CompensationParameters) -> None:
         self._turn = QuaternionGravity(parameters.gravity, stale_after_s=parameters.orientation.stale_after)
 
-    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
+    def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:  # noqa: ARG002
         """From this sample's orientation."""
         if sample.orientation is not None and not self._turn.update(sample.orientation, time_s):
             # Time went back: what was known is of no use any more.
@@ -188,15 +193,18 @@ class ListenerSource:
         self._limit_s = parameters.orientation.stale_after
         self._turn = QuaternionGravity(parameters.gravity, stale_after_s=self._limit_s)
         self._taken: Oriented | None = None
+        self.epoch_s = 0.0
+        """By how much CLOCK_REALTIME of the latest sample is later than its CLOCK_MONOTONIC."""
         self.describe = listener.describe
 
-    def gravity(self, sample: Sample, time_s: float) -> Vector3 | None:
+    def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:
         """From the latest orientation, if its time is close to the sample's."""
+        self.epoch_s = epoch_s
         self._turn.follow(sample.angular_rate, time_s)
         latest = self._listener.latest
         if latest is not self._taken and latest is not None:
             self._taken = latest
-            stamp_s = latest.stamp_ns * 1e-9
+            stamp_s = latest.stamp_ns * 1e-9 - epoch_s
             if not self._turn.update(latest.quaternion, stamp_s):
                 # The publisher's clock went back, or it is another publisher: what came last is what counts.
                 self._turn.reset()
@@ -208,7 +216,7 @@ class ListenerSource:
         latest, name = self._listener.latest, self.describe
         if latest is None:
             return f"no orientation from {name}: {self._listener.problem}"
-        behind_s = time_s - latest.stamp_ns * 1e-9
+        behind_s = time_s + self.epoch_s - latest.stamp_ns * 1e-9
         if behind_s < 0:
             return (
                 f"the orientation from {name} is stamped {_seconds(-behind_s)} after the sample (limit "

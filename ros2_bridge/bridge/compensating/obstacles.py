@@ -7,6 +7,7 @@ from typing import Final
 from bridge.compensating.gravity_sources import (
     IMU_IS_OFF,
     AccelerometerSource,
+    ListenerSource,
     Listening,
     NoSource,
     SensorSource,
@@ -77,15 +78,18 @@ class Obstacles:
         self, parameters: CompensationParameters, source: Source, listener: Listening | None
     ) -> str | None:
         """The same without subscribers, as far as it can be known while no sample is compensated."""
-        sample, time_s = self._watch.sample, self._watch.stamp_ns * 1e-9
+        sample, frame = self._watch.sample, self._watch.frame
+        time_s = 0.0 if frame is None else frame.monotonic_ns * 1e-9
         if not parameters.payload.mass:
             return None
         if isinstance(source, NoSource):
             return source.why_none(time_s)
-        if listener is not None:
+        if listener is not None and isinstance(source, ListenerSource):
             latest, limit_s = listener.latest, parameters.orientation.stale_after
-            fits = latest is not None and abs(time_s - latest.stamp_ns * 1e-9) <= limit_s
-            return None if fits or sample is None else source.why_none(time_s)
+            if frame is None or (latest and abs(frame.stamp_ns - latest.stamp_ns) <= limit_s * 1e9):
+                return None
+            source.epoch_s = (frame.stamp_ns - frame.monotonic_ns) * 1e-9
+            return source.why_none(time_s)
         if isinstance(source, SensorSource) and sample is not None and sample.orientation is None:
             return source.why_none(time_s)
         is_off = self._link.settings.get("imu_active") == 0 or (

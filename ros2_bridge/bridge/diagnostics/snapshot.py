@@ -80,6 +80,7 @@ class Snapshot(NamedTuple):
             temperature=self.temperature,
             locked=None if mode is None else mode == "locked",
             recoveries=self.new_server.recoveries,
+            missed_deadlines=self.new_server.missed_deadlines,
             reconnects=self.new_connects if self.connects > 1 else 0,
             is_lost=self.lost is not None,
             state="?" if self.info is None else self.info.state,
@@ -105,16 +106,17 @@ def row_of(rows: object, position: int) -> Mapping[str, Any]:
 
 
 class ServerCounts(NamedTuple):
-    """What the server itself has counted of our sensor, by the names in `status`."""
+    """What the server itself has counted, of our sensor or at all, by the names in `status`."""
 
     lost_samples: int = 0
     not_finite: int = 0
     recoveries: int = 0
+    missed_deadlines: int = 0
 
     @classmethod
     def of(cls, status: Mapping[str, Any], position: int) -> ServerCounts:
         """Those in a `status` reply; 0 for what it does not say."""
-        row = row_of(status.get("sensors"), position)
+        row = {**status, **row_of(status.get("sensors"), position)}
         return cls(*(value if type(value := row.get(name)) is int else 0 for name in cls._fields))
 
     def since(self, then: ServerCounts | None) -> ServerCounts:

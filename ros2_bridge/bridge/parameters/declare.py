@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Any, Final
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -10,7 +9,10 @@ from rclpy.node import Node
 
 from bridge.parameters.row import ParameterValue, Row
 from bridge.parameters.table import PARAMETERS, Parameters, gather_all
+from protocol.settings import SETTINGS
+from protocol.text.did_you_mean import did_you_mean
 
+SETTINGS_PREFIX: Final = "settings."
 _OF_OTHERS: Final = ("qos_overrides.", "use_sim_time", "start_type_description_service")
 """Prefixes of parameters that rclpy itself may declare."""
 
@@ -28,13 +30,13 @@ def declare(node: Node) -> Parameters:
 
 def warn_of_others(node: Node) -> None:
     """Warn of given parameters that the node does not have; call it once all are declared."""
-    names = list(node.get_parameters_by_prefix(""))
+    # Not the node's own list, which leaves out settings without a value.
+    names = [row.name for row in PARAMETERS] + [SETTINGS_PREFIX + name for name in SETTINGS]
     for given in node._parameter_overrides:  # rclpy has no public name
         if node.has_parameter(given) or given.startswith(_OF_OTHERS):
             continue
-        near = difflib.get_close_matches(given, names, 1)
-        meant = f"did you mean {near[0]}?" if near else "ros2 param list shows the valid names"
-        node.get_logger().warning(f"unknown parameter {given} is ignored: {meant}")
+        guess = did_you_mean(given, names) or "; ros2 param list shows the valid names"
+        node.get_logger().warning(f"unknown parameter {given} is ignored{guess}")
     if node.get_parameter("use_sim_time").value is True:
         node.get_logger().warning(
             "use_sim_time is true, but a real sensor has no simulation time: stamps are wall-clock time, and "

@@ -66,9 +66,10 @@ class LiveParameters:
 
 def _convert(parameters: Sequence[Parameter]) -> list[Parameter]:
     """Whole numbers as the floats that are meant: `ros2 param set /bridge tool_mass 1`."""
-    return [
-        Parameter(parameter.name, value=_LIVE[parameter.name].convert(parameter.value))
-        if parameter.name in _LIVE and parameter.value is not None
-        else parameter
-        for parameter in parameters
-    ]
+    converted = []
+    for parameter in parameters:
+        row, value = _LIVE.get(parameter.name), parameter.value
+        meant = value if row is None else row.convert(value)
+        # Only if it is another: of an empty array rclpy cannot tell the type.
+        converted.append(parameter if meant is value else Parameter(parameter.name, value=meant))
+    return converted

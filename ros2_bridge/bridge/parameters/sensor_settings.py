@@ -10,19 +10,17 @@ what was set since, in force together.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from bridge.parameters.declare import SETTINGS_PREFIX as PREFIX
 from bridge.parameters.row import ParameterError
 from bridge.stream.link import Link
 from bridge.stream.requests import CONFIGURE_TIMEOUT_S, RequestFailedError, Requests
 from protocol.errors import SettingError
 from protocol.settings import SETTINGS, Setting, SettingValue, check_settings
-
-PREFIX: Final = "settings."
 
 
 class SettingsParameters:

@@ -19,6 +19,7 @@ from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
 from ft_compensation.stationary import StationaryMeans, StationaryWindow
 from ft_compensation.stationary_limits import StationaryLimits
+from protocol.framing import DataMessage
 from protocol.pdo import Sample, Vector3
 
 _BEGINS_S: Final = 1.0
@@ -101,10 +102,10 @@ class StageTopic(Protocol):
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed."""
 
-    def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Publish a force and a torque."""
 
-    def note(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+    def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Take a sample that `publishing_frequency` leaves out."""
 
     def tune(self, parameters: CompensationParameters) -> None:
@@ -136,7 +137,7 @@ class CompensatedOutput:
         self._begins_s = math.inf
         """Time of a subscription after which nothing was published yet, s; infinite: unknown."""
         self.time_s = 0.0
-        """The latest sample's, seconds since the Unix epoch."""
+        """The latest sample's, CLOCK_MONOTONIC of the server: CLOCK_REALTIME may be set meanwhile."""
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed to any of the topics, or a window is open."""
@@ -161,33 +162,33 @@ class CompensatedOutput:
         for topic in self._all:
             topic.tune(parameters)
 
-    def follow(self, sample: Sample, stamp_ns: int) -> None:
+    def follow(self, sample: Sample, frame: DataMessage) -> None:
         """Give source, open window and filters a sample that is not published."""
-        self.time_s = time_s = stamp_ns * 1e-9
+        self.time_s = time_s = frame.monotonic_ns * 1e-9
         plan = self.plan
-        gravity = self._gravity(plan, sample, time_s)
+        gravity = self._gravity(plan, sample, frame)
         if self._noting and gravity is not None and self.hold is None and not self._unusable(plan, sample):
             stages = self._stages(plan, sample, gravity, time_s)
             for topic in self._noting:
-                topic.note(*stages[topic.index], stamp_ns)
+                topic.note(*stages[topic.index], frame)
 
-    def _gravity(self, plan: Plan, sample: Sample, time_s: float) -> Vector3 | None:
+    def _gravity(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
         """Gravity as far as it is needed, None if it is not known; the open window takes the sample in."""
         window = self.window
         gravity: Vector3 | None = ZERO
         if plan.needs_gravity or window is not None:
-            gravity = plan.source.gravity(sample, time_s)
-            if window is not None and window.add(sample, time_s, gravity):
+            gravity = plan.source.gravity(sample, self.time_s, (frame.stamp_ns - frame.monotonic_ns) * 1e-9)
+            if window is not None and window.add(sample, self.time_s, gravity):
                 self.window = None
             if not plan.needs_gravity:
                 gravity = ZERO
         return gravity
 
-    def publish(self, sample: Sample, stamp_ns: int) -> None:
+    def publish(self, sample: Sample, frame: DataMessage) -> None:
         """Compensate a sample and publish its stages; nothing if gravity is needed and not known."""
-        self.time_s = time_s = stamp_ns * 1e-9
+        self.time_s = time_s = frame.monotonic_ns * 1e-9
         plan = self.plan
-        gravity = self._gravity(plan, sample, time_s)
+        gravity = self._gravity(plan, sample, frame)
         self.is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
         self.broken = self._unusable(plan, sample)
         if gravity is None or self.hold is not None or self.is_saturated or self.broken is not None:
@@ -201,7 +202,7 @@ class CompensatedOutput:
         if (watch := plan.watch) is not None and watch.is_due(time_s):
             watch.look(stages.final.force, gravity, sample.angular_rate, time_s)
         for topic in self._wanted:
-            topic.send(*stages[topic.index], stamp_ns)
+            topic.send(*stages[topic.index], frame)
         self.published += 1
 
     @staticmethod

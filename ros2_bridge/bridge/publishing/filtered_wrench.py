@@ -12,6 +12,7 @@ from bridge.publishing.messages import WrenchTopic
 from ft_compensation.compensator import Stages
 from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
 from ft_compensation.quantities import CompensationError
+from protocol.framing import DataMessage
 from protocol.pdo import Vector3
 
 
@@ -63,6 +64,7 @@ class FilteredTopic:
         try:
             self._filter.design(settings, rate_hz)
         except CompensationError as error:
+            self._node.get_logger().warning(f"wrench_filtered has stopped: {error}")
             return f"wrench_filtered has stopped: {error}"
         notch = f", notch {settings.notch:g} Hz" if settings.notch else ""
         self._node.get_logger().info(
@@ -71,12 +73,12 @@ class FilteredTopic:
         )
         return ""
 
-    def note(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+    def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Filter a sample that is not published."""
         if self._is_ready():
-            self._filter.step(force, torque, stamp_ns)
+            self._filter.step(force, torque, frame.monotonic_ns)
 
-    def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Filter a sample and publish it."""
         if self._is_ready() and self._topic is not None:
-            self._topic.send(*self._filter.step(force, torque, stamp_ns), stamp_ns)
+            self._topic.send(*self._filter.step(force, torque, frame.monotonic_ns), frame)

@@ -11,6 +11,7 @@ from bridge.parameters.row import Numbers
 from bridge.parameters.table import Parameters
 from bridge.publishing.messages import Topic
 from bridge.publishing.serialized import SerializedMessage, axes
+from protocol.framing import DataMessage
 from protocol.pdo import Sample
 
 _UNKNOWN: Final = [-1.0, *[0.0] * 8]
@@ -46,10 +47,10 @@ class RawImuOutput(Topic):
     def _orientation_covariance(self, parameters: Parameters) -> list[float]:  # noqa: ARG002
         return _UNKNOWN
 
-    def publish(self, sample: Sample, stamp_ns: int) -> None:
+    def publish(self, sample: Sample, frame: DataMessage) -> None:
         """Publish acceleration and angular rate."""
         serialized = self._serialized
-        serialized.stamp(stamp_ns)
+        serialized.stamp(frame.stamp_ns)
         serialized.fill(0, sample.acceleration)
         serialized.fill(1, sample.angular_rate)
         self._publish(serialized.message())
@@ -64,11 +65,11 @@ class ImuOutput(RawImuOutput):
     def _orientation_covariance(self, parameters: Parameters) -> list[float]:
         return _covariance(parameters.orientation_covariance)
 
-    def publish(self, sample: Sample, stamp_ns: int) -> None:
+    def publish(self, sample: Sample, frame: DataMessage) -> None:
         """Publish acceleration, angular rate and orientation."""
         if sample.orientation is not None:
             self._serialized.fill(2, sample.orientation)
-            super().publish(sample, stamp_ns)
+            super().publish(sample, frame)
 
 
 def _covariance(values: Numbers) -> list[float]:

@@ -22,6 +22,7 @@ from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.table import Parameters
 from bridge.publishing.serialized import SerializedMessage, axes
 from ft_compensation.compensator import Stages
+from protocol.framing import DataMessage
 from protocol.pdo import Sample, Vector3
 
 ARRAY_LABEL: Final = "Fx Fy Fz Mx My Mz Ax Ay Az Rx Ry Rz"
@@ -41,10 +42,10 @@ class Output(Protocol):
     def fields(self) -> Sequence[str]:
         """The fields of `Sample` that it publishes: all of them are finite when `publish` is called."""
 
-    def publish(self, sample: Sample, stamp_ns: int) -> None:
-        """Publish `sample`; `stamp_ns` is its time, ns since the Unix epoch."""
+    def publish(self, sample: Sample, frame: DataMessage) -> None:
+        """Publish `sample`, which came in `frame`: its stamps."""
 
-    def follow(self, sample: Sample, stamp_ns: int) -> None:
+    def follow(self, sample: Sample, frame: DataMessage) -> None:
         """Take note of a sample that `publishing_frequency` leaves out."""
 
 
@@ -66,11 +67,11 @@ class Outputs:
             if configure is not None:
                 configure(parameters)
 
-    def publish_finite(self, sample: Sample, stamp_ns: int) -> None:
+    def publish_finite(self, sample: Sample, frame: DataMessage) -> None:
         """Publish a sample that is not finite everywhere where it is."""
         for output in self.wanted:
             if all(_is_finite(getattr(sample, field)) for field in output.fields):
-                output.publish(sample, stamp_ns)
+                output.publish(sample, frame)
 
 
 def create_publisher(node: Node, message_type: Any, topic: str) -> Any:
@@ -92,7 +93,7 @@ class Topic:
         """Whether anybody has subscribed."""
         return bool(self.publisher.get_subscription_count())
 
-    def follow(self, sample: Sample, stamp_ns: int) -> None:
+    def follow(self, sample: Sample, frame: DataMessage) -> None:
         """Nothing: each message stands by itself."""
 
 
@@ -112,7 +113,7 @@ class ArrayOutput(Topic):
             message, [[(message.data, position) for position in range(ARRAY_SIZE)]]
         )
 
-    def publish(self, sample: Sample, stamp_ns: int) -> None:  # noqa: ARG002 - the message has no header
+    def publish(self, sample: Sample, frame: DataMessage) -> None:  # noqa: ARG002 - the message has no header
         """Publish the twelve values."""
         self._serialized.fill(0, sample.array)
         self._publish(self._serialized.message())
@@ -129,9 +130,9 @@ class WrenchTopic(Topic):
         positions = [[*axes(wrench.force), *axes(wrench.torque)]]
         self._serialized = SerializedMessage(message, positions, message.header.stamp)
 
-    def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Publish a force and a torque."""
-        self._publish(self._serialized.filled(stamp_ns, force + torque))
+        self._publish(self._serialized.filled(frame.stamp_ns, force + torque))
 
 
 class WrenchOutput(WrenchTopic):
@@ -139,9 +140,9 @@ class WrenchOutput(WrenchTopic):
 
     fields = ("force", "torque")
 
-    def publish(self, sample: Sample, stamp_ns: int) -> None:
+    def publish(self, sample: Sample, frame: DataMessage) -> None:
         """Publish force and torque."""
-        self.send(sample.force, sample.torque, stamp_ns)
+        self.send(sample.force, sample.torque, frame)
 
 
 class StageTopic(WrenchTopic):
@@ -161,7 +162,7 @@ class StageTopic(WrenchTopic):
     def tune(self, parameters: CompensationParameters) -> None:
         """Nothing."""
 
-    def note(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+    def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Nothing."""
 
 
@@ -187,9 +188,9 @@ class TemperatureOutput(Topic):
         message.header.frame_id = parameters.frame_id
         self._serialized = SerializedMessage(message, [[(message, "temperature")]], message.header.stamp)
 
-    def publish(self, sample: Sample, stamp_ns: int) -> None:
+    def publish(self, sample: Sample, frame: DataMessage) -> None:
         """Publish the temperature."""
-        self._publish(self._serialized.filled(stamp_ns, (sample.temperature,)))
+        self._publish(self._serialized.filled(frame.stamp_ns, (sample.temperature,)))
 
 
 def _is_finite(value: float | Sequence[float] | None) -> bool:

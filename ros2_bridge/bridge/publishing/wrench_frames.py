@@ -17,6 +17,7 @@ from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.table import Parameters
 from bridge.publishing.messages import StageTopic
 from ft_compensation.outputs.frames import WrenchTransform
+from protocol.framing import DataMessage
 from protocol.pdo import Vector3
 
 TF_PERIOD_S: Final = 0.005
@@ -51,9 +52,9 @@ class FixedFrameTopic(StageTopic):
         super().__init__(node, f"wrench_compensated/{name}", name, "final")
         self._transform = transform
 
-    def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Publish them in this frame."""
-        super().send(*self._transform.apply(force, torque), stamp_ns)
+        super().send(*self._transform.apply(force, torque), frame)
 
 
 class _Found(NamedTuple):
@@ -104,12 +105,12 @@ class TfFrameTopic(StageTopic):
         """Forget the pose."""
         self._found, self._misses = None, 0
 
-    def send(self, force: Vector3, torque: Vector3, stamp_ns: int) -> None:
+    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Publish them in this frame, if its pose is known."""
-        self._asked_ns = stamp_ns
+        self._asked_ns = stamp_ns = frame.stamp_ns
         found = self._found
         if found is not None and (not found.stamp_ns or abs(stamp_ns - found.stamp_ns) <= self._limit_ns):
-            super().send(*found.transform.apply(force, torque), stamp_ns)
+            super().send(*found.transform.apply(force, torque), frame)
 
     @property
     def problem(self) -> str:

@@ -25,10 +25,13 @@ class BiasServices:
         window = take_window(control, self._requests, needs_gravity=control.parameters.payload.mass > 0)
         means = window.means()
         payload, gravity = control.parameters.payload, None
-        if payload.mass:
+        try:
             acceleration = control.parameters.accelerometer.reading.correct(means.acceleration)
             gravity = window.gravity() or gravity_of(acceleration, length(control.parameters.gravity))
-        control.set_bias(estimate_bias(means, payload, gravity), "tare")
+        except CompensationError:  # then the payload cannot be changed without another tare
+            if payload.mass:
+                raise
+        control.set_bias(estimate_bias(means, payload, gravity), "tare", gravity)
         weight = (
             f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
             if payload.mass

@@ -54,7 +54,7 @@ class Outputs(Protocol):
     def wanted(self) -> Sequence[Any]:
         """Those outputs that somebody has subscribed to."""
 
-    def publish_finite(self, sample: Sample, stamp_ns: int) -> None:
+    def publish_finite(self, sample: Sample, frame: DataMessage) -> None:
         """Publish a sample that is not finite everywhere where it is."""
 
 
@@ -203,10 +203,10 @@ class Reader:
                 sample = decoders[len(frame.process_data)].decode(frame.process_data)
                 if sample.is_finite:
                     for output in outputs.wanted:
-                        output.publish(sample, frame.stamp_ns)
-                    watch.sample, watch.stamp_ns = sample, frame.stamp_ns
+                        output.publish(sample, frame)
+                    watch.sample, watch.frame = sample, frame
                 else:
-                    self._publish_finite(sample, frame.stamp_ns)
+                    self._publish_finite(sample, frame)
                 watch.ages.append(monotonic_ns() - frame.monotonic_ns)
             frames.clear()
 
@@ -233,12 +233,12 @@ class Reader:
         sample = self._decoders[len(frame.process_data)].decode(frame.process_data)
         if sample.is_finite:
             for output in self._outputs.wanted:
-                output.follow(sample, frame.stamp_ns)
+                output.follow(sample, frame)
         else:
             self.not_finite += 1
 
-    def _publish_finite(self, sample: Sample, stamp_ns: int) -> None:
-        self._outputs.publish_finite(sample, stamp_ns)
+    def _publish_finite(self, sample: Sample, frame: DataMessage) -> None:
+        self._outputs.publish_finite(sample, frame)
         self.not_finite += 1
         now_s = self._clock.monotonic()
         if now_s >= self._next_warning_s:

@@ -93,6 +93,20 @@ class _Section:
         return result
 
 
+def check(settings: FilterSettings, rate_hz: float) -> None:
+    """CompensationError if samples of this rate are too few for it."""
+    half = rate_hz / 2.0
+    frequencies = {"cutoff": settings.cutoff}
+    if settings.notch:
+        frequencies |= {"notch": settings.notch, "notch_width": settings.notch_width}
+    for name, value in frequencies.items():
+        if not value < half:
+            raise CompensationError(
+                f"filter.{name} is {value:g} Hz, but must be below half of the sampling rate, "
+                f"{half:g} Hz: lower it"
+            )
+
+
 class WrenchFilter:
     """Filters every sample of a stream. `step` is for one thread; another may `design` meanwhile."""
 
@@ -108,16 +122,7 @@ class WrenchFilter:
 
     def design(self, settings: FilterSettings, rate_hz: float) -> None:
         """For samples of this rate, from the next one on. CompensationError if they are too few for it."""
-        half = rate_hz / 2.0
-        frequencies = {"cutoff": settings.cutoff}
-        if settings.notch:
-            frequencies |= {"notch": settings.notch, "notch_width": settings.notch_width}
-        for name, value in frequencies.items():
-            if not value < half:
-                raise CompensationError(
-                    f"filter.{name} is {value:g} Hz, but must be below half of the sampling rate, "
-                    f"{half:g} Hz: lower it"
-                )
+        check(settings, rate_hz)
         designs = [low_pass(settings.cutoff, rate_hz)]
         if settings.notch:
             designs.insert(0, notch(settings.notch, settings.notch_width, rate_hz))

@@ -24,6 +24,7 @@ from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
 from ft_compensation.outputs.frames import WrenchTransform
 from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.stationary_limits import StationaryLimits
+from protocol.framing import DataMessage
 from protocol.pdo import Sample, SampleDecoder, encode
 from scripts.benchmarks.chain import Setup
 from scripts.demonstration.child import DemoError
@@ -78,6 +79,10 @@ def costs(setup: Setup) -> Costs:
         node = rclpy.create_node("compensation_cost", context=context)
         output = CompensatedOutput(make_stages(node, "ft"))
 
+        def frame_at(number: int) -> DataMessage:
+            now_ns = _START_NS + number * step_ns
+            return DataMessage(number, now_ns, now_ns, 0, 0, 3, b"")
+
         def measure(name: str, *, inertia: bool, window: bool) -> None:
             source = AccelerometerSource(CompensationParameters(payload=_TOOL), GyroscopeOffset())
             output.plan = Plan(
@@ -85,9 +90,9 @@ def costs(setup: Setup) -> Costs:
             )
             output.window = RestWindow(1e9, StationaryLimits(), source) if window else None
             for number in range(-setup.rate_hz, 0):  # a second, until gravity is known
-                output.follow(samples[number % SAMPLES], _START_NS + number * step_ns)
+                output.follow(samples[number % SAMPLES], frame_at(number))
             before = output.published
-            found[name] = took(lambda number: output.publish(samples[number], _START_NS + number * step_ns))
+            found[name] = took(lambda number: output.publish(samples[number], frame_at(number)))
             if output.published - before != SAMPLES:
                 raise DemoError(f"{name}: not all samples were compensated")
 
