@@ -284,7 +284,9 @@ def test_a_backlog_does_not_delay_its_end(out: Path, monkeypatch: pytest.MonkeyP
     calls = itertools.count()
     monkeypatch.setattr(recorder, "time", SimpleNamespace(monotonic=lambda: next(calls) * 0.1))
     monkeypatch.setattr(recorder, "MAX_BACKLOG", 20_000)
-    came = [[frame(number) for number in range(first, first + 64)] for first in range(0, 32_000, 64)]
+    came: list[Batch] = [
+        [frame(number) for number in range(first, first + 64)] for first in range(0, 32_000, 64)
+    ]
     slow = new_recorder(out)
     for batch in came:
         slow.put(batch)
