@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 import time
 from pathlib import Path
@@ -49,12 +48,6 @@ class Parts:
         self.made.append(path)
         self._opened = time.monotonic()
         return disk
-
-    def remove(self) -> None:
-        """Remove the created files, as far as possible; they must be closed."""
-        for path in self.made:
-            with contextlib.suppress(OSError):
-                path.unlink()
 
     def is_full(self, size: int) -> bool:
         """Whether the file, of `size` bytes, is full."""

@@ -22,7 +22,7 @@ from clients.record.source import Batch, Source
 from clients.recording.file_format import FORMAT_VERSION
 from clients.recording.reader import Event
 from clients.recording.ros_messages import RosTopics
-from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
+from protocol.errors import ConnectionFailedError, ProtocolError, RefusedError, UnreachableError
 from protocol.program.version import VERSION
 from protocol.text.untrusted import rows
 from protocol.text.visible import printable
@@ -45,6 +45,8 @@ def run(argv: Sequence[str] | None, signals: Signals) -> int:
             return _run(source, parts, options, signals)
     except UnreachableError as error:
         _say(f"{error.at(options.address)}, or use --wait")
+    except RefusedError as error:
+        _say(f"the server refused: {error}")
     except (RecordingError, ProtocolError) as error:
         _say(str(error))
     return 1
@@ -80,40 +82,30 @@ def _connect(source: Source, options: RecordOptions, signals: Signals) -> Batch 
 def _record(
     source: Source, recorder: Recorder, batch: Batch, options: RecordOptions, parts: Parts, signals: Signals
 ) -> int:
-    began, reason, code, refused = time.monotonic(), "asked to stop", 0, ""
+    began, reason, code = time.monotonic(), "asked to stop", 0
     with Progress(options.path.name, options.seconds) as progress:
         progress.say(f"recording {options.address} to {parts.made[0]}; Ctrl-C ends it")
-        try:
-            while True:
-                recorder.put(batch)
-                _report(batch, progress)
-                if recorder.failed:
-                    code = 1
-                    break
-                if signals.asked:
-                    break
-                if options.seconds is not None and time.monotonic() - began >= options.seconds:
-                    reason = "time is up"
-                    break
-                if not (source.connected or options.reconnect):
-                    reason = "the server ended"
-                    break
-                progress.show(recorder, connected=source.connected)
-                batch = source.receive()
-        except ProtocolError as error:
-            reason, code = f"the server refused: {error}", 1
-            refused = reason
+        while True:
+            recorder.put(batch)
+            _report(batch, progress)
+            if recorder.failed:
+                code = 1
+                break
+            if signals.asked:
+                break
+            if options.seconds is not None and time.monotonic() - began >= options.seconds:
+                reason = "time is up"
+                break
+            if not (source.connected or options.reconnect):
+                reason = "the server ended"
+                break
+            progress.show(recorder, connected=source.connected)
+            batch = source.receive()
         seconds = time.monotonic() - began
         source.close()
         recorder.stop(reason)
-    if refused:
-        _say(refused)
-        if not recorder.saved and recorder.error is None:
-            # An empty file would block the next attempt.
-            parts.remove()
-            return code
     if recorder.error is not None:
-        _say(f"{recorder.error}; what was written before is intact")
+        _say(str(recorder.error))
         code = 1
     _say(_summary(recorder, parts, seconds))
     return code
@@ -137,7 +129,7 @@ def _report(batch: Batch, progress: Progress) -> None:
             row = item.event
             words = row.get("message") or row.get("reason") or ""
             position = f" {row['sensor']}" if "sensor" in row else ""
-            if item.name != "connected":
+            if item.name != "connected" or words:
                 progress.say(printable(f"{item.name}{position}{': ' if words else ''}{words}", 300))
 
 

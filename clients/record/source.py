@@ -5,10 +5,11 @@ Batches, because waking up for each frame would cost more than all other work on
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import time
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 from clients.recording.file_format import RECORDER
 from clients.recording.reader import Description, Event
@@ -19,6 +20,7 @@ from protocol.control import request
 from protocol.errors import ConnectionFailedError, RefusedError
 from protocol.framing import DataMessage
 from protocol.text.json_text import JsonObject
+from protocol.text.untrusted import rows
 
 Batch = list[DataMessage | Description | Event]
 
@@ -33,7 +35,7 @@ _CHANGES: Final = frozenset({ServerEvent.RECONFIGURED, ServerEvent.SENSOR_BACK})
 
 
 class Source:
-    """A subscription that is renewed whenever the connection ends.
+    """A subscription that is renewed whenever the connection ends, to those of the sensors that are there.
 
     Attributes:
         connected: whether there is a connection now.
@@ -48,10 +50,6 @@ class Source:
         self._client: Client | None = None
         self._retry_at = 0.0
         self._refusal = ""
-        self._greeting: Batch = []
-        """What is to be said of a connection made anew once its subscription is granted."""
-        self._subscribed: JsonObject | None = None
-        """The latest reply that granted a subscription."""
 
     @property
     def connected(self) -> bool:
@@ -65,18 +63,29 @@ class Source:
         """
         client = Client(self.address.port, self.address.host)
         try:
-            self._ask(client, "subscribe", **self._subscription())
+            there = {row.get("sensor") for row in rows(client.description.get("sensors"))}
+            missing = set[int]() if self.description is None else {*(self._sensors or ())} - there
+            wanted = self._sensors and [sensor for sensor in self._sensors if sensor not in missing]
+            # After connecting, so that the TCP window can grow to it.
+            client.connection.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+            # REPEATED frames too: they show that a sensor was silent.
+            client.subscribe(wanted, fresh_only=False)
         except BaseException:
             client.close()
             raise
-        # After connecting, so that the TCP window can grow to it.
-        client.connection.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-        self._client, self.description = client, client.description
+        self._client, self.description, self._refusal = client, client.description, ""
+        said = {"message": f"without sensor {', '.join(map(str, sorted(missing)))}"} if missing else {}
         same_machine = client.connection.same_machine
-        return [_noted("connected", server=str(self.address), same_machine=same_machine)]
+        batch: Batch = [_noted("connected", server=str(self.address), same_machine=same_machine, **said)]
+        batch.append(Description(time.time_ns(), client.description))
+        with contextlib.suppress(ConnectionFailedError):  # `receive` will find that, too
+            batch += client.receive(0.0)
+            for event in client.events:
+                self._happened(client, event, batch)
+        return batch
 
     def receive(self) -> Batch:
-        """Sleep for BATCH_S, then return everything received; RefusedError if the server refuses."""
+        """Sleep for BATCH_S, then return everything received."""
         time.sleep(BATCH_S)
         client = self._client
         if client is None:
@@ -88,16 +97,9 @@ class Source:
                 self._take(client, batch)
                 if not more:
                     break
-        except ConnectionFailedError as error:
+        except (ConnectionFailedError, RefusedError) as error:
             self.close()
             batch.append(_noted("disconnected", reason=str(error)))
-        except RefusedError as error:
-            if self._subscribed is None:
-                raise
-            # A server that was started again: the sensor may be there the next time.
-            self.close()
-            known, self._refusal = self._refusal == str(error), str(error)
-            batch = [] if known else [_noted("refused", message=f"the server refused: {error}")]
         return batch
 
     def close(self) -> None:
@@ -107,44 +109,37 @@ class Source:
             self._client = None
             self._retry_at = time.monotonic() + _RETRY_S
 
-    def _subscription(self) -> dict[str, Any]:
-        # REPEATED frames too: they show that a sensor was silent.
-        values: dict[str, Any] = {"fresh_only": False}
-        if self._sensors is not None:
-            values["sensors"] = list(self._sensors)
-        return values
-
     def _connect_again(self) -> Batch:
         if time.monotonic() < self._retry_at:
             return []
         try:
-            self._greeting = self.connect()
-        except ConnectionFailedError:
+            return self.connect()
+        except (ConnectionFailedError, RefusedError) as error:
             self._retry_at = time.monotonic() + _RETRY_S
-        return []
+            if not isinstance(error, RefusedError) or str(error) == self._refusal:
+                return []
+            self._refusal = str(error)
+            return [_noted("disconnected", reason=self._refusal)]
 
     def _take(self, client: Client, batch: Batch) -> None:
         while (message := client.connection.next_message()) is not None:
             if isinstance(message, DataMessage):
                 batch.append(message)
             elif "event" in message:
-                if message.get("source") == RECORDER:
-                    del message["source"]  # reserved for the recorder's own events
-                batch.append(Event(time.time_ns(), message))
-                if message["event"] in _CHANGES:
-                    self._ask(client, "describe")
+                self._happened(client, message, batch)
             elif message.get("ok") is not True:
                 raise RefusedError.of(message)
             else:
-                self.description = self._subscribed = message
-                self._refusal = ""
-                batch += self._greeting
-                self._greeting = []
+                self.description = message
                 batch.append(Description(time.time_ns(), message))
 
     @staticmethod
-    def _ask(client: Client, action: str, **values: Any) -> None:
-        client.connection.send(request(action, "record", **values))
+    def _happened(client: Client, event: JsonObject, batch: Batch) -> None:
+        if event.get("source") == RECORDER:
+            del event["source"]  # reserved for the recorder's own events
+        batch.append(Event(time.time_ns(), event))
+        if event["event"] in _CHANGES:
+            client.connection.send(request("describe", "record"))
 
 
 def _noted(name: str, **values: object) -> Event:

@@ -412,3 +412,23 @@ def test_what_is_no_frame(texts: list[str], words: str) -> None:
 def test_no_frames(value: str) -> None:
     with SimulatedNode(Sensor(), wrench_frames=value) as node:
         assert node.parameters("wrench_frames") == [[""]]
+
+
+def qos(node: SimulatedNode) -> dict[str, tuple[str, str, int]]:
+    """Reliability, durability and depth of the node's own topics."""
+    profiles = {name.rpartition("/")[2]: topic.qos_profile for name, topic in node.topics.items()}
+    del profiles["parameter_events"]  # rclpy's
+    return {name: (p.reliability.name, p.durability.name, p.depth) for name, p in profiles.items()}
+
+
+def test_every_topic_is_reliable_unless_its_qos_is_overridden() -> None:
+    """A best-effort publisher never reaches a reliable subscriber, which is what most tools are."""
+    with SimulatedNode(Sensor(), **{"filter.cutoff": 10.0, "wrench_frames": "[tcp 0 0 0.5]"}) as node:
+        expected = dict.fromkeys(qos(node), ("RELIABLE", "VOLATILE", 10))
+        assert {"wrench", "wrench_filtered", "tcp", "data_raw", "diagnostics"} <= expected.keys()
+        assert qos(node) == expected
+    best_effort = {"qos_overrides./mine.publisher.reliability": "best_effort"}
+    with SimulatedNode(Sensor(), "-r", "wrench:=/mine", **best_effort) as node:
+        assert {name for name, (reliability, *_) in qos(node).items() if reliability != "RELIABLE"} == {
+            "mine"
+        }

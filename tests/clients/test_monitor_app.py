@@ -88,6 +88,17 @@ def test_next_goes_round() -> None:
     play(scene)
 
 
+def test_w_shows_all_warnings_and_any_other_key_leads_back() -> None:
+    async def scene(stage: Stage) -> None:
+        stage.model.take([made.frame(6400, {"warnings": 0x7FFFFFFF})], stage.now_s)
+        for page in (1, 2, 3, 1):
+            assert f"page {page} of 3" in await stage.press("w")
+        assert "Stream" in await stage.press("t")
+        assert "Tare sensor" not in stage.shown()
+
+    play(scene)
+
+
 def test_pause_holds_the_picture_and_counts_on() -> None:
     async def scene(stage: Stage) -> None:
         assert "PAUSED" in await stage.press("p")
