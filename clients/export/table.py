@@ -23,14 +23,6 @@ COLUMNS: Final = (
 )  # fmt: skip
 
 
-def _since(before: DataMessage | None, frame: DataMessage) -> int:
-    """By CLOCK_MONOTONIC, which nobody sets; by CLOCK_REALTIME where the machine was started again."""
-    if before is None:
-        return 0
-    passed_ns = frame.monotonic_ns - before.monotonic_ns
-    return passed_ns if passed_ns > -_SECOND else frame.stamp_ns - before.stamp_ns
-
-
 class Table:
     """Makes lines of frames.
 
@@ -49,7 +41,8 @@ class Table:
     def lines(self, frames: Iterable[DataMessage]) -> Iterator[str]:
         """The names, then a line for each; PdoSizeError."""
         yield ",".join(COLUMNS) + "\n"
-        before, passed_ns = None, 0
+        first_ns: int | None = None
+        last_ns = stamp_ns = 0
         second, date = -1, ""
         for frame in frames:
             # A gap before a frame that is left out is before the next sample.
@@ -59,12 +52,14 @@ class Table:
                 self._gaps[frame.sensor] = flags & DataFlag.GAP
                 continue
             self.written += 1
-            passed_ns += _since(before, frame)
-            before = frame
-            whole, ns = divmod(frame.stamp_ns, _SECOND)
+            first_ns = frame.monotonic_ns if first_ns is None else first_ns
+            if frame.monotonic_ns < last_ns - _SECOND:  # its machine was restarted: only the stamps go on
+                first_ns += frame.monotonic_ns - last_ns - max(0, frame.stamp_ns - stamp_ns)
+            last_ns, stamp_ns = frame.monotonic_ns, frame.stamp_ns
+            whole, ns = divmod(stamp_ns, _SECOND)
             if whole != second:
                 second, date = whole, f"{datetime.fromtimestamp(whole, UTC):%Y-%m-%dT%H:%M:%S}"
-            cells = [_seconds(passed_ns), f"{date}.{ns:09d}Z", frame.sensor, frame.sequence]
+            cells = [_seconds(last_ns - first_ns), f"{date}.{ns:09d}Z", frame.sensor, frame.sequence]
             yield f"{','.join(map(str, cells))},{self._values(frame.process_data, flags)}\n"
 
     def _values(self, data: bytes, flags: int) -> str:

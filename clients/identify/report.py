@@ -46,9 +46,10 @@ def show_result(console: Console, result: Identified) -> None:
         table.add_row(f"center of gravity {axis}", f"{1000 * value:.2f}", f"{1000 * interval:.2f}", "mm")
     _add_bias(table, result.bias, result.bias_interval)
     if (fit := result.accelerometer) is not None:
-        for axis, value, half in zip("xyz", fit.calibration.offset, fit.offset_interval, strict=True):
+        found = fit.calibration
+        for axis, value, half in zip("xyz", found.offset, found.offset_interval, strict=True):
             table.add_row(f"accelerometer offset {axis}", f"{value:.3f}", f"{half:.3f}", "m/s²")
-        for axis, value, half in zip("xyz", fit.calibration.scale, fit.scale_interval, strict=True):
+        for axis, value, half in zip("xyz", found.scale, found.scale_interval, strict=True):
             table.add_row(f"accelerometer scale {axis}", f"{value:.4f}", f"{half:.4f}", "")
     console.print(table)
     console.print(
@@ -112,12 +113,7 @@ def _fit(fit: Fit, unit: str) -> str:
 def _accelerometer(fit: OffsetFit | None) -> dict[str, Any] | None:
     if fit is None:
         return None
-    return {
-        **fit.calibration._asdict(),
-        "offset_interval": fit.offset_interval,
-        "scale_interval": fit.scale_interval,
-        "undetermined": fit.undetermined,
-    }
+    return {**fit.calibration._asdict(), "undetermined": fit.undetermined}
 
 
 def _length(values: Sequence[float]) -> float:

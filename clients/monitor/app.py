@@ -146,17 +146,19 @@ class Monitor(App[None]):
             self.repaint()
         elif self._look.question:
             self._answer((event.character or "").lower())
-        elif self._look.help or self._look.warnings:
-            self._look = replace(self._look, help=False, warnings=False)
+        elif self._look.help:
+            self._look = replace(self._look, help=False)
+        elif self._look.warnings and event.character != "w":
+            self._look = replace(self._look, warnings=0)
         else:
             action = {
                 "t": self._ask_tare,
                 "r": self._record,
                 "p": self._pause,
                 " ": self._pause,
-                "w": self._warnings,
                 "0": self._reset,
                 "n": self._next,
+                "w": self._warnings,
                 "?": self._help,
                 "h": self._help,
                 "q": self.exit,
@@ -214,7 +216,7 @@ class Monitor(App[None]):
             self._look = replace(self._look, selected=(self._look.selected + 1) % count)
 
     def _warnings(self) -> None:
-        self._look = replace(self._look, warnings=True)
+        self._look = replace(self._look, warnings=self._look.warnings + 1)
 
     def _help(self) -> None:
         self._look = replace(self._look, help=True)

@@ -22,7 +22,7 @@ from clients.record.source import Batch, Source
 from clients.recording.file_format import FORMAT_VERSION
 from clients.recording.reader import Event
 from clients.recording.ros_messages import RosTopics
-from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
+from protocol.errors import ConnectionFailedError, ProtocolError, RefusedError, UnreachableError
 from protocol.program.version import VERSION
 from protocol.text.untrusted import rows
 from protocol.text.visible import printable
@@ -45,6 +45,8 @@ def run(argv: Sequence[str] | None, signals: Signals) -> int:
             return _run(source, parts, options, signals)
     except UnreachableError as error:
         _say(f"{error.at(options.address)}, or use --wait")
+    except RefusedError as error:
+        _say(f"the server refused: {error}")
     except (RecordingError, ProtocolError) as error:
         _say(str(error))
     return 1
@@ -100,7 +102,7 @@ def _record(
         source.close()
         recorder.stop(reason)
     if recorder.error is not None:
-        _say(f"{recorder.error}; what was written before is intact")
+        _say(str(recorder.error))
     _say(_summary(recorder, parts, seconds))
     return int(recorder.error is not None)
 
@@ -123,7 +125,7 @@ def _report(batch: Batch, progress: Progress) -> None:
             row = item.event
             words = row.get("message") or row.get("reason") or ""
             position = f" {row['sensor']}" if "sensor" in row else ""
-            if item.name != "connected":
+            if item.name != "connected" or words:
                 progress.say(printable(f"{item.name}{position}{': ' if words else ''}{words}", 300))
 
 

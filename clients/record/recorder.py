@@ -25,10 +25,10 @@ from protocol.framing import DataMessage
 
 FLUSH_S: Final = 0.4
 """Longest time until received frames are in the file."""
-STOP_S: Final = 5.0
-"""Longest time for what is queued when it is stopped."""
 MAX_BACKLOG: Final = 200_000
 """Maximum number of queued frames: a minute of two sensors at 1600 Hz, some 80 MB."""
+_END_S: Final = 3.0
+"""Longest time for writing what is queued when it is to stop: ros2 launch sends the next signal after 5 s."""
 
 
 class Recorder:
@@ -62,7 +62,8 @@ class Recorder:
         self._disk: DiskFile
         self._writer: RecordingWriter
         self._open_part()
-        self._reason, self._give_up_at = "", math.inf
+        self._reason = ""
+        self._end_by = math.inf
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
@@ -90,10 +91,11 @@ class Recorder:
         self._queue.put(batch)
 
     def stop(self, reason: str) -> None:
-        """Write what is queued and finish the file; `error` is set if that failed."""
+        """Write what is queued, for a bounded time, and finish the file; `error` is set if that failed."""
         if self._overflow:
             self._queue.put([lost(self._overflow, "the disk did not keep up")])
-        self._reason, self._give_up_at = reason, time.monotonic() + STOP_S
+        self._reason = reason
+        self._end_by = time.monotonic() + _END_S
         self._queue.put(None)
         self._thread.join()
         while not self._queue.empty():  # queued after a failure
@@ -107,27 +109,31 @@ class Recorder:
             self._end_part(self._reason)
         except DiskError as error:
             self.error = error
-            # The failed flush was truncated.
-            self.tally.dropped += self._unflushed
-            self.saved -= self._unflushed
+            # The failed flush was truncated; of a file that was removed nothing is left.
+            missing = self._writer.frames if self._disk.removed else self._unflushed
+            self.tally.dropped += missing
+            self.saved -= missing
         finally:
             self._disk.close()
 
     def _record(self) -> None:
         self._flush_at = time.monotonic() + FLUSH_S
+        too_late = 0
         while True:
             try:
                 batch = self._queue.get(timeout=max(0.0, self._flush_at - time.monotonic()))
             except queue.Empty:
                 batch = []
             if batch is None:
+                if too_late:
+                    self._write(lost(too_late, "there was no time left to write them"))
                 return
-            if time.monotonic() > self._give_up_at:
-                self._leave_out(batch)
-                return
+            self._backlog -= len(batch)
+            if time.monotonic() >= self._end_by:
+                too_late += sum(isinstance(item, DataMessage) for item in batch)
+                batch = [item for item in batch if not isinstance(item, DataMessage)]
             for item in batch:
                 self._write(item)
-            self._backlog -= len(batch)
             if time.monotonic() >= self._flush_at:
                 self._flush_at = time.monotonic() + FLUSH_S
                 self._writer.flush()
@@ -136,13 +142,6 @@ class Recorder:
                     self._end_part("rotated")
                     self._finished_bytes += self._writer.size
                     self._open_part()
-
-    def _leave_out(self, batch: Batch) -> None:
-        """It is stopped, and writing takes too long: what is still queued is lost."""
-        frames = sum(isinstance(item, DataMessage) for item in batch)
-        while (more := self._queue.get()) is not None:
-            frames += sum(isinstance(item, DataMessage) for item in more)
-        self._write(lost(frames, "it was stopped before everything was written"))
 
     def _write(self, item: DataMessage | Description | Event) -> None:
         writer = self._writer

@@ -30,7 +30,7 @@ _CHANGES: Final = frozenset({ServerEvent.RECONFIGURED, ServerEvent.SENSOR_BACK})
 
 
 class Source:
-    """A subscription that is renewed whenever the connection ends."""
+    """A subscription that is renewed whenever the connection ends, to those of the sensors that are there."""
 
     def __init__(self, address: Address, sensors: Sequence[int] | None) -> None:
         """Nothing is sent before `connect`. `sensors` are positions on the bus, None for all."""
@@ -73,11 +73,10 @@ class Source:
                 batch.append(item)
             elif isinstance(item, Connected):
                 self._problem = ""
-                batch.append(
-                    _noted(
-                        "connected", server=str(self.address), same_machine=self._client.session.same_machine
-                    )
-                )
+                missing = ", ".join(map(str, item.missing))
+                said = {"message": f"without sensor {missing}"} if missing else {}
+                same_machine = self._client.session.same_machine
+                batch.append(_noted("connected", server=str(self.address), same_machine=same_machine, **said))
                 batch.append(Description(time.time_ns(), item.description))
             elif isinstance(item, Disconnected):
                 if item.was_connected:

@@ -61,11 +61,16 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 class DiskFile:
-    """A new file for writing, with the part of a binary file's interface that `mcap.writer.Writer` needs."""
+    """A new file for writing, with the part of a binary file's interface that `mcap.writer.Writer` needs.
+
+    Attributes:
+        removed: whether the file had no name any more when it was flushed last.
+    """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         """Create the file; DiskError if that fails, or if it exists and `overwrite` is False."""
         self.path = path
+        self.removed = False
         self._waiting: list[bytes] = []
         self._position = 0
         """Including what is buffered."""
@@ -97,7 +102,7 @@ class DiskFile:
         return self._position
 
     def flush(self) -> None:
-        """Write what is buffered; DiskError if that fails, and then none of it is in the file."""
+        """Write what is buffered; DiskError if that fails, and then none of it is in the file, or no file."""
         data = memoryview(b"".join(self._waiting))
         self._waiting.clear()
         done = 0
@@ -109,10 +114,13 @@ class DiskFile:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, self._written)
             self._position = self._written
-            raise DiskError(f"{self.path} cannot be written: {error.strerror}") from None
+            raise DiskError(
+                f"{self.path} cannot be written: {error.strerror}; what was written before is intact"
+            ) from None
         self._written = self._position
-        if os.fstat(self._fd).st_nlink == 0:
-            raise DiskError(f"{self.path} was deleted while it was being written")
+        self.removed = os.fstat(self._fd).st_nlink == 0
+        if self.removed:
+            raise DiskError(f"{self.path} was removed while it was written: nothing of it is left")
 
     def sync(self) -> None:
         """Synchronize the file to the disk; DiskError."""

@@ -41,8 +41,9 @@ class Meter:
     def count(self, frame: DataMessage, due_ns: int, now_ns: int) -> None:
         """A frame was sent; `due_ns` is when it was due, 0 if it had no time."""
         self.sent += 1
-        self._counts[frame.sensor, frame.flags & (_REPEATED | _INVALID)] += 1
-        self._not_finite[frame.sensor] += not is_finite(frame.process_data)
+        old = frame.flags & (_REPEATED | _INVALID)
+        self._counts[frame.sensor, old] += 1
+        self._not_finite[frame.sensor] += not old and not is_finite(frame.process_data)
         if due_ns:
             self._late.append((now_ns, now_ns - due_ns))
             self._missed += now_ns - due_ns > _MISSED_NS
@@ -67,7 +68,8 @@ class Meter:
         }
 
     def _of_sensor(self, position: int) -> dict[str, Any]:
-        rate_hz = self._sensors.sensors[position].row.get("rate_hz")
+        sensor = self._sensors.sensors[position]
+        rate_hz = sensor.row.get("rate_hz")
         period_us = 1e6 / rate_hz if isinstance(rate_hz, int | float) and rate_hz > 0 else None
         return {
             "sensor": position,
@@ -77,14 +79,16 @@ class Meter:
             "lost_samples": 0,
             "not_finite": self._not_finite[position],
             "recoveries": 0,
+            **sensor.emergencies(),
+            "settling": False,
             "clock": {
-                "mode": "locked", "stamps": "polling", "period_us": period_us, "offset_ppm": 0.0,
+                "mode": "locked",
+                "stamps": "polling",
+                "period_us": period_us,
+                "offset_ppm": 0.0,
                 "uncertainty_us": 0.0,
             },
-            "emergencies": 0,
-            "emergency": None,
-            "settling": False,
-        }  # fmt: skip
+        }
 
 
 def _summary_us(late_ns: Iterable[int]) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping
 from typing import Any, Final, NoReturn
 
@@ -19,6 +20,22 @@ class ReplayedSensor:
 
     def __init__(self, row: dict[str, Any]) -> None:
         self.row = row
+        self._emergencies: int = 0
+        self._emergency: dict[str, Any] | None = None
+        self._emergency_at = 0.0
+
+    def take_emergency(self, event: Mapping[str, Any]) -> None:
+        """An emergency was recorded."""
+        self._emergencies += 1
+        self._emergency = {key: event.get(key) for key in ("code", "text", "register", "data")}
+        self._emergency_at = time.monotonic()
+
+    def emergencies(self) -> dict[str, Any]:
+        """Its part of the `status` reply."""
+        last = self._emergency and {
+            **self._emergency, "ago_s": round(time.monotonic() - self._emergency_at, 3)
+        }  # fmt: skip
+        return {"emergencies": self._emergencies, "emergency": last}
 
     def describe(self) -> dict[str, Any]:
         """Its part of the `describe` reply."""
@@ -42,13 +59,15 @@ class ReplayedSensors:
         rows = description.reply.get("sensors")
         for row in rows if isinstance(rows, list) else ():
             if isinstance(row, dict) and (sensor := self._at(row.get("sensor"))) is not None:
-                sensor.row = row
+                sensor.row = {**row, "settling": False}  # it was, when it was described
 
     def take(self, event: Event) -> None:
         """Apply an event of the recording to the descriptions."""
         sensor = self._at(event.event.get("sensor"))
         if sensor is None:
             return
+        if event.name == ServerEvent.EMERGENCY:
+            sensor.take_emergency(event.event)
         settings = event.event.get("settings")
         if isinstance(settings, dict):
             sensor.row = {**sensor.row, "settings": settings}

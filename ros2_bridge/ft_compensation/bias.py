@@ -1,29 +1,38 @@
 """The bias: estimated while the sensor is stationary, ramped in, and undone.
 
 Pose-aware: with a payload, its weight at the pose of the window is not part of the bias, so it stays with
-gravity compensation and the bias holds in every pose.
+gravity compensation and the bias holds in every pose. `Taken` is what it takes to tell the bias for another
+payload.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 from typing import Final, NamedTuple
+
+import numpy as np
 
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
+    NORMAL_95,
     ZERO,
+    Accelerometer,
     CompensationError,
     Payload,
     Wrench,
     length,
+    wrench_text,
 )
 from ft_compensation.stationary import StationaryMeans
 from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 GRAVITY_TOLERANCE: Final = 0.5
 """m/s²: how much a stationary accelerometer may differ from g."""
+_ABOUT_TWO_AXES: Final = 2.45 / NORMAL_95
+"""From half of an interval of one axis to the radius that holds as often about two (Rayleigh)."""
 
 
 def gravity_of(
@@ -45,6 +54,15 @@ def gravity_of(
     return x * scale, y * scale, z * scale
 
 
+def tilt_95(gravity: Vector3, accelerometer: Accelerometer) -> float:
+    """In 95 % of cases `gravity` (m/s²), from what it reads at rest, is tilted by less than this, rad."""
+    up = np.array(gravity) / (size := length(gravity))
+    across = np.eye(3) - np.outer(up, up)
+    half = np.hypot(accelerometer.offset_interval, np.multiply(accelerometer.scale_interval, gravity))
+    variance = np.linalg.eigvalsh(across @ np.diag(half**2) @ across)[-1]
+    return _ABOUT_TWO_AXES * math.sqrt(max(float(variance), 0.0)) / size
+
+
 def estimate_bias(
     means: StationaryMeans,
     payload: Payload = NO_PAYLOAD,
@@ -59,14 +77,51 @@ def estimate_bias(
     """
     if not payload.mass:
         return means.wrench
-    return means.wrench.plus(weight(payload, gravity or gravity_of(means.acceleration)), -1.0)
+    return means.wrench.plus(_weight(payload, gravity or gravity_of(means.acceleration)), -1.0)
 
 
-def weight(payload: Payload, gravity: Vector3) -> Wrench:
-    """What a payload weighs with this gravity in the sensor's frame, m/s²."""
+def _weight(payload: Payload, gravity: Vector3) -> Wrench:
     return Compensator(payload).compensate(ZERO, ZERO, gravity).gravity
 
 
+class Taken(NamedTuple):
+    """What a bias was taken with."""
+
+    payload: Payload = NO_PAYLOAD
+    """Whose weight is not part of it."""
+    gravity: Vector3 | None = ZERO
+    """During the tare, in the sensor's frame, m/s². None: unknown. Zero: of no tare, it holds for any."""
+
+    def weighed(self, payload: Payload) -> tuple[Wrench, Taken]:
+        """By how much the bias is another for this payload; nothing if gravity is unknown."""
+        if self.gravity is None or payload == self.payload:
+            return NO_WRENCH, self
+        change = _weight(self.payload, self.gravity).plus(_weight(payload, self.gravity), -1.0)
+        return change, Taken(payload, self.gravity)
+
+    def warning(self, change: Wrench, payload: Payload, magnitude: float) -> str:
+        """What `weighed`, and its `change`, mean for a user, a sentence; empty if nothing."""
+        if change == NO_WRENCH:
+            return self.doubt(payload, magnitude)
+        return (
+            "the tool's parameters are not those of the tare: the bias is what it finds with the new ones, "
+            f"another by {wrench_text(change)}; if the tool was put on or exchanged since, tare again"
+        )
+
+    def doubt(self, payload: Payload, magnitude: float) -> str:
+        """Why the bias may not fit this payload, a sentence; empty if it does. `magnitude`: gravity's."""
+        if self.gravity is not None or payload == self.payload:
+            return ""
+        (was, (ax, ay, az)), (mass, (bx, by, bz)) = self.payload, payload
+        moved = mass * bx - was * ax, mass * by - was * ay, mass * bz - was * az
+        return (
+            f"the bias was taken with {self.payload}, and in which pose is not known: with {payload} it may "
+            f"be wrong by {abs(mass - was) * magnitude:.3g} N and {length(moved) * magnitude:.3g} Nm in "
+            "every pose: tare again"
+        )
+
+
+_OF_NO_TARE: Final = Taken()
 _EARLY_S: Final = 0.1
 """A sample may be so much older than the one that a ramp began at."""
 
@@ -76,6 +131,8 @@ class _Course(NamedTuple):
     target: Wrench
     begin_s: float
     seconds: float
+    taken: Taken
+    """The target."""
 
     def is_under_way(self, now_s: float) -> bool:
         """Whether a sample of this time falls into it.
@@ -84,6 +141,9 @@ class _Course(NamedTuple):
         """
         return self.seconds > 0.0 and -_EARLY_S <= now_s - self.begin_s < self.seconds
 
+    def shifted(self, change: Wrench, taken: Taken) -> _Course:
+        return self._replace(start=self.start.plus(change), target=self.target.plus(change), taken=taken)
+
 
 class BiasRamp:
     """The applied bias: moves linearly from the old to the new one; the last change can be undone.
@@ -91,11 +151,11 @@ class BiasRamp:
     Times are of the samples, s on any one clock. `at` may run in one thread while others change it.
     """
 
-    def __init__(self, bias: Wrench = NO_WRENCH, seconds: float = 0.0) -> None:
+    def __init__(self, bias: Wrench = NO_WRENCH, seconds: float = 0.0, taken: Taken = _OF_NO_TARE) -> None:
         """`seconds` is how long a change takes; 0 = at once."""
         self.seconds = seconds
-        self._course = _Course(bias, bias, 0.0, 0.0)
-        self._before: Wrench | None = None
+        self._course = _Course(bias, bias, 0.0, 0.0, taken)
+        self._before: tuple[Wrench, Taken] | None = None
         self._lock = threading.RLock()
 
     @property
@@ -103,23 +163,33 @@ class BiasRamp:
         """The bias that it leads to."""
         return self._course.target
 
-    def go(self, target: Wrench, now_s: float) -> None:
+    @property
+    def taken(self) -> Taken:
+        """What that was taken with."""
+        return self._course.taken
+
+    def go(self, target: Wrench, now_s: float, taken: Taken = _OF_NO_TARE) -> None:
         """From the bias of `now_s` (the newest sample's time) to `target`."""
         with self._lock:
-            self._before = self.target
-            self._course = _Course(self.at(now_s), target, now_s, self.seconds)
+            self._before = self.target, self.taken
+            self._course = _Course(self.at(now_s), target, now_s, self.seconds, taken)
 
     def shift(self, change: Wrench) -> None:
         """At once, whatever it is and was: the sensor itself adds so much more from here on."""
         with self._lock:
-            start, target, begin_s, seconds = self._course
-            self._course = _Course(start.plus(change), target.plus(change), begin_s, seconds)
-            if self._before not in {None, NO_WRENCH}:  # none stays none
-                self._before = self._before.plus(change)
+            self._course = self._course.shifted(change, self.taken)
+            if self._before is not None and self._before[0] != NO_WRENCH:  # none stays none
+                self._before = self._before[0].plus(change), self._before[1]
 
-    def forget(self) -> None:
-        """There is nothing to undo any more."""
-        self._before = None
+    def weighed(self, payload: Payload) -> BiasRamp:
+        """Another ramp that is as far, for another payload."""
+        other = BiasRamp(seconds=self.seconds)
+        with self._lock:
+            other._course = self._course.shifted(*self.taken.weighed(payload))
+            if self._before is not None:
+                change, taken = self._before[1].weighed(payload)
+                other._before = self._before[0].plus(change), taken
+        return other
 
     def undo(self, now_s: float) -> Wrench:
         """Go back to the target before the last `go` and return it. CompensationError if there is none."""
@@ -127,9 +197,9 @@ class BiasRamp:
             before = self._before
             if before is None:
                 raise CompensationError("there is no change of the bias to undo")
-            self.go(before, now_s)
+            self.go(before[0], now_s, before[1])
             self._before = None
-            return before
+            return before[0]
 
     def arrived(self, now_s: float) -> bool:
         """Whether the bias of `now_s` is the target."""
@@ -140,7 +210,7 @@ class BiasRamp:
         course = self._course
         if not course.is_under_way(now_s):
             return course.target
-        start, target, begin_s, seconds = course
+        start, target, begin_s, seconds, _ = course
         share = max(0.0, (now_s - begin_s) / seconds)
         (ax, ay, az), (au, av, aw) = start
         (bx, by, bz), (bu, bv, bw) = target

@@ -57,8 +57,11 @@ class Payload(NamedTuple):
         (kilograms,) = _finite((mass,), 1, "a mass")
         if kilograms < 0.0:
             raise ValueError(f"a mass cannot be negative: {kilograms:g} kg")
-        x, y, z = _finite(center, 3, "a center of gravity")
-        return cls(kilograms, (x, y, z))
+        return cls(kilograms, vector(center, "a center of gravity"))
+
+    def __str__(self) -> str:
+        """For people."""
+        return f"a tool of {self.mass:.3g} kg" if self.mass else "no tool_mass"
 
 
 AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
@@ -73,12 +76,26 @@ def wrench_text(wrench: Wrench) -> str:
 NO_PAYLOAD: Final = Payload()
 
 
+OFFSET_PRIOR: Final = 0.4
+"""m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered."""
+SCALE_PRIOR: Final = 0.005
+"""Likewise of an axis' sensitivity, relative; local gravity is within it."""
+NORMAL_95: Final = 1.96
+"""Half of a 95 % interval, in standard deviations."""
+
+
 class Accelerometer(NamedTuple):
-    """What an accelerometer reads: `scale` times the truth, axis by axis, plus `offset`."""
+    """What an accelerometer reads: `scale` times the truth, axis by axis, plus `offset`.
+
+    Every `..._interval` is half the width of the 95 % interval; of what is typical, unless it was identified.
+    """
 
     offset: Vector3 = ZERO
     """m/s²"""
     scale: Vector3 = (1.0, 1.0, 1.0)
+    offset_interval: Vector3 = (NORMAL_95 * OFFSET_PRIOR,) * 3
+    """m/s²"""
+    scale_interval: Vector3 = (NORMAL_95 * SCALE_PRIOR,) * 3
 
     def correct(self, acceleration: Vector3) -> Vector3:
         """The truth, m/s², of what was read."""
@@ -92,6 +109,12 @@ EXACT: Final = Accelerometer()
 def length(a: Vector3) -> float:
     """The length of a vector."""
     return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+
+
+def vector(values: object, name: str) -> Vector3:
+    """Three numbers. ValueError, a sentence with their `name`, if they are not three finite ones."""
+    x, y, z = _finite(values, 3, name)
+    return x, y, z
 
 
 def _finite(values: object, count: int, name: str) -> list[float]:

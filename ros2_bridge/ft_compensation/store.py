@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from ft_compensation.quantities import CompensationError, Payload, Wrench
+from ft_compensation.quantities import CompensationError, Payload, Wrench, vector
 from protocol.pdo import Vector3
 
 _FORMAT: Final = "bota-ethercat-bridge compensation"
@@ -37,7 +37,7 @@ class Stored(NamedTuple):
     offset: Wrench | None = None
     """The sensor's own offset, which the bias was taken with; None if not known or not needed."""
     gravity: Vector3 | None = None
-    """Gravity in the sensor's frame when the bias was measured, m/s²; None if it was not, or is not known."""
+    """In the sensor's frame during the tare, m/s²; None if not known. Zero: it does not matter."""
 
 
 def default_directory() -> Path:
@@ -135,8 +135,8 @@ def _parse(data: bytes, serial: int) -> Stored:
         if "tool_mass" in content:
             payload = Payload.of(content["tool_mass"], content.get("tool_center_of_gravity"))
         if "gravity" in content:
-            gravity = Wrench.of([*content["gravity"], 0, 0, 0]).force
-    except (ValueError, TypeError) as error:
+            gravity = vector(content["gravity"], "gravity")
+    except ValueError as error:
         raise _ContentError(str(error)) from None
     return Stored(bias, payload, str(content.get("saved", ""))[:40], offset, gravity)
 

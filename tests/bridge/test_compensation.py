@@ -15,6 +15,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 
+from ft_compensation.quantities import Payload
 from protocol.control import Event, event
 from protocol.framing import DataFlag
 from protocol.pdo import encode
@@ -98,36 +99,6 @@ def test_gravity_goes_along_with_the_pose(stages: Stages, server: SimulatedServe
     stages.settle([3.0, 0.0, 0.0, 0.0, 0.25, 0.0])  # what the environment does is left as it is
 
 
-@pytest.mark.parametrize("up", [UP, SIDE, (1, 1, 1)])
-def test_a_payload_that_is_set_after_the_tare_is_not_subtracted_twice(
-    stages: Stages, server: SimulatedServer, node: SimulatedNode, up: tuple[int, int, int]
-) -> None:
-    """A tare without a payload holds its weight in that pose; with the payload it holds in every pose."""
-    hold(server, up, bias=BIAS)
-    assert node.set_parameter("tool_mass", 0.0) == (True, "")
-    assert node.trigger("tare")[0]
-    stages.settle(ZERO6)
-    stages.forget()
-    assert node.set_parameter("tool_mass", TOOL.mass) == (True, "")
-    node.run(0.2)
-    assert all(is_near(message, ZERO6, 0.02) for message in stages.final[2:]), "nor in between"
-    assert list(node.parameters("bias")[0]) == pytest.approx(BIAS.values, abs=0.02)
-    hold(server, OVER, bias=BIAS)
-    stages.settle(ZERO6, 0.02)
-    assert "no change of the bias to undo" in node.trigger("undo_tare")[1]
-
-
-def test_a_payload_that_is_changed_after_a_tare_of_unknown_gravity_is_a_warning(
-    stages: Stages, server: SimulatedServer, node: SimulatedNode
-) -> None:
-    stages.settle(ZERO6)
-    assert node.set_parameter("tool_mass", 0.0) == (True, "")
-    hold(server, UP, acceleration_z=-0.5)  # an accelerometer that reads nothing like g
-    assert node.trigger("tare")[0]
-    assert node.set_parameter("tool_mass", 1.5) == (True, "")
-    assert "wrench_compensated may be wrong by 14.7 N and " in node.log
-
-
 def test_a_tare_takes_the_offset_and_leaves_the_tool(
     stages: Stages, server: SimulatedServer, node: SimulatedNode
 ) -> None:
@@ -176,6 +147,111 @@ def test_a_tare_without_a_payload_takes_all(
     stages.settle(ZERO6)
     hold(server, OVER)
     stages.settle([a - b for a, b in zip(weight(OVER), weight(UP), strict=True)])
+
+
+@pytest.mark.parametrize(
+    ("name", "then"),
+    [("tool_mass", 0.0), ("tool_mass", 1.5), ("tool_center_of_gravity", [0.0, 0.1, 0.0])],
+)
+def test_a_tool_that_is_set_right_after_the_tare(
+    stages: Stages, server: SimulatedServer, node: SimulatedNode, name: str, then: Any
+) -> None:
+    """The bias follows from what the tare measured: nothing jumps, and it holds in every pose."""
+    assert node.set_parameter(name, then) == (True, "")
+    hold(server, (1, 0, 2), bias=BIAS)
+    node.run(1.0)
+    assert node.trigger("tare")[0]
+    assert node.set_parameter("bias_ramp_time", 0.5) == (True, "")
+    stages.settle(ZERO6)
+    stages.forget()
+    node.run(0.1)
+    assert node.set_parameter(name, START[name]) == (True, "")
+    node.run(0.1)
+    assert max(abs(value) for message in stages.final for value in six(message)) < 1e-3
+    assert "if the tool was put on or exchanged since, tare again" in node.log
+    assert list(node.parameters("bias")[0]) == pytest.approx(BIAS.values, abs=1e-3)
+    hold(server, OVER, bias=BIAS)
+    stages.settle(ZERO6)
+    hold(server, SIDE, bias=BIAS)
+    stages.settle(ZERO6)
+
+
+def test_a_tare_that_is_gone_back_to_is_for_the_tool_of_now(
+    stages: Stages, server: SimulatedServer, node: SimulatedNode
+) -> None:
+    assert node.set_parameter("tool_mass", 0.0) == (True, "")
+    for up in (UP, SIDE):
+        hold(server, up, bias=BIAS)
+        node.run(1.0)
+        assert node.trigger("tare")[0]
+    assert node.set_parameter("tool_mass", TOOL.mass) == (True, "")
+    for done in (True, False):
+        assert node.trigger("undo_tare")[0] is done
+        hold(server, OVER, bias=BIAS)
+        stages.settle(ZERO6)
+
+
+def test_a_tare_that_finds_the_same_bias_is_of_its_own_pose(
+    stages: Stages, server: SimulatedServer, node: SimulatedNode
+) -> None:
+    assert node.set_parameter("tool_mass", 0.0) == (True, "")
+    for up in (UP, SIDE):
+        hold(server, up, payload=Payload(), bias=BIAS)
+        node.run(1.0)
+        assert node.trigger("tare")[0]
+    assert node.set_parameter("tool_mass", TOOL.mass) == (True, "")
+    stages.settle(ZERO6)
+
+
+def put(node: SimulatedNode, **named: Any) -> Any:
+    """Set parameters at once; the result."""
+    messages = [Parameter(name, value=value).to_parameter_msg() for name, value in named.items()]
+    request = SetParametersAtomically.Request(parameters=messages)
+    return node.call("set_parameters_atomically", request).result
+
+
+def test_a_tare_before_an_identification_is_gone_back_to_with_its_tool(
+    stages: Stages, server: SimulatedServer, node: SimulatedNode
+) -> None:
+    assert node.set_parameter("tool_mass", 0.0) == (True, "")
+    hold(server, SIDE, bias=BIAS)
+    node.run(1.0)
+    assert node.trigger("tare")[0]
+    assert put(node, tool_mass=TOOL.mass, bias=[9.0, *ZERO6[1:]]).successful
+    assert list(node.parameters("bias")[0]) == [9.0, *ZERO6[1:]]
+    assert node.trigger("undo_tare")[0]
+    hold(server, OVER, bias=BIAS)
+    stages.settle(ZERO6)
+
+
+def test_a_bias_that_was_given_is_not_of_a_tool(
+    stages: Stages, server: SimulatedServer, node: SimulatedNode
+) -> None:
+    assert node.trigger("tare")[0]
+    assert node.set_parameter("bias", [*BIAS.values]) == (True, "")
+    assert node.set_parameter("tool_mass", 0.4) == (True, "")
+    assert node.parameters("bias") == [pytest.approx([*BIAS.values])]
+
+
+def test_a_tool_that_a_tare_without_gravity_does_not_know(
+    stages: Stages, server: SimulatedServer, node: SimulatedNode
+) -> None:
+    assert node.set_parameter("tool_mass", 0.0) == (True, "")
+    assert node.set_parameter("orientation_source", "none") == (True, "")
+    assert node.trigger("tare")[0]
+    assert node.set_parameter("orientation_source", "accelerometer") == (True, "")
+    node.until(compensation=OK)
+    bias = node.parameters("bias")
+    assert node.set_parameter("tool_mass", 1.5) == (True, "")
+    told = "with a tool of 1.5 kg it may be wrong by 14.7 N and 0.816 Nm in every pose: tare again"
+    assert node.log.count(told) == 1
+    node.until(told, compensation=WARN)
+    assert node.parameters("bias") == bias
+    assert node.set_parameter("tool_mass", 0.0) == (True, "")
+    node.until(compensation=OK)
+    assert node.set_parameter("tool_mass", 1.5) == (True, "")
+    assert node.trigger("tare")[0]
+    node.until(compensation=OK)
 
 
 @pytest.mark.parametrize(
@@ -377,14 +453,9 @@ def test_a_wrong_value_is_refused_and_the_old_one_stays(
 
 
 def test_several_are_set_at_once_or_not_at_all(stages: Stages, node: SimulatedNode) -> None:
-    def put(**named: Any) -> Any:
-        messages = [Parameter(name, value=value).to_parameter_msg() for name, value in named.items()]
-        request = SetParametersAtomically.Request(parameters=messages)
-        return node.call("set_parameters_atomically", request).result
-
-    assert not put(tool_mass=2.0, bias=[0.0] * 5).successful
+    assert not put(node, tool_mass=2.0, bias=[0.0] * 5).successful
     assert node.parameters("tool_mass") == [TOOL.mass]
-    assert put(tool_mass=0.4, bias=[1.0, *ZERO6[1:]]).successful
+    assert put(node, tool_mass=0.4, bias=[1.0, *ZERO6[1:]]).successful
     half = [part / 2 for part in weight(UP)]
     stages.settle([half[0] - 1.0, *half[1:]])
 

@@ -115,6 +115,10 @@ def test_the_offset_of_the_accelerometer_is_found_and_subtracted_from_then_on(
     found, scale = started.parameters("accelerometer.offset", "accelerometer.scale")
     assert list(found) == pytest.approx(offset, abs=2e-3)
     assert list(scale) == pytest.approx([1.0] * 3, abs=1e-3)
+    for name in ("accelerometer.offset_interval", "accelerometer.scale_interval"):
+        (half,) = started.parameters(name)
+        assert written[name] == pytest.approx(list(half), abs=1e-8)
+        assert 0.0 < max(half) < 0.01
     stages = Stages(started)
     hold(server, (1, -2, 1.5), bias=BIAS, force_z=-5.0, **off)
     stages.settle([0.0, 0.0, -5.0, 0.0, 0.0, 0.0], within=5e-3)
@@ -126,7 +130,8 @@ def test_the_offset_of_the_accelerometer_is_found_and_subtracted_from_then_on(
     stages.settle(ZERO6, within=1e-2)
     for name, value in (
         ("compensate_inertia", False), ("tool_mass", 0.0), ("accelerometer.offset", [0.0] * 3),
-        ("accelerometer.scale", [1.0] * 3),
+        ("accelerometer.scale", [1.0] * 3), ("accelerometer.offset_interval", [0.784] * 3),
+        ("accelerometer.scale_interval", [0.0098] * 3),
     ):  # fmt: skip
         assert started.set_parameter(name, value)[0]
     assert started.trigger("clear_tare")[0]

@@ -391,21 +391,21 @@ def test_the_source_tf(ros_node: Node) -> None:
         source = ListenerSource(CompensationParameters(orientation=chosen), opened)
 
         def gravity(time_s: float) -> Any:
-            return source.gravity(sample(), time_s)
+            return source.gravity(sample(), time_s, time_s)
 
         wait_until(lambda: buffer.asked, "a lookup")
         assert gravity(1000.0) is None
         words = "no orientation from TF from world to ft: TF has no pose of ft in world: frame does not exist"
-        wait_until(lambda: source.why_none(1000.0) == words, words)
+        wait_until(lambda: source.why_none(1000.0, 1000.0) == words, words)
         buffer.quaternion, buffer.stamp_ns = TILTED, 1000 * 10**9
         buffer.error = None
         wait_until(lambda: gravity(1000.0) is not None, "gravity")
         # The frames say all, so `mounting` is not for TF.
         assert gravity(1000.0) == pytest.approx((-9.80665, 0.0, 0.0))
         assert gravity(1000.6) is None
-        assert "older than the sample (limit 0.5 s)" in source.why_none(1000.6)
+        assert "older than the sample (limit 0.5 s)" in source.why_none(1000.6, 1000.6)
         buffer.error = "the tree fell apart"
-        wait_until(lambda: "the tree fell apart" in source.why_none(1000.6), "the reason")
+        wait_until(lambda: "the tree fell apart" in source.why_none(1000.6, 1000.6), "the reason")
         buffer.stamp_ns = 1001 * 10**9
         buffer.error = None
         wait_until(lambda: gravity(1001.0) is not None, "gravity again")
@@ -486,13 +486,13 @@ def test_a_clock_that_goes_back_does_not_stop_a_source_for_ever() -> None:
 
     listening = Listening()
     source = ListenerSource(CompensationParameters(), listening)
-    assert source.gravity(sample(), 5000.0) == pytest.approx((0.0, 0.0, -9.80665))
+    assert source.gravity(sample(), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, -9.80665))
     listening.latest = Oriented(TILTED, 100 * 10**9)
-    assert source.gravity(sample(), 100.0) == pytest.approx((-9.80665, 0.0, 0.0))
+    assert source.gravity(sample(), 100.0, 100.0) == pytest.approx((-9.80665, 0.0, 0.0))
     own = SensorSource(CompensationParameters())
-    assert own.gravity(sample(orientation=UPRIGHT), 5000.0) == pytest.approx((0.0, 0.0, -9.80665))
-    assert own.gravity(sample(orientation=TILTED), 100.0) == pytest.approx((-9.80665, 0.0, 0.0))
-    assert own.gravity(sample(), 101.0) is None
+    assert own.gravity(sample(orientation=UPRIGHT), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, -9.80665))
+    assert own.gravity(sample(orientation=TILTED), 100.0, 100.0) == pytest.approx((-9.80665, 0.0, 0.0))
+    assert own.gravity(sample(), 101.0, 101.0) is None
 
 
 def test_rotations_multiply_in_the_order_that_is_said() -> None:

@@ -27,7 +27,7 @@ from protocol.framing import DataMessage
 from protocol.pdo import encode
 from tests.bridge.compensating import six, stamp_ns
 from tests.bridge.conftest import retire, wait_until
-from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
+from tests.bridge.simulated_node import STEP_S, SimulatedNode, SimulatedServer
 from tests.bridge.streaming import RATE_HZ, SETTINGS
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("_ros")]
@@ -43,6 +43,11 @@ class Sensor(SimulatedServer):
         super().__init__()
         self.shakes = shakes
         self.on_step: Callable[[], None] = lambda: None
+        self.clock_step_ns = 0
+        """By how much the wall clock has been set."""
+
+    def time_ns(self) -> int:
+        return super().time_ns() + self.clock_step_ns
 
     def step(self) -> None:
         force = float(self.sent % 20) if self.shakes else 5.0
@@ -52,13 +57,13 @@ class Sensor(SimulatedServer):
 
 
 def filtered(messages: list[Any], rate_hz: float = RATE_HZ, **settings: float) -> dict[int, list[float]]:
-    """What the filter makes of these wrenches, by stamp."""
+    """What the filter makes of these wrenches, none missing, by stamp."""
     made, found = WrenchFilter(), {}
     made.design(FilterSettings(**settings), rate_hz)
-    for message in messages:
+    for number, message in enumerate(messages):
         fx, fy, fz, mx, my, mz = six(message)
-        stamp = stamp_ns(message)
-        found[stamp] = [*made.step((fx, fy, fz), (mx, my, mz), stamp).values]
+        time_ns = round(number * STEP_S * 1e9)
+        found[stamp_ns(message)] = [*made.step((fx, fy, fz), (mx, my, mz), time_ns).values]
     return found
 
 
@@ -93,6 +98,18 @@ def test_the_filter_and_its_delay() -> None:
         assert got[0].header.frame_id == "ft_sensor"
         assert six(got[0]) == pytest.approx(six(raw[0])), "no transient"
         assert node.log.count("wrench_filtered") == 1
+
+
+@pytest.mark.parametrize("set_by_s", [-3600, 3600])
+def test_setting_the_wall_clock_does_not_restart_the_filter(set_by_s: int) -> None:
+    server = Sensor()
+    with SimulatedNode(server, **TEN_HZ) as node:
+        node.run(0.3)
+        raw, got = node.hear("wrench_compensated"), node.hear("wrench_filtered")
+        node.run(0.55)
+        server.clock_step_ns = set_by_s * 10**9
+        node.run(0.45)
+        check_filtered(got, raw, 95, cutoff=10.0)
 
 
 def test_a_limit_to_the_frequency_comes_after_the_filter() -> None:
@@ -132,19 +149,33 @@ def test_it_can_be_configured_while_the_node_runs() -> None:
         assert "it must be 0, for none, or at least 0.05 Hz" in reason
 
 
-@pytest.mark.parametrize(("name", "value"), [("cutoff", 50.0), ("cutoff", 400.0), ("notch", 60.0)])
-def test_a_frequency_beyond_half_of_the_rate_is_refused(name: str, value: float) -> None:
-    with SimulatedNode(Sensor(), **TEN_HZ) as node:
+@pytest.mark.parametrize("limit", [50.0, 50.5, 1000.0])
+def test_a_frequency_that_the_sampling_rate_does_not_allow_is_refused(limit: float) -> None:
+    server = Sensor()
+    with SimulatedNode(server, **TEN_HZ) as node:
         got = node.hear("wrench_filtered")
-        node.run(0.2)
-        done, reason = node.set_parameter(f"filter.{name}", value)
-        assert not done
-        assert reason == (
-            f"filter.{name} is {value:g} Hz, but must be below half of the sampling rate, 50 Hz: lower it"
-        )
+        node.run(0.3)
+        for name in ("cutoff", "notch"):
+            refused = (
+                f"filter.{name} is {limit:g} Hz, but must be below half of the sampling rate, 50 Hz: lower it"
+            )
+            assert node.set_parameter(f"filter.{name}", limit) == (False, refused)
+        assert node.set_parameter("filter.notch_width", limit) == (True, ""), "there is no notch"
+        assert not node.set_parameter("filter.notch", 20.0)[0]
+        assert node.set_parameter("filter.cutoff", 49.9) == (True, "")
         got.clear()
-        node.run(0.2)
-        assert got, "it goes on as it was"
+        node.run(0.1)
+        assert got
+        server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS, rate_hz=50))
+        node.run(0.1)
+        assert node.set_parameter("filter.dead_band_force", 1.0) == (True, ""), "which changes no frequency"
+        assert (
+            "must be below half of the sampling rate, 25 Hz" in node.set_parameter("filter.cutoff", 30.0)[1]
+        )
+        server.listens = False
+        server.drop()
+        node.run(0.1)
+        assert node.set_parameter("filter.cutoff", 30.0) == (True, ""), "the next sensor's rate is not known"
 
 
 def test_it_follows_the_sensors_rate() -> None:
@@ -155,7 +186,7 @@ def test_it_follows_the_sensors_rate() -> None:
         server.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS, rate_hz=50))
         words = "filter.cutoff is 40 Hz, but must be below half of the sampling rate, 25 Hz"
         node.until(f"wrench_filtered has stopped: {words}", compensation=ERROR)
-        assert node.log.count(words) == 1
+        assert node.log.count(f"wrench_filtered has stopped: {words}") == 1
         got.clear()
         node.run(0.2)
         assert not got
@@ -329,8 +360,7 @@ def test_tf_in_a_real_executor(server: Sensor, tf: FakeTf) -> None:
 
     def publishes() -> bool:
         assert topic.is_wanted()
-        frame = DataMessage(0, server.time_ns(), 0, 0, 0, 3, b"")
-        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), frame)
+        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), DataMessage(1, server.time_ns(), 0, 0, 0, 3, b""))
         executor.spin_once(0.01)
         return bool(heard)
 
@@ -382,3 +412,23 @@ def test_what_is_no_frame(texts: list[str], words: str) -> None:
 def test_no_frames(value: str) -> None:
     with SimulatedNode(Sensor(), wrench_frames=value) as node:
         assert node.parameters("wrench_frames") == [[""]]
+
+
+def qos(node: SimulatedNode) -> dict[str, tuple[str, str, int]]:
+    """Reliability, durability and depth of the node's own topics."""
+    profiles = {name.rpartition("/")[2]: topic.qos_profile for name, topic in node.topics.items()}
+    del profiles["parameter_events"]  # rclpy's
+    return {name: (p.reliability.name, p.durability.name, p.depth) for name, p in profiles.items()}
+
+
+def test_every_topic_is_reliable_unless_its_qos_is_overridden() -> None:
+    """A best-effort publisher never reaches a reliable subscriber, which is what most tools are."""
+    with SimulatedNode(Sensor(), **{"filter.cutoff": 10.0, "wrench_frames": "[tcp 0 0 0.5]"}) as node:
+        expected = dict.fromkeys(qos(node), ("RELIABLE", "VOLATILE", 10))
+        assert {"wrench", "wrench_filtered", "tcp", "data_raw", "diagnostics"} <= expected.keys()
+        assert qos(node) == expected
+    best_effort = {"qos_overrides./mine.publisher.reliability": "best_effort"}
+    with SimulatedNode(Sensor(), "-r", "wrench:=/mine", **best_effort) as node:
+        assert {name for name, (reliability, *_) in qos(node).items() if reliability != "RELIABLE"} == {
+            "mine"
+        }

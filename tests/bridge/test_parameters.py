@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,16 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
+
 from bridge.parameters.compensation import ROWS as COMPENSATION_ROWS
 from bridge.parameters.compensation import gather
 from bridge.parameters.declare import descriptor
 from bridge.parameters.row import ParameterError
 from bridge.parameters.table import PARAMETERS
+from tests.bridge.compensating import UP, hold
+from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 
 pytestmark = pytest.mark.ros
 ROWS = {row.name: row for row in PARAMETERS}
@@ -43,7 +49,9 @@ def test_defaults_are_the_contracts() -> None:
         "orientation.mounting": (0.0, 0.0, 0.0, 1.0), "orientation.stale_after": 0.1,
         "accelerometer.stale_after": 0.5, "accelerometer.time_constant": 0.5, "accelerometer.gate": 0.5,
         "accelerometer.tilt_limit": 0.2, "accelerometer.offset": (0.0, 0.0, 0.0),
-        "accelerometer.scale": (1.0, 1.0, 1.0), "rest.duration": 1.0, "rest.force_spread": 0.8,
+        "accelerometer.scale": (1.0, 1.0, 1.0), "accelerometer.offset_interval": (0.784, 0.784, 0.784),
+        "accelerometer.scale_interval": (0.0098, 0.0098, 0.0098),
+        "rest.duration": 1.0, "rest.force_spread": 0.8,
         "rest.torque_spread": 0.02, "rest.force_wander": 0.3, "rest.torque_wander": 0.01,
         "rest.angular_rate": 0.05, "rest.angular_rate_spread": 0.02, "rest.acceleration_spread": 0.3,
         "rest.acceleration_wander": 0.05, "identify.file": "auto",
@@ -131,3 +139,52 @@ def test_every_parameter_describes_itself() -> None:
         assert described.read_only is not row.live
         if isinstance(row.default, int | float) and not isinstance(row.default, bool):
             assert described.integer_range or described.floating_point_range, row.name
+
+
+# What any participant may send.
+
+
+def hostile_values(length: int) -> Iterator[ParameterValue]:
+    """Numbers that are none or too large, arrays of `length` of them, empty ones, and every type."""
+    kinds = ParameterType
+    for number in (math.nan, math.inf, -math.inf, 1e308, -1e308, -1.0):
+        yield ParameterValue(type=kinds.PARAMETER_DOUBLE, double_value=number)
+        yield ParameterValue(type=kinds.PARAMETER_DOUBLE_ARRAY, double_array_value=[number] * length)
+    for whole in (-1, 2**63 - 1, -(2**63)):
+        yield ParameterValue(type=kinds.PARAMETER_INTEGER, integer_value=whole)
+        yield ParameterValue(type=kinds.PARAMETER_INTEGER_ARRAY, integer_array_value=[whole] * length)
+    yield ParameterValue(type=kinds.PARAMETER_BOOL, bool_value=True)
+    for text in ("", " ", "-1", "a\x00b", "/" * 300):
+        yield ParameterValue(type=kinds.PARAMETER_STRING, string_value=text)
+        yield ParameterValue(type=kinds.PARAMETER_STRING_ARRAY, string_array_value=[text] * length)
+    yield from (ParameterValue(type=kind) for kind in (*range(11), 255))  # empty, and no types
+
+
+@pytest.mark.usefixtures("_ros")
+def test_no_value_of_any_parameter_ends_the_node() -> None:
+    server = SimulatedServer()
+    hold(server, UP)
+    with SimulatedNode(server) as node:
+        heard = node.hear("wrench_compensated")
+        node.run(1.0)
+        names = node.call("list_parameters", ListParameters.Request()).result.names
+        assert {*ROWS, "settings.fir", "use_sim_time"} <= {*names}
+        for name in names:
+            (before,) = node.call("get_parameters", GetParameters.Request(names=[name])).values
+            length = max(len(getattr(before, f"{kind}_array_value")) for kind in ("double", "string"))
+            for value in hostile_values(length or 3):
+                parameters = [Parameter(name=name, value=value)]
+                (result,) = node.call("set_parameters", SetParameters.Request(parameters=parameters)).results
+                request = SetParametersAtomically.Request(parameters=parameters)
+                again = node.call("set_parameters_atomically", request).result
+                assert again.successful == result.successful, (name, value)
+                if result.successful:
+                    restored = SetParameters.Request(parameters=[Parameter(name=name, value=before)])
+                    assert node.call("set_parameters", restored).results[0].successful, (name, value)
+                else:
+                    assert result.reason, (name, value)
+                values = node.call("get_parameters", GetParameters.Request(names=[name])).values
+                assert values == [before], (name, value)
+            heard.clear()
+            node.run(0.05)
+            assert heard, name

@@ -58,15 +58,6 @@ def test_a_line_is_a_sample_in_si_units(tmp_path: Path) -> None:
     assert (third_row["orientation_x"], third_row["orientation_w"], third_row["warnings"]) == ("0", "1", "3")
 
 
-def test_time_passes_evenly_while_the_clock_is_set(tmp_path: Path) -> None:
-    path, out = tmp_path / "run.mcap", tmp_path / "run.csv"
-    set_s = (0, 0, -300_000_000, -300_000_000, 3_600_000_000_000)
-    moved = [frame(n)._replace(stamp_ns=frame(n).stamp_ns + by) for n, by in enumerate(set_s)]
-    record(path, moved)
-    export(path)
-    assert [row["time_s"] for row in rows(out)] == [f"0.{n * PERIOD_NS:09d}" for n in range(len(set_s))]
-
-
 def test_what_is_no_new_sample_is_left_out_but_not_its_gap(tmp_path: Path) -> None:
     path, out = tmp_path / "run.mcap", tmp_path / "out.csv"
     gap, repeated, invalid = DataFlag.GAP, DataFlag.REPEATED, DataFlag.INVALID
@@ -83,6 +74,23 @@ def test_what_is_no_new_sample_is_left_out_but_not_its_gap(tmp_path: Path) -> No
     export(path, out, "--all", "--force", "--sensor", 0)
     flags = [(row["gap"], row["repeated"], row["invalid"]) for row in rows(out)]
     assert flags == [("0", "0", "0"), ("1", "1", "0"), ("0", "0", "1"), ("0", "0", "0"), ("0", "0", "0")]
+
+
+def test_time_is_the_monotonic_clocks(tmp_path: Path) -> None:
+    """The wall clock is set back by an hour; then the machine is restarted, and its clock begins anew."""
+    path, hour_ns, second_ns = tmp_path / "run.mcap", 3600 * 10**9, 10**9
+    made = [frame(number) for number in range(8000, 8006)]
+    made[2:4] = [item._replace(stamp_ns=item.stamp_ns - hour_ns) for item in made[2:4]]
+    made[4:] = [
+        item._replace(
+            stamp_ns=item.stamp_ns - hour_ns + second_ns, monotonic_ns=item.monotonic_ns - 9 * second_ns
+        )
+        for item in made[4:]
+    ]
+    record(path, made)
+    export(path)
+    times = [0, PERIOD_NS, 2 * PERIOD_NS, 3 * PERIOD_NS, second_ns + 4 * PERIOD_NS, second_ns + 5 * PERIOD_NS]
+    assert [row["time_s"] for row in rows(path.with_suffix(".csv"))] == [f"{ns / 1e9:.9f}" for ns in times]
 
 
 def test_what_cannot_be_done_is_said_and_leaves_nothing(tmp_path: Path) -> None:

@@ -201,6 +201,17 @@ def test_a_gap_or_a_restarted_server_ends_a_rest(tmp_path: Path) -> None:
     assert len(found.periods) == 3
 
 
+def test_setting_the_wall_clock_ends_no_rest(tmp_path: Path) -> None:
+    one = [frame for frame in posed() if frame.monotonic_ns < 1.2e9]
+    half = len(one) // 2
+    record(path := tmp_path / "set.mcap", [
+        *one[:half], *(frame._replace(stamp_ns=frame.stamp_ns + 3600 * 10**9) for frame in one[half:]),
+    ])  # fmt: skip
+    with open_recording(path) as opened:
+        (found,) = find_stationary_periods(columns(opened), least_seconds=0.5).periods
+    assert found.seconds == pytest.approx(1.0, abs=0.05)
+
+
 def test_the_wrong_units_are_noticed(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wide = ("--limit", "angular_rate=10", "--limit", "angular_rate_spread=10")
     assert "check imu_raw_units" in refused(capsys, recording, "--imu-raw-units", "si", *wide)

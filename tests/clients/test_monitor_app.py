@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from clients.monitor import cli
 from clients.monitor.app import Monitor
 from clients.monitor.model.server import Model
 from clients.monitor.recorder import Recorder
@@ -85,6 +84,17 @@ def test_next_goes_round() -> None:
         assert "Sensor 0  BFT-SENS" in stage.shown()
         assert "Sensor 1  BFT-ROKS" in await stage.press("n")
         assert "Sensor 0  BFT-SENS" in await stage.press("n")
+
+    play(scene)
+
+
+def test_w_shows_all_warnings_and_any_other_key_leads_back() -> None:
+    async def scene(stage: Stage) -> None:
+        stage.model.take([made.frame(6400, {"warnings": 0x7FFFFFFF})], stage.now_s)
+        for page in (1, 2, 3, 1):
+            assert f"page {page} of 3" in await stage.press("w")
+        assert "Stream" in await stage.press("t")
+        assert "Tare sensor" not in stage.shown()
 
     play(scene)
 
@@ -188,17 +198,3 @@ def test_only_rows_that_changed_are_drawn(monkeypatch: pytest.MonkeyPatch) -> No
         assert [region.y for region in drawn] == [22]
 
     play(scene)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code"), [(["--once"], 1), (["--json", "--onc"], 1), ([], 0), (["--json"], 0)]
-)
-def test_once_that_is_stopped_while_it_loads_has_not_said_that_all_is_fine(
-    arguments: list[str], code: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("clients.monitor.options.parse", interrupted)
-    monkeypatch.setattr("signal.signal", lambda *_: None)
-    assert cli.main(arguments) == code

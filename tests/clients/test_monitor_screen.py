@@ -73,16 +73,6 @@ def test_80x24_has_the_state_of_a_sensor_that_is_lost_and_of_its_neighbors() -> 
     assert "firmware" not in text, "it goes first"
 
 
-def test_all_warnings_are_on_a_page_of_their_own() -> None:
-    state = made.troubled()
-    few = next(sensor.alerts for sensor in state.sensors if sensor.alerts)
-    many = tuple(few[0]._replace(text=f"warning {number}") for number in range(15))
-    state = replace(state, sensors=(replace(state.sensors[0], alerts=many),))
-    assert "more: press w" in plain(state)
-    text = plain(state, Look(warnings=True), height=40)
-    assert all(f"warning {number}" in text for number in range(15))
-
-
 def test_60x15_keeps_force_torque_the_stream_and_the_worst_warning() -> None:
     text = plain(made.troubled(), width=60, height=15)
     for fact in ("Fx", "Fy", "Fz!", "Mx", "My", "Mz", "Stream", "saturated: Fz", "Reduce sensor loading"):
@@ -91,6 +81,21 @@ def test_60x15_keeps_force_torque_the_stream_and_the_worst_warning() -> None:
 
 def test_what_does_not_fit_of_the_warnings_is_counted() -> None:
     assert re.search(r"and \d more", plain(made.troubled(), width=60, height=15))
+
+
+def test_every_warning_can_be_reached() -> None:
+    state = made.troubled()
+    alert = state.sensors[0].alerts[0]
+    many = tuple(alert._replace(text=f"warning {n:02}", remedy="a remedy " * 8) for n in range(30))
+    state = replace(state, sensors=(replace(state.sensors[0], alerts=many), *state.sensors[1:]))
+    assert re.search(r"and \d+ more: press w", plain(state))
+    pages = [plain(state, Look(warnings=number)) for number in range(1, 5)]
+    for page in pages:
+        assert "Warnings of sensor 0" in page
+        assert "w: next page" in page
+    assert sorted(set(re.findall(r"warning \d\d", "".join(pages)))) == [f"warning {n:02}" for n in range(30)]
+    assert pages[3] == pages[0], "round and round"
+    assert "none" in plain(made.healthy(), Look(warnings=1))
 
 
 def test_two_sensors_stand_one_below_the_other_where_there_is_room() -> None:

@@ -6,13 +6,13 @@ It is a process where it is stopped or killed from outside, which nothing else c
 from __future__ import annotations
 
 import contextlib
-import math
+import itertools
 import os
+import queue
 import random
 import signal
 import socket
 import subprocess
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,17 +23,17 @@ import pytest
 from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
-from clients.record import cli, program
+from clients.record import cli, program, recorder
 from clients.record import parts as record_parts
-from clients.record import recorder as recorder_module
 from clients.record.parts import Parts
 from clients.record.recorder import FLUSH_S, Recorder
-from clients.record.source import BATCH_S, Source
+from clients.record.source import BATCH_S, Batch, Source
 from clients.recording.file_format import FORMAT_VERSION, frame_topic
 from clients.recording.reader import open_recording
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.address import Address
 from protocol.framing import DataFlag, DataMessage
+from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.recordings import frame, record
 from tests.clients.running import (
     NoSignals,
@@ -47,7 +47,7 @@ from tests.clients.running import (
     wait_until,
 )
 from tests.served_simulation import served
-from tests.server.running import needs_bus, server
+from tests.server.running import PATIENCE_S, needs_bus, server
 
 Run = Callable[..., tuple[int, str]]
 SECOND = 800
@@ -170,78 +170,41 @@ def test_it_records_across_the_restart_of_the_server(out: Path, capsys: pytest.C
         assert len(opened.descriptions) == 2
 
 
-def test_it_waits_for_a_sensor_that_a_new_server_does_not_have(
+def test_it_records_on_without_a_sensor_that_the_restarted_server_lacks(
     out: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An overnight recording goes on once the sensor is back; the refusal is said once."""
-    two, one = [SensorOptions(), SensorOptions(serial=2)], [SensorOptions()]
-    with served(*two, sinc_length=512) as first, recording(out, first.port, "--sensor", "1") as recorder:
+    with (
+        served(SensorOptions(), SensorOptions(), sinc_length=512) as first,
+        recording(out, first.port, "--sensor", "0", "--sensor", "1") as recorder,
+    ):
         recorder.wait_for_frames(20)
         first.close()
-        with served(*one, port=first.port, sinc_length=512) as second:
-            wait_until(lambda: "the server has no sensor 1" in capsys.readouterr().err, "the refusal")
-            time.sleep(1.0)
-            second.close()
-        with served(*two, port=first.port, sinc_length=512):
+        with served(port=first.port, sinc_length=512) as second:
             recorder.wait_for_frames(20)
+            second.close()
+        with served(SensorOptions(), SensorOptions(), port=first.port, sinc_length=512):
+            wait_until(lambda: read(out)[-1].sensor == 1, "a frame of the sensor that is back")
             assert recorder.stop() == 0
+    assert "connected: without sensor 1" in capsys.readouterr().err
     with open_recording(out) as opened:
-        names = [event.name for event in opened.events]
-        assert names == ["connected", "shutting_down", "disconnected", "refused", "connected"]
+        said = [event.event.get("message") for event in opened.events if event.name == "connected"]
+        assert said == [None, "without sensor 1", None]
+
+
+def test_a_refusal_does_not_end_a_recording_that_runs(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with ScriptedServer() as server, recording(out, server.port) as recorder:
+        assert server.subscribed.wait(PATIENCE_S)
+        server.answers["subscribe"] = lambda _: {"ok": False, "error": {"code": "busy", "message": "not now"}}
+        server.drop()
+        wait_until(lambda: "refused: not now" in capsys.readouterr().err, "the refusal")
+        server.answers.clear()
+        assert server.subscribed.wait(PATIENCE_S)
+        server.send_sample(1.0)
+        recorder.wait_for_frames(1)
+        assert recorder.stop() == 0
 
 
 # -- what is lost
-
-
-def new_recorder(out: Path) -> Recorder:
-    parts = Parts(out, size=None, seconds=None, overwrite=False)
-    return Recorder(parts, "test", {"format": FORMAT_VERSION}, {})
-
-
-def test_each_batch_is_flushed_once_that_is_due(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder_module, "FLUSH_S", 0.0)
-    recorder = new_recorder(out)
-    try:
-        for first in (0, 10):
-            recorder.put([frame(number) for number in range(first, first + 10)])
-        wait_until(lambda: recorder.saved == 20, "both to be taken")
-        assert frames_in(out) >= 10, "the first was flushed before the second was taken"
-    finally:
-        recorder.stop("")
-
-
-def test_a_file_that_is_deleted_meanwhile_is_an_error(out: Path) -> None:
-    recorder = new_recorder(out)
-    recorder.put([frame(0)])
-    wait_until(lambda: frames_in(out) == 1, "the frame")
-    out.unlink()
-    recorder.put([frame(1)])
-    wait_until(lambda: recorder.failed, "its end")
-    recorder.stop("")
-    assert "was deleted while it was being written" in str(recorder.error)
-
-
-def test_a_backlog_does_not_hold_up_its_end(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What cannot be written in time is counted, and the file says where it is missing."""
-    monkeypatch.setattr(recorder_module, "STOP_S", 0.0)
-    recorder, gate = new_recorder(out), threading.Event()
-    write = recorder._write
-    monkeypatch.setattr(recorder, "_write", lambda item: (gate.wait(), write(item)))
-    for number in range(100):
-        recorder.put([frame(number)])
-    stopping = threading.Thread(target=recorder.stop, args=("asked to stop",))
-    stopping.start()
-    wait_until(lambda: recorder._give_up_at < math.inf, "stop")
-    gate.set()
-    stopping.join(30)
-    assert not stopping.is_alive()
-    with open_recording(out) as opened:
-        frames = list(opened.frames())
-        (missing,) = [event.event for event in opened.events if event.name == "lost"]
-        assert opened.end is not None
-        assert opened.end["reason"] == "asked to stop"
-    assert len(frames) + missing["frames"] == 100
-    assert missing["frames"] == recorder.tally.dropped > 90
 
 
 def test_what_the_server_withheld_is_said(out: Path, tmp_path: Path, run: Run) -> None:
@@ -292,14 +255,74 @@ def test_seconds_of_frames_have_room_in_the_kernel(endless: Replay) -> None:
     assert room >= min(4 * 1024 * 1024, 2 * most)
 
 
-def test_frames_get_into_the_file_before_it_ends(out: Path) -> None:
+def new_recorder(out: Path) -> Recorder:
+    return Recorder(
+        Parts(out, size=None, seconds=None, overwrite=False), "test", {"format": FORMAT_VERSION}, {}
+    )
+
+
+def test_frames_get_into_the_file_before_it_ends(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert BATCH_S + FLUSH_S < 0.5, "a machine that is busy may double it"
-    recorder = new_recorder(out)
-    try:
-        recorder.put([frame(number) for number in range(10)])
-        wait_until(lambda: frames_in(out) == 10, "the frames, though no more come")
-    finally:
-        recorder.stop("")
+    now_s, in_file = [0.0], []
+
+    def batches() -> Iterator[Batch | None]:
+        yield [frame(number) for number in range(10)]
+        now_s[0] += FLUSH_S
+        yield []
+        in_file.append(frames_in(out))
+        yield None
+
+    queued = batches()
+    played = SimpleNamespace(get=lambda timeout: next(queued), put=lambda batch: None, empty=lambda: True)
+    monkeypatch.setattr(recorder, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr(recorder, "queue", SimpleNamespace(SimpleQueue=lambda: played, Empty=queue.Empty))
+    new_recorder(out).stop("")
+    assert in_file == [10], "though no more come"
+
+
+def test_a_backlog_does_not_delay_its_end(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a machine so loaded that writing all of it would take minutes, and more came than can be queued."""
+    calls = itertools.count()
+    monkeypatch.setattr(recorder, "time", SimpleNamespace(monotonic=lambda: next(calls) * 0.1))
+    monkeypatch.setattr(recorder, "MAX_BACKLOG", 20_000)
+    came: list[Batch] = [
+        [frame(number) for number in range(first, first + 64)] for first in range(0, 32_000, 64)
+    ]
+    slow = new_recorder(out)
+    for batch in came:
+        slow.put(batch)
+    slow.stop("asked to stop")
+    assert slow.error is None
+    with open_recording(out) as opened:
+        assert len(list(opened.frames())) == slow.saved < 16_000
+        assert opened.cut_off is None
+        lost = sum(event.event["frames"] for event in opened.events)
+        assert opened.end is not None
+        assert str(lost) == opened.end["dropped"]
+    assert slow.saved + lost == 32_000
+
+
+def test_of_a_file_that_is_removed_nothing_is_said_to_be_there(out: Path) -> None:
+    removed = new_recorder(out)
+    removed.put([frame(number) for number in range(10)])
+    wait_until(lambda: frames_in(out) == 10, "the frames")
+    out.unlink()
+    removed.put([frame(10)])
+    removed.stop("asked to stop")
+    assert str(removed.error) == f"{out} was removed while it was written: nothing of it is left"
+    assert (removed.saved, removed.tally.dropped) == (0, 11)
+
+
+def test_a_part_that_was_taken_away_is_none_of_its_business(
+    endless: Replay, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record_parts, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic()))
+    part = out.with_name("out_0.mcap")
+    with recording(out, endless.port, "--rotate-seconds", "1") as recorder:
+        wait_until(out.with_name("out_1.mcap").exists, "the second file")
+        part.unlink()
+        wait_until(out.with_name("out_3.mcap").exists, "the fourth file")
+        assert recorder.stop() == 0
 
 
 def killed(endless: Replay, out: Path, frames: int) -> None:

@@ -5,6 +5,7 @@ It runs in a thread, except where its imports are what a test is about.
 
 from __future__ import annotations
 
+import math
 import signal
 import socket
 import subprocess
@@ -18,7 +19,7 @@ from typing import Any
 import pytest
 
 from bridge.stream.connection import Connection
-from clients.recording.reader import Event, open_recording
+from clients.recording.reader import Description, Event, open_recording
 from clients.replay import cli, program
 from clients.replay.sensors import ReplayedSensors
 from protocol.client import Client, connect
@@ -27,11 +28,12 @@ from protocol.errors import RefusedError
 from protocol.framing import DataMessage
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
 from tests.clients.running import Client as Requests
-from tests.clients.running import NoSignals, free_port, listen, replaying, signalled
+from tests.clients.running import NoSignals, free_port, listen, replaying, signalled, wait_until
+from tests.served_simulation import served
 from tests.server.running import PATIENCE_S
-from tests.simulation import Simulation
 
 COUNT = 400
+EMERGENCY = {"code": 0xFF01, "text": "device specific", "register": 0x81, "data": "0102030405"}
 
 Run = Callable[..., tuple[int, str]]
 
@@ -145,24 +147,33 @@ def test_describe_says_that_it_is_a_replay(path: Path, frames: list[DataMessage]
 
 
 def keys(value: object) -> object:
-    """All names in a message, of the first item of each list."""
-    if isinstance(value, dict):
-        return {name: keys(item) for name, item in value.items()}
-    return [keys(item) for item in value[:1]] if isinstance(value, list) else None
+    """The keys of a reply, of the objects in it, and of the first in each of its lists."""
+    if isinstance(value, list):
+        return [keys(row) for row in value[:1]]
+    return {key: keys(row) for key, row in value.items()} if isinstance(value, dict) else None
 
 
-def test_status_has_what_a_server_s_has(path: Path, frames: list[DataMessage]) -> None:
-    del frames
-    with replaying("--loop", path) as served, connect(served.port) as client:
+def test_status_has_all_that_a_server_s_has(path: Path) -> None:
+    made = writer(path)
+    made.describe(START_NS, describe(0))
+    made.event(START_NS, {"event": "emergency", **EMERGENCY, "sensor": 0, "count": 4, "message": "over"})
+    for number in range(100):
+        made.frame(frame(number, temperature=30.0 if number else math.nan))
+    made.finish({})
+    with served() as server, connect(server.port) as client:
+        server.command("emergency 0xFF01 0x81 0102030405")
         client.receive(PATIENCE_S)
+        wait_until(lambda: client.ask("status")["sensors"][0]["emergency"], "the emergency")
+        expected = client.ask("status")
+    with replaying("--loop", path) as running, connect(running.port) as client:
+        next(client.frames())
         status = client.ask("status")
-    simulation = Simulation()
-    asks = simulation.connect()
-    asks.ask("subscribe")
-    assert keys(status) == keys(asks.ask("status"))
-    assert [row["sensor"] for row in status["sensors"]] == [0, 1]
-    assert status["sensors"][0]["fresh"] > 0
-    assert status["sensors"][0]["clock"]["period_us"] == 1250
+    assert keys(status) == keys(expected)
+    (sensor,) = status["sensors"]
+    assert {**sensor["emergency"], "ago_s": 0} == {**EMERGENCY, "ago_s": 0}
+    assert (sensor["emergencies"], sensor["not_finite"]) == (1, 1)
+    assert sensor["fresh"] > 0
+    assert sensor["clock"]["period_us"] == 1250
     assert status["clients"][0]["sent"] > 0
 
 
@@ -235,6 +246,17 @@ def test_describe_follows_the_events(path: Path, frames: list[DataMessage]) -> N
             ("OP", 64),
             (state, 32),
         ]
+
+
+def test_no_sensor_settles_for_ever(path: Path, frames: list[DataMessage]) -> None:
+    """It did when it was described; the node's tare waits for the end of it."""
+    del frames
+    with open_recording(path) as recording:
+        sensors = ReplayedSensors(recording.sensors)
+    described = describe(0)
+    described["sensors"][0]["settling"] = True
+    sensors.describe(Description(0, described))
+    assert not sensors.sensors[0].describe()["settling"]
 
 
 # -- arguments and what is not there

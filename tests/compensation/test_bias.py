@@ -11,15 +11,15 @@ from typing import Any
 
 import pytest
 
-from ft_compensation.bias import BiasRamp, estimate_bias, gravity_of
+from ft_compensation.bias import BiasRamp, Taken, estimate_bias, gravity_of, tilt_95
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import NO_WRENCH, CompensationError, Wrench
+from ft_compensation.quantities import NO_WRENCH, Accelerometer, CompensationError, Payload, Wrench
 from ft_compensation.stationary import NotStationaryError, StationaryMeans, StationaryWindow
 from ft_compensation.stationary_limits import StationaryLimits
 from protocol.framing import DataFlag
 from protocol.pdo import STANDARD_GRAVITY, Sample
 from protocol.sensor.warnings_register import WarningFlag
-from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, noisy, sample
+from tests.compensation.making import AXES, BIAS, TOOL, cross, gravity_for, load, noisy, sample
 
 RATE = 800
 
@@ -191,6 +191,33 @@ def test_only_the_direction_comes_from_the_accelerometer() -> None:
     assert gravity_of((0.0, 0.0, 10.0)) == (0.0, 0.0, -STANDARD_GRAVITY)
 
 
+@pytest.mark.parametrize("interval", [None, 0.02])
+def test_gravity_is_within_the_tilt_that_is_told_in_95_percent(interval: float | None) -> None:
+    """In any pose, with an accelerometer as identification expects it, or as it has found it."""
+    known = (
+        Accelerometer() if interval is None else Accelerometer(offset_interval=(interval, 3 * interval, 0.0))
+    )
+    noise, draws, held = random.Random(7), 4000, 0
+    for _ in range(draws):
+        up = [noise.gauss(0, 1) for _ in range(3)]
+        truth = [-part for part in gravity_for(up)]
+        offset = [noise.gauss(0, half / 1.96) for half in known.offset_interval]
+        scale = [noise.gauss(1, half / 1.96) for half in known.scale_interval]
+        read = [part * s + o for part, s, o in zip(truth, scale, offset, strict=True)]
+        found = gravity_of((read[0], read[1], read[2]), tolerance=3.0)
+        sine = math.hypot(*cross(found, truth)) / STANDARD_GRAVITY**2
+        held += math.asin(min(sine, 1.0)) <= tilt_95(found, known)
+    assert 0.945 <= held / draws <= 0.985, "more where two axes are not equally known"
+
+
+def test_an_axis_that_is_vertical_tilts_nothing() -> None:
+    known = Accelerometer(offset_interval=(0.0, 0.0, 0.8), scale_interval=(0.01, 0.01, 0.01))
+    assert tilt_95(gravity_for((0, 0, 1)), known) == pytest.approx(0.0, abs=1e-9)
+    assert tilt_95(gravity_for((1, 0, 0)), known) == pytest.approx(
+        0.8 / STANDARD_GRAVITY * 2.45 / 1.96, rel=1e-3
+    )
+
+
 # Ramp and undo.
 
 OLD, NEW = Wrench.of([0, 0, 0, 0, 0, 0]), Wrench.of([1, -2, 4, 0.5, 0, -1])
@@ -260,12 +287,29 @@ def test_the_last_change_is_undone_once() -> None:
         ramp.undo(20.0)
 
 
-def test_an_undone_change_follows_a_shift_of_the_sensors_own_offset() -> None:
-    def number(value: float) -> Wrench:
-        return Wrench.of([value] * 6)
+def test_undoing_goes_back_to_a_bias_that_was_shifted_meanwhile() -> None:
+    """The sensor was tared: its own offset, and every bias of before with it, has changed."""
 
-    ramp = BiasRamp(number(1))
-    ramp.go(number(3), 0.0)
-    ramp.shift(number(10))
-    assert ramp.target == number(13)
-    assert ramp.undo(1.0) == ramp.target == number(11)
+    def fx(force: float) -> Wrench:
+        return Wrench.of([force, 0, 0, 0, 0, 0])
+
+    ramp = BiasRamp(fx(1.0))
+    ramp.go(fx(3.0), 0.0)
+    ramp.shift(fx(10.0))
+    assert ramp.target == fx(13.0)
+    assert ramp.undo(1.0) == ramp.at(1.0) == fx(11.0)
+
+
+def test_a_shift_and_another_tool_change_both_biases() -> None:
+    """The one in force was taken with gravity along -x, the one before along -z."""
+    ramp = BiasRamp(NO_WRENCH, seconds=1.0)
+    ramp.go(load((0, 0, 1)), 0.0, Taken(Payload(), gravity_for((0, 0, 1))))
+    ramp.go(load((1, 0, 0)), 5.0, Taken(Payload(), gravity_for((1, 0, 0))))
+    ramp.shift(NEW)
+    weighed = ramp.weighed(TOOL)
+    assert ramp.target == load((1, 0, 0)).plus(NEW), "it is another ramp"
+    assert weighed.target.values == pytest.approx(BIAS.plus(NEW).values)
+    started = load((0, 0, 1)).plus(NEW).plus(BIAS).plus(load((1, 0, 0)), -1.0)
+    assert weighed.at(5.0).values == pytest.approx(started.values), "which jumps as much as the weight does"
+    assert weighed.undo(10.0).values == pytest.approx(BIAS.plus(NEW).values)
+    assert weighed.taken == Taken(TOOL, gravity_for((0, 0, 1)))

@@ -181,7 +181,7 @@ def test_an_offset_that_the_poses_do_not_determine_stays_open_and_the_result_say
     found = identify(poses, one_axis=True)
     assert found.accelerometer is not None
     assert found.accelerometer.undetermined == "x"
-    x, y, z = found.accelerometer.offset_interval
+    x, y, z = found.accelerometer.calibration.offset_interval
     assert x > 0.3
     assert max(y, z) < 0.02
     assert found.bias_interval.force[0] > 0.1 > max(found.bias_interval.force[1:])

@@ -9,7 +9,7 @@ from typing import Final
 from rich.text import Text
 
 from clients import numbers
-from clients.monitor.model.state import AXES, SensorState, State
+from clients.monitor.model.state import AXES, State
 from clients.monitor.view import words
 from clients.monitor.view.glyphs import ALARM, BAD, LABEL, NOTICE, UNICODE, VALUE, Glyphs, to_ascii
 from clients.monitor.view.panel import MOST_TALL, Row, alerts, all_alerts, field, panel
@@ -18,9 +18,9 @@ KEYS: Final = (
     ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),
     ("r", "record", "start or stop a recording in this folder (ethercat-record)"),
     ("p", "pause", "freeze the display; samples and peaks still count"),
-    ("w", "warnings", "all warnings of this sensor"),
     ("0", "reset", "reset peaks and past warnings"),
     ("n", "next", "the next sensor of the chain"),
+    ("w", "warn", "all warnings of this sensor"),
     ("?", "help", "this page"),
     ("q", "quit", "also Ctrl-C; Ctrl-L redraws the screen"),
 )
@@ -45,8 +45,8 @@ class Look:
     question: str = ""
     """The pending question."""
     help: bool = False
-    warnings: bool = False
-    """Whether the list of all warnings is asked for."""
+    warnings: int = 0
+    """The page of all warnings that is shown, from 1; 0: none. After the last comes the first."""
     glyphs: Glyphs = UNICODE
 
 
@@ -57,7 +57,7 @@ def render(state: State, look: Look, width: int, height: int) -> list[Text]:
     elif look.help:
         rows = _help(state)
     elif look.warnings and state.sensors:
-        rows = _warnings(state.sensors[look.selected % len(state.sensors)], width)
+        rows = _warnings(state, look, width, height)
     else:
         rows = _overview(state, look, width, height)
     rows = rows[:height] + [Text()] * (height - len(rows))
@@ -174,16 +174,11 @@ def _keys(look: Look, width: int) -> Text:
     if look.paused:
         names["p"] = "resume"
     row = Text()
-    gap = "  " if width >= 60 else " "
+    gap = "  " if width >= 68 else " "
     for key, name in names.items():
         row.append(key, VALUE)
-        row.append(f" {name}{gap}" if width >= 50 else f"{gap}", LABEL)
+        row.append(f" {name}{gap}" if width >= 60 else f"{gap}", LABEL)
     return row
-
-
-def _warnings(sensor: SensorState, width: int) -> list[Text]:
-    title = Text(f"Warnings of sensor {sensor.position}; press any key to return", VALUE)
-    return [title, Text(), *all_alerts(sensor, width)]
 
 
 def _help(state: State) -> list[Text]:
@@ -205,6 +200,18 @@ def _help(state: State) -> list[Text]:
         )
     ]
     return rows
+
+
+def _warnings(state: State, look: Look, width: int, height: int) -> list[Text]:
+    """All warnings of the selected sensor, a page of them."""
+    sensor = state.sensors[look.selected % len(state.sensors)]
+    lines = all_alerts(sensor, width)
+    room = height - 4
+    pages = [lines[start : start + room] for start in range(0, len(lines), room)]
+    number = (look.warnings - 1) % len(pages)
+    shown = pages[number] + [Text()] * (room - len(pages[number]))
+    title = Text(f"Warnings of sensor {sensor.position}: page {number + 1} of {len(pages)}", VALUE)
+    return [title, Text(), *shown, Text(), Text("w: next page, any other key: return", LABEL)]
 
 
 def _fitted(row: Text, width: int, glyphs: Glyphs) -> Text:

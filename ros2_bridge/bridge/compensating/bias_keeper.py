@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from bridge.parameters.compensation import AUTO, CompensationParameters
-from ft_compensation.bias import weight
-from ft_compensation.quantities import NO_WRENCH, Payload, Wrench, wrench_text
+from ft_compensation.bias import BiasRamp, Taken
+from ft_compensation.quantities import NO_WRENCH, Wrench, length, wrench_text
 from ft_compensation.store import CompensationStore, Stored, StoreError, default_directory
-from protocol.pdo import Vector3
 
 FROM_PARAMETER: Final = "parameter"
 
@@ -25,8 +24,7 @@ class Beginning(NamedTuple):
     """Where it comes from."""
     is_one: bool
     """Whether there is a bias: a zero that was not measured is none."""
-    gravity: Vector3 | None = None
-    """In the sensor's frame when it was measured; None: not known."""
+    taken: Taken = Taken()
 
 
 class BiasKeeper:
@@ -40,35 +38,31 @@ class BiasKeeper:
     def __init__(self, log: Any) -> None:
         self.serial: str | None = None
         self.problem = ""
-        self._kept: tuple[object, ...] | None = None
-        """The content of the file."""
+        self._kept: tuple[Wrench, Taken, Wrench | None] | None = None
+        """The content of the file: a bias, how it was taken, and the sensor's own offset at that time."""
         self._log = log
 
     def forget(self) -> None:
         """Store the bias again, whatever the file has."""
         self._kept = None
 
-    def keep(
-        self,
-        bias: Wrench,
-        parameters: CompensationParameters,
-        offset: Wrench | None,
-        gravity: Vector3 | None,
-    ) -> None:
-        """Store `bias`, taken with the sensor's own `offset` and `gravity` in its frame, for the connected
-        sensor, if enabled and changed. `offset` is None if it is unknown, or if there is no bias."""
+    def keep(self, ramp: BiasRamp, parameters: CompensationParameters, offset: Wrench | None) -> None:
+        """Store the bias that `ramp` leads to, for the connected sensor, if enabled and changed.
+
+        `offset` is the sensor's own at that time, None if it is unknown, or if there is no bias.
+        """
         if not parameters.bias_keep:
             self.problem = ""
             return
-        content = bias, offset, gravity, parameters.payload
-        if self.serial is None or content == self._kept:
+        bias, taken = ramp.target, ramp.taken
+        if self.serial is None or (bias, taken, offset) == self._kept:
             return
         try:
-            path = _store(parameters).save(_number(self.serial), bias, parameters.payload, offset, gravity)
+            path = _store(parameters).save(_number(self.serial), bias, taken.payload, offset, taken.gravity)
         except StoreError as error:
             self._say_not_kept(str(error))
             return
-        self._kept, self.problem = content, ""
+        self._kept, self.problem = (bias, taken, offset), ""
         self._log.info(f"the bias is kept in {path}")
 
     def take(
@@ -98,20 +92,15 @@ class BiasKeeper:
                 "parameter bias is given, and is overwritten"
             )
             return None
+        before = Taken(stored.payload or parameters.payload, stored.gravity)
         if stored.offset == offset:
-            self._kept = stored.bias, offset, stored.gravity, stored.payload
+            self._kept = stored.bias, before, offset
         self._log.info(f"the sensor with serial number {serial} has the bias that was kept at {stored.saved}")
-        bias = stored.bias
-        if stored.payload is not None and stored.payload != parameters.payload and stored.gravity is not None:
-            bias = rework(bias, stored.payload, parameters.payload, stored.gravity)
-            self._log.info(anew(parameters.payload))
-        elif stored.payload is not None and stored.payload != parameters.payload:
-            self._log.warning(
-                f"the kept bias was taken with {_payload_text(stored.payload)}, and now there is "
-                f"{_payload_text(parameters.payload)}: tare again"
-            )
+        change, taken = before.weighed(parameters.payload)
+        if warning := taken.warning(change, parameters.payload, length(parameters.gravity)):
+            self._log.warning(warning)
         is_one = stored.bias != NO_WRENCH or stored.offset is not None
-        return Beginning(bias, f"kept since {stored.saved}", is_one, stored.gravity)
+        return Beginning(stored.bias.plus(change), f"kept since {stored.saved}", is_one, taken)
 
     def _look_up(
         self, serial: str, parameters: CompensationParameters, offset: Wrench | None
@@ -144,23 +133,6 @@ class BiasKeeper:
     def _say_not_kept(self, problem: str) -> None:
         self.problem = problem
         self._log.warning(problem)
-
-
-def rework(bias: Wrench, was: Payload, payload: Payload, gravity: Vector3) -> Wrench:
-    """The bias of the same measurement, with `gravity` in the sensor's frame, for another payload."""
-    return bias.plus(weight(was, gravity)).plus(weight(payload, gravity), -1.0)
-
-
-def anew(payload: Payload) -> str:
-    """The sentence about that."""
-    return (
-        f"the bias was worked out anew from its tare, for {_payload_text(payload)}: if it is another tool "
-        "than then, tare again"
-    )
-
-
-def _payload_text(payload: Payload) -> str:
-    return f"a tool of {payload.mass:.3g} kg" if payload.mass else "no tool_mass"
 
 
 def directory_of(parameter: str) -> Path:

@@ -7,13 +7,13 @@ change goes through it, so that it always shows what is in force, or ramped in.
 from __future__ import annotations
 
 import contextlib
-import math
+import threading
 from collections.abc import Callable, Iterator
 from typing import Final
 
 from rclpy.node import Node
 
-from bridge.compensating.bias_keeper import FROM_PARAMETER, BiasKeeper, anew, rework
+from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper
 from bridge.compensating.gravity_sources import NoSource, Source
 from bridge.compensating.obstacles import Obstacles
 from bridge.compensating.own_offset import OwnOffset
@@ -26,20 +26,10 @@ from bridge.parameters.table import Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
 from bridge.stream.link import Link
 from bridge.stream.watch import Watch
-from ft_compensation.bias import BiasRamp
+from ft_compensation.bias import BiasRamp, Taken
 from ft_compensation.compensator import Compensator
-from ft_compensation.outputs.filter import check as check_filter
 from ft_compensation.payload_watch import PayloadWatch
-from ft_compensation.quantities import (
-    NO_WRENCH,
-    Accelerometer,
-    CompensationError,
-    Payload,
-    Wrench,
-    length,
-    wrench_text,
-)
-from protocol.pdo import Vector3
+from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, length, wrench_text
 
 _MEASURED: Final = ("tare", "identified")
 """Where a bias comes from that is one even if it is zero."""
@@ -74,10 +64,12 @@ class CompensationControl:
         self.count_not_finite = count_not_finite
         """Samples so far that were not finite somewhere."""
         self._next_origin = FROM_PARAMETER
-        self._gravity: Vector3 | None = None
-        """In the sensor's frame when the bias in force was measured; None: it was not, or it is not known."""
+        self._next_taken: Taken | None = None
+        """Of the bias that is being put in force, where that is a tare."""
         self._choice.check(self.parameters)
         self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
+        self._shifting = threading.Lock()
+        """For whoever shifts the ramp, or replaces it and the plan."""
         self._watch: PayloadWatch | None = None
         self._watched: object = None
         self.obstacles, self._live = Obstacles(link, watch), live
@@ -155,6 +147,7 @@ class CompensationControl:
             stops_on_saturation=output.stops_on_saturation,
             problem=self.obstacles.conflict(self.parameters)
             or self._own_offset.doubt()
+            or self._ramp.taken.doubt(payload, length(self.parameters.gravity))
             or self.keeping
             or (watch.finding if watch is not None else ""),
         )
@@ -164,12 +157,15 @@ class CompensationControl:
         """Whether it is on the way to `bias`, as of the latest sample."""
         return not self._ramp.arrived(self.output.time_s)
 
-    def set_bias(self, bias: Wrench, origin: str, gravity: Vector3 | None = None) -> None:
-        """Put a bias in force, measured with `gravity` in the sensor's frame, and keep it if asked to."""
+    def set_bias(self, bias: Wrench, origin: str, taken: Taken | None = None) -> None:
+        """Put a bias in force, `taken` by a tare, and keep it if that is asked for."""
         self._own_offset.begin(bias, is_measured=origin in _MEASURED)
-        self._gravity = gravity
-        with self._origin(origin):
-            self._live.put(bias=[*bias.values])
+        self._next_taken = taken
+        try:
+            with self._origin(origin):
+                self._live.put(bias=[*bias.values])
+        finally:
+            self._next_taken = None
 
     def undo_bias(self) -> Wrench:
         """Go back to the bias before, and return it; CompensationError if there is none."""
@@ -186,8 +182,7 @@ class CompensationControl:
             "bias": [*bias.values],
         }
         if accelerometer is not None:
-            values["accelerometer.offset"] = [*accelerometer.offset]
-            values["accelerometer.scale"] = [*accelerometer.scale]
+            values |= {f"accelerometer.{name}": [*part] for name, part in accelerometer._asdict().items()}
         with self._origin("identified"):
             self._live.put(**values)
 
@@ -200,13 +195,13 @@ class CompensationControl:
             self._next_origin = FROM_PARAMETER
 
     def _check(self, wanted: CompensationParameters) -> None:
-        """ParameterError for what cannot be had with this sensor or node."""
+        """ParameterError if they cannot be had here."""
         self._choice.check(wanted)
-        if wanted.filter != self.parameters.filter and wanted.filter.cutoff and self.link.rate_hz:
-            try:
-                check_filter(wanted.filter, self.link.rate_hz)
-            except CompensationError as error:
-                raise ParameterError(str(error)) from None
+        if self.link.connection is not None and (rate_hz := self.link.rate_hz):
+            known = self.parameters.filter.problems(rate_hz)
+            for problem in wanted.filter.problems(rate_hz):
+                if problem not in known:
+                    raise ParameterError(problem)
 
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted
@@ -218,44 +213,32 @@ class CompensationControl:
                 self._choice.source = NoSource(str(error))
         self.output.tune(wanted)
         self._ramp.seconds = wanted.bias_ramp_time
-        if wanted.payload != was.payload and wanted.bias == was.bias:
-            self._rework(was.payload, wanted.payload)
+        before = self.bias
         # A parameter that the shift of the bias has not reached yet is no wish.
-        if wanted.bias not in (was.bias, self.bias):
-            if self._next_origin == FROM_PARAMETER:
-                self._gravity = None
-            self._ramp.go(wanted.bias, self.output.time_s)
-            self._own_offset.begin(wanted.bias, is_measured=self._next_origin in _MEASURED)
-            self.origin = self._next_origin
-        self._make_plan()
+        is_wish = self._next_taken is not None or wanted.bias not in (was.bias, before)
+        with self._shifting:
+            if wanted.payload != was.payload:
+                self._ramp = self._ramp.weighed(wanted.payload)
+            if is_wish:
+                self._ramp.go(wanted.bias, self.output.time_s, self._next_taken or Taken())
+                self._own_offset.begin(wanted.bias, is_measured=self._next_origin in _MEASURED)
+                self.origin = self._next_origin
+            self._make_plan()
+        if wanted.payload != was.payload and not is_wish:
+            self._say_weighed(self.bias.plus(before, -1.0))
         self.output.stops_on_saturation = wanted.on_saturation == "stop"
         if self.output.hold is not _LOOKING_UP:
             self.obstacles.hold(self.parameters, self.output)
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
             self._keeper.forget()
-        self._keep(wanted)
+        self._keeper.keep(self._ramp, wanted, self._own_offset.to_keep)
 
-    def _keep(self, wanted: CompensationParameters) -> None:
-        self._keeper.keep(self.bias, wanted, self._own_offset.to_keep, self._gravity)
-
-    def _rework(self, was: Payload, payload: Payload) -> None:
-        """The payload was corrected: work the bias out anew from what the tare measured, or warn."""
-        if not self._own_offset.has_bias or self.origin in (FROM_PARAMETER, "identified"):
-            return
-        if self._gravity is not None:
-            self._ramp.shift(rework(self.bias, was, payload, self._gravity).plus(self.bias, -1.0))
-            self._ramp.forget()
-            self._log.info(anew(payload))
-            self._guard.trigger()
-            return
-        g = length(self.parameters.gravity)
-        centers = zip(payload.center, was.center, strict=True)
-        moment = math.hypot(*(payload.mass * now - was.mass * then for now, then in centers)) * g
-        self._log.warning(
-            "the bias is of before tool_mass or tool_center_of_gravity was changed, and where gravity was "
-            f"then is unknown: wrench_compensated may be wrong by {abs(payload.mass - was.mass) * g:.1f} N "
-            f"and {moment:.2f} Nm until the next tare"
-        )
+    def _say_weighed(self, change: Wrench) -> None:
+        """The payload is another one, and so the bias of a tare, by `change`."""
+        parameters = self.parameters
+        if warning := self._ramp.taken.warning(change, parameters.payload, length(parameters.gravity)):
+            self._log.warning(warning)
+        self._guard.trigger()  # the parameter follows
 
     def _make_plan(self) -> None:
         wanted = self.parameters
@@ -286,8 +269,8 @@ class CompensationControl:
             offset = self._own_offset.begin(self.bias)
             begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters, offset)
             if begin is not None:
-                self._own_offset.has_bias, self._gravity = begin.is_one, begin.gravity
-                self._begin_with(begin.bias, begin.origin)
+                self._own_offset.has_bias = begin.is_one
+                self._begin_with(begin)
             elif is_another:
                 # What was before in its history was the other's too.
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
@@ -297,7 +280,7 @@ class CompensationControl:
                 self._make_plan()
                 self.sensors += 1
             if not self.keeping and self.bias != NO_WRENCH:
-                self._keep(self.parameters)
+                self._keeper.keep(self._ramp, self.parameters, self._own_offset.to_keep)
         self._follow_offset()
         if self.bias != self.parameters.bias:
             self._live.put(bias=[*self.bias.values])  # shifted
@@ -309,17 +292,18 @@ class CompensationControl:
         """Shift the bias by the change of the sensor's own offset, from the next sample on; any thread."""
         change = self._own_offset.follow()
         if change is not None:
-            self._ramp.shift(change)
+            with self._shifting:
+                self._ramp.shift(change)
             self._log.info(
                 f"the sensor's own offset was changed by {wrench_text(change)}: the bias is shifted by that"
             )
             self._guard.trigger()
 
-    def _begin_with(self, bias: Wrench, origin: str) -> None:
+    def _begin_with(self, begin: Beginning) -> None:
         """Put a bias in force at once, with nothing before it."""
         problem = self.keeping
-        with self._origin(origin):
-            self._ramp = BiasRamp(bias, self.parameters.bias_ramp_time)
-            self._live.put(bias=[*bias.values])
-        self.origin, self._keeper.problem = origin, problem
+        with self._origin(begin.origin):
+            self._ramp = BiasRamp(begin.bias, self.parameters.bias_ramp_time, begin.taken)
+            self._live.put(bias=[*begin.bias.values])
+        self.origin, self._keeper.problem = begin.origin, problem
         self._make_plan()

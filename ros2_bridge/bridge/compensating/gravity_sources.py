@@ -9,11 +9,13 @@ import math
 from typing import Final, NamedTuple, Protocol
 
 from bridge.parameters.compensation import CompensationParameters, Quaternion
-from ft_compensation.attitude.tilt import GyroscopeOffset, unidentified
+from ft_compensation.attitude.tilt import GyroscopeOffset
+from ft_compensation.bias import tilt_95
 from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
 from ft_compensation.quantities import EXACT, length
-from protocol.pdo import Sample, Vector3
+from protocol.pdo import STANDARD_GRAVITY, Sample, Vector3
 
+_POSES: Final = ((STANDARD_GRAVITY, 0.0, 0.0), (0.0, STANDARD_GRAVITY, 0.0), (0.0, 0.0, STANDARD_GRAVITY))
 IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
 
 
@@ -36,13 +38,16 @@ class Source(Protocol):
     def tilt(self) -> float | None:
         """The error of the direction that is not exceeded in 95 % of cases, rad; None if unknown."""
 
-    def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:
-        """m/s², for the sample of this CLOCK_MONOTONIC; None if what is known is too old, or nothing is.
+    def gravity(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:
+        """m/s², for this sample; None if what is known is too old, or nothing is.
 
-        `epoch_s`: by how much its CLOCK_REALTIME, which orientations of others are stamped by, is later.
+        Args:
+            sample: the next one.
+            time_s: its time by a clock that nobody sets.
+            stamp_s: its time by the wall clock, which others stamp their orientations by.
         """
 
-    def why_none(self, time_s: float) -> str:
+    def why_none(self, time_s: float, stamp_s: float) -> str:
         """The reason for None, a sentence."""
 
     def age_s(self, time_s: float) -> float:
@@ -59,11 +64,11 @@ class NoSource:
     def __init__(self, why: str = "orientation_source is none") -> None:
         self._why = why
 
-    def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:  # noqa: ARG002
+    def gravity(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """None."""
         return None
 
-    def why_none(self, time_s: float) -> str:  # noqa: ARG002
+    def why_none(self, time_s: float, stamp_s: float) -> str:  # noqa: ARG002
         """What to do."""
         return (
             f"{self._why}, so where gravity points is not known: set orientation_source to a source, or "
@@ -93,17 +98,17 @@ class AccelerometerSource:
             offset=gyroscope,
         )
         self._correct = None if p.reading == EXACT else p.reading.correct
+        # In the worst of the poses: the filter does not see it.
+        self._own_tilt = max(tilt_95(pose, p.reading) for pose in _POSES)
         self._broken = ""
 
     @property
     def tilt(self) -> float | None:
         """The bound of the estimate's tilt that holds in 95 % of cases, rad."""
-        found = self._filter.tilt_95
-        if self._correct is None:
-            found = unidentified(found)
+        found = math.hypot(self._filter.tilt_95, self._own_tilt)
         return found if math.isfinite(found) else None
 
-    def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:  # noqa: ARG002
+    def gravity(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """From this sample and those before it."""
         acceleration = sample.acceleration
         if not (any(acceleration) or any(sample.angular_rate)):
@@ -122,7 +127,7 @@ class AccelerometerSource:
             self._broken = "" if any(acceleration) else IMU_IS_OFF
         return found
 
-    def why_none(self, time_s: float) -> str:
+    def why_none(self, time_s: float, stamp_s: float) -> str:  # noqa: ARG002
         """The IMU is off or broken, it is too early, or the sensor has been accelerated for long."""
         if self._broken:
             return self._broken
@@ -154,7 +159,7 @@ class SensorSource:
     def __init__(self, parameters: CompensationParameters) -> None:
         self._turn = QuaternionGravity(parameters.gravity, stale_after_s=parameters.orientation.stale_after)
 
-    def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:  # noqa: ARG002
+    def gravity(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """From this sample's orientation."""
         if sample.orientation is not None and not self._turn.update(sample.orientation, time_s):
             # Time went back: what was known is of no use any more.
@@ -162,7 +167,7 @@ class SensorSource:
             self._turn.update(sample.orientation, time_s)
         return self._turn.gravity(time_s)
 
-    def why_none(self, time_s: float) -> str:  # noqa: ARG002
+    def why_none(self, time_s: float, stamp_s: float) -> str:  # noqa: ARG002
         """It estimates none."""
         return (
             "the sensor gives no orientation of its own: switch it on (settings.orientation_estimation), "
@@ -193,30 +198,27 @@ class ListenerSource:
         self._limit_s = parameters.orientation.stale_after
         self._turn = QuaternionGravity(parameters.gravity, stale_after_s=self._limit_s)
         self._taken: Oriented | None = None
-        self.epoch_s = 0.0
-        """By how much CLOCK_REALTIME of the latest sample is later than its CLOCK_MONOTONIC."""
         self.describe = listener.describe
 
-    def gravity(self, sample: Sample, time_s: float, epoch_s: float = 0.0) -> Vector3 | None:
+    def gravity(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:
         """From the latest orientation, if its time is close to the sample's."""
-        self.epoch_s = epoch_s
         self._turn.follow(sample.angular_rate, time_s)
         latest = self._listener.latest
         if latest is not self._taken and latest is not None:
             self._taken = latest
-            stamp_s = latest.stamp_ns * 1e-9 - epoch_s
-            if not self._turn.update(latest.quaternion, stamp_s):
+            then_s = latest.stamp_ns * 1e-9 - stamp_s + time_s
+            if not self._turn.update(latest.quaternion, then_s):
                 # The publisher's clock went back, or it is another publisher: what came last is what counts.
                 self._turn.reset()
-                self._turn.update(latest.quaternion, stamp_s)
+                self._turn.update(latest.quaternion, then_s)
         return self._turn.gravity(time_s)
 
-    def why_none(self, time_s: float) -> str:
+    def why_none(self, time_s: float, stamp_s: float) -> str:  # noqa: ARG002
         """Nothing has come, it stopped, it is of no use, or its stamps are of another time."""
         latest, name = self._listener.latest, self.describe
         if latest is None:
             return f"no orientation from {name}: {self._listener.problem}"
-        behind_s = time_s + self.epoch_s - latest.stamp_ns * 1e-9
+        behind_s = stamp_s - latest.stamp_ns * 1e-9
         if behind_s < 0:
             return (
                 f"the orientation from {name} is stamped {_seconds(-behind_s)} after the sample (limit "

@@ -7,7 +7,6 @@ from typing import Final
 from bridge.compensating.gravity_sources import (
     IMU_IS_OFF,
     AccelerometerSource,
-    ListenerSource,
     Listening,
     NoSource,
     SensorSource,
@@ -67,31 +66,32 @@ class Obstacles:
     ) -> str | None:
         """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
         if not output.has_subscribers:
-            return output.hold or self._foreseen(parameters, source, listener)
+            return output.hold or self._foreseen(parameters, output, source, listener)
         if not output.is_stopped:
             return None
         if output.is_saturated:
             return output.hold or _SATURATED
-        return output.hold or output.broken or source.why_none(output.time_s)
+        return output.hold or output.broken or source.why_none(output.time_s, output.stamp_s)
 
     def _foreseen(
-        self, parameters: CompensationParameters, source: Source, listener: Listening | None
+        self,
+        parameters: CompensationParameters,
+        output: CompensatedOutput,
+        source: Source,
+        listener: Listening | None,
     ) -> str | None:
         """The same without subscribers, as far as it can be known while no sample is compensated."""
-        sample, frame = self._watch.sample, self._watch.frame
-        time_s = 0.0 if frame is None else frame.monotonic_ns * 1e-9
+        sample, stamp_s = self._watch.sample, self._watch.stamp_ns * 1e-9
         if not parameters.payload.mass:
             return None
         if isinstance(source, NoSource):
-            return source.why_none(time_s)
-        if listener is not None and isinstance(source, ListenerSource):
+            return source.why_none(output.time_s, stamp_s)
+        if listener is not None:
             latest, limit_s = listener.latest, parameters.orientation.stale_after
-            if frame is None or (latest and abs(frame.stamp_ns - latest.stamp_ns) <= limit_s * 1e9):
-                return None
-            source.epoch_s = (frame.stamp_ns - frame.monotonic_ns) * 1e-9
-            return source.why_none(time_s)
+            fits = latest is not None and abs(stamp_s - latest.stamp_ns * 1e-9) <= limit_s
+            return None if fits or sample is None else source.why_none(output.time_s, stamp_s)
         if isinstance(source, SensorSource) and sample is not None and sample.orientation is None:
-            return source.why_none(time_s)
+            return source.why_none(output.time_s, stamp_s)
         is_off = self._link.settings.get("imu_active") == 0 or (
             sample is not None and not any(sample.acceleration)
         )

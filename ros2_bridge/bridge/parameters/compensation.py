@@ -68,6 +68,10 @@ _TABLE: Final = (
     Row("accelerometer.offset", ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
     Row("accelerometer.scale", EXACT.scale,
         "Its scale factors; ~/identify finds them", 0, 2, lengths=(3,)),
+    Row("accelerometer.offset_interval", EXACT.offset_interval,
+        "Half of the 95 % interval of its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
+    Row("accelerometer.scale_interval", EXACT.scale_interval,
+        "Half of the 95 % interval of its scale; ~/identify finds it", 0, 1, lengths=(3,)),
     Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
     Row("rest.force_spread", _REST.force_spread, "Largest standard deviation when stationary, N", 0, 1e3),
     Row("rest.torque_spread", _REST.torque_spread, "Largest standard deviation when stationary, Nm", 0, 1e3),
@@ -112,11 +116,13 @@ class AccelerometerParameters(NamedTuple):
     tilt_limit: float = 0.2
     offset: Vector3 = EXACT.offset
     scale: Vector3 = EXACT.scale
+    offset_interval: Vector3 = EXACT.offset_interval
+    scale_interval: Vector3 = EXACT.scale_interval
 
     @property
     def reading(self) -> Accelerometer:
         """The correction of its readings."""
-        return Accelerometer(self.offset, self.scale)
+        return Accelerometer(self.offset, self.scale, self.offset_interval, self.scale_interval)
 
 
 class CompensationParameters(NamedTuple):

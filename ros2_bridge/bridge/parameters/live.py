@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -13,6 +14,7 @@ from bridge.parameters.row import ParameterError
 from bridge.parameters.table import PARAMETERS, Parameters, gather_all
 
 _LIVE: Final = {row.name: row for row in PARAMETERS if row.live}
+_TYPES: Final = {type_.value for type_ in Parameter.Type}
 
 
 class LiveParameters:
@@ -28,6 +30,9 @@ class LiveParameters:
         node.add_pre_set_parameters_callback(_convert)
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._after_set)
+        for service in node.services:
+            if service.srv_type in (SetParameters, SetParametersAtomically):
+                service.callback = _refuse_unknown_types(service.callback)
 
     def put(self, **values: Any) -> None:
         """Set parameters from within; ParameterError if that is refused."""
@@ -64,12 +69,31 @@ class LiveParameters:
         )
 
 
+def _refuse_unknown_types(set_parameters: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """rclpy's callback of a service, which raises where anybody sends a type that there is not."""
+
+    def callback(request: Any, response: Any) -> Any:
+        unknown = {parameter.value.type for parameter in request.parameters} - _TYPES
+        if not unknown:
+            return set_parameters(request, response)
+        reason = f"there is no parameter type {unknown.pop()}: see rcl_interfaces/msg/ParameterType"
+        result = SetParametersResult(successful=False, reason=reason)
+        if isinstance(response, SetParameters.Response):
+            response.results = [result] * len(request.parameters)
+        else:
+            response.result = result
+        return response
+
+    return callback
+
+
 def _convert(parameters: Sequence[Parameter]) -> list[Parameter]:
     """Whole numbers as the floats that are meant: `ros2 param set /bridge tool_mass 1`."""
-    converted = []
-    for parameter in parameters:
-        row, value = _LIVE.get(parameter.name), parameter.value
-        meant = value if row is None else row.convert(value)
-        # Only if it is another: of an empty array rclpy cannot tell the type.
-        converted.append(parameter if meant is value else Parameter(parameter.name, value=meant))
-    return converted
+    return [_converted(parameter) for parameter in parameters]
+
+
+def _converted(parameter: Parameter) -> Parameter:
+    row = _LIVE.get(parameter.name)
+    value = parameter.value if row is None else row.convert(parameter.value)
+    # Only where it is another: rclpy cannot tell the type of an empty array.
+    return parameter if value is parameter.value else Parameter(parameter.name, value=value)

@@ -50,14 +50,14 @@ class RestWindow:
         self._count = 0
         self._blind: str | None = None
 
-    def add(self, sample: Sample, time_s: float, gravity: Vector3 | None) -> bool:
+    def add(self, sample: Sample, time_s: float, stamp_s: float, gravity: Vector3 | None) -> bool:
         """Take a sample, for the reader. True: the window is complete."""
         if gravity is not None:
             (x, y, z), (gx, gy, gz) = self._gravity, gravity
             self._gravity = (x + gx, y + gy, z + gz)
             self._count += 1
         elif self._blind is None:
-            self._blind = self.source.why_none(time_s)
+            self._blind = self.source.why_none(time_s, stamp_s)
         window = self._window
         # Too few samples, as of a slow sensor or a busy machine, make it longer.
         if not window.add(sample, time_s) or not (window.count >= self._fewest or window.spoiled):
@@ -136,8 +136,8 @@ class CompensatedOutput:
         """Whether the latest could not be compensated; at the start, whether for long."""
         self._begins_s = math.inf
         """Time of a subscription after which nothing was published yet, s; infinite: unknown."""
-        self.time_s = 0.0
-        """The latest sample's, CLOCK_MONOTONIC of the server: CLOCK_REALTIME may be set meanwhile."""
+        self.time_s = self.stamp_s = 0.0
+        """The latest sample's, seconds: by the server's monotonic clock, and since the Unix epoch."""
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed to any of the topics, or a window is open."""
@@ -164,21 +164,21 @@ class CompensatedOutput:
 
     def follow(self, sample: Sample, frame: DataMessage) -> None:
         """Give source, open window and filters a sample that is not published."""
-        self.time_s = time_s = frame.monotonic_ns * 1e-9
         plan = self.plan
         gravity = self._gravity(plan, sample, frame)
         if self._noting and gravity is not None and self.hold is None and not self._unusable(plan, sample):
-            stages = self._stages(plan, sample, gravity, time_s)
+            stages = self._stages(plan, sample, gravity, self.time_s)
             for topic in self._noting:
                 topic.note(*stages[topic.index], frame)
 
     def _gravity(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
         """Gravity as far as it is needed, None if it is not known; the open window takes the sample in."""
+        self.time_s, self.stamp_s = time_s, stamp_s = frame.monotonic_ns * 1e-9, frame.stamp_ns * 1e-9
         window = self.window
         gravity: Vector3 | None = ZERO
         if plan.needs_gravity or window is not None:
-            gravity = plan.source.gravity(sample, self.time_s, (frame.stamp_ns - frame.monotonic_ns) * 1e-9)
-            if window is not None and window.add(sample, self.time_s, gravity):
+            gravity = plan.source.gravity(sample, time_s, stamp_s)
+            if window is not None and window.add(sample, time_s, stamp_s, gravity):
                 self.window = None
             if not plan.needs_gravity:
                 gravity = ZERO
@@ -186,9 +186,9 @@ class CompensatedOutput:
 
     def publish(self, sample: Sample, frame: DataMessage) -> None:
         """Compensate a sample and publish its stages; nothing if gravity is needed and not known."""
-        self.time_s = time_s = frame.monotonic_ns * 1e-9
         plan = self.plan
         gravity = self._gravity(plan, sample, frame)
+        time_s = self.time_s
         self.is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
         self.broken = self._unusable(plan, sample)
         if gravity is None or self.hold is not None or self.is_saturated or self.broken is not None:

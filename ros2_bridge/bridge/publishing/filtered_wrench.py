@@ -53,6 +53,8 @@ class FilteredTopic:
         if wanted != self._designed:
             self.problem = self._design(*wanted)
             self._designed = wanted
+            if self.problem:
+                self._node.get_logger().warning(self.problem)
         return not self.problem
 
     def _design(self, settings: FilterSettings, rate_hz: float) -> str:
@@ -64,7 +66,6 @@ class FilteredTopic:
         try:
             self._filter.design(settings, rate_hz)
         except CompensationError as error:
-            self._node.get_logger().warning(f"wrench_filtered has stopped: {error}")
             return f"wrench_filtered has stopped: {error}"
         notch = f", notch {settings.notch:g} Hz" if settings.notch else ""
         self._node.get_logger().info(

@@ -43,7 +43,7 @@ class Output(Protocol):
         """The fields of `Sample` that it publishes: all of them are finite when `publish` is called."""
 
     def publish(self, sample: Sample, frame: DataMessage) -> None:
-        """Publish `sample`, which came in `frame`: its stamps."""
+        """Publish `sample`, which came in `frame`: its stamp, and for intervals its monotonic time."""
 
     def follow(self, sample: Sample, frame: DataMessage) -> None:
         """Take note of a sample that `publishing_frequency` leaves out."""

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 from rclpy.node import Node
 
 from bridge.compensating.control import CompensationControl
+from bridge.publishing.compensated_wrench import RestWindow
 from bridge.services.triggers import create_triggers
 from bridge.services.window import take_window
 from bridge.stream.requests import Requests
-from ft_compensation.bias import estimate_bias, gravity_of
+from ft_compensation.bias import Taken, estimate_bias, gravity_of, tilt_95
 from ft_compensation.quantities import NO_WRENCH, CompensationError, length, wrench_text
+from ft_compensation.stationary import StationaryMeans
+from protocol.pdo import Vector3
 
 
 class BiasServices:
@@ -24,21 +29,33 @@ class BiasServices:
         control = self._control
         window = take_window(control, self._requests, needs_gravity=control.parameters.payload.mass > 0)
         means = window.means()
-        payload, gravity = control.parameters.payload, None
+        payload = control.parameters.payload
         try:
-            acceleration = control.parameters.accelerometer.reading.correct(means.acceleration)
-            gravity = window.gravity() or gravity_of(acceleration, length(control.parameters.gravity))
-        except CompensationError:  # then the payload cannot be changed without another tare
+            gravity: Vector3 | None = self._gravity(window, means)
+        except CompensationError:
             if payload.mass:
                 raise
-        control.set_bias(estimate_bias(means, payload, gravity), "tare", gravity)
-        weight = (
-            f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
-            if payload.mass
-            else "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds "
-            "in this orientation only"
-        )
+            gravity = None  # until there is a tool_mass nobody needs it
+        control.set_bias(estimate_bias(means, payload, gravity), "tare", Taken(payload, gravity))
+        if not payload.mass or gravity is None:
+            weight = (
+                "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds in "
+                "this orientation only"
+            )
+        else:
+            weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
+            if window.source.is_accelerometer:
+                tilt = tilt_95(gravity, control.parameters.accelerometer.reading)
+                force = payload.mass * length(gravity) * tilt
+                weight += f"; gravity may be tilted by {math.degrees(tilt):.1f}° (95 %), {force:.1g} N of it"
         return self._said(f"bias of {means.samples} samples: {wrench_text(control.bias)}; {weight}")
+
+    def _gravity(self, window: RestWindow, means: StationaryMeans) -> Vector3:
+        parameters = self._control.parameters
+        if conflict := self._control.obstacles.conflict(parameters, needs_gravity=True):
+            raise CompensationError(conflict)
+        acceleration = parameters.accelerometer.reading.correct(means.acceleration)
+        return window.gravity() or gravity_of(acceleration, length(parameters.gravity))
 
     def _clear(self) -> str:
         self._control.set_bias(NO_WRENCH, "cleared")

@@ -204,7 +204,7 @@ class Reader:
                 if sample.is_finite:
                     for output in outputs.wanted:
                         output.publish(sample, frame)
-                    watch.sample, watch.frame = sample, frame
+                    watch.sample, watch.stamp_ns = sample, frame.stamp_ns
                 else:
                     self._publish_finite(sample, frame)
                 watch.ages.append(monotonic_ns() - frame.monotonic_ns)

@@ -54,8 +54,8 @@ class Watch:
         """Nanoseconds from a sample to the end of its publication, newest last."""
         self.sample: Sample | None = None
         """The newest sample that was published."""
-        self.frame: DataMessage | None = None
-        """What it came in."""
+        self.stamp_ns = 0
+        """Its time, ns since the Unix epoch."""
         self.saturated = 0
         """Samples whose force or torque was saturated."""
 

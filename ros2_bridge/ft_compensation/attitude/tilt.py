@@ -39,9 +39,8 @@ from ft_compensation.attitude.block import Block
 from ft_compensation.attitude.covariance import Array, inverse, largest
 from ft_compensation.attitude.in_motion import MotionTilt
 from ft_compensation.attitude.steadiness import Rest, Steadiness
-from ft_compensation.identification.estimation import OFFSET_PRIOR
 from ft_compensation.quantities import ZERO
-from protocol.pdo import STANDARD_GRAVITY, Vector3
+from protocol.pdo import Vector3
 
 BLOCK_S: Final = 0.05
 """Long enough for a vibration of 20 Hz to cancel out, a quarter of the shortest move."""
@@ -79,14 +78,6 @@ _MOTION: Final = 0.05**2 / BLOCK_S
 """rad²: accelerations of 0.5 m/s² that last for half a second, as equivalent white noise: f is not steady."""
 _OWN_OFFSET: Final = 0.01**2
 """rad²: tilt by an accelerometer offset of 0.1 m/s², which is not observable here."""
-
-
-def unidentified(tilt_95: float) -> float:
-    """The same bound for an accelerometer whose offset nobody has found: what identification expects."""
-    more = (OFFSET_PRIOR / STANDARD_GRAVITY) ** 2 - _OWN_OFFSET
-    return math.sqrt(tilt_95**2 + COVERS_95**2 * more)
-
-
 _ANY_LENGTH: Final = 0.5
 """Part of g by which |f| may differ from it: not in free fall or a shock."""
 _START: Final = math.radians(20.0) ** 2
@@ -173,7 +164,7 @@ class TiltFilter:
 
     @property
     def tilt_95(self) -> float:
-        """The true tilt is below this in 95 % of cases, rad, if the accelerometer was identified."""
+        """The true tilt is below this in 95 % of cases, rad."""
         return COVERS_95 * math.sqrt(largest(self._covariance) + _OWN_OFFSET)
 
     @property

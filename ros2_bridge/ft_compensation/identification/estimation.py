@@ -17,11 +17,8 @@ import numpy as np
 
 from ft_compensation.identification.student import two_sided
 from ft_compensation.identification.weighted import Array, Known, Solution, solve
+from ft_compensation.quantities import OFFSET_PRIOR, SCALE_PRIOR
 
-OFFSET_PRIOR: Final = 0.4
-"""m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered."""
-SCALE_PRIOR: Final = 0.005
-"""Likewise of an axis' sensitivity, relative; local gravity is within it."""
 _LENGTH_DEVIATION: Final = 0.002
 """m/s²: what is assumed of the length of a mean acceleration beyond offset and sensitivities, ..."""
 _LENGTH_DEGREES: Final = 6.0

@@ -33,6 +33,8 @@ def to_yaml(
     if accelerometer is not None:
         rows.append(("accelerometer.offset", accelerometer.offset, "m/s², subtracted"))
         rows.append(("accelerometer.scale", accelerometer.scale, "divided by, after that"))
+        rows.append(("accelerometer.offset_interval", accelerometer.offset_interval, "m/s², half of 95 %"))
+        rows.append(("accelerometer.scale_interval", accelerometer.scale_interval, "half of 95 %"))
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     lines += [f"{node}:", "  ros__parameters:", f"    tool_mass: {_number(payload.mass)}  # kg"]
     lines += [f"    {name}: [{', '.join(map(_number, values))}]  # {unit}" for name, values, unit in rows]

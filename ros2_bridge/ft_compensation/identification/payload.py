@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ft_compensation.identification.estimation import OFFSET_PRIOR, Value, estimate
+from ft_compensation.identification.estimation import Value, estimate
 from ft_compensation.identification.judgement import (
     ARM,
     Fit,
@@ -21,7 +21,15 @@ from ft_compensation.identification.judgement import (
 )
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
 from ft_compensation.identification.weighted import Array
-from ft_compensation.quantities import Accelerometer, CompensationError, Payload, Wrench, length
+from ft_compensation.quantities import (
+    NORMAL_95,
+    OFFSET_PRIOR,
+    Accelerometer,
+    CompensationError,
+    Payload,
+    Wrench,
+    length,
+)
 from protocol.pdo import Vector3
 
 LARGEST_MASS: Final = 500.0
@@ -52,9 +60,6 @@ class OffsetFit(NamedTuple):
     """What the poses say of the accelerometer."""
 
     calibration: Accelerometer
-    offset_interval: Vector3
-    """m/s²"""
-    scale_interval: Vector3
     undetermined: str
     """Axes whose offset the poses do not determine: "", "x", ..."""
 
@@ -169,10 +174,10 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
 def _accelerometer(offset: Value | None, scale: Value | None) -> OffsetFit | None:
     if offset is None or scale is None:
         return None
-    limit = _UNKNOWN * 1.96 * OFFSET_PRIOR
+    limit = _UNKNOWN * NORMAL_95 * OFFSET_PRIOR
     open_axes = "".join(axis for axis, half in zip("xyz", offset.half, strict=True) if half > limit)
-    calibration = Accelerometer(_triple(offset.value), _triple(scale.value))
-    return OffsetFit(calibration, _triple(offset.half), _triple(scale.half), open_axes)
+    values = offset.value, scale.value, offset.half, scale.half
+    return OffsetFit(Accelerometer(*map(_triple, values)), open_axes)
 
 
 def _condition(gravity: Array) -> float:

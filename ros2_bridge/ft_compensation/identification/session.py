@@ -76,8 +76,9 @@ def summary(result: Identified) -> str:
 
 def accelerometer_text(fit: OffsetFit) -> str:
     """Offset and sensitivities of the accelerometer with their confidence intervals, a sentence."""
-    axes = zip("xyz", fit.calibration.offset, fit.offset_interval, strict=True)
+    found = fit.calibration
+    axes = zip("xyz", found.offset, found.offset_interval, strict=True)
     offset = ", ".join(f"{axis} {value:.3f} ± {half:.3f}" for axis, value, half in axes)
-    axes = zip("xyz", fit.calibration.scale, fit.scale_interval, strict=True)
+    axes = zip("xyz", found.scale, found.scale_interval, strict=True)
     scale = ", ".join(f"{axis} {value:.4f} ± {half:.4f}" for axis, value, half in axes)
     return f"Accelerometer: offset {offset} m/s², scale {scale}"

@@ -35,6 +35,19 @@ class FilterSettings(NamedTuple):
     dead_band_torque: float = 0.0
     """Nm"""
 
+    def problems(self, rate_hz: float) -> list[str]:
+        """Why samples of this rate are too few for it, a sentence for each frequency."""
+        half = rate_hz / 2.0
+        frequencies = {"cutoff": self.cutoff} if self.cutoff else {}
+        if self.cutoff and self.notch:
+            frequencies |= {"notch": self.notch, "notch_width": self.notch_width}
+        return [
+            f"filter.{name} is {value:g} Hz, but must be below half of the sampling rate, {half:g} Hz: "
+            "lower it"
+            for name, value in frequencies.items()
+            if not value < half
+        ]
+
 
 class Coefficients(NamedTuple):
     """y[n] = b0 x[n] + b1 x[n-1] + b2 x[n-2] - a1 y[n-1] - a2 y[n-2]"""
@@ -93,20 +106,6 @@ class _Section:
         return result
 
 
-def check(settings: FilterSettings, rate_hz: float) -> None:
-    """CompensationError if samples of this rate are too few for it."""
-    half = rate_hz / 2.0
-    frequencies = {"cutoff": settings.cutoff}
-    if settings.notch:
-        frequencies |= {"notch": settings.notch, "notch_width": settings.notch_width}
-    for name, value in frequencies.items():
-        if not value < half:
-            raise CompensationError(
-                f"filter.{name} is {value:g} Hz, but must be below half of the sampling rate, "
-                f"{half:g} Hz: lower it"
-            )
-
-
 class WrenchFilter:
     """Filters every sample of a stream. `step` is for one thread; another may `design` meanwhile."""
 
@@ -122,7 +121,8 @@ class WrenchFilter:
 
     def design(self, settings: FilterSettings, rate_hz: float) -> None:
         """For samples of this rate, from the next one on. CompensationError if they are too few for it."""
-        check(settings, rate_hz)
+        for problem in settings.problems(rate_hz):
+            raise CompensationError(problem)
         designs = [low_pass(settings.cutoff, rate_hz)]
         if settings.notch:
             designs.insert(0, notch(settings.notch, settings.notch_width, rate_hz))

@@ -72,16 +72,18 @@ def costs(setup: Setup) -> Costs:
     data, decoder = list(frames()), SampleDecoder(SIZE)
     samples: list[Sample] = [decoder.decode(one) for one in data]
     step_ns = 1_000_000_000 // setup.rate_hz
+
+    def frame(number: int) -> DataMessage:
+        moment = _START_NS + number * step_ns
+        return DataMessage(number, moment, moment, 0, 0, 3, data[number % SAMPLES])
+
+    messages = [frame(number) for number in range(SAMPLES)]
     found = {"decoding": took(lambda number: decoder.decode(data[number]))}
     context = Context()
     rclpy.init(args=[], context=context)
     try:
         node = rclpy.create_node("compensation_cost", context=context)
         output = CompensatedOutput(make_stages(node, "ft"))
-
-        def frame_at(number: int) -> DataMessage:
-            now_ns = _START_NS + number * step_ns
-            return DataMessage(number, now_ns, now_ns, 0, 0, 3, b"")
 
         def measure(name: str, *, inertia: bool, window: bool) -> None:
             source = AccelerometerSource(CompensationParameters(payload=_TOOL), GyroscopeOffset())
@@ -90,9 +92,9 @@ def costs(setup: Setup) -> Costs:
             )
             output.window = RestWindow(1e9, StationaryLimits(), source) if window else None
             for number in range(-setup.rate_hz, 0):  # a second, until gravity is known
-                output.follow(samples[number % SAMPLES], frame_at(number))
+                output.follow(samples[number % SAMPLES], frame(number))
             before = output.published
-            found[name] = took(lambda number: output.publish(samples[number], frame_at(number)))
+            found[name] = took(lambda number: output.publish(samples[number], messages[number]))
             if output.published - before != SAMPLES:
                 raise DemoError(f"{name}: not all samples were compensated")
 
