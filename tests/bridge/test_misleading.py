@@ -22,15 +22,6 @@ from tests.compensation.making import TOOL
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("_ros")]
 OK, WARN, ERROR, STALE = range(4)
-TOPICS = {
-    "sensone_sensor_data",
-    "wrench",
-    "data_raw",
-    "data",
-    "temperature",
-    "wrench_compensated",
-    "wrench_filtered",
-}
 WEIGHT: dict[str, Any] = {"tool_mass": TOOL.mass, "tool_center_of_gravity": [*TOOL.center], **QUICK}
 
 
@@ -226,13 +217,3 @@ def test_frames_have_no_leading_slash(name: str) -> None:
 def test_the_array_follows_the_namespace(node: SimulatedNode) -> None:
     assert node.name.replace("bridge", "sensone_sensor_data") in node.topics
     assert node.node.resolve_topic_name("/sensone_sensor_data") not in node.topics
-
-
-def test_topics_are_reliable_and_keep_few_messages(server: SimulatedServer) -> None:
-    with SimulatedNode(server, **{"filter.cutoff": 10.0}) as node:
-        profiles = {publisher.topic: publisher.qos_profile for publisher in node.node.publishers}
-        ours = [name for name in profiles if name.rsplit("/", 1)[-1] in TOPICS]
-        assert len(ours) == len(TOPICS)
-        for name in ours:
-            assert (profiles[name].reliability.name, profiles[name].depth) == ("RELIABLE", 10), name
-            assert profiles[name].durability.name == "VOLATILE"
