@@ -55,9 +55,9 @@ thread = threading.Thread(target=run, daemon=True)
 thread.start()
 while True:
     try:
-        with connect(port) as sensor:
+        with connect(port, timeout_s=5.0) as sensor:
             assert next(iter(sensor)).force == (0, 0, 0)
-            assert not sensor.connection.receive(wait=False) or sensor.receive(0.1)
+            assert sensor.receive()
         break
     except Exception as error:
         assert "refused" in str(error), error
