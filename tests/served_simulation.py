@@ -69,14 +69,14 @@ class ServedSimulation(Simulation):
     def listen(self) -> Transport:
         return _Transport(self.clock, self.port)
 
-    def publish(self, made: Sequence[Made], now_ns: int) -> None:
-        self.hub.publish(made, now_ns)
+    def note(self, made: Sequence[Made]) -> None:
+        """Nothing is kept: it may run for long."""
 
-    def serve(self, until_ns: int) -> None:
+    def serves(self, until_ns: int, serve: Callable[[int], None]) -> None:
         self._goes_on.wait()
         while not self._todo.empty():
             self._todo.get()()
-        super().serve(until_ns)
+        super().serves(until_ns, serve)
 
     def command(self, line: str) -> str:
         """As that of `Simulation`, from another thread."""

@@ -13,17 +13,11 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
-from ethercat_server.acquisition.cycle import Cycle
-from ethercat_server.acquisition.jobs import Jobs
-from ethercat_server.acquisition.recovery import Recovery
-from ethercat_server.acquisition.start_up import bring_up
-from ethercat_server.acquisition.stream import Made, make_streams
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.doctor.bus import measurement
 from ethercat_server.doctor.bus.receiver import MESSAGE
 from ethercat_server.ethercat.backend import CheckInterrupt
@@ -35,10 +29,8 @@ from ethercat_server.links import direct
 from ethercat_server.links.remote import ServerLink
 from ethercat_server.process import realtime
 from ethercat_server.sensor import look
-from ethercat_server.sensor.others import Others
-from ethercat_server.serving.actions import Actions
+from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.sensor_actions import SensorActions
 from ethercat_server.serving.transport.in_memory import InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine, SimulatedClock
@@ -47,7 +39,7 @@ from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
 from protocol.client import Client, client
 from protocol.text.json_text import JsonObject
 from tests.memory_channel import MemoryChannel
-from tests.simulation import Asked, NoWatchdog
+from tests.simulation import Asked
 
 PATIENCE_S = 60.0
 """Simulated time that anything may take."""
@@ -140,6 +132,22 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     assert not any(bus.stats(position)["calibration_writes"] for position in range(len(options.sensors)))
 
 
+class _Hub(Hub):
+    """Keeps what it announces."""
+
+    def __init__(self, server: SimulatedServer) -> None:
+        super().__init__(server.transport, server.clock.monotonic_ns)
+        self._server = server
+
+    def serve(self, until_ns: int) -> None:
+        super().serve(until_ns)
+        self._server.served()
+
+    def broadcast(self, message: JsonObject) -> None:
+        self._server.events.append(message)
+        super().broadcast(message)
+
+
 class SimulatedServer:
     """A server that streams the sensors of a bus, while somebody waits for something from it."""
 
@@ -151,35 +159,18 @@ class SimulatedServer:
         self.clients_clock = _ServersClock(self)
         self.hangs = False
         """Whether it is stopped by somebody."""
-        ethercat = Bus(bus.backend)
-        sensors = bring_up(ethercat, Asked({"sinc_length": SINC_LENGTH}), lambda: None).sensors
-        timing = ExchangeTiming(bus.clock.now_ns)
-        self.streams = make_streams(ethercat, sensors, timing)
         self.transport = InMemoryTransport(bus.clock)
-        self.hub = Hub(self.transport, bus.clock.monotonic_ns)
-        self.recovery = Recovery(ethercat, sensors, self.streams, self._announce, Others(ethercat, ()))
-        self.jobs = Jobs(ethercat, sensors)
-        self.cycle = Cycle(
-            ethercat, sensors, self.streams, timing, self, self.recovery, self.jobs, NoWatchdog()
-        )
-        actions = SensorActions(ethercat, self.hub, self.recovery, self.jobs, sensors, self.streams)
+        self.hub = _Hub(self)
         # Here a message comes a period late, because time passes while the server serves: ages mean nothing.
-        self.hub.start(Actions(self.hub, self.cycle, actions, {"boot_id": "simulated"}).handle)
+        asked = Asked({"sinc_length": SINC_LENGTH})
+        self.server = Server(Bus(bus.backend), self.hub, asked, extra={"boot_id": "simulated"})
+        self.streams, self.cycle = self.server.streams, self.server.cycle
         self._stop_if: Callable[[], object] = lambda: False
 
-    def publish(self, made: Sequence[Made], now_ns: int) -> None:
-        """See `Outlet`."""
-        self.hub.publish(made, now_ns)
-
-    def serve(self, until_ns: int) -> None:
-        """See `Outlet`."""
-        self.hub.serve(until_ns)
+    def served(self) -> None:
+        """The hub has served its clients once."""
         if self._stop_if():
             self.cycle.stop()
-
-    def _announce(self, event: JsonObject) -> None:
-        self.events.append(event)
-        self.hub.broadcast(event)
 
     def run_until(self, condition: Callable[[], object], seconds: float = PATIENCE_S) -> bool:
         """Let it run until `condition` holds, at most for this simulated time; returns whether it does."""

@@ -20,18 +20,11 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.acquisition.cycle import Cycle
-from ethercat_server.acquisition.jobs import Jobs
-from ethercat_server.acquisition.recovery import Recovery
-from ethercat_server.acquisition.start_up import bring_up
-from ethercat_server.acquisition.stream import Made, make_streams
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.stream import Made
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.sensor.others import Others
 from ethercat_server.sensor.sensor import Identity
-from ethercat_server.serving.actions import Actions
+from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.sensor_actions import SensorActions
 from ethercat_server.serving.transport.base import Transport
 from ethercat_server.serving.transport.in_memory import InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
@@ -70,11 +63,23 @@ class Asked:
         pass
 
 
-class NoWatchdog:
-    feed_every_ns = 1 << 62
+class RecordingHub(Hub):
+    """Keeps what it hands to its clients; simulated time passes while it serves them."""
 
-    def feed(self) -> None:
-        pass
+    def __init__(self, simulation: Simulation) -> None:
+        super().__init__(simulation.listen(), simulation.clock.monotonic_ns)
+        self._simulation = simulation
+
+    def publish(self, made: Sequence[Made], now_ns: int) -> None:
+        self._simulation.note(made)
+        super().publish(made, now_ns)
+
+    def serve(self, until_ns: int) -> None:
+        self._simulation.serves(until_ns, super().serve)
+
+    def broadcast(self, message: JsonObject) -> None:
+        self._simulation.events.append(message)
+        super().broadcast(message)
 
 
 class Simulation:
@@ -93,52 +98,41 @@ class Simulation:
         self.clock = self.backend.clock
         self.started_ns = self.clock.now_ns
         self.transport = InMemoryTransport(self.clock)
-        self.hub = Hub(self.listen(), self.clock.monotonic_ns)
-        self.bus = Bus(self.backend)
-        self.sensors, slaves = bring_up(self.bus, Asked(settings, keep_unset=keep_unset), lambda: None)
-        self.others = Others(self.bus, slaves)
-        timing = ExchangeTiming(self.clock.now_ns)
-        self.streams = make_streams(self.bus, self.sensors, timing)
-        self.events: list[JsonObject] = []
-        self.recovery = Recovery(self.bus, self.sensors, self.streams, self._announce, self.others)
-        self.jobs = Jobs(self.bus, self.sensors)
-        self.cycle = Cycle(
-            self.bus, self.sensors, self.streams, timing, self, self.recovery, self.jobs, NoWatchdog()
-        )
-        actions = SensorActions(self.bus, self.hub, self.recovery, self.jobs, self.sensors, self.streams)
-        self.hub.start(Actions(self.hub, self.cycle, actions, {"others": self.others.rows}).handle)
-        self.clients: list[Client] = []
         self.frames: list[DataMessage] = []
         self.published_ns: list[int] = []
         """When each was handed out."""
+        self.events: list[JsonObject] = []
         self._decoder = FrameDecoder()
         self._awaited: Callable[[], object] = lambda: False
         self.on_serve: Callable[[int], None] = lambda _: None
+        self.hub = RecordingHub(self)
+        self.bus = Bus(self.backend)
+        self.server = Server(self.bus, self.hub, Asked(settings, keep_unset=keep_unset))
+        self.sensors, self.streams, self.others = self.server.sensors, self.server.streams, self.server.others
+        self.recovery, self.jobs, self.cycle = self.server.recovery, self.server.jobs, self.server.cycle
+        self.clients: list[Client] = []
 
     def listen(self) -> Transport:
         """Where its clients come from."""
         return self.transport
 
-    # -- what the loop hands its samples to
+    # -- what the loop hands to its clients
 
-    def publish(self, made: Sequence[Made], now_ns: int) -> None:
+    def note(self, made: Sequence[Made]) -> None:
+        """Keep the frames of an exchange."""
         for frame, _, _ in made:
             self._decoder.feed(frame)
             self._decoder.take_data(self.frames)
             self.published_ns.append(self.clock.now_ns)
-        self.hub.publish(made, now_ns)
 
-    def serve(self, until_ns: int) -> None:
+    def serves(self, until_ns: int, serve: Callable[[int], None]) -> None:
+        """Have the hub serve until then."""
         self.on_serve(until_ns)
-        self.hub.serve(until_ns)
+        serve(until_ns)
         for client in self.clients:
             client.receive()
         if self._awaited():
             self.cycle.stop()
-
-    def _announce(self, event: JsonObject) -> None:
-        self.events.append(event)
-        self.hub.broadcast(event)
 
     # -- what a test does
 

@@ -20,7 +20,7 @@ ETHERCAT: Final = {S, f"{S}.ethercat"}
 SENSOR: Final = ETHERCAT | {f"{S}.sensor"} | PROTOCOL
 ACQUISITION: Final = SENSOR | {f"{S}.acquisition"}
 SERVING: Final = ACQUISITION | {f"{S}.serving"}
-DAEMON: Final = SERVING | {f"{S}.process", f"{S}.daemon", f"{S}.virtual_sensor"}
+DAEMON: Final = SERVING | {f"{S}.server"} | {f"{S}.process", f"{S}.daemon", f"{S}.virtual_sensor"}
 LINKS: Final = ACQUISITION | {f"{S}.process", f"{S}.virtual_sensor", f"{S}.links", "protocol.client"}
 CLIENTS: Final = {"clients", "clients.recording", "protocol.client"} | PROTOCOL
 
@@ -38,6 +38,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     f"{S}.acquisition": ACQUISITION,
     f"{S}.serving": SERVING,
     f"{S}.process": {S, f"{S}.process", "protocol.errors"},
+    f"{S}.server": SERVING,
     f"{S}.daemon": DAEMON,
     # Programs beside the server.
     f"{S}.virtual_sensor": SENSOR | {f"{S}.process", f"{S}.virtual_sensor"},
@@ -140,8 +141,7 @@ def names_in(tree: ast.AST) -> set[str]:
 
 def room(module: str) -> str:
     """The room a module stands in: the longest line of the table that is its package or above it."""
-    path = MODULES[module]
-    parts = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
+    parts = module.split(".")
     while ".".join(parts) not in ROOMS:
         parts.pop()
     return ".".join(parts)

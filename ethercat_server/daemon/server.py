@@ -8,28 +8,17 @@ import logging
 import os
 from collections.abc import Sequence
 
-from ethercat_server.acquisition.cycle import Cycle
-from ethercat_server.acquisition.jobs import Jobs
-from ethercat_server.acquisition.recovery import Recovery
-from ethercat_server.acquisition.start_up import bring_up
-from ethercat_server.acquisition.stream import make_streams
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.daemon.options import ServerOptions, parse_options
 from ethercat_server.daemon.service import Policy, Service
-from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.master.soem import SoemBackend
-from ethercat_server.ethercat.nic.claim import claimed
+from ethercat_server.ethercat.open_bus import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.process.notify import Notifier
 from ethercat_server.process.privileges import User, become, user_to_become
 from ethercat_server.process.signals import Signals
-from ethercat_server.sensor.others import Others
-from ethercat_server.serving.actions import Actions
+from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.sensor_actions import SensorActions
 from ethercat_server.serving.transport.sockets import SocketTransport
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
-from protocol.control import Event, event
 
 log = logging.getLogger(__name__)
 
@@ -45,29 +34,17 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         ifname, priority = options.ifname, options.server["rt_priority"]
         if options.is_virtual:
             ifname = cleanup.enter_context(_virtual_bus(options)).ifname
-        cleanup.enter_context(claimed(ifname, allow_ip=options.allow_ip))
-        backend = SoemBackend(ifname)
-        bus = Bus(backend)
-        backend.on_emergency = bus.emergencies.note
-        cleanup.callback(bus.close)
-        backend.open()
+        bus = cleanup.enter_context(open_bus(ifname, allow_ip=options.allow_ip))
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)
         _give_up_root(user, options)
         policy.apply(hub)
-        sensors, slaves = bring_up(bus, options, signals.check)
-        timing = ExchangeTiming(bus.clock.monotonic_ns())
-        streams = make_streams(bus, sensors, timing)
-        others = Others(bus, slaves)
-        recovery, jobs = Recovery(bus, sensors, streams, hub.broadcast, others), Jobs(bus, sensors)
-        cycle = Cycle(bus, sensors, streams, timing, hub, recovery, jobs, notifier)
-        on_sensors = SensorActions(bus, hub, recovery, jobs, sensors, streams)
-        service = Service(argv, policy, hub, on_sensors, notifier)
-        cycle.every_second = service.every_second
-        signals.call(cycle.stop, service.reload)
-        hub.start(
-            Actions(hub, cycle, on_sensors, {"others": others.rows, "interface": options.ifname}).handle
+        server = Server(
+            bus, hub, options, signals.check, watchdog=notifier, extra={"interface": options.ifname}
         )
-        for sensor in sensors:
+        service = Service(argv, policy, server, notifier)
+        server.cycle.every_second = service.every_second
+        signals.call(server.stop, service.reload)
+        for sensor in server.sensors:
             log.info(
                 "sensor %d: %s, serial %d, firmware %s, %d bytes at %d Hz",
                 sensor.number, sensor.identity.name, sensor.identity.serial, sensor.identity.firmware,
@@ -79,10 +56,9 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         log.info("streaming %s on port %d", ifname, options.port)
         service.ready()
         try:
-            cycle.run()
+            server.run()
         finally:
             notifier.stopping()
-            hub.broadcast(event(Event.SHUTTING_DOWN))
         log.info("shutting down: the sensors go to INIT")
 
 

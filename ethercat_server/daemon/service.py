@@ -18,10 +18,10 @@ from ethercat_server.errors import UsageError
 from ethercat_server.process import realtime
 from ethercat_server.process.notify import Notifier
 from ethercat_server.sensor.sensor import Sensor
+from ethercat_server.server import Server
 from ethercat_server.serving.connection import Limits
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.permissions import controlling_uids, local_names
-from ethercat_server.serving.sensor_actions import SensorActions
 from protocol.errors import RequestError
 from protocol.settings import SettingValue
 
@@ -54,19 +54,17 @@ class Service:
         self,
         argv: Sequence[str] | None,
         policy: Policy,
-        hub: Hub,
-        on_sensors: SensorActions,
+        server: Server,
         notifier: Notifier,
     ) -> None:
         self._argv = argv
         self._policy = policy
-        self._hub = hub
-        self._on_sensors = on_sensors
+        self._server = server
         self._notifier = notifier
         self._fresh: Policy | UsageError | None = None
         self._reading: threading.Thread | None = None
         self._again = False
-        self._pending: list[dict[str, SettingValue]] = [{} for _ in on_sensors.sensors]
+        self._pending: list[dict[str, SettingValue]] = [{} for _ in server.sensors]
         """By number: settings that a reload could not apply; the next one tries again."""
 
     def ready(self) -> None:
@@ -101,12 +99,12 @@ class Service:
         try:
             if not isinstance(fresh, Policy):
                 raise fresh or UsageError("it cannot be read")
-            changes = [self._changes(sensor, fresh.options) for sensor in self._on_sensors.sensors]
+            changes = [self._changes(sensor, fresh.options) for sensor in self._server.sensors]
         except UsageError as error:
             log.error("reload failed, the configuration is unchanged: %s", error)
             return
         was, now = self._policy.options, fresh.options
-        fresh.apply(self._hub)
+        fresh.apply(self._server.hub)
         self._policy = fresh
         changed = [name for name in SERVER_SETTINGS if was.server[name] != now.server[name]]
         later = [f"[server] {name}" for name in changed if not SERVER_SETTINGS[name].at_once]
@@ -118,7 +116,7 @@ class Service:
         if later:
             log.warning("a change of %s requires a restart", ", ".join(later))
         try:
-            now.check_sensors({sensor.number: sensor.identity for sensor in self._on_sensors.sensors})
+            now.check_sensors({sensor.number: sensor.identity for sensor in self._server.sensors})
         except UsageError as error:
             log.warning("%s", error)  # the other sensors get their settings all the same
         for number, settings in enumerate(changes):
@@ -150,14 +148,14 @@ class Service:
                     del pending[name]
 
         try:
-            self._on_sensors.configure(number, changed, save_too=False, done=done)
+            self._server.actions.configure(number, changed, save_too=False, done=done)
         except RequestError as error:
             done(None, error)
 
     def _update_status(self) -> None:
-        sensors = self._on_sensors.sensors
+        sensors = self._server.sensors
         lost = [sensor.number for sensor in sensors if not sensor.streams]
         text = f"streaming {len(sensors) - len(lost)} of {len(sensors)} sensors"
         if lost:
             text += f", lost: {', '.join(map(str, lost))}"
-        self._notifier.status(f"{text}; {len(self._hub.connections)} clients")
+        self._notifier.status(f"{text}; {len(self._server.hub.connections)} clients")

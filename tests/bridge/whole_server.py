@@ -17,8 +17,8 @@ SLOW = {"sinc_length": 512}
 class Serving(Simulation):
     """Stops after each sample, so that the node gets it at once."""
 
-    def publish(self, made: Sequence[Made], now_ns: int) -> None:
-        super().publish(made, now_ns)
+    def note(self, made: Sequence[Made]) -> None:
+        super().note(made)
         self.cycle.stop()
 
 

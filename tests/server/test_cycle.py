@@ -150,11 +150,11 @@ def test_samples_that_pass_while_the_sensor_itself_is_held_up_are_counted(dc: st
     running.run(0.5)
     running.backend.become(Machine(late=0.01, late_ns=late_ms * 1e6))
     running.run(3.0)
-    check_lost(running, 5 * late_ms)
+    check_lost(running, 2 * late_ms)
 
 
 @pytest.mark.parametrize("dc", ["", "none"])
-@pytest.mark.parametrize("jitter_us", [200, 400, 700])
+@pytest.mark.parametrize("jitter_us", [300, 400, 700])
 @pytest.mark.parametrize("seed", [3, 1])
 def test_whatever_is_lost_is_counted_though_frames_take_long_and_unevenly(
     seed: int, jitter_us: int, dc: str
@@ -170,13 +170,13 @@ def test_polls_of_several_sensors_are_merged_where_exchanges_cost_time(
 ) -> None:
     """As they do on a real machine: without cost there is nothing to save."""
     running = Simulation(*(SensorOptions(serial=n, signal="clock", ppm=37.0 * n) for n in range(4)))
-    publish = running.publish
+    publish = running.hub.publish
 
     def busy(made: Sequence[Made], now_ns: int) -> None:
         publish(made, now_ns)
         running.clock.advance(running.clock.now_ns + 15_000 + 15_000 * len(made))
 
-    monkeypatch.setattr(running, "publish", busy)
+    monkeypatch.setattr(running.hub, "publish", busy)
     running.run(1.5)
     before = running.status()["cycles"]
     running.published_ns.clear()

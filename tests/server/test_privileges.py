@@ -20,6 +20,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
+from ethercat_server import server
 from ethercat_server.daemon import server as daemon
 from ethercat_server.errors import ServerError, StopRequestedError, UsageError
 from ethercat_server.process import privileges, realtime
@@ -89,15 +90,10 @@ def test_what_needs_root_is_done_first_and_all_before_a_frame_is_read(
 ) -> None:
     done: list[str] = []
 
-    class Backend:
-        def __init__(self, ifname: str) -> None:
-            done.append(f"made {ifname}")
-
-        def open(self) -> None:
-            done.append("opened")
-
-        def close(self) -> None:
-            pass
+    @contextlib.contextmanager
+    def open_bus(ifname: str, **_: object) -> Iterator[MagicMock]:
+        done.append(f"opened {ifname}")
+        yield MagicMock()
 
     def bring_up(*_: object) -> None:
         done.append("brought up")
@@ -106,10 +102,8 @@ def test_what_needs_root_is_done_first_and_all_before_a_frame_is_read(
     def prepare(_priority: int, _cpu: int | None, *, becomes_user: bool) -> None:
         done.append(f"prepared, becomes user: {becomes_user}")
 
-    monkeypatch.setattr(daemon, "claimed", lambda *_, **__: contextlib.nullcontext())
-    monkeypatch.setattr(daemon, "SoemBackend", Backend)
-    monkeypatch.setattr(daemon, "Bus", lambda _: MagicMock())
-    monkeypatch.setattr(daemon, "bring_up", bring_up)
+    monkeypatch.setattr(daemon, "open_bus", open_bus)
+    monkeypatch.setattr(server, "bring_up", bring_up)
     monkeypatch.setattr(realtime, "prepare", prepare)
     monkeypatch.setattr(daemon, "become", lambda user: done.append(f"became {user}"))
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
@@ -119,7 +113,7 @@ def test_what_needs_root_is_done_first_and_all_before_a_frame_is_read(
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-    assert done == ["made ens5", "opened", "prepared, becomes user: True", "became nobody", "brought up"]
+    assert done == ["opened ens5", "prepared, becomes user: True", "became nobody", "brought up"]
 
 
 # -- how

@@ -14,7 +14,6 @@ import pytest
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.daemon.service import Policy, Service
 from ethercat_server.process.notify import Notifier
-from ethercat_server.serving.sensor_actions import SensorActions
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.server.manager import WATCHDOG_US, Manager
 from tests.simulation import Simulation
@@ -34,13 +33,9 @@ class Administered:
         self._file, self._log = directory / "c.toml", caplog
         self._file.write_text("[server]\n")
         arguments = ["memory", "1", "--config", str(self._file)]
-        actions = SensorActions(
-            simulation.bus, simulation.hub, simulation.recovery,
-            simulation.jobs, simulation.sensors, simulation.streams,
-        )  # fmt: skip
         self.notifier = Notifier()
         policy = Policy(parse_options(arguments))
-        self.service = Service(arguments, policy, simulation.hub, actions, self.notifier)
+        self.service = Service(arguments, policy, simulation.server, self.notifier)
         self.client = simulation.connect()
         self.client.ask("subscribe")
         simulation.cycle._watchdog = self.notifier

@@ -1,0 +1,21 @@
+"""Opens the bus on a network interface, through pysoem."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.master.soem import SoemBackend
+from ethercat_server.ethercat.nic.claim import claimed
+
+
+@contextlib.contextmanager
+def open_bus(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
+    """The open bus on `ifname`; its sensors go to INIT at the end. Errors as `claimed`."""
+    with claimed(ifname, allow_ip=allow_ip):
+        backend = SoemBackend(ifname)
+        with contextlib.closing(Bus(backend)) as bus:
+            backend.on_emergency = bus.emergencies.note
+            backend.open()
+            yield bus

@@ -1,0 +1,88 @@
+"""The one assembly of a server: on an open bus, with a hub for its clients, it streams, answers and stops.
+
+The daemon, the private server of `ethercat-sensor` and `ethercat-doctor`, and the tests are this class.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ethercat_server.acquisition.cycle import Cycle, Watchdog
+from ethercat_server.acquisition.jobs import Jobs
+from ethercat_server.acquisition.recovery import Recovery
+from ethercat_server.acquisition.start_up import Wanted, bring_up
+from ethercat_server.acquisition.stream import make_streams
+from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.sensor.others import Others
+from ethercat_server.serving.actions import Actions
+from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.sensor_actions import SensorActions
+from protocol.control import Event, event
+
+
+class NoWatchdog:
+    """Nobody waits for a sign of life."""
+
+    feed_every_ns = 1 << 62
+
+    def feed(self) -> None:
+        """Nothing is fed."""
+
+
+class Server:
+    """Every sensor of a bus, streamed to the clients of a hub.
+
+    Attributes:
+        bus: the open bus.
+        hub: the clients.
+        sensors: by number.
+        streams: their samples, by number.
+        others: the slaves that are no sensors.
+        recovery: what brings lost sensors back.
+        jobs: what clients asked for and is under way.
+        actions: what acts on the sensors for clients, and for a reload.
+        cycle: the loop.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        hub: Hub,
+        wanted: Wanted,
+        check_interrupt: Callable[[], None] = lambda: None,
+        *,
+        watchdog: Watchdog | None = None,
+        extra: dict[str, Any] | None = None,
+    ) -> None:
+        """Take the sensors to OP with the `wanted` settings; ServerError says why one cannot be.
+
+        `check_interrupt` is called between the steps and may raise to give up; `extra` is added to the reply
+        of `describe`.
+        """
+        self.bus, self.hub = bus, hub
+        self.sensors, slaves = bring_up(bus, wanted, check_interrupt)
+        timing = ExchangeTiming(bus.clock.monotonic_ns())
+        self.streams = make_streams(bus, self.sensors, timing)
+        self.others = Others(bus, slaves)
+        self.recovery = Recovery(bus, self.sensors, self.streams, hub.broadcast, self.others)
+        self.jobs = Jobs(bus, self.sensors)
+        self.cycle = Cycle(
+            bus, self.sensors, self.streams, timing, hub, self.recovery, self.jobs, watchdog or NoWatchdog()
+        )
+        self.actions = SensorActions(bus, hub, self.recovery, self.jobs, self.sensors, self.streams)
+        hub.start(
+            Actions(hub, self.cycle, self.actions, {"others": self.others.rows, **(extra or {})}).handle
+        )
+
+    def run(self) -> None:
+        """Stream until `stop`; the clients hear of the end."""
+        try:
+            self.cycle.run()
+        finally:
+            self.hub.broadcast(event(Event.SHUTTING_DOWN))
+
+    def stop(self) -> None:
+        """End `run` soon; from any thread, and in a signal handler."""
+        self.cycle.stop()
