@@ -20,7 +20,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from ethercat_server import server
+from ethercat_server import server as assembly
 from ethercat_server.daemon import server as daemon
 from ethercat_server.errors import ServerError, StopRequestedError, UsageError
 from ethercat_server.process import privileges, realtime
@@ -103,7 +103,7 @@ def test_what_needs_root_is_done_first_and_all_before_a_frame_is_read(
         done.append(f"prepared, becomes user: {becomes_user}")
 
     monkeypatch.setattr(daemon, "open_bus", open_bus)
-    monkeypatch.setattr(server, "bring_up", bring_up)
+    monkeypatch.setattr(assembly, "bring_up", bring_up)
     monkeypatch.setattr(realtime, "prepare", prepare)
     monkeypatch.setattr(daemon, "become", lambda user: done.append(f"became {user}"))
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
