@@ -18,15 +18,16 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.doctor.bus import measurement
+from ethercat_server.access import private_server, raw, sensors
+from ethercat_server.access.sensors import Sensors
+from ethercat_server.acquisition.start_up import AsFound, Wanted
+from ethercat_server.doctor.bus import examination, measurement
 from ethercat_server.doctor.bus.receiver import MESSAGE
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
-from ethercat_server.links import direct
-from ethercat_server.links.remote import ServerLink
 from ethercat_server.process import realtime
 from ethercat_server.sensor import look
 from ethercat_server.server import Server
@@ -125,7 +126,15 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     bus = SimulatedBus(MemoryBackend(*options.slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(look, "read_image", _read_image)
-        patch.setattr(direct, "open_bus", lambda _ifname, _cleanup, **_: Bus(bus.backend))
+        for module in (raw, examination):
+            patch.setattr(module, "open_bus", lambda _ifname, **_: contextlib.closing(Bus(bus.backend)))
+
+        def private(_ifname: str, *, force: bool, allow_ip: bool) -> PrivateServer:
+            server = PrivateServer(bus, AsFound(force=force))
+            patch.setattr(Sensors, "clock", server.clients_clock)
+            return server
+
+        patch.setattr(sensors, "PrivateServer", private)
         patch.setattr(realtime, "prepare", lambda _priority, _cpu: None)
         patch.setattr(measurement, "_client", _client)
         yield bus
@@ -153,7 +162,7 @@ class SimulatedServer:
 
     address = "localhost:12001"
 
-    def __init__(self, bus: SimulatedBus) -> None:
+    def __init__(self, bus: SimulatedBus, wanted: Wanted | None = None) -> None:
         self.bus = bus
         self.events: list[JsonObject] = []
         self.clients_clock = _ServersClock(self)
@@ -162,8 +171,8 @@ class SimulatedServer:
         self.transport = InMemoryTransport(bus.clock)
         self.hub = _Hub(self)
         # Here a message comes a period late, because time passes while the server serves: ages mean nothing.
-        asked = Asked({"sinc_length": SINC_LENGTH})
-        self.server = Server(Bus(bus.backend), self.hub, asked, extra={"boot_id": "simulated"})
+        wanted = wanted or Asked({"sinc_length": SINC_LENGTH})
+        self.server = Server(Bus(bus.backend), self.hub, wanted, extra={"boot_id": "simulated"})
         self.streams, self.cycle = self.server.streams, self.server.cycle
         self._stop_if: Callable[[], object] = lambda: False
 
@@ -197,13 +206,32 @@ class SimulatedServer:
         return Client(12001, stream=False, channel=MemoryChannel(self, buffer_size=1 << 20)).connect()
 
 
+class PrivateServer(SimulatedServer):
+    """One that a program has for itself."""
+
+    error = None
+
+    def __init__(self, bus: SimulatedBus, wanted: Wanted) -> None:
+        super().__init__(bus, wanted)
+        self.channel = MemoryChannel(self, buffer_size=1 << 20)
+
+    def interrupt(self) -> None:
+        """See `PrivateServer`."""
+        self.server.jobs.interrupt(private_server.STOPPED)
+
+    def close(self) -> None:
+        """See `PrivateServer`."""
+        self.hub.close()
+        self.server.bus.close()
+
+
 @contextlib.contextmanager
 def simulated_server(bus: SimulatedBus) -> Iterator[SimulatedServer]:
     """A server that streams from `bus`, behind every address."""
     server = SimulatedServer(bus)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(client, "TcpChannel", lambda *_: MemoryChannel(server, buffer_size=1 << 20))
-        patch.setattr(ServerLink, "clock", server.clients_clock)
+        patch.setattr(Sensors, "clock", server.clients_clock)
         yield server
 
 

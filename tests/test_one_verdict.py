@@ -187,7 +187,7 @@ def doctor(stream: Stream, after: Mapping[str, Any] = STATUS) -> Said:
         ask=lambda action: {"sensors": [ROW]} if action == "describe" else next(statuses),
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(through_server, "ServerLink", lambda _: link)
+        patch.setattr(through_server.Sensors, "through", lambda _: link)
         view = ServerView(Address("localhost", 1), "server", 1.0)
     [finding] = view.sensors()
     verdict = judge(view.observation(0))

@@ -90,9 +90,16 @@ def bring_up(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Start
     found = find_sensors(bus, wanted, check_interrupt)
     for sensor in found.sensors:
         sdo = GuardedSdo(BlockingSdo(bus, sensor.number, check_interrupt))
-        if wanted.keep_unset:
-            _keep_unset(sdo, sensor)
-        finish(set_up(sdo, sensor), clock=bus.clock)
+        if isinstance(wanted, AsFound):
+            finish(read_in_force(sdo, sensor), clock=bus.clock)
+            if "sinc_length" not in sensor.wanted:
+                raise BusError(
+                    f"sensor {sensor.number} does not report its sampling rate: power it off and on"
+                )
+        else:
+            if wanted.keep_unset:
+                _keep_unset(sdo, sensor)
+            finish(set_up(sdo, sensor), clock=bus.clock)
         _tell_offset(sdo, sensor)
     check_interrupt()
     enter_op(bus, found.sensors, check_interrupt)

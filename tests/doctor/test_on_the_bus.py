@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from ethercat_server.access.holder import Holder
 from ethercat_server.doctor.bus import examination
 from ethercat_server.doctor.finding import Level
 from ethercat_server.ethercat.nic.ip import Routes
-from ethercat_server.links.holder import Holder
 from tests.doctor.made_up import but
 from tests.doctor.running import examined
 from tests.simulated_links import MESSAGE_NS, SimulatedBus, registers, simulated_bus, simulated_server

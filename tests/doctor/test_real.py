@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 
+from ethercat_server.access.holder import find_holder
 from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.machine.facts import Link, collect
 from ethercat_server.ethercat.nic.ip import Routes
-from ethercat_server.links.holder import find_holder
 from tests.doctor.running import ATTEMPTS, MODULE, STARVED, doctor, doctor_here, doctor_of_nobody, levels
 from tests.server import readable
 from tests.server.as_another_user import NOBODY
@@ -216,7 +216,7 @@ def test_another_user_sees_that_an_interface_is_in_use_but_not_by_whom(bench: Be
     """The kernel shows other users' sockets, but not whose they are."""
     become = ("setpriv", f"--reuid={NOBODY.pw_uid}", f"--regid={NOBODY.pw_gid}", "--clear-groups")
     readable.need(*become)
-    script = f"from ethercat_server.links.holder import find_holder; print(find_holder({bench[0].far!r}))"
+    script = f"from ethercat_server.access.holder import find_holder; print(find_holder({bench[0].far!r}))"
     seen = subprocess.run(
         [*readable.under(), *become, readable.PYTHON, "-c", script],
         capture_output=True,

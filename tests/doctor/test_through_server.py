@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from ethercat_server.access.holder import Holder
 from ethercat_server.doctor.bus import examination
 from ethercat_server.doctor.finding import Level
-from ethercat_server.links.holder import Holder
 from protocol.address import Address
 from tests.doctor.running import examined
 from tests.simulated_links import SINC_LENGTH, SimulatedBus, SimulatedServer, simulated_bus, simulated_server

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ethercat_server.access.adapters import promiscuity_kept
+from ethercat_server.access.holder import Holder, find_holder
 from ethercat_server.doctor import verdict
 from ethercat_server.doctor.bus import findings as on_bus
 from ethercat_server.doctor.bus import slaves
@@ -21,8 +23,7 @@ from ethercat_server.doctor.machine.machine import Machine
 from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
 from ethercat_server.ethercat.nic.ip import network_trouble
-from ethercat_server.links.holder import Holder, find_holder
-from ethercat_server.links.promiscuity import promiscuity_kept
+from ethercat_server.ethercat.open_bus import open_bus
 from protocol.address import Address
 
 if TYPE_CHECKING:
@@ -115,12 +116,11 @@ def _through_server(
 
 
 def _on_bus(machine: Machine, request: Request) -> Iterator[Finding]:
-    from ethercat_server.links.direct import open_bus  # noqa: PLC0415 - loads pysoem, which only this needs
 
     with contextlib.ExitStack() as cleanup:
         cleanup.enter_context(promiscuity_kept(machine.ifname))
         try:
-            bus = open_bus(machine.ifname, cleanup, allow_ip=machine.allow_ip)
+            bus = cleanup.enter_context(open_bus(machine.ifname, allow_ip=machine.allow_ip))
         except ServerError as error:
             yield replace(bad(str(error), ""), subject="bus", check="slaves")
             return

@@ -8,10 +8,10 @@ from itertools import groupby
 from operator import attrgetter
 from typing import Any, Final
 
+from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, warning
 from ethercat_server.doctor.verdict import age_finding, as_cause, exchange_finding, wake_finding
 from ethercat_server.errors import ServerError
-from ethercat_server.links.remote import ServerLink
 from protocol.address import Address
 from protocol.control import Event
 from protocol.framing import DataMessage
@@ -33,7 +33,7 @@ class ServerView:
     def __init__(self, address: Address, holder: str, seconds: float) -> None:
         """ServerError if it does not answer."""
         self.holder, self.address = holder, address
-        link = ServerLink(address)
+        link = Sensors.through(address)
         try:
             rows: list[dict[str, Any]] = link.ask("describe")["sensors"]
             self.before: dict[str, Any] = link.ask("status")
@@ -49,7 +49,7 @@ class ServerView:
         if not all(isinstance(row, dict) for row in rows):
             raise ServerError("the server's reply is not understood: install the same version of both")
 
-    def _take(self, link: ServerLink, frames: Sequence[DataMessage]) -> None:
+    def _take(self, link: Sensors, frames: Sequence[DataMessage]) -> None:
         now_ns = link.clock.monotonic_ns()
         for position, of_one in groupby(sorted(frames, key=_POSITION), _POSITION):
             if position < len(self._observers):
