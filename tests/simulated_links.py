@@ -21,8 +21,7 @@ import pytest
 from ethercat_server.access import private_server, raw, sensors
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.acquisition.start_up import AsFound, Wanted
-from ethercat_server.doctor.bus import examination, measurement
-from ethercat_server.doctor.bus.receiver import MESSAGE
+from ethercat_server.doctor.bus import examination
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave import registers as reg
@@ -46,8 +45,6 @@ PATIENCE_S = 60.0
 """Simulated time that anything may take."""
 SINC_LENGTH, RATE_HZ = 512, 100
 """What a server sets the sensors to: the fewer samples, the faster it is simulated."""
-MESSAGE_NS = 40_000
-"""How long a message takes to the doctor's client."""
 
 
 class SimulatedBus:
@@ -129,14 +126,13 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
         for module in (raw, examination):
             patch.setattr(module, "open_bus", lambda _ifname, **_: contextlib.closing(Bus(bus.backend)))
 
-        def private(_ifname: str, *, force: bool, allow_ip: bool) -> PrivateServer:
+        def private(_ifname: str, *, force: bool = False, **_: object) -> PrivateServer:
             server = PrivateServer(bus, AsFound(force=force))
             patch.setattr(Sensors, "clock", server.clients_clock)
             return server
 
         patch.setattr(sensors, "PrivateServer", private)
         patch.setattr(realtime, "prepare", lambda _priority, _cpu: None)
-        patch.setattr(measurement, "_client", _client)
         yield bus
     assert not any(bus.stats(position)["calibration_writes"] for position in range(len(options.sensors)))
 
@@ -210,6 +206,7 @@ class PrivateServer(SimulatedServer):
     """One that a program has for itself."""
 
     error = None
+    real_time = True
 
     def __init__(self, bus: SimulatedBus, wanted: Wanted) -> None:
         super().__init__(bus, wanted)
@@ -252,19 +249,3 @@ class _ServersClock:
     def sleep(self, seconds: float, /) -> None:
         """See `Clock`."""
         self._server.run_until(lambda: False, seconds)
-
-
-class _Receiver:
-    """Stands for the process in which the doctor's client runs."""
-
-    def __init__(self) -> None:
-        self.result: dict[int, int] = {}
-
-    def send(self, message: bytes) -> None:
-        number, _ = MESSAGE.unpack(message)
-        self.result[number] = MESSAGE_NS
-
-
-@contextlib.contextmanager
-def _client() -> Iterator[_Receiver]:
-    yield _Receiver()

@@ -7,6 +7,7 @@ as they are set, and go to INIT at the end.
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import socket
@@ -35,12 +36,22 @@ class PrivateServer:
     Attributes:
         channel: the only connection to it.
         error: what ended it, if it ended by itself.
+        real_time: whether its thread has real-time scheduling.
     """
 
     def __init__(
-        self, ifname: str, *, force: bool, allow_ip: bool, rt_priority: int = realtime.DEFAULT_PRIORITY
+        self,
+        ifname: str,
+        *,
+        force: bool = False,
+        allow_ip: bool = False,
+        rt_priority: int = realtime.DEFAULT_PRIORITY,
+        cpu: int | None = None,
     ) -> None:
-        """ServerError if a sensor cannot be brought to OP; `force` takes over a bus in use."""
+        """ServerError if a sensor cannot be brought to OP; `force` takes over a bus in use.
+
+        `rt_priority` and `cpu` are as the server's.
+        """
         with contextlib.ExitStack() as cleanup:
             bus = cleanup.enter_context(open_interface(ifname, allow_ip=allow_ip))
             own, servers = socket.socketpair()
@@ -50,7 +61,8 @@ class PrivateServer:
             self.channel = _PairChannel(own)
             self.error: Exception | None = None
             self._server = Server(bus, hub, AsFound(force=force), extra={"interface": ifname})
-            self._rt_priority = rt_priority
+            self._rt_priority, self._cpu = rt_priority, cpu
+            self.real_time = False
             self._cleanup = cleanup.pop_all()
         self._thread = threading.Thread(target=self._run, name="server", daemon=True)
         self._thread.start()
@@ -64,12 +76,15 @@ class PrivateServer:
         self._server.stop()
         self._thread.join(_END_S)
         self._cleanup.close()
+        gc.unfreeze()
+        gc.enable()
 
     def _run(self) -> None:
         # Python handles signals in the main thread; they must interrupt its system calls.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
         try:
-            realtime.prepare(self._rt_priority, None)
+            realtime.prepare(self._rt_priority, self._cpu)
+            self.real_time = os.sched_getscheduler(0) == os.SCHED_FIFO
             self._server.run()
         except Exception as error:  # noqa: BLE001 - for the main thread, which finds the connection closed
             self.error = error

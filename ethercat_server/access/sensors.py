@@ -102,10 +102,10 @@ class Sensors:
             raise ServerError(f"the program at {address} is not an ethercat-server: check the port") from None
 
     @classmethod
-    def on_interface(cls, ifname: str, *, force: bool, allow_ip: bool) -> Sensors:
-        """Those on an interface that no server uses, set as they are."""
+    def on_interface(cls, ifname: str, **options: Any) -> Sensors:
+        """Those on an interface that no server uses, set as they are; see `PrivateServer`."""
         used = f"the interface {ifname}"
-        private = PrivateServer(ifname, force=force, allow_ip=allow_ip)
+        private = PrivateServer(ifname, **options)
         try:
             client = Client(0, stream=False, raw=True, reconnect=False, channel=private.channel)
             return cls(client.connect(), used, used, private)
@@ -231,6 +231,11 @@ class Sensors:
                 if not settled.take(frame, frame.sensor in settling):
                     return
             settling = later
+
+    @property
+    def real_time(self) -> bool:
+        """Whether a server of this process's own has real-time scheduling."""
+        return self._private is not None and self._private.real_time
 
     @property
     def same_machine(self) -> bool:
