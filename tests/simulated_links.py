@@ -29,17 +29,13 @@ from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
 from ethercat_server.process import realtime
 from ethercat_server.sensor import look
-from ethercat_server.server import Server
-from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.transport.in_memory import InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
-from ethercat_server.simulation.machine import Machine, SimulatedClock
+from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
 from protocol.client import Client, client
-from protocol.text.json_text import JsonObject
 from tests.memory_channel import MemoryChannel
-from tests.simulation import Asked
+from tests.simulation import Simulation
 
 PATIENCE_S = 60.0
 """Simulated time that anything may take."""
@@ -137,67 +133,28 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     assert not any(bus.stats(position)["calibration_writes"] for position in range(len(options.sensors)))
 
 
-class _Hub(Hub):
-    """Keeps what it announces."""
-
-    def __init__(self, server: SimulatedServer) -> None:
-        super().__init__(server.transport, server.clock.monotonic_ns)
-        self._server = server
-
-    def serve(self, until_ns: int) -> None:
-        super().serve(until_ns)
-        self._server.served()
-
-    def broadcast(self, message: JsonObject) -> None:
-        self._server.events.append(message)
-        super().broadcast(message)
-
-
-class SimulatedServer:
+class SimulatedServer(Simulation):
     """A server that streams the sensors of a bus, while somebody waits for something from it."""
 
     address = "localhost:12001"
 
     def __init__(self, bus: SimulatedBus, wanted: Wanted | None = None) -> None:
-        self.bus = bus
-        self.events: list[JsonObject] = []
+        # Here a message comes a period late, because time passes while the server serves: ages mean nothing.
+        super().__init__(
+            backend=bus.backend, settings={"sinc_length": SINC_LENGTH}, wanted=wanted, boot_id="simulated"
+        )
         self.clients_clock = _ServersClock(self)
         self.hangs = False
         """Whether it is stopped by somebody."""
-        self.transport = InMemoryTransport(bus.clock)
-        self.hub = _Hub(self)
-        # Here a message comes a period late, because time passes while the server serves: ages mean nothing.
-        wanted = wanted or Asked({"sinc_length": SINC_LENGTH})
-        self.server = Server(Bus(bus.backend), self.hub, wanted, extra={"boot_id": "simulated"})
-        self.streams, self.cycle = self.server.streams, self.server.cycle
-        self._stop_if: Callable[[], object] = lambda: False
-
-    def served(self) -> None:
-        """The hub has served its clients once."""
-        if self._stop_if():
-            self.cycle.stop()
-
-    def run_until(self, condition: Callable[[], object], seconds: float = PATIENCE_S) -> bool:
-        """Let it run until `condition` holds, at most for this simulated time; returns whether it does."""
-        until_ns = self.bus.clock.now_ns + round(seconds * 1e9)
-        if self.hangs:
-            self.bus.clock.sleep(seconds)
-        elif not condition() and seconds > 0:
-            self._stop_if = lambda: condition() or self.bus.clock.now_ns >= until_ns
-            self.cycle.stopping = False
-            self.cycle.run()
-        return bool(condition())
-
-    @property
-    def clock(self) -> SimulatedClock:
-        """The bus's."""
-        return self.bus.clock
 
     def go_on(self, until: Callable[[], object], seconds: float) -> None:
         """See `memory_channel.Server`."""
-        self.run_until(until, seconds)
+        if self.hangs:
+            self.clock.sleep(seconds)
+        else:
+            super().go_on(until, seconds)
 
-    def connect(self) -> Client:
+    def client(self) -> Client:
         """A client for this test's own requests."""
         return Client(12001, stream=False, channel=MemoryChannel(self, buffer_size=1 << 20)).connect()
 
@@ -215,11 +172,6 @@ class PrivateServer(SimulatedServer):
     def interrupt(self) -> None:
         """See `PrivateServer`."""
         self.server.jobs.interrupt(private_server.STOPPED)
-
-    def close(self) -> None:
-        """See `PrivateServer`."""
-        self.hub.close()
-        self.server.bus.close()
 
 
 @contextlib.contextmanager
@@ -240,12 +192,12 @@ class _ServersClock:
 
     def monotonic_ns(self) -> int:
         """See `Clock`."""
-        return self._server.bus.clock.monotonic_ns()
+        return self._server.clock.monotonic_ns()
 
     def time_ns(self) -> int:
         """See `Clock`."""
-        return self._server.bus.clock.time_ns()
+        return self._server.clock.time_ns()
 
     def sleep(self, seconds: float, /) -> None:
         """See `Clock`."""
-        self._server.run_until(lambda: False, seconds)
+        self._server.go_on(lambda: False, seconds)
