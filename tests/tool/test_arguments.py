@@ -155,17 +155,6 @@ def test_a_snapshot_that_cannot_be_written_is_said_before_the_sensor_is_read(fil
     assert said in one_sentence(tool_here("snapshot", "ens5", file, code=1))
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [[], ["colour"], ["objects", "--colour"], ["watch", "a", "b"], ["watch", "a", "--seconds", "-1"]],
-)
-def test_what_argparse_finds_is_exit_code_2(arguments: list[str]) -> None:
-    assert "usage: ethercat-sensor" in tool_here(*arguments, code=2).err
-    assert (
-        tool_here(*arguments, "--json", code=2).json["error"] in tool_here(*arguments, "--json", code=2).err
-    )
-
-
 def test_help_names_every_command_and_the_exit_codes() -> None:
     shown = tool_here("--help").out
     for name in (
