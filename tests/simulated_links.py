@@ -22,13 +22,14 @@ from ethercat_server.doctor.bus import measurement
 from ethercat_server.doctor.bus.receiver import MESSAGE
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.datagrams import ByPosition
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.coe import finish
-from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
+from ethercat_server.ethercat.slave.sii import read_sii
 from ethercat_server.links import direct
 from ethercat_server.links.remote import ServerLink
 from ethercat_server.process import realtime
-from ethercat_server.sensor import look
+from ethercat_server.sensor import scan
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.transport.in_memory import InMemoryTransport
@@ -96,7 +97,7 @@ class SimulatedBus:
         return [(row["index"], row["subindex"], row["hex"]) for row in self.stats(position)["sdo_writes"]]
 
 
-_READ_IMAGE = look.read_image
+_READ_IMAGE = scan.read_image
 
 
 def _read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda: None) -> bytes:
@@ -124,7 +125,7 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     options = options_from(build_parser().parse_args(["lo", *map(str, arguments)]))
     bus = SimulatedBus(MemoryBackend(*options.slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(look, "read_image", _read_image)
+        patch.setattr(scan, "read_image", _read_image)
         patch.setattr(direct, "open_bus", lambda _ifname, _cleanup, **_: Bus(bus.backend))
         patch.setattr(realtime, "prepare", lambda _priority, _cpu: None)
         patch.setattr(measurement, "_client", _client)

@@ -9,19 +9,34 @@ from __future__ import annotations
 import functools
 import struct
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend
+from ethercat_server.ethercat.clock import Clock
 from ethercat_server.ethercat.late_answers import LateAnswers
 from ethercat_server.ethercat.wire import FIRST_DATA, SHORTEST_FRAME, Command, build, is_answer
 
+# SOEM uses the indices below, and the exchange of process data those from `process_data.FIRST_INDEX` on.
 FIRST_INDEX: Final = 0x80
-"""SOEM uses the indices below, and the exchange of process data those from `process_data.FIRST_INDEX` on."""
 _INDICES: Final = 0x10
 _TIMEOUT_S: Final = 0.02
 _REGISTER_ATTEMPTS: Final = 20
 _U16: Final = struct.Struct("<H")
+
+
+class Registers(Protocol):
+    """How registers and mailboxes of slaves are reached: by number, as on a `Bus`, or `ByPosition`."""
+
+    @property
+    def clock(self) -> Clock:
+        """The time that passes meanwhile."""
+
+    def read_register(self, number: int, address: int, size: int, /) -> bytes | None:
+        """None if the slave did not do it."""
+
+    def write_register(self, number: int, address: int, data: bytes, /) -> bool:
+        """False if the slave did not do it."""
 
 
 class Datagrams:
@@ -133,3 +148,11 @@ class Datagrams:
                 return _U16.unpack_from(answer, end)[0], answer[FIRST_DATA:end]
             self._late.note(answer)
         return None
+
+
+class ByPosition:
+    """The registers of slaves that have no station address, in place of those of a `Bus`."""
+
+    def __init__(self, bus: Datagrams) -> None:
+        self.clock = bus.clock
+        self.read_register, self.write_register = bus.read_at, bus.write_at

@@ -16,13 +16,12 @@ from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.errors import BusError, ServerError, UsageError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.mailbox.mailbox import Mailbox
+from ethercat_server.ethercat.datagrams import ByPosition
 from ethercat_server.ethercat.master.soem import SoemBackend
 from ethercat_server.ethercat.nic.claim import claimed
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.ethercat.slave.coe import BlockingSdo, MailboxSdo, Sdo, Steps, finish
-from ethercat_server.ethercat.slave.sii import ByPosition
+from ethercat_server.ethercat.slave.coe import MailboxSdo, Sdo, Steps, finish
 from ethercat_server.links.link import (
     Found,
     Link,
@@ -34,11 +33,10 @@ from ethercat_server.links.link import (
 )
 from ethercat_server.process import realtime
 from ethercat_server.process.notify import Notifier
-from ethercat_server.sensor import look
+from ethercat_server.sensor import scan
 from ethercat_server.sensor.configuration import Change, save
 from ethercat_server.sensor.guard import GuardedSdo
-from ethercat_server.sensor.others import Others
-from ethercat_server.sensor.scan import look_safely
+from ethercat_server.sensor.scan import OtherSlaves, look_safely
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.sensor.set_up import set_up
 from ethercat_server.sensor.tare import LATER, tare
@@ -61,7 +59,6 @@ def open_bus(ifname: str, cleanup: contextlib.ExitStack, *, allow_ip: bool = Fal
     cleanup.enter_context(claimed(ifname, allow_ip=allow_ip))
     backend = SoemBackend(ifname)
     bus = Bus(backend)
-    backend.on_emergency = bus.emergencies.note
     cleanup.callback(bus.close)
     backend.open()
     return bus
@@ -75,7 +72,7 @@ def read_images(
     images: dict[int, bytes | BusError] = {}
     for slave in look_safely(bus, _no_check, force=force):
         try:
-            images[slave.position] = look.read_image(bus, slave.position)
+            images[slave.position] = scan.read_image(bus, slave.position)
         except BusError as error:
             images[slave.position] = error
     return images
@@ -107,7 +104,7 @@ class DirectLink(Link):
 
     def sdo(self, number: int) -> GuardedSdo:
         """See `Link`."""
-        return self._slave or GuardedSdo(BlockingSdo(self._bus, number))
+        return self._slave or GuardedSdo(self._bus.slaves[number].sdo)
 
     def configure(self, number: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """See `Link`."""
@@ -163,7 +160,7 @@ class _Running:
         self._clock = bus.clock
         timing = ExchangeTiming(bus.clock.monotonic_ns())
         self.streams = make_streams(bus, sensors, timing)
-        self.recovery = Recovery(bus, sensors, self.streams, lambda _: None, Others(bus, ()))
+        self.recovery = Recovery(bus, sensors, self.streams, lambda _: None, OtherSlaves(bus, ()))
         self.on_idle: Callable[[], bool] = lambda: True
         self._jobs = Jobs(bus, sensors)
         self._cycle = Cycle(bus, sensors, self.streams, timing, self, self.recovery, self._jobs, Notifier())
@@ -294,7 +291,7 @@ def _find_slave(bus: Bus, wanted: str) -> tuple[Found, GuardedSdo]:
         )
     rows = bus.read_surely_at(slave.position, reg.SYNC_MANAGER, 2 * reg.SYNC_MANAGER_SIZE)
     out, back = struct.unpack_from("<HH", rows), struct.unpack_from("<HH", rows, reg.SYNC_MANAGER_SIZE)
-    sdo = GuardedSdo(MailboxSdo(Mailbox(ByPosition(bus), slave.position, (out, back))))
+    sdo = GuardedSdo(MailboxSdo(ByPosition(bus), slave.position, (out, back)))
     serial = slave.sii["serial"] if slave.sii else 0
     return Found(slave.position, Identity(slave.name, serial, "", ""), "slave"), sdo
 

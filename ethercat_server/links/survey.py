@@ -11,8 +11,7 @@ from ethercat_server.links import direct
 from ethercat_server.links.holder import Holder, find_holder
 from ethercat_server.links.interfaces import is_local, kind, open_routes
 from ethercat_server.links.promiscuity import promiscuity_kept
-from ethercat_server.sensor.look import Slave
-from ethercat_server.sensor.scan import look_safely
+from ethercat_server.sensor.scan import Slave, look_safely
 
 _IFF_UP, _IFF_LOOPBACK = 0x1, 0x8
 _ETHERNET: Final = 1

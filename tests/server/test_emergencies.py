@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from ethercat_server.ethercat.mailbox.emergency import ERROR_CLASSES, Emergency
+from ethercat_server.ethercat.slave.emergencies import ERROR_CLASSES, Emergency
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions

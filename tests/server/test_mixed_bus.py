@@ -161,7 +161,7 @@ def test_addresses_that_others_answer_to_are_not_taken() -> None:
     assert Exchange(bus)() == 3, "no FMMU of another answers to it"
     taken = [range(start, start + size) for image in (before[0], before[2]) for start, size in fmmus(image)]
     assert taken
-    (own, _), *_ = fmmus(bytes(reg.FMMU) + bus.fmmus[0])
+    (own, _), *_ = fmmus(registers(backend)[1])
     assert not any(own in area for area in taken)
 
 

@@ -10,7 +10,6 @@ import pytest
 from ethercat_server.errors import SdoAbortError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.mailbox.mailbox import Mailbox
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, T, finish
 from ethercat_server.ethercat.slave.registers import MAILBOX_IN_STATUS
 
@@ -48,7 +47,7 @@ def run(bus: GivenBus, steps: Steps[T]) -> T:
 
 
 def mailbox(bus: GivenBus) -> MailboxSdo:
-    return MailboxSdo(Mailbox(cast(Bus, bus), 0, MAILBOXES))
+    return MailboxSdo(cast(Bus, bus), 0, MAILBOXES)
 
 
 def test_a_read_leaves_the_late_answer_to_a_repeated_write_alone() -> None:

@@ -10,7 +10,7 @@ from ethercat_server.ethercat.nic.ip import network_trouble
 from ethercat_server.links.remote import ServerLink
 from ethercat_server.links.survey import Adapter, adapters, look_on
 from ethercat_server.process.command_line import FAILED
-from ethercat_server.sensor.look import NoSlaveError
+from ethercat_server.sensor.scan import NoSlaveError
 from ethercat_server.tool.command import DONE, Command
 from ethercat_server.tool.show import columns, say, say_json
 
