@@ -18,36 +18,30 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.doctor.bus import measurement
-from ethercat_server.doctor.bus.receiver import MESSAGE
+from ethercat_server.access import private_server, raw, sensors
+from ethercat_server.access.sensors import Sensors
+from ethercat_server.acquisition.start_up import AsFound, Wanted
+from ethercat_server.doctor.bus import examination
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import ByPosition
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import read_sii
-from ethercat_server.links import direct
-from ethercat_server.links.remote import ServerLink
 from ethercat_server.process import realtime
 from ethercat_server.sensor import scan
-from ethercat_server.server import Server
-from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.transport.in_memory import InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
-from ethercat_server.simulation.machine import Machine, SimulatedClock
+from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
 from protocol.client import Client, client
-from protocol.text.json_text import JsonObject
 from tests.memory_channel import MemoryChannel
-from tests.simulation import Asked
+from tests.simulation import Simulation
 
 PATIENCE_S = 60.0
 """Simulated time that anything may take."""
 SINC_LENGTH, RATE_HZ = 512, 100
 """What a server sets the sensors to: the fewer samples, the faster it is simulated."""
-MESSAGE_NS = 40_000
-"""How long a message takes to the doctor's client."""
 
 
 class SimulatedBus:
@@ -126,76 +120,59 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     bus = SimulatedBus(MemoryBackend(*options.slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scan, "read_image", _read_image)
-        patch.setattr(direct, "open_bus", lambda _ifname, _cleanup, **_: Bus(bus.backend))
+        for module in (raw, examination):
+            patch.setattr(module, "open_bus", lambda _ifname, **_: contextlib.closing(Bus(bus.backend)))
+
+        def private(_ifname: str, *, force: bool = False, **_: object) -> PrivateServer:
+            server = PrivateServer(bus, AsFound(force=force))
+            patch.setattr(Sensors, "clock", server.clients_clock)
+            return server
+
+        patch.setattr(sensors, "PrivateServer", private)
         patch.setattr(realtime, "prepare", lambda _priority, _cpu: None)
-        patch.setattr(measurement, "_client", _client)
         yield bus
     assert not any(bus.stats(position)["calibration_writes"] for position in range(len(options.sensors)))
 
 
-class _Hub(Hub):
-    """Keeps what it announces."""
-
-    def __init__(self, server: SimulatedServer) -> None:
-        super().__init__(server.transport, server.clock.monotonic_ns)
-        self._server = server
-
-    def serve(self, until_ns: int) -> None:
-        super().serve(until_ns)
-        self._server.served()
-
-    def broadcast(self, message: JsonObject) -> None:
-        self._server.events.append(message)
-        super().broadcast(message)
-
-
-class SimulatedServer:
+class SimulatedServer(Simulation):
     """A server that streams the sensors of a bus, while somebody waits for something from it."""
 
     address = "localhost:12001"
 
-    def __init__(self, bus: SimulatedBus) -> None:
-        self.bus = bus
-        self.events: list[JsonObject] = []
+    def __init__(self, bus: SimulatedBus, wanted: Wanted | None = None) -> None:
+        # Here a message comes a period late, because time passes while the server serves: ages mean nothing.
+        super().__init__(
+            backend=bus.backend, settings={"sinc_length": SINC_LENGTH}, wanted=wanted, boot_id="simulated"
+        )
         self.clients_clock = _ServersClock(self)
         self.hangs = False
         """Whether it is stopped by somebody."""
-        self.transport = InMemoryTransport(bus.clock)
-        self.hub = _Hub(self)
-        # Here a message comes a period late, because time passes while the server serves: ages mean nothing.
-        asked = Asked({"sinc_length": SINC_LENGTH})
-        self.server = Server(Bus(bus.backend), self.hub, asked, extra={"boot_id": "simulated"})
-        self.streams, self.cycle = self.server.streams, self.server.cycle
-        self._stop_if: Callable[[], object] = lambda: False
-
-    def served(self) -> None:
-        """The hub has served its clients once."""
-        if self._stop_if():
-            self.cycle.stop()
-
-    def run_until(self, condition: Callable[[], object], seconds: float = PATIENCE_S) -> bool:
-        """Let it run until `condition` holds, at most for this simulated time; returns whether it does."""
-        until_ns = self.bus.clock.now_ns + round(seconds * 1e9)
-        if self.hangs:
-            self.bus.clock.sleep(seconds)
-        elif not condition() and seconds > 0:
-            self._stop_if = lambda: condition() or self.bus.clock.now_ns >= until_ns
-            self.cycle.stopping = False
-            self.cycle.run()
-        return bool(condition())
-
-    @property
-    def clock(self) -> SimulatedClock:
-        """The bus's."""
-        return self.bus.clock
 
     def go_on(self, until: Callable[[], object], seconds: float) -> None:
         """See `memory_channel.Server`."""
-        self.run_until(until, seconds)
+        if self.hangs:
+            self.clock.sleep(seconds)
+        else:
+            super().go_on(until, seconds)
 
-    def connect(self) -> Client:
+    def client(self) -> Client:
         """A client for this test's own requests."""
         return Client(12001, stream=False, channel=MemoryChannel(self, buffer_size=1 << 20)).connect()
+
+
+class PrivateServer(SimulatedServer):
+    """One that a program has for itself."""
+
+    error = None
+    real_time = True
+
+    def __init__(self, bus: SimulatedBus, wanted: Wanted) -> None:
+        super().__init__(bus, wanted)
+        self.channel = MemoryChannel(self, buffer_size=1 << 20)
+
+    def interrupt(self) -> None:
+        """See `PrivateServer`."""
+        self.server.jobs.interrupt(private_server.STOPPED)
 
 
 @contextlib.contextmanager
@@ -204,7 +181,7 @@ def simulated_server(bus: SimulatedBus) -> Iterator[SimulatedServer]:
     server = SimulatedServer(bus)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(client, "TcpChannel", lambda *_: MemoryChannel(server, buffer_size=1 << 20))
-        patch.setattr(ServerLink, "clock", server.clients_clock)
+        patch.setattr(Sensors, "clock", server.clients_clock)
         yield server
 
 
@@ -216,28 +193,12 @@ class _ServersClock:
 
     def monotonic_ns(self) -> int:
         """See `Clock`."""
-        return self._server.bus.clock.monotonic_ns()
+        return self._server.clock.monotonic_ns()
 
     def time_ns(self) -> int:
         """See `Clock`."""
-        return self._server.bus.clock.time_ns()
+        return self._server.clock.time_ns()
 
     def sleep(self, seconds: float, /) -> None:
         """See `Clock`."""
-        self._server.run_until(lambda: False, seconds)
-
-
-class _Receiver:
-    """Stands for the process in which the doctor's client runs."""
-
-    def __init__(self) -> None:
-        self.result: dict[int, int] = {}
-
-    def send(self, message: bytes) -> None:
-        number, _ = MESSAGE.unpack(message)
-        self.result[number] = MESSAGE_NS
-
-
-@contextlib.contextmanager
-def _client() -> Iterator[_Receiver]:
-    yield _Receiver()
+        self._server.go_on(lambda: False, seconds)

@@ -20,6 +20,7 @@ from typing import Any
 
 import pytest
 
+from ethercat_server.acquisition.start_up import Wanted
 from ethercat_server.acquisition.stream import Made
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.sensor import Identity
@@ -91,7 +92,8 @@ class Simulation:
         machine: Machine | None = None,
         settings: Mapping[str, SettingValue] = {},
         backend: MemoryBackend | None = None,
-        keep_unset: bool = False,
+        wanted: Wanted | None = None,
+        **extra: object,
     ) -> None:
         """`backend` is that of a simulation before, for a server that is started again."""
         self.backend = backend or MemoryBackend(*sensors, machine=machine)
@@ -107,7 +109,7 @@ class Simulation:
         self.on_serve: Callable[[int], None] = lambda _: None
         self.hub = RecordingHub(self)
         self.bus = Bus(self.backend)
-        self.server = Server(self.bus, self.hub, Asked(settings, keep_unset=keep_unset))
+        self.server = Server(self.bus, self.hub, wanted or Asked(settings), extra=extra)
         self.sensors, self.streams, self.others = self.server.sensors, self.server.streams, self.server.others
         self.recovery, self.jobs, self.cycle = self.server.recovery, self.server.jobs, self.server.cycle
         self.clients: list[Client] = []

@@ -21,7 +21,7 @@ SENSOR: Final = ETHERCAT | {f"{S}.sensor"} | PROTOCOL
 ACQUISITION: Final = SENSOR | {f"{S}.acquisition"}
 SERVING: Final = ACQUISITION | {f"{S}.serving"}
 DAEMON: Final = SERVING | {f"{S}.server"} | {f"{S}.process", f"{S}.daemon", f"{S}.virtual_sensor"}
-LINKS: Final = ACQUISITION | {f"{S}.process", f"{S}.virtual_sensor", f"{S}.links", "protocol.client"}
+ACCESS: Final = (DAEMON - {f"{S}.daemon"}) | {f"{S}.access", "protocol.client"}
 CLIENTS: Final = {"clients", "clients.recording", "protocol.client"} | PROTOCOL
 
 ROOMS: Final[dict[str, set[str]]] = {
@@ -43,9 +43,9 @@ ROOMS: Final[dict[str, set[str]]] = {
     # Programs beside the server.
     f"{S}.virtual_sensor": SENSOR | {f"{S}.process", f"{S}.virtual_sensor"},
     f"{S}.simulation": SENSOR | {f"{S}.virtual_sensor", f"{S}.simulation"},
-    f"{S}.links": LINKS,
-    f"{S}.tool": LINKS | {f"{S}.daemon", f"{S}.tool"},
-    f"{S}.doctor": LINKS | {f"{S}.daemon", f"{S}.doctor"},
+    f"{S}.access": ACCESS,
+    f"{S}.tool": ACCESS | {f"{S}.daemon", f"{S}.tool"},
+    f"{S}.doctor": ACCESS | {f"{S}.daemon", f"{S}.doctor"},
     # ROS 2.
     "ft_compensation": {"ft_compensation"} | PROTOCOL,
     "bridge": {"bridge", "ft_compensation", "protocol.client"} | PROTOCOL,
@@ -218,9 +218,3 @@ def test_what_needs_no_ros_loads_none(part: str) -> None:
         if is_below(name, part):
             ros = {found for found in reached(name) if PACKAGES.get(found.split(".")[0]) == {"bridge"}}
             assert not ros, name
-
-
-def test_every_room_says_what_lives_there() -> None:
-    for name, path in MODULES.items():
-        if path.name == "__init__.py":
-            assert ast.get_docstring(tree(path)), name

@@ -25,11 +25,10 @@ from clients.monitor.view.table import table
 from clients.monitor.view.table import verdict as monitor_verdict
 from clients.report.examine import examine
 from clients.report.page.page import as_json
-from ethercat_server.doctor.bus import through_server
-from ethercat_server.doctor.bus.through_server import ServerView
+from ethercat_server.access.sensors import Sensors
+from ethercat_server.doctor.bus.server_view import ServerView
 from ethercat_server.doctor.finding import Level as Found
 from protocol.accounting import NOT_NEW
-from protocol.address import Address
 from protocol.framing import DataFlag, DataMessage
 from protocol.health.judge import Observation, judge
 from protocol.health.limits import LIMITS
@@ -186,9 +185,7 @@ def doctor(stream: Stream, after: Mapping[str, Any] = STATUS) -> Said:
         clock=clock, listen=listen, same_machine=True, close=lambda: None,
         ask=lambda action: {"sensors": [ROW]} if action == "describe" else next(statuses),
     )  # fmt: skip
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(through_server, "ServerLink", lambda _: link)
-        view = ServerView(Address("localhost", 1), "server", 1.0)
+    view = ServerView(cast(Sensors, link), 1.0, own=False)
     [finding] = view.sensors()
     verdict = judge(view.observation(0))
     assert finding.values["verdict"] == verdict.level.key

@@ -59,7 +59,7 @@ def interrupted(name: str, number: int, at: str, arguments: str) -> tuple[int, s
     ("name", "module", "arguments"),
     [
         ("ethercat-sensor", "argparse", "--help"),
-        ("ethercat-sensor", "ethercat_server.links.reach", "--help"),
+        ("ethercat-sensor", "ethercat_server.access.sensors", "--help"),
         ("ethercat-doctor", "ethercat_server.daemon.options", "--help"),
         ("ethercat-virtual-sensor", "argparse", "--help"),
         ("ethercat-identify", "clients.program", "--help"),

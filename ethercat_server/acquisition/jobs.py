@@ -50,6 +50,7 @@ class Jobs:
         self._stepped_ns = 0
         self.waiting = 0
         """Jobs that are not done."""
+        self._interrupted: BusError | None = None
 
     def start(
         self,
@@ -72,6 +73,10 @@ class Jobs:
             )
         self._queues[number].append(_Job(steps, done, changes))
         self.waiting += 1
+
+    def interrupt(self, error: BusError) -> None:
+        """Raise `error` in the job that is under way, if there is one; from any thread."""
+        self._interrupted = error
 
     def is_changing(self, number: int) -> bool:
         """Whether a job that changes the sensor `number` is under way or waits."""
@@ -100,7 +105,11 @@ class Jobs:
         error: RequestError | None = None
         try:
             if self._sensors[number].streams:
-                next(steps)
+                if (interrupted := self._interrupted) is None:
+                    next(steps)
+                else:
+                    self._interrupted = None
+                    steps.throw(interrupted)
                 return
             steps.throw(CutOffError(f"sensor {number} {_AWAY}"))
             raise CutOffError(f"sensor {number} {_AWAY}")

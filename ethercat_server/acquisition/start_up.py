@@ -89,10 +89,7 @@ def bring_up(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Start
     found = find_sensors(bus, wanted, check_interrupt)
     for sensor in found.sensors:
         sdo = GuardedSdo(bus.slaves[sensor.number].sdo)
-        if wanted.keep_unset:
-            finish(_keep_unset(sdo, sensor), clock=bus.clock, check_interrupt=check_interrupt)
-        finish(set_up(sdo, sensor), clock=bus.clock, check_interrupt=check_interrupt)
-        finish(_log_offset(sdo, sensor), clock=bus.clock, check_interrupt=check_interrupt)
+        finish(_prepare(sdo, sensor, wanted), clock=bus.clock, check_interrupt=check_interrupt)
     enter_op(bus, found.sensors, check_interrupt)
     return found
 
@@ -161,6 +158,19 @@ def _try_again(attempt: Callable[[bool], T]) -> T:
     return attempt(True)
 
 
+def _prepare(sdo: Sdo, sensor: Sensor, wanted: Wanted) -> Steps[None]:
+    """In PREOP: write what is wanted, or only read what is in force."""
+    if isinstance(wanted, AsFound):
+        yield from read_in_force(sdo, sensor)
+        if "sinc_length" not in sensor.wanted:
+            raise BusError(f"sensor {sensor.number} does not report its sampling rate: power it off and on")
+    else:
+        if wanted.keep_unset:
+            yield from _keep_unset(sdo, sensor)
+        yield from set_up(sdo, sensor)
+    yield from _note_offset(sdo, sensor)
+
+
 def _keep_unset(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     """Want what the sensor has where nobody asked for anything; BusError if the two are inconsistent."""
     asked = dict(sensor.wanted)
@@ -180,7 +190,7 @@ def _keep_unset(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     log.info("sensor %d keeps what nobody set: %s", sensor.number, ", ".join(texts) or "the defaults")
 
 
-def _log_offset(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+def _note_offset(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     """A tare of before, saved or not, is in all samples: it is to be known, and to outlive a power cut."""
     try:
         offset = sensor.offset = yield from read_offset(sdo)

@@ -1,4 +1,4 @@
-"""Findings from measured latencies, of the doctor or of a running server."""
+"""Findings from the latencies that a server has measured."""
 
 from __future__ import annotations
 
@@ -7,18 +7,16 @@ from dataclasses import replace
 from typing import Any, Final
 
 from ethercat_server.acquisition.health.round_trip import SLOW_US, cost
-from ethercat_server.doctor.bus.measurement import PERIOD_NS, Measured, summary_us
-from ethercat_server.doctor.finding import Finding, Level, bad, cannot_look, note, ok, skipped, warning
+from ethercat_server.doctor.finding import Finding, Level, bad, note, ok, warning
 from protocol.health.limits import LIMITS
 
-_PERIOD_US: Final = PERIOD_NS / 1000
+_PERIOD_US: Final = 1250.0
+"""The sample period at the factory setting, 800 Hz."""
 _WAKE_NOTE_US: Final = 100
 _WAKE_WARNING_US: Final = 250
 _EXCHANGE_NOTE_US: Final = 250
-_MESSAGE_NOTE_US: Final = 500
 _MANY: Final = 0.001
 """Fraction of all cycles above which late or lost ones are `bad`."""
-FORMULA: Final = "age = max(0, margin + lateness - its median + (exchange - its mean) / 2) + exchange / 2"
 _STEADIER: Final = "see 'A steadier cycle' in docs/operations.md"
 
 
@@ -28,32 +26,17 @@ def points(summary: Mapping[str, Any]) -> str:
     return ", ".join(f"{text} {float(summary[name]):.0f}" for name, text in names.items()) + " µs"
 
 
-def scheduling(measured: Measured) -> Iterator[Finding]:
+def scheduling(priority: int, *, real_time: bool) -> Iterator[Finding]:
     """Scheduling of the loop."""
-    if measured.real_time:
-        yield ok(f"SCHED_FIFO {measured.priority}", real_time=True)
-    elif not measured.priority:
+    if real_time:
+        yield ok(f"SCHED_FIFO {priority}", real_time=True)
+    elif not priority:
         yield note("ordinary scheduling, as requested", "other programs preempt it", real_time=False)
     else:
         why = (
             "real-time priority was not granted, so other programs preempt it: run with sudo, or as a service"
         )
         yield note("ordinary scheduling", why, real_time=False)
-
-
-def wake_ups(measured: Measured) -> Iterator[Finding]:
-    """Lateness of wake-ups."""
-    if not measured.late:
-        cannot_look("nothing was measured")
-    summary = summary_us(measured.late)
-    late = sum(value > PERIOD_NS for value in measured.late)
-    yield _as_measured(measured, wake_finding(summary, late, len(measured.late)))
-
-
-def _as_measured(measured: Measured, finding: Finding) -> Finding:
-    """Without the scheduling that a server has it says how this user's programs fare, and no more."""
-    denied = measured.priority and not measured.real_time
-    return replace(finding, level=min(finding.level, Level.NOTE)) if denied else finding
 
 
 def wake_finding(summary: Mapping[str, Any], late: int, count: int) -> Finding:
@@ -76,25 +59,9 @@ def wake_finding(summary: Mapping[str, Any], late: int, count: int) -> Finding:
     return ok(text, **values)
 
 
-def exchanges(measured: Measured, size: int) -> Iterator[Finding]:
-    """Duration of exchanges."""
-    whole = [value for value in measured.exchanges if value >= 0]
-    if not whole:
-        if not measured.exchanges:
-            cannot_look("no access to the bus")
-        yield bad(
-            f"none of {len(measured.exchanges)} frames was answered by all slaves",
-            "check cable and power",
-            lost=measured.lost,
-        )
-        return
-    summary = summary_us(whole)
-    text = f"{points(summary)} for frames with {size} bytes of data"
-    yield exchange_finding(text, summary, measured.lost, len(measured.exchanges))
-
-
-def exchange_finding(text: str, summary: Mapping[str, Any], lost: int, count: int) -> Finding:
+def exchange_finding(when: str, summary: Mapping[str, Any], lost: int, count: int) -> Finding:
     """The finding for a summary: `lost` of `count` exchanges did not come back."""
+    text = f"{points(summary)}{when}"
     values: dict[str, Any] = {**summary, "exchanges": count, "lost": lost}
     if lost:
         make = bad if lost > _MANY * count else warning
@@ -106,35 +73,6 @@ def exchange_finding(text: str, summary: Mapping[str, Any], lost: int, count: in
     if summary["p99"] > _EXCHANGE_NOTE_US:
         return note(text, "network card, driver or load: see coalescing, interrupts", **values)
     return ok(text, **values)
-
-
-def messages(measured: Measured) -> Iterator[Finding]:
-    """Latency of a message to a client with ordinary scheduling."""
-    if not measured.messages:
-        cannot_look("no message was received: is the loopback interface up?")
-    summary = summary_us(list(measured.messages.values()))
-    text = f"{points(summary)} to a client on this machine"
-    missing = len(measured.late) - len(measured.messages)
-    if summary["p99"] > _MESSAGE_NOTE_US or missing:
-        why = "clients have ordinary scheduling, so other programs preempt them: reduce the load"
-        yield _as_measured(measured, _by_age(summary["p99"])(text, why, missing=missing, **summary))
-    else:
-        yield ok(text, missing=missing, **summary)
-
-
-def age(measured: Measured) -> Iterator[Finding]:
-    """Expected age of samples when the server sends them, and at a client."""
-    handed_out, arrived = measured.ages()
-    if not handed_out:
-        yield skipped("it requires exchanges on the bus")
-        return
-    yield age_finding(
-        "expected when sent",
-        summary_us(handed_out),
-        f"{FORMULA}; margin {measured.margin_ns() / 1000:.0f} µs",
-    )
-    if arrived:
-        yield age_finding("expected at a local client", summary_us(arrived), "the same + message")
 
 
 def age_finding(what: str, summary: Mapping[str, Any], how: str) -> Finding:

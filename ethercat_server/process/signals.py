@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 from ethercat_server.errors import StopRequestedError
@@ -35,3 +36,27 @@ class Signals:
         self._received = True
         if self._stop is not None:
             self._stop()
+
+
+@contextlib.contextmanager
+def signals_held_back() -> Iterator[None]:
+    """Defer SIGINT and SIGTERM during a change."""
+    signals = {signal.SIGINT, signal.SIGTERM}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def signals_call(handle: Callable[[], None]) -> Iterator[None]:
+    """SIGINT and SIGTERM only call `handle`."""
+    before = {
+        number: signal.signal(number, lambda *_: handle()) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

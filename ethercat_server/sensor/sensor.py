@@ -33,6 +33,22 @@ class Identity(NamedTuple):
         return f"{self.name} with serial {self.serial}"
 
 
+class Found(NamedTuple):
+    """A sensor that was found, or the foreign slave that was asked for."""
+
+    number: int
+    identity: Identity
+    what: str = "sensor"
+
+    def __str__(self) -> str:
+        """Its description in messages."""
+        return f"{self.what} {self.number}: {self.identity.name}, serial {self.identity.serial}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Its JSON form."""
+        return {self.what: self.number, **self.identity._asdict()}
+
+
 class SensorState(Enum):
     """What a sensor is doing. It is in exactly one of these; `Sensor.enter` goes to another."""
 

@@ -7,9 +7,8 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
+from ethercat_server.access.sensors import Sensors, open_sensors
 from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
-from ethercat_server.links.link import Link
-from ethercat_server.links.reach import open_link
 from protocol.program.server_choice import HELP
 
 DONE: Final = 0
@@ -27,7 +26,7 @@ class Command(NamedTuple):
     """Returns the exit code; raises ServerError."""
 
 
-def add_link_arguments(
+def add_sensor_arguments(
     parser: argparse.ArgumentParser, *, all_if_none: bool = False, take_over: bool = True
 ) -> None:
     """IFACE or --server, and --sensor; `--force` to take over a bus in use, unless it has another meaning."""
@@ -55,10 +54,8 @@ def add_link_arguments(
 
 
 @contextlib.contextmanager
-def link(args: argparse.Namespace, *, slave: str | None = None) -> Iterator[Link]:
-    """The link given by the arguments (see `open_link`); closed at the end."""
-    opened = open_link(args.iface, args.server, slave=slave, force=args.take_over, allow_ip=args.allow_ip)
-    try:
-        yield opened
-    finally:
-        opened.close()
+def sensors_of(args: argparse.Namespace) -> Iterator[Sensors]:
+    """The sensors given by the arguments (see `open_sensors`); closed at the end."""
+    found = open_sensors(args.iface, args.server, force=args.take_over, allow_ip=args.allow_ip)
+    with contextlib.closing(found):
+        yield found

@@ -7,7 +7,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from ethercat_server.links.link import Found, Link
+from ethercat_server.access.sensors import Sensors
+from ethercat_server.sensor.sensor import Found
 from protocol.text.json_text import finite
 
 
@@ -17,10 +18,10 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
-def report(as_json: bool, link: Link, found: Found, values: dict[str, Any], *lines: str) -> None:
+def report(as_json: bool, opened: Sensors, found: Found, values: dict[str, Any], *lines: str) -> None:
     """The result for one sensor: a JSON object with `values`, or the sensor's name and `lines`."""
     if as_json:
-        say_json({"through": link.used, **found.as_json(), **values})
+        say_json({"through": opened.used, **found.as_json(), **values})
     else:
         say("\n".join([str(found), *lines]))
 

@@ -11,7 +11,7 @@ from clients.monitor import options as monitor
 from clients.record import options as record
 from clients.replay import options as replay
 from clients.report import options as report
-from ethercat_server.links import reach
+from ethercat_server.access import sensors
 from protocol.program.server_choice import default_server, is_address, own_server
 
 Read = Callable[[list[str]], tuple[str, str]]
@@ -153,5 +153,5 @@ def test_a_wrong_file_is_named(
 def test_the_tool_without_an_interface_asks_the_server(
     iface: str | None, server: str | None, reached: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reach, "ServerLink", str)
-    assert str(reach.find_server(iface, server)) == reached
+    monkeypatch.setattr(sensors.Sensors, "through", str)
+    assert str(sensors.find_server(iface, server)) == reached

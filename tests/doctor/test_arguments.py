@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 
@@ -59,15 +58,14 @@ def test_no_such_interface_is_a_finding_and_the_machine_is_looked_at() -> None:
     there = {(row["subject"], row["check"]) for row in ended.json["findings"]}
     assert {(c.subject, c.name) for c in CHECKS if c.subject in {"kernel", "rights", "processors"}} <= there
     assert "there is no such interface" in ended.findings("bus")["slaves"]["found"]
-    assert ended.findings("measurement")["wake-ups"]["values"]["wake_ups"] > 0
-    assert ended.findings("measurement")["exchanges"]["level"] == "skipped"
+    assert ended.findings("measurement")["all"]["level"] == "skipped"
 
 
 def test_the_loopback_interface_is_no_place_for_a_sensor() -> None:
     ended = doctor_here("lo", "--seconds", 0)
     assert ended.code == 1
     assert "the loopback interface" in ended.out
-    assert "not checked: disabled by --seconds 0" in ended.out
+    assert "not checked: the bus is not accessed" in ended.out
     _, _, end = ended.out.partition("\nTrouble: 1 bad, ")
     assert end.splitlines()[1] == "  bad      interface, link: the loopback interface"
     assert "flush" not in ended.out, "the machine needs its addresses"
@@ -89,21 +87,6 @@ def test_reader_that_has_enough() -> None:
     assert piped.wait(timeout=PATIENCE_S) == 1
     assert piped.stderr.read() == ""
     piped.stderr.close()
-
-
-def test_stopped_while_it_measures() -> None:
-    running = subprocess.Popen(
-        [sys.executable, "-m", MODULE, "nosuch0", "--seconds", "600"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert running.stdout is not None
-    while "no such interface" not in (line := running.stdout.readline()):
-        assert line, running.communicate()
-    running.send_signal(signal.SIGTERM)
-    _, err = running.communicate(timeout=PATIENCE_S)
-    assert (running.returncode, err) == (1, "ethercat-doctor: stopped\n")
 
 
 def test_json_says_on_what_and_how_long() -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from ethercat_server.access.holder import Holder
 from ethercat_server.doctor.bus import examination
 from ethercat_server.doctor.finding import Level
-from ethercat_server.links.holder import Holder
 from protocol.address import Address
 from tests.doctor.running import examined
 from tests.simulated_links import SINC_LENGTH, SimulatedBus, SimulatedServer, simulated_bus, simulated_server
@@ -32,7 +32,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
 
 def test_its_figures_and_clients_instead_of_the_bus(bench: Bench, tmp_path: Path) -> None:
     bus, server = bench
-    assert server.connect().ask("subscribe")["ok"]
+    assert server.client().ask("subscribe")["ok"]
     findings = examined(bus, tmp_path, 1.0)
     found = findings.of("server")
     assert set(found) == {"server", "sensors", "wake-ups", "exchanges", "age of data", "clients"}
@@ -61,7 +61,7 @@ def test_without_measuring_it_does_not_wait(bench: Bench, tmp_path: Path) -> Non
 def test_losses_show(bench: Bench, tmp_path: Path) -> None:
     bus, server = bench
     bus.command("power cycle 0.2 @1")
-    assert server.run_until(lambda: [event["event"] for event in server.events][-1:] == ["sensor_back"])
+    server.run_until(lambda: [event["event"] for event in server.events][-1:] == ["sensor_back"], "the event")
     before, after = (finding for finding in examined(bus, tmp_path, 0.5) if finding.check == "sensors")
     assert after.level > Level.OK
     assert (before.values["recoveries"], after.values["recoveries"]) == (0, 1)
@@ -79,7 +79,7 @@ def test_losses_while_it_looks_are_told(bench: Bench, tmp_path: Path) -> None:
 def test_a_lost_sensor_is_bad(bench: Bench, tmp_path: Path) -> None:
     bus, server = bench
     bus.command("power off @1")
-    assert server.run_until(lambda: server.events)
+    server.run_until(lambda: server.events, "the event")
     found = examined(bus, tmp_path, 0.5)
     assert found.worst is Level.BAD
     sensor = found.of("server")["sensors"]

@@ -6,6 +6,7 @@ import pytest
 
 from ethercat_server.errors import BusError
 from tests.server.bench import Bench
+from tests.simulation import Asked
 
 
 def test_the_next_one_finds_the_sensor_in_op_after_one_that_was_killed() -> None:
@@ -71,7 +72,7 @@ def test_what_nobody_set_is_kept_if_that_is_asked_for_and_outlives_a_power_cut(
     saved: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
-    bench = Bench(backend=saved.simulation.backend, settings={"fir": False}, keep_unset=True)
+    bench = Bench(backend=saved.simulation.backend, wanted=Asked({"fir": False}, keep_unset=True))
     assert in_force(bench) == (51, False, 1003)
     assert "sensor 0 keeps what nobody set: sinc_length = 51" in caplog.text
     assert "nobody set fir" not in caplog.text
@@ -85,10 +86,10 @@ def test_what_nobody_set_is_kept_if_that_is_asked_for_and_outlives_a_power_cut(
 def test_kept_settings_that_contradict_those_set_end_the_start(saved: Bench) -> None:
     backend = Bench(backend=saved.simulation.backend).start_again().simulation.backend
     with pytest.raises(BusError, match="contradict those set: fast is true but fir is false"):
-        Bench(backend=backend, settings={"fast": True}, keep_unset=True)
+        Bench(backend=backend, wanted=Asked({"fast": True}, keep_unset=True))
 
 
 def test_a_fresh_sensor_has_nothing_to_keep_but_the_defaults(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    assert in_force(Bench(keep_unset=True)) == (64, False, 800)
+    assert in_force(Bench(wanted=Asked(keep_unset=True))) == (64, False, 800)
     assert "sensor 0 keeps what nobody set: the defaults" in caplog.text

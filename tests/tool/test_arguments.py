@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from ethercat_server.access import holder
+from ethercat_server.access.holder import find_holder
 from ethercat_server.errors import ForbiddenWriteError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.slave.coe import Steps, finish
-from ethercat_server.links import holder
-from ethercat_server.links.holder import find_holder
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
 from ethercat_server.tool.snapshot_file import RESTORABLE
@@ -55,7 +55,8 @@ def test_the_guard_lets_no_write_of_the_factory_calibration_through() -> None:
 
 def test_all_that_can_write_is_behind_the_guard() -> None:
     unguarded = {"MailboxSdo", "_ServerSdo", "sdo"}
-    for path in (ROOT / "ethercat_server" / "tool").glob("*.py"):
+    server = ROOT / "ethercat_server"
+    for path in [*(server / "tool").rglob("*.py"), *(server / "access").glob("*.py")]:
         tree = ast.parse(path.read_text())
         inside = {
             id(call)
@@ -66,8 +67,8 @@ def test_all_that_can_write_is_behind_the_guard() -> None:
         for call in ast.walk(tree):
             if not isinstance(call, ast.Call) or _name(call) not in unguarded:
                 continue
-            is_links = _name(call) == "sdo" and "recovery" not in ast.unparse(call.func)
-            assert is_links or id(call) in inside, f"{path.name}: {ast.unparse(call)}"
+            is_guarded = _name(call) == "sdo" and "recovery" not in ast.unparse(call.func)
+            assert is_guarded or id(call) in inside, f"{path.name}: {ast.unparse(call)}"
         assert "sdo_write(" not in path.read_text(), path
     assert not [row for row in RESTORABLE if row.index in {FACTORY_CALIBRATION, 0x7000, 0x8030}]
 

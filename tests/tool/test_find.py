@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import pytest
 
+from ethercat_server.access import raw
+from ethercat_server.access.adapters import Adapter
+from ethercat_server.access.holder import Holder
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.nic.ip import Routes
-from ethercat_server.links import direct, survey
-from ethercat_server.links.holder import Holder
-from ethercat_server.links.survey import Adapter
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.tool.commands import find
 from protocol.address import Address
@@ -24,7 +24,7 @@ from tests.tool.running import tool_here
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedBus]:
     """Two sensors behind whatever is opened."""
-    monkeypatch.setattr(survey, "promiscuity_kept", lambda _: contextlib.nullcontext())
+    monkeypatch.setattr(raw, "promiscuity_kept", lambda _: contextlib.nullcontext())
     with simulated_bus("--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", "--serial", "10,20") as bus:
         yield bus
 
@@ -75,7 +75,7 @@ def test_what_is_no_candidate_is_not_even_opened(
     def fail(*_: object, **__: object) -> None:
         pytest.fail("it was opened")
 
-    monkeypatch.setattr(direct, "open_bus", fail)
+    monkeypatch.setattr(raw, "open_bus", fail)
     row = found(monkeypatch, adapter, code=1)["x"]
     assert why in str(row["found"])
     assert not row["looked"]
@@ -88,14 +88,14 @@ def test_other_interfaces_without_a_sensor_are_told_apart(
     empty.command("power off")
     buses = {"empty": empty, "foreign": foreign, "at_work": at_work, "ens5": bench.backend}
 
-    def open_bus(ifname: str, *_: object, **__: object) -> Bus:
+    def open_bus(ifname: str, **_: object) -> contextlib.closing[Bus]:
         if ifname == "denied":
             raise InterfaceError("not allowed to open denied: CAP_NET_RAW missing; run with sudo")
-        return Bus(buses[ifname])
+        return contextlib.closing(Bus(buses[ifname]))
 
     before = registers(at_work)
     with monkeypatch.context() as patch:  # undone before that of the bench
-        patch.setattr(direct, "open_bus", open_bus)
+        patch.setattr(raw, "open_bus", open_bus)
         rows = found(monkeypatch, *(Adapter(name) for name in (*buses, "denied")))
     assert rows["empty"]["found"] == "no EtherCAT slave answers"
     assert rows["foreign"]["found"] == "another EtherCAT slave"

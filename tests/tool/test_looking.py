@@ -17,7 +17,7 @@ from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, NOTE_NAMES
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.tool.cli import COMMANDS
 from tests.simulated_links import SimulatedBus, registers, simulated_bus
-from tests.tool.odd_firmware import FOREIGN_VENDOR, foreign, no_mailbox
+from tests.tool.odd_firmware import FOREIGN_VENDOR, fewer_objects, foreign, no_mailbox
 from tests.tool.running import complaints, one_sentence, tool_here
 
 
@@ -79,16 +79,17 @@ def test_every_object_is_read_and_decoded(bench: SimulatedBus) -> None:
     )
 
 
-def test_objects_that_cannot_be_read_have_a_line_with_the_reason(bench: SimulatedBus) -> None:
+def test_objects_that_cannot_be_read_have_a_line_with_the_reason(
+    bench: SimulatedBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
     near = bench.near
-    bench.command("abort 0x8010 4 0x06020000")
+    fewer_objects(monkeypatch)
     bench.command("abort 0x8002 1 0x08000021")
     lines = tool_here("objects", near).out.splitlines()
     missing = next(line for line in lines if "0x8010:4" in line)
-    assert "this firmware does not have it (abort 0x06020000)" in missing
+    assert "this firmware does not have it (abort 0x06090011)" in missing
     assert "refused" in next(line for line in lines if "0x8002:1" in line)
     assert any("Sampling rate" in line and "800" in line for line in lines)
-    bench.command("abort 0x8010 4 0x06020000")
     alone = tool_here("read", near, "0x8010:4", code=1)
     assert "this firmware does not have it" in alone.out + alone.err
 
@@ -185,7 +186,7 @@ def test_watch_gives_si_units_rate_and_warnings() -> None:
 
 
 def test_watch_counts_the_samples_that_the_bus_lost(chain: SimulatedBus) -> None:
-    chain.at(0.5, "deaf 0.02")
+    chain.at(1.2, "deaf 0.02")
     ended = tool_here("watch", chain.near, "--seconds", 0.9, "--interval", 10, "--json")
     assert [json.loads(line)["gaps"] for line in ended.out.splitlines()] == [1, 1]
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from ethercat_server.links.survey import adapters
+from ethercat_server.access.adapters import adapters
 from ethercat_server.tool.commands import find
 from tests.server.commands import stats, written
 from tests.server.running import (

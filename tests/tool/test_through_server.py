@@ -51,7 +51,7 @@ def test_the_eeprom_is_read_while_the_server_streams(bench: Bench) -> None:
     assert [row["sync_managers"][3]["size"] for row in found] == [77, 77]
     assert "\n000e: 14|00|00|00\n" in tool_here("eeprom", *SERVER, "--sensor", "20").out
     assert server.events == []
-    rows = server.connect().ask("status")["sensors"]
+    rows = server.client().ask("status")["sensors"]
     assert all(row["fresh"] > 20 for row in rows)
     assert [(row["lost_samples"], row["recoveries"]) for row in rows] == [(0, 0), (0, 0)]
 
@@ -95,7 +95,7 @@ def test_plan_apply_save(bench: Bench) -> None:
     assert "nothing to change" in tool_here("plan", *asked).out
     tool_here("save", "--sensor", 1, *SERVER)
     assert ("0x8030", 1, "01") in bus.written(1)
-    assert [row["rate_hz"] for row in server.connect().ask("describe")["sensors"]] == [RATE_HZ, 400]
+    assert [row["rate_hz"] for row in server.client().ask("describe")["sensors"]] == [RATE_HZ, 400]
 
 
 def test_what_is_said_to_last_outlasts_the_sensors_power(bench: Bench) -> None:
@@ -104,10 +104,10 @@ def test_what_is_said_to_last_outlasts_the_sensors_power(bench: Bench) -> None:
     assert applied.splitlines()[-1].startswith("in force until the server is started again, also after")
     tared = tool_here("tare", "--sensor", 0, "--samples", 20, *SERVER).out
     assert "in force while the server runs, then until the sensor is powered off" in tared
-    before = server.connect().ask("describe")["sensors"][0]
+    before = server.client().ask("describe")["sensors"][0]
     bus.power_cycle()
-    assert server.run_until(lambda: any(event["event"] == "sensor_back" for event in server.events))
-    after = server.connect().ask("describe")["sensors"][0]
+    server.run_until(lambda: any(event["event"] == "sensor_back" for event in server.events), "the event")
+    after = server.client().ask("describe")["sensors"][0]
     assert (after["settings"]["sinc_length"], after["offset"]) == (128, before["offset"])
     assert any(after["offset"])
     assert "nothing to change" in tool_here("plan", "--sensor", 0, "--set", "sinc_length=128", *SERVER).out
@@ -127,12 +127,12 @@ def test_apply_that_fails_half_way_takes_everything_back(
 
 def test_what_the_sensor_lacks_or_contradicts_itself_changes_nothing(bench: Bench) -> None:
     bus, server = bench
-    before = server.connect().ask("describe")["sensors"][0]["settings"]
+    before = server.client().ask("describe")["sensors"][0]["settings"]
     asked = ("--sensor", 0, *SERVER, "--set", "temperature_compensation=on")
     bus.command("abort 0x8010 4 0x06020000")
     missing = tool_here("apply", *asked, "--set", "coordinate_system=on", code=1)
     assert "has no setting coordinate_system" in one_sentence(missing)
-    assert server.connect().ask("describe")["sensors"][0]["settings"] == before
+    assert server.client().ask("describe")["sensors"][0]["settings"] == before
     refused = tool_here("apply", *asked, "--set", "fast=on", code=2)
     assert "fast is true but fir is false" in one_sentence(refused)
 
@@ -149,7 +149,7 @@ def test_a_tare_that_is_stopped_tells_what_came_of_it(bench: Bench) -> None:
     bus.at(1.0, lambda: signal.raise_signal(signal.SIGINT))
     tared = tool_here("tare", "--samples", 200, "--sensor", 0, "--json", *SERVER)
     assert "continues the tare: waiting for its result" in tared.err
-    held = server.connect().ask("sdo_read", sensor=0, index=0x8000, subindex=1, type="f32")["value"]
+    held = server.client().ask("sdo_read", sensor=0, index=0x8000, subindex=1, type="f32")["value"]
     assert tared.json["new_offset"][0] == held == -1.5
 
 
@@ -164,7 +164,7 @@ def test_a_tare_that_is_stopped_twice_is_left_to_the_server(bench: Bench) -> Non
 def test_a_sensor_that_is_out_does_not_hide_the_other(bench: Bench) -> None:
     bus, server = bench
     bus.command("power off @1")
-    assert server.run_until(lambda: [event["event"] for event in server.events] == ["sensor_lost"])
+    server.run_until(lambda: [event["event"] for event in server.events] == ["sensor_lost"], "the event")
     found = tool_here("eeprom", *SERVER, "--sensor", 0, "--json").json
     assert found["slaves"][0]["serial"] == 10
     tool_here("eeprom", *SERVER, "--sensor", 10)

@@ -1,38 +1,33 @@
-"""Checks of the bus, and the measurement; or the figures of a server that uses the interface."""
+"""Checks of the bus, and what a server measures on it: the one that uses it, or the doctor's own."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+from ethercat_server.access.adapters import promiscuity_kept
+from ethercat_server.access.holder import Holder, find_holder
+from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor import verdict
 from ethercat_server.doctor.bus import findings as on_bus
 from ethercat_server.doctor.bus import slaves
-from ethercat_server.doctor.bus.measurement import Exchange, Measured, measure
-from ethercat_server.doctor.bus.through_server import ServerView
+from ethercat_server.doctor.bus.server_view import ServerView
 from ethercat_server.doctor.examination import examine
-from ethercat_server.doctor.finding import CannotLookError, Finding, bad, cannot_look, skipped
+from ethercat_server.doctor.finding import CannotLookError, Finding, bad, cannot_look, ok, skipped
 from ethercat_server.doctor.machine import nic
 from ethercat_server.doctor.machine.facts import read_counters
 from ethercat_server.doctor.machine.machine import Machine
 from ethercat_server.errors import ServerError
-from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
 from ethercat_server.ethercat.nic.ip import network_trouble
-from ethercat_server.links.holder import Holder, find_holder
-from ethercat_server.links.promiscuity import promiscuity_kept
+from ethercat_server.ethercat.open_bus import open_bus
 from protocol.address import Address
 
 if TYPE_CHECKING:
     from ethercat_server.ethercat.bus import Bus
 
-_PROCESS_DATA_SIZE: Final = 62
-"""Bytes of a sensor's outputs and its usual inputs."""
-_LONGEST_PROBE: Final = 256
-"""Registers up to here can be read without side effects."""
-_EXCHANGE_TIMEOUT_S: Final = 0.01
 _NET_ADMIN, _NET_RAW = 12, 13
 
 
@@ -49,13 +44,13 @@ def examine_bus(machine: Machine, request: Request) -> Iterator[Finding]:
     """The bus itself, or the figures of its server; and the measurement."""
     holder = find_holder(machine.ifname)
     if holder is not None and holder.address is not None:
-        yield from _through_server(machine, holder, holder.address, request)
+        yield from _through_server(holder, holder.address, request)
         return
     try:
         _check_may_look(machine, holder)
     except CannotLookError as error:
         yield replace(_no_bus(holder, str(error)), subject="bus", check="slaves")
-        yield from _measured(_measure(machine, request, None), 0)
+        yield _not_measured("the bus is not accessed")
         return
     yield from _on_bus(machine, request)
 
@@ -96,44 +91,86 @@ def _no_bus(holder: Holder | None, why: str) -> Finding:
     return bad(why, "two masters disturb each other: stop it", f"sudo kill {holder.pid}")
 
 
-def _through_server(
-    machine: Machine, holder: Holder, address: Address, request: Request
-) -> Iterator[Finding]:
-    view: list[ServerView] = []
+def _through_server(holder: Holder, address: Address, request: Request) -> Iterator[Finding]:
     if request.seconds:
         request.announce(f"watching the server for {request.seconds:g} s ...")
+    views: list[ServerView] = []
 
-    def reach() -> Iterator[Finding]:
-        view.append(ServerView(address, str(holder), request.seconds))
-        yield from view[0].server()
+    def watch() -> Iterator[Finding]:
+        views.append(ServerView(Sensors.through(address), request.seconds, own=False))
+        why = "the bus is not accessed while it streams; these are the server's figures"
+        hours = float(views[0].after["uptime_s"]) / 3600
+        yield ok(f"{holder} serves it at {address}, up {hours:.1f} h", why, **address._asdict())
 
-    yield from examine("server", "server", reach)
-    if view:
-        yield from view[0].examine(examine)
-    else:
-        yield from _measured(_measure(machine, request, None), 0)
+    yield from examine("server", "server", watch)
+    for view in views:
+        yield from view.examine("server", examine)
 
 
 def _on_bus(machine: Machine, request: Request) -> Iterator[Finding]:
-    from ethercat_server.links.direct import open_bus  # noqa: PLC0415 - loads pysoem, which only this needs
-
+    """The slaves, as they are; then what a server of the doctor's own measures, and the new errors."""
+    of_card = read_counters(machine.ifname)
     with contextlib.ExitStack() as cleanup:
         cleanup.enter_context(promiscuity_kept(machine.ifname))
+        found: list[slaves.Slave] = []
         try:
-            bus = open_bus(machine.ifname, cleanup, allow_ip=machine.allow_ip)
+            with open_bus(machine.ifname, allow_ip=machine.allow_ip) as bus:
+                count = yield from _slaves(machine, bus, found)
         except ServerError as error:
             yield replace(bad(str(error), ""), subject="bus", check="slaves")
             return
-        count = slaves.count(bus)
-        yield from examine("bus", "slaves", functools.partial(on_bus.answers, machine.shown, count))
-        found: list[slaves.Slave] = []
-        in_use = slaves.in_use(bus, count)
-        for position in range(count):
-            yield from _slave(bus, position, count, found, in_use=in_use)
-        if len(found) == count:
-            yield from examine("bus", "sensors", functools.partial(on_bus.sensors, found))
-            yield from examine("bus", "line", functools.partial(on_bus.line, found))
-        yield from _measured_on_bus(machine, request, bus, count, found)
+        if not request.seconds:
+            yield _not_measured("disabled by --seconds 0")
+            return
+        if not any(slave.is_sensor for slave in found) or any(slave.left_alone for slave in found):
+            yield _not_measured("there is no sensor to measure with, or another master has the bus")
+            return
+        yield from _measured(machine, request)
+        yield from examine(
+            "measurement", "card meanwhile", lambda: nic.rising(of_card, read_counters(machine.ifname))
+        )
+        before = {slave.position: slave.counters for slave in found}
+
+        def meanwhile() -> Iterator[Finding]:
+            with open_bus(machine.ifname, allow_ip=machine.allow_ip) as bus:
+                after = {position: slaves.read_counters(bus, position) for position in before}
+            yield from on_bus.new_errors(before, after, count)
+
+        yield from examine("measurement", "bus meanwhile", meanwhile)
+
+
+def _not_measured(why: str) -> Finding:
+    return replace(skipped(why), subject="measurement", check="all")
+
+
+def _slaves(machine: Machine, bus: Bus, found: list[slaves.Slave]) -> Generator[Finding, None, int]:
+    """Those that answer, which are added to `found`; returns how many there are."""
+    count = slaves.count(bus)
+    yield from examine("bus", "slaves", functools.partial(on_bus.answers, machine.shown, count))
+    in_use = slaves.in_use(bus, count)
+    for position in range(count):
+        yield from _slave(bus, position, count, found, in_use=in_use)
+    if len(found) == count:
+        yield from examine("bus", "sensors", functools.partial(on_bus.sensors, found))
+        yield from examine("bus", "line", functools.partial(on_bus.line, found))
+    return count
+
+
+def _measured(machine: Machine, request: Request) -> Iterator[Finding]:
+    """What a server measures here, with the sensors set as they are."""
+    request.announce(f"measuring for {request.seconds:g} s ...")
+    views: list[ServerView] = []
+
+    def watch() -> Iterator[Finding]:
+        sensors = Sensors.on_interface(
+            machine.ifname, allow_ip=machine.allow_ip, rt_priority=machine.rt_priority, cpu=request.cpu
+        )
+        views.append(ServerView(sensors, request.seconds, own=True))
+        yield from verdict.scheduling(machine.rt_priority, real_time=sensors.real_time)
+
+    yield from examine("measurement", "scheduling", watch)
+    for view in views:
+        yield from view.examine("measurement", examine)
 
 
 def _slave(
@@ -151,46 +188,3 @@ def _slave(
         yield from examine(
             "bus", f"slave {position} errors", functools.partial(on_bus.errors, found[-1], count)
         )
-
-
-def _measured_on_bus(
-    machine: Machine, request: Request, bus: Bus, count: int, found: list[slaves.Slave]
-) -> Iterator[Finding]:
-    size = min(_LONGEST_PROBE, _PROCESS_DATA_SIZE * max(1, count))
-    of_card = read_counters(machine.ifname)
-    exchange = (lambda: bus.count_slaves(size, _EXCHANGE_TIMEOUT_S) == count) if count else None
-    measured = _measure(machine, request, exchange, bus.clock)
-    yield from _measured(measured, size)
-    if measured is None:
-        return
-    yield from examine(
-        "measurement", "card meanwhile", lambda: nic.rising(of_card, read_counters(machine.ifname))
-    )
-    if found:
-        before = {slave.position: slave.counters for slave in found}
-
-        def meanwhile() -> Iterator[Finding]:
-            after = {position: slaves.read_counters(bus, position) for position in before}
-            yield from on_bus.new_errors(before, after, count)
-
-        yield from examine("measurement", "bus meanwhile", meanwhile)
-
-
-def _measure(
-    machine: Machine, request: Request, exchange: Exchange | None, clock: Clock = SYSTEM_CLOCK
-) -> Measured | None:
-    if not request.seconds:
-        return None
-    request.announce(f"measuring for {request.seconds:g} s ...")
-    return measure(request.seconds, exchange, machine.rt_priority, request.cpu, clock)
-
-
-def _measured(measured: Measured | None, size: int) -> Iterator[Finding]:
-    if measured is None:
-        yield replace(skipped("disabled by --seconds 0"), subject="measurement", check="all")
-        return
-    yield from examine("measurement", "scheduling", lambda: verdict.scheduling(measured))
-    yield from examine("measurement", "wake-ups", lambda: verdict.wake_ups(measured))
-    yield from examine("measurement", "exchanges", lambda: verdict.exchanges(measured, size))
-    yield from examine("measurement", "messages", lambda: verdict.messages(measured))
-    yield from examine("measurement", "age of data", lambda: verdict.age(measured))

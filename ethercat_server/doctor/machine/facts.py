@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from ethercat_server.access.adapters import is_local, kind, open_routes
 from ethercat_server.doctor.finding import cannot_look
 from ethercat_server.ethercat.nic.ip import Routes, find_routes
-from ethercat_server.links.interfaces import is_local, kind, open_routes
 
 _IFF_UP, _IFF_LOOPBACK = 0x1, 0x8
 _NO_SUPPORT: Final = "the driver does not support it"

@@ -8,32 +8,29 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+from ethercat_server.access.raw import read_images
+from ethercat_server.access.sensors import choose, find_server, note
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.slave import sii_content
-from ethercat_server.links.direct import read_images
-from ethercat_server.links.link import Found, choose, note
-from ethercat_server.links.reach import find_server
 from ethercat_server.process.command_line import FAILED
-from ethercat_server.sensor.sensor import Identity
-from ethercat_server.tool.command import DONE, Command, add_link_arguments
+from ethercat_server.sensor.sensor import Found, Identity
+from ethercat_server.tool.command import DONE, Command, add_sensor_arguments
 from ethercat_server.tool.show import columns, say, say_json
 
 
 def _eeprom_arguments(parser: argparse.ArgumentParser) -> None:
-    add_link_arguments(parser, all_if_none=True)
+    add_sensor_arguments(parser, all_if_none=True)
 
 
 def _images(args: argparse.Namespace) -> dict[int, bytes | BusError]:
     """The SII of each selected slave by position, or the error of reading it."""
-    with contextlib.ExitStack() as cleanup:
-        link = find_server(args.iface, args.server)
-        if link is not None:
-            cleanup.callback(link.close)
+    if (server := find_server(args.iface, args.server)) is not None:
+        with contextlib.closing(server):
             return {
-                sensor.number: _image(functools.partial(link.sii, sensor.number))
-                for sensor in link.chosen(args.sensor)
+                found.number: _image(functools.partial(server.sii, found.number))
+                for found in server.chosen(args.sensor)
             }
-        images = read_images(args.iface, cleanup, force=args.take_over, allow_ip=args.allow_ip)
+    images = read_images(args.iface, force=args.take_over, allow_ip=args.allow_ip)
     if args.sensor is None:
         return images
     found = [_identified(position, image) for position, image in images.items()]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from typing import Any, NamedTuple
 
+from ethercat_server.access.adapters import Adapter, adapters
+from ethercat_server.access.raw import look_on
+from ethercat_server.access.sensors import Sensors
 from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.nic.ip import network_trouble
-from ethercat_server.links.remote import ServerLink
-from ethercat_server.links.survey import Adapter, adapters, look_on
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.scan import NoSlaveError
 from ethercat_server.tool.command import DONE, Command
@@ -103,16 +105,13 @@ def _ask(row: Adapter) -> _Found:
         return _Found(row, False, f"left alone: in use by {row.holder}", [])
     where = f"through the server at {row.holder.address}, {row.holder}"
     try:
-        link = ServerLink(row.holder.address)
+        with contextlib.closing(Sensors.through(row.holder.address)) as server:
+            sensors = [
+                {"sensor": found.number, "name": found.identity.name, "serial": found.identity.serial}
+                for found in server.sensors
+            ]
     except ServerError as error:
         return _Found(row, False, f"left alone: in use by {row.holder}: {error}", [])
-    try:
-        sensors = [
-            {"sensor": found.number, "name": found.identity.name, "serial": found.identity.serial}
-            for found in link.sensors
-        ]
-    finally:
-        link.close()
     return _described(row, sensors, 0, f" ({where})")
 
 

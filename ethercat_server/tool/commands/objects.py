@@ -7,14 +7,16 @@ import struct
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
+from ethercat_server.access.raw import open_interface, open_slave
+from ethercat_server.access.sensors import find_server, note
 from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError, UsageError
 from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
-from ethercat_server.links.link import Found, Link, note
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION, ObjectEntry
 from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, find_objects, similar_names
+from ethercat_server.sensor.sensor import Found
 from ethercat_server.sensor.set_up import read_sinc
-from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
+from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, sensors_of
 from ethercat_server.tool.show import columns, say, say_json, value_text
 from protocol.pdo import INPUT_OBJECT
 from protocol.sensor.meaning import value_meaning
@@ -76,12 +78,10 @@ class _Sensor(NamedTuple):
         return {**self.found.as_json(), "objects": objects, **error}
 
 
-def _read_sensor(opened: Link, found: Found, rows: Sequence[ObjectEntry]) -> _Sensor:
+def _read_sensor(sdo: Sdo, found: Found, rows: Sequence[ObjectEntry]) -> _Sensor:
     objects: list[tuple[ObjectEntry, dict[str, Any]]] = []
     try:
-        if any(row.index == INPUT_OBJECT for row in rows):
-            opened.wait_settled([found.number])
-        objects.extend(_read_rows(opened.sdo(found.number), rows))
+        objects.extend(_read_rows(sdo, rows))
     except BusError as error:
         return _Sensor(found, objects, error)
     return _Sensor(found, objects, None)
@@ -102,7 +102,7 @@ def _read_rows(sdo: Sdo, rows: Sequence[ObjectEntry]) -> Iterator[tuple[ObjectEn
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_link_arguments(parser, all_if_none=True)
+    add_sensor_arguments(parser, all_if_none=True)
     parser.add_argument(
         "--slave", metavar="POSITION:NAME",
         help="the standard objects of a slave that is no sensor, such as 1:EL3102, in the state it is in",
@@ -110,7 +110,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _read_arguments(parser: argparse.ArgumentParser) -> None:
-    add_link_arguments(parser, all_if_none=True)
+    add_sensor_arguments(parser, all_if_none=True)
     parser.add_argument(
         "names", nargs="+", metavar="NAME",
         help="object: a name such as 'Sampling rate' or 'Force/Torque Offset', a setting, or 0x8006:1",
@@ -153,13 +153,24 @@ def _show(
     slave: str | None = None,
 ) -> int:
     """`all_wanted`: an object that cannot be read is a failure, also where the firmware does not have it."""
-    with link(args, slave=slave) as opened:
-        sensors = [_read_sensor(opened, found, rows) for found in opened.chosen(args.sensor)]
+    if slave is not None:
+        if find_server(args.iface, args.server) is not None:
+            raise UsageError("a server reads the objects of sensors only: stop it to read those of a slave")
+        used = f"the interface {args.iface}"
+        with open_interface(args.iface, allow_ip=args.allow_ip) as bus:
+            found, sdo = open_slave(bus, slave)
+            sensors = [_read_sensor(sdo, found, rows)]
+    else:
+        with sensors_of(args) as opened:
+            used, chosen = opened.used, opened.chosen(args.sensor)
+            if any(row.index == INPUT_OBJECT for row in rows):
+                opened.wait_settled([found.number for found in chosen])
+            sensors = [_read_sensor(opened.sdo(found.number), found, rows) for found in chosen]
     errors = [sensor.error for sensor in sensors if sensor.error]
     if len(errors) == len(sensors):
         raise errors[0]
     if args.json:
-        say_json({"through": opened.used, "sensors": [sensor.as_json() for sensor in sensors]})
+        say_json({"through": used, "sensors": [sensor.as_json() for sensor in sensors]})
     else:
         for sensor in sensors:
             _say_sensor(sensor)

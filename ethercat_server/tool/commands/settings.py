@@ -7,15 +7,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ethercat_server.access.sensors import Sensors
 from ethercat_server.daemon.config_file import EMPTY, read_config
 from ethercat_server.daemon.options import ServerOptions, parse_assignments
 from ethercat_server.errors import BusError, UsageError
 from ethercat_server.ethercat.slave.coe import finish
-from ethercat_server.links.link import Found, Link, signals_held_back
+from ethercat_server.process.signals import signals_held_back
 from ethercat_server.sensor.configuration import Change, save
 from ethercat_server.sensor.objects import dictionary
-from ethercat_server.sensor.sensor import Sensor
-from ethercat_server.tool.command import CHANGES, DONE, Command, add_link_arguments, link
+from ethercat_server.sensor.sensor import Found, Sensor
+from ethercat_server.tool.command import CHANGES, DONE, Command, add_sensor_arguments, sensors_of
 from ethercat_server.tool.show import columns, report, value_text
 from protocol.errors import SettingError
 from protocol.sensor.meaning import meaning, value_meaning
@@ -70,7 +71,7 @@ def change_lines(found: list[dict[str, Any]]) -> str:
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_link_arguments(parser)
+    add_sensor_arguments(parser)
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",
         help="a setting; may be given more than once: "
@@ -104,7 +105,7 @@ def _asked(args: argparse.Namespace) -> ServerOptions:
 
 
 def _look(
-    args: argparse.Namespace, opened: Link, options: ServerOptions
+    args: argparse.Namespace, opened: Sensors, options: ServerOptions
 ) -> tuple[Found, dict[str, SettingValue], Sensor]:
     """The chosen sensor, the settings requested for it, and those in force."""
     found = opened.choose(args.sensor)
@@ -117,7 +118,7 @@ def _look(
 
 def _plan(args: argparse.Namespace) -> int:
     asked = _asked(args)
-    with link(args) as opened:
+    with sensors_of(args) as opened:
         found, settings, sensor = _look(args, opened, asked)
     changed = changes(sensor, settings)
     now = meaning(sensor.settings, sensor.rate_hz)
@@ -136,7 +137,7 @@ def _plan(args: argparse.Namespace) -> int:
 
 def _apply(args: argparse.Namespace) -> int:
     asked = _asked(args)
-    with link(args) as opened:
+    with sensors_of(args) as opened:
         found, settings, before = _look(args, opened, asked)
         changed = changes(before, settings)
         if changed or args.save:
@@ -153,9 +154,9 @@ def _apply(args: argparse.Namespace) -> int:
     return DONE
 
 
-def saving_lines(link: Link, changed: bool, saved: bool) -> list[str]:
+def saving_lines(opened: Sensors, changed: bool, saved: bool) -> list[str]:
     """How long a change lasts."""
-    unsaved = UNSAVED_IN_SERVER if link.restores else UNSAVED
+    unsaved = UNSAVED_IN_SERVER if opened.restores else UNSAVED
     return [SAVED] if saved else [unsaved] if changed else []
 
 
@@ -170,7 +171,7 @@ def verify(sensor: Sensor, settings: Mapping[str, SettingValue]) -> None:
         )
 
 
-def save_now(opened: Link, found: Found) -> None:
+def save_now(opened: Sensors, found: Found) -> None:
     """Store the sensor's parameters in its flash."""
     sensor = Sensor(found.number, found.identity, {})
     with signals_held_back():
@@ -178,7 +179,7 @@ def save_now(opened: Link, found: Found) -> None:
 
 
 def _save(args: argparse.Namespace) -> int:
-    with link(args) as opened:
+    with sensors_of(args) as opened:
         found = opened.choose(args.sensor)
         save_now(opened, found)
     report(args.json, opened, found, {"saved": True}, f"  {SAVED}")
@@ -188,5 +189,5 @@ def _save(args: argparse.Namespace) -> int:
 COMMANDS = (
     Command("plan", "show what a change of settings would do, without doing it", _arguments, _plan),
     Command("apply", "change settings, all or none, and verify them", _apply_arguments, _apply),
-    Command("save", "store the sensor's parameters in its flash", add_link_arguments, _save),
+    Command("save", "store the sensor's parameters in its flash", add_sensor_arguments, _save),
 )

@@ -9,12 +9,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from ethercat_server.access.sensors import Sensors, failed_change, note
 from ethercat_server.errors import BusError, SdoAbortError, ServerError
 from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
-from ethercat_server.links.link import Found, Link, failed_change, note, signals_held_back
+from ethercat_server.process.signals import signals_held_back
 from ethercat_server.sensor.objects.search import BY_ADDRESS, KNOWN_OBJECTS
-from ethercat_server.sensor.sensor import Identity, Sensor
-from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
+from ethercat_server.sensor.sensor import Found, Identity, Sensor
+from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, sensors_of
 from ethercat_server.tool.commands.objects import read_object
 from ethercat_server.tool.commands.settings import (
     add_save,
@@ -34,7 +35,7 @@ _TAKE_OVER: Final = "--take-over"
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_link_arguments(parser, take_over=False)
+    add_sensor_arguments(parser, take_over=False)
     parser.add_argument("file", type=Path, metavar="FILE", help="JSON file")
     parser.add_argument(_TAKE_OVER, action="store_true", help="take over a bus in use, as --force elsewhere")
 
@@ -51,10 +52,10 @@ def _restore_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 @contextlib.contextmanager
-def _link(args: argparse.Namespace) -> Iterator[Link]:
-    """The link; an error advises the option that these commands have."""
+def _opened(args: argparse.Namespace) -> Iterator[Sensors]:
+    """As `sensors_of`; an error advises the option that these commands have."""
     try:
-        with link(args) as opened:
+        with sensors_of(args) as opened:
             yield opened
     except BusError as error:
         if "; --force " not in str(error):
@@ -68,7 +69,7 @@ def _snapshot(args: argparse.Namespace) -> int:
 
 
 def _take(args: argparse.Namespace, file: NewFile) -> int:
-    with _link(args) as opened:
+    with _opened(args) as opened:
         found = opened.choose(args.sensor)
         sensor, sdo = opened.in_force(found), opened.sdo(found.number)
         read = [(row, finish(read_object(sdo, row))) for row in KNOWN_OBJECTS]
@@ -96,7 +97,7 @@ def _as_json(address: tuple[int, int], name: str, values: dict[str, Any]) -> dic
 
 def _restore(args: argparse.Namespace) -> int:
     snapshot = read_snapshot(args.file)
-    with _link(args) as opened:
+    with _opened(args) as opened:
         found = opened.choose(args.sensor)
         _check_whose(found.identity, snapshot.identity, args)
         sensor = opened.in_force(found, snapshot.settings)
@@ -156,7 +157,7 @@ def _differing(
 
 
 def _put_back(
-    opened: Link,
+    opened: Sensors,
     found: Found,
     sensor: Sensor,
     settings: Mapping[str, SettingValue],

@@ -7,11 +7,13 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from ethercat_server.access.sensors import Sensors, note
 from ethercat_server.errors import BusError, UsageError
 from ethercat_server.ethercat.slave.coe import finish
-from ethercat_server.links.link import Found, Link, note, signals_held_back
+from ethercat_server.process.signals import signals_held_back
+from ethercat_server.sensor.sensor import Found
 from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
-from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
+from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, sensors_of
 from ethercat_server.tool.commands.settings import UNSAVED
 from ethercat_server.tool.show import columns, report
 from protocol.control import ACTIONS, MAX_TARE_SAMPLES
@@ -26,7 +28,7 @@ _DEFAULT_SAMPLES: Final = ACTIONS["tare"].parameters["samples"].default
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_link_arguments(parser)
+    add_sensor_arguments(parser)
     parser.add_argument(
         "--samples", type=int, default=_DEFAULT_SAMPLES, metavar="N",
         help=f"number of samples to average, 1 to {MAX_TARE_SAMPLES} (default %(default)s)",
@@ -51,7 +53,7 @@ def _tare(args: argparse.Namespace) -> int:
         raise UsageError(f"--target: {error}") from None
     if args.undo or args.clear:
         return _take_back(args)
-    with link(args) as opened:
+    with sensors_of(args) as opened:
         found = opened.choose(args.sensor)
         tared = opened.tare(found.number, args.samples, args.target)
     _remember(found, tared["old_offset"], tared["new_offset"])
@@ -65,13 +67,13 @@ def _tare(args: argparse.Namespace) -> int:
     return DONE
 
 
-def _lasts(opened: Link) -> str:
+def _lasts(opened: Sensors) -> str:
     return _UNSAVED_IN_SERVER if opened.restores else _UNSAVED
 
 
 def _take_back(args: argparse.Namespace) -> int:
     """Write the offset of before the last tare, or zeros, and verify it."""
-    with link(args) as opened:
+    with sensors_of(args) as opened:
         found = opened.choose(args.sensor)
         sdo = opened.sdo(found.number)
         before = finish(read_offset(sdo), clock=opened.clock)

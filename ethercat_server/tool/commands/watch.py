@@ -7,11 +7,12 @@ import sys
 from collections.abc import Sequence
 from typing import Any, Final
 
+from ethercat_server.access.sensors import note
 from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.clock import Clock, Deadline
-from ethercat_server.links.link import Found, note
 from ethercat_server.process.command_line import FAILED
-from ethercat_server.tool.command import DONE, Command, add_link_arguments, link
+from ethercat_server.sensor.sensor import Found
+from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, sensors_of
 from ethercat_server.tool.commands.block import Block
 from ethercat_server.tool.show import columns, say, say_json
 from protocol.framing import DataFlag, DataMessage
@@ -162,7 +163,7 @@ _positive.__name__ = "positive number"
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_link_arguments(parser, all_if_none=True)
+    add_sensor_arguments(parser, all_if_none=True)
     parser.add_argument("--samples", type=int, metavar="N", help="stop after N samples of each sensor")
     parser.add_argument("--seconds", type=_positive, metavar="S", help="stop after S seconds")
     parser.add_argument(
@@ -174,7 +175,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 def _watch(args: argparse.Namespace) -> int:
     if args.samples is not None and args.samples < 1:
         raise UsageError(f"--samples {args.samples}: it must be 1 or more")
-    with link(args) as opened:
+    with sensors_of(args) as opened:
         sensors = opened.chosen(args.sensor)
         watch = _Watch(sensors, args, opened.clock)
         if not args.json and not watch.on_terminal:

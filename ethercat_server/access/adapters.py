@@ -1,19 +1,18 @@
-"""The network interfaces of this machine, and the careful look for sensors on one of them."""
+"""The network interfaces of this machine, as the kernel describes them by pyroute2."""
 
 from __future__ import annotations
 
 import contextlib
+import socket
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from ethercat_server.access.holder import Holder, find_holder
 from ethercat_server.ethercat.nic.ip import Routes, find_routes
-from ethercat_server.links import direct
-from ethercat_server.links.holder import Holder, find_holder
-from ethercat_server.links.interfaces import is_local, kind, open_routes
-from ethercat_server.links.promiscuity import promiscuity_kept
-from ethercat_server.sensor.scan import Slave, look_safely
+from ethercat_server.process.signals import signals_held_back
 
-_IFF_UP, _IFF_LOOPBACK = 0x1, 0x8
+_IFF_UP, _IFF_LOOPBACK, _IFF_PROMISC = 0x1, 0x8, 0x100
 _ETHERNET: Final = 1
 _CARDS: Final = frozenset({"", "veth"})
 """Kinds that a sensor can be connected to: network cards, and what tests use for one."""
@@ -85,11 +84,42 @@ def _adapter(row: Any, carrying: set[int]) -> Adapter:
     )
 
 
-def look_on(ifname: str) -> list[Slave]:
-    """The slaves on `ifname`, all left in the state they are in; ServerError if it cannot be looked at.
+@contextlib.contextmanager
+def promiscuity_kept(ifname: str) -> Iterator[None]:
+    """Restore promiscuous mode to off afterwards if it was off before: SOEM switches it on and leaves it."""
 
-    Frames of another master are waited for first; nothing is asked if there are some.
-    """
-    with contextlib.ExitStack() as cleanup:
-        cleanup.enter_context(promiscuity_kept(ifname))
-        return look_safely(direct.open_bus(ifname, cleanup), lambda: None)
+    def is_promiscuous() -> bool | None:
+        with open_routes() as route:
+            flags = {row.get_attr("IFLA_IFNAME"): row["flags"] for row in route.get_links()}.get(ifname)
+        return None if flags is None else bool(flags & _IFF_PROMISC)
+
+    before = is_promiscuous()
+    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - loaded by now
+
+    try:
+        yield
+    finally:
+        if before is False and is_promiscuous():
+            with open_routes() as route, contextlib.suppress(NetlinkError, OSError):
+                route.link("set", index=socket.if_nametoindex(ifname), flags=0, change=_IFF_PROMISC)
+
+
+@contextlib.contextmanager
+def open_routes() -> Iterator[Any]:
+    """pyroute2's IPRoute. Signals wait meanwhile: its import and its event loop do not bear an exception."""
+    with signals_held_back():
+        from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
+
+        with IPRoute() as route:
+            yield route
+
+
+def kind(row: Any) -> str:
+    """Of a virtual interface, such as veth or bridge; empty for a network card."""
+    info = row.get_attr("IFLA_LINKINFO")
+    return (info.get_attr("IFLA_INFO_KIND") if info else None) or ""
+
+
+def is_local(row: Any) -> bool:
+    """Whether what it stands on is an interface of this namespace: a veth's other end is not below it."""
+    return row.get_attr("IFLA_LINK_NETNSID") is None and kind(row) != "veth"

@@ -1,4 +1,7 @@
-"""The stream, the figures and the clients of a server that uses the interface, instead of the bus."""
+"""What a server measures: the one that uses the interface, or the doctor's own.
+
+Its stream is judged as every client's; its wake-ups, exchanges and ages may be the cause of what is found.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,10 @@ from itertools import groupby
 from operator import attrgetter
 from typing import Any, Final
 
+from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, warning
 from ethercat_server.doctor.verdict import age_finding, as_cause, exchange_finding, wake_finding
 from ethercat_server.errors import ServerError
-from ethercat_server.links.remote import ServerLink
-from protocol.address import Address
 from protocol.control import Event
 from protocol.framing import DataMessage
 from protocol.health import verdict as health
@@ -30,10 +32,9 @@ _LOG: Final = "see the server's log (journalctl -u 'ethercat-server@*')"
 class ServerView:
     """The stream and the `status` of a server over the measuring time."""
 
-    def __init__(self, address: Address, holder: str, seconds: float) -> None:
-        """ServerError if it does not answer."""
-        self.holder, self.address = holder, address
-        link = ServerLink(address)
+    def __init__(self, sensors: Sensors, seconds: float, *, own: bool) -> None:
+        """Watch for `seconds`, then close `sensors`. `own`: its figures are those since its start."""
+        link, self._own = sensors, own
         try:
             rows: list[dict[str, Any]] = link.ask("describe")["sensors"]
             self.before: dict[str, Any] = link.ask("status")
@@ -49,7 +50,7 @@ class ServerView:
         if not all(isinstance(row, dict) for row in rows):
             raise ServerError("the server's reply is not understood: install the same version of both")
 
-    def _take(self, link: ServerLink, frames: Sequence[DataMessage]) -> None:
+    def _take(self, link: Sensors, frames: Sequence[DataMessage]) -> None:
         now_ns = link.clock.monotonic_ns()
         for position, of_one in groupby(sorted(frames, key=_POSITION), _POSITION):
             if position < len(self._observers):
@@ -81,14 +82,6 @@ class ServerView:
     def grown(self, name: str) -> int:
         """Increase of a counter."""
         return int(self.after[name]) - int(self.before[name])
-
-    def server(self) -> Iterator[Finding]:
-        """The server itself."""
-        why = "the bus is not accessed while it streams; these are the server's figures"
-        hours = float(self.after["uptime_s"]) / 3600
-        yield ok(
-            f"{self.holder} serves it at {self.address}, up {hours:.1f} h", why, **self.address._asdict()
-        )
 
     def sensors(self) -> Iterator[Finding]:
         """Each sensor: the verdict on its stream."""
@@ -122,27 +115,30 @@ class ServerView:
             else:
                 yield ok(f"{text}: {verdict.sentence[0].lower()}{verdict.sentence[1:]}", **values)
 
+    def _summaries(self) -> tuple[dict[str, Any], str]:
+        """What it sums up, and over which time."""
+        return (self.after, "") if self._own else (self.after["last_10s"], " in the last 10 s")
+
     def wake_ups(self) -> Iterator[Finding]:
-        """The server's lateness in the last ten seconds."""
-        missed = self.grown("missed_deadlines")
-        summary, cycles = self.after["last_10s"]["wake_us"], max(1, self.grown("cycles"))
-        yield as_cause(wake_finding(summary, missed, cycles))
+        """Its lateness."""
+        missed, (summaries, _) = self.grown("missed_deadlines"), self._summaries()
+        yield as_cause(wake_finding(summaries["wake_us"], missed, max(1, self.grown("cycles"))))
 
     def exchanges(self) -> Iterator[Finding]:
-        """The server's exchanges in the last ten seconds."""
-        summary = self.after["last_10s"]["exchange_us"]
+        """How long its exchanges take, and how many are lost."""
+        summaries, when = self._summaries()
         lost, count = self.grown("lost_frames"), max(1, self.grown("cycles"))
-        text = "".join(f"{name} {summary[key]:.0f}, " for name, key in (("p50", "p50"), ("p99", "p99")))
-        text += f"max {summary['max']:.0f} µs in the last 10 s"
-        yield as_cause(exchange_finding(text, summary, lost, count))
+        yield as_cause(exchange_finding(when, summaries["exchange_us"], lost, count))
 
     def ages(self) -> Iterator[Finding]:
         """The age of samples when the server sends them."""
-        for position, summary in enumerate(self.after["last_10s"]["age_us"]):
+        summaries, when = self._summaries()
+        recent = [row["age_us"] for row in self.after["sensors"]] if self._own else summaries["age_us"]
+        for position, summary in enumerate(recent):
             if not summary or not summary.get("max"):
                 cannot_look("the server reports it once it follows the sensor's clock")
             how = "the server's estimate; a message to a client takes about 50 µs more"
-            yield age_finding(f"sensor {position}, when sent in the last 10 s", summary, how)
+            yield age_finding(f"sensor {position}, when sent{when}", summary, how)
 
     def clients(self) -> Iterator[Finding]:
         """The clients, and those that are too slow."""
@@ -159,10 +155,11 @@ class ServerView:
         else:
             yield ok(f"{text}, none too slow", **values)
 
-    def examine(self, examine: Examine) -> Iterator[Finding]:
-        """All checks but that of the server itself."""
-        yield from examine("server", "sensors", self.sensors)
-        yield from examine("server", "wake-ups", self.wake_ups)
-        yield from examine("server", "exchanges", self.exchanges)
-        yield from examine("server", "age of data", self.ages)
-        yield from examine("server", "clients", self.clients)
+    def examine(self, subject: str, examine: Examine) -> Iterator[Finding]:
+        """All checks."""
+        yield from examine(subject, "sensors", self.sensors)
+        yield from examine(subject, "wake-ups", self.wake_ups)
+        yield from examine(subject, "exchanges", self.exchanges)
+        yield from examine(subject, "age of data", self.ages)
+        if not self._own:
+            yield from examine(subject, "clients", self.clients)

@@ -1,0 +1,137 @@
+"""A server of this process's own, for a program on an interface that no server uses.
+
+The program talks to it as to any other, over a connected pair of sockets. It sets nothing: the sensors stream
+as they are set, and go to INIT at the end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import signal
+import socket
+import threading
+from collections.abc import Sequence
+from typing import Final
+
+from ethercat_server.access.raw import open_interface
+from ethercat_server.acquisition.start_up import AsFound
+from ethercat_server.errors import BusError
+from ethercat_server.process import realtime
+from ethercat_server.server import Server
+from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.transport.sockets import SocketStream, SocketTransport
+from protocol.client.channel import RECEIVE_BUFFER, TcpChannel
+from protocol.errors import UnreachableError
+
+STOPPED: Final = BusError("stopped before it was done")
+_ENDED: Final = "it has ended"
+_END_S: Final = 5.0
+
+
+class PrivateServer:
+    """Runs in a thread until `close`.
+
+    Attributes:
+        channel: the only connection to it.
+        error: what ended it, if it ended by itself.
+        real_time: whether its thread has real-time scheduling.
+    """
+
+    def __init__(
+        self,
+        ifname: str,
+        *,
+        force: bool = False,
+        allow_ip: bool = False,
+        rt_priority: int = realtime.DEFAULT_PRIORITY,
+        cpu: int | None = None,
+    ) -> None:
+        """ServerError if a sensor cannot be brought to OP; `force` takes over a bus in use.
+
+        `rt_priority` and `cpu` are as the server's.
+        """
+        with contextlib.ExitStack() as cleanup:
+            bus = cleanup.enter_context(open_interface(ifname, allow_ip=allow_ip))
+            own, servers = socket.socketpair()
+            transport = _PairTransport(servers)
+            hub = Hub(transport)
+            cleanup.callback(hub.close)
+            self.channel = _PairChannel(own)
+            self.error: Exception | None = None
+            self._server = Server(bus, hub, AsFound(force=force), extra={"interface": ifname})
+            self._rt_priority, self._cpu = rt_priority, cpu
+            self.real_time = False
+            self._cleanup = cleanup.pop_all()
+        self._thread = threading.Thread(target=self._run, name="server", daemon=True)
+        self._thread.start()
+
+    def interrupt(self) -> None:
+        """Have what is being done on a sensor undone; its request fails."""
+        self._server.jobs.interrupt(STOPPED)
+
+    def close(self) -> None:
+        """The sensors go to INIT, the interface is released."""
+        self._server.stop()
+        self._thread.join(_END_S)
+        self._cleanup.close()
+        gc.unfreeze()
+        gc.enable()
+
+    def _run(self) -> None:
+        # Python handles signals in the main thread; they must interrupt its system calls.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+        try:
+            realtime.prepare(self._rt_priority, self._cpu)
+            self.real_time = os.sched_getscheduler(0) == os.SCHED_FIFO
+            self._server.run()
+        except Exception as error:  # noqa: BLE001 - for the main thread, which finds the connection closed
+            self.error = error
+            self._server.hub.close()
+
+
+class _PairTransport(SocketTransport):
+    """Has one client, at the other end of a pair of sockets."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        super().__init__((), 0)
+        self._sock: socket.socket | None = sock
+
+    def listening(self) -> Sequence[int]:
+        """See `Transport`."""
+        return () if self._sock is None else (self._sock.fileno(),)
+
+    def accept(self, fd: int) -> SocketStream | None:  # noqa: ARG002
+        """See `Transport`."""
+        sock, self._sock = self._sock, None
+        return None if sock is None else _PairStream(sock, None)
+
+    def close(self) -> None:
+        """See `Transport`."""
+        super().close()
+        if self._sock is not None:
+            self._sock.close()
+
+
+class _PairStream(SocketStream):
+    def peer_uid(self) -> int | None:
+        """See `Stream`."""
+        return os.geteuid()
+
+
+class _PairChannel(TcpChannel):
+    """The program's end of the pair."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        super().__init__("", 0)
+        self._pair: socket.socket | None = sock
+        self.is_near = True
+
+    def connect(self, timeout_s: float) -> bool:  # noqa: ARG002
+        """See `Channel`."""
+        if self._pair is None:
+            raise UnreachableError(_ENDED)
+        self._sock, self._pair = self._pair, None
+        self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        return True
