@@ -194,15 +194,14 @@ class Recovery:
         self._mailboxes = Mailboxes(bus, sensors, announce)
         self._clock = bus.clock
         self.causes = Causes(bus.ifname)
-        self._work: dict[int, Steps[bool]] = {}
-        """What is under way to bring back those that do not stream."""
+        self._work: dict[int, Steps[bool]] = {}  # what is under way to bring back those that do not stream
         self._lost_at_ns: dict[int, int] = {}
         self._changing: dict[int, _Reconfiguration] = {}
         self._short = 0
         self._watch_ns = 0
         self._watched = 0
+        # Or at the mailboxes: in turns, so that no exchange has to wait for both.
         self._looks_at_states = False
-        """Or at the mailboxes: in turns, so that no exchange has to wait for both."""
         self.alive_wkc: list[int]
         """The working counter of each frame if all sensors that are not lost take part."""
         self.all_lost: bool

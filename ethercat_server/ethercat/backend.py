@@ -13,8 +13,7 @@ from typing import Protocol
 
 from ethercat_server.ethercat.clock import Clock
 
-CheckInterrupt = Callable[[], None]
-"""Called while something takes long; may raise to give it up."""
+CheckInterrupt = Callable[[], None]  # called while something takes long; may raise to give it up
 
 
 class Master(Protocol):

@@ -18,10 +18,10 @@ from protocol.settings import SETTINGS, SettingValue, check_combination
 
 _SAVE_TIMEOUT_S: Final = 5.0
 
+# How the sentence of a change that failed goes on.
 IN_FORCE: Final = "; the former settings are in force"
 LATER: Final = "; it gets its former settings when it is back"
 _AGAIN: Final = "configure it again"
-"""How the sentence of a change that failed goes on."""
 
 
 class Change:

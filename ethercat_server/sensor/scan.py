@@ -41,8 +41,7 @@ _MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
 _INPUTS: Final = 0x1180
 _SYNC_MANAGER: Final = struct.Struct("<HH4x")
 _NAMELESS: Final = "nameless"
-_KNOWN: Final = ("vendor", "product", "revision", "name")
-"""What `describe` says of a slave from its SII."""
+_KNOWN: Final = ("vendor", "product", "revision", "name")  # what `describe` says of a slave from its SII
 _MOST_LISTED: Final = 64
 _ABSENT_AFTER: Final = 3  # unanswered reads in a row; a single lost datagram says nothing
 _ABSENT: Final = "ABSENT"

@@ -13,10 +13,9 @@ from ethercat_server.ethercat.clock import Clock, Deadline
 from protocol.sensor.meaning import value_meaning
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
 
+# How long Bota's own driver lets a sensor settle: new filter settings, and the data after entering OP.
 SETTLING_S: Final = 0.5
-"""How long Bota's own driver lets a sensor settle: new filter settings, and the data after entering OP."""
-SETTLING_SAMPLES: Final = 8
-"""At the lowest rates: how many samples the filters take, and a new offset."""
+SETTLING_SAMPLES: Final = 8  # at the lowest rates: how many samples the filters take, and a new offset
 _MODEL_NAME: Final = re.compile(r"BFT-[A-Z]{4}-ECAT-M8")
 
 

@@ -19,8 +19,7 @@ from ethercat_server.sensor.sensor import SETTLING_S, Identity, Sensor
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor, sinc_length_of
 from protocol.text.visible import visible
 
-_LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]
-"""sinc_length."""
+_LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]  # sinc_length
 _OFFSETS: Final = tuple((dictionary.FORCE_TORQUE_OFFSET, sub) for sub in range(1, 7))
 
 NO_SETTINGS: Final[Mapping[str, SettingValue]] = {}

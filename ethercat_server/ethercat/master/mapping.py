@@ -20,8 +20,8 @@ from ethercat_server.ethercat.slave.sii_content import Sii
 
 _FIRST_STATION: Final = 0x1001
 _LOGICAL_BYTES: Final = 0x10000  # of the logical address space for the sensors' process data
+# Kind of the sync manager, the object with its PDOs, kind of the FMMU.
 _ASSIGNMENTS: Final = (("outputs", 0x1C12, reg.FMMU_WRITE), ("inputs", 0x1C13, reg.FMMU_READ))
-"""Kind of the sync manager, the object with its PDOs, kind of the FMMU."""
 _MOST_BYTES: Final = 1486
 _MOST_SUBINDEX, _MOST_INDEX, _MOST_ENTRY = 0xFF, 0xFFFF, 0xFFFFFFFF
 

@@ -33,8 +33,8 @@ _PYSOEM_ERRORS: Final = (
     pysoem.ConfigMapError,
     pysoem.NetworkInterfaceNotOpenError,
 )
+# What pysoem makes of entries of its error ring that it does not expect after a mapping.
 _UNEXPECTED: Final = "unexpected error"
-"""What pysoem makes of entries of its error ring that it does not expect after a mapping."""
 
 
 class SoemBackend:

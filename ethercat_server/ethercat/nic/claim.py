@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Final
 
 from ethercat_server.errors import InterfaceError
-from ethercat_server.ethercat.nic.interface import look_up, trouble
-from ethercat_server.ethercat.nic.ip import ALLOW_IP, find_routes, network_trouble
+from ethercat_server.ethercat.nic.interface import ALLOW_IP, find_routes, look_up, network_trouble, trouble
 from ethercat_server.ethercat.nic.lock import in_use, locked
 from ethercat_server.ethercat.nic.packet_sockets import master_sockets, users_of
 
-MAX_NAME_LENGTH: Final = 15
-"""Linux's limit; a longer name would overflow SOEM's buffer."""
+MAX_NAME_LENGTH: Final = 15  # Linux's limit; a longer name would overflow SOEM's buffer
 
 _CARRIER_TIMEOUT_S: Final = 5.0
 _CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}

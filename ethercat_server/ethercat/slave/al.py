@@ -96,10 +96,9 @@ class AlState(IntEnum):
 
 
 # Real devices are slow: firmware that starts, filters that are initialized.
+# Timeout for an AL state after it was requested.
 STATE_S: Final = {AlState.INIT: 5.0, AlState.PREOP: 10.0, AlState.SAFEOP: 10.0, AlState.OP: 10.0}
-"""Timeout for an AL state after it was requested."""
-ACKNOWLEDGE_S: Final = 5.0
-"""Timeout for an error to be gone after it was acknowledged."""
+ACKNOWLEDGE_S: Final = 5.0  # timeout for an error to be gone after it was acknowledged
 
 
 class AlStatus(NamedTuple):

@@ -19,8 +19,8 @@ from ethercat_server.ethercat.slave.emergencies import Emergencies, Emergency
 from ethercat_server.ethercat.slave.registers import MAILBOX_FULL, MAILBOX_IN_STATUS
 
 T = TypeVar("T")
+# Work in steps: yields when the loop should have its turn, returns the result.
 Steps = Generator[None, None, T]
-"""Work in steps: yields when the loop should have its turn, returns the result."""
 
 _SHORTEST: Final = 16
 _LONGEST: Final = 1486

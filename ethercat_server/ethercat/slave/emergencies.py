@@ -26,6 +26,7 @@ _TELL_AGAIN_NS: Final = 10_000_000_000  # for the same code, if no other one cam
 _TELL_EVERY_NS: Final = 1_000_000_000
 _TELL_AT_ONCE: Final = 5  # of one sensor, and then one each `_TELL_EVERY_NS`
 
+# By error code without its lower byte; what is not here belongs to the class of its first digit.
 ERROR_CLASSES: Final[dict[int, str]] = {
     0x0000: "error reset, or no error",
     0x1000: "generic error",
@@ -54,7 +55,6 @@ ERROR_CLASSES: Final[dict[int, str]] = {
     0xF000: "additional functions",
     0xFF00: "device-specific",
 }
-"""By error code without its lower byte; what is not here belongs to the class of its first digit."""
 
 
 class Emergency(NamedTuple):

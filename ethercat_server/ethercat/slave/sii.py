@@ -18,11 +18,9 @@ from ethercat_server.ethercat.slave.registers import SII_CONTROL, SII_OWNER
 OF_FIRMWARE: Final = b"\x01"
 OF_MASTER: Final = b"\x00"
 _TAKE: Final = b"\x02"
-_IN_USE: Final = 0x01
-"""Of the byte after the owner: the firmware is accessing it."""
+_IN_USE: Final = 0x01  # of the byte after the owner: the firmware is accessing it
 
-_REGISTERS: Final = struct.Struct("<HI8s")
-"""Control and status, the word's address, the data."""
+_REGISTERS: Final = struct.Struct("<HI8s")  # control and status, the word's address, the data
 _COMMAND: Final = struct.Struct("<HI")
 _READ: Final = 0x0100
 _NONE: Final = 0x0000

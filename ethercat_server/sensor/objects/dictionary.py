@@ -17,10 +17,10 @@ from protocol.sensor.meaning import value_meaning
 from protocol.settings import SETTINGS, SettingValue
 
 VENDOR_ID: Final = 0x0000B07A
-PRODUCT_CODE: Final = 1
-"""All Gen-0 EtherCAT models have product code 1; the name identifies the model."""
+PRODUCT_CODE: Final = 1  # all Gen-0 EtherCAT models have product code 1; the name identifies the model
 REVISION: Final = 3
 
+# Names of the Gen-0 models, as in SII and in object 0x1008.
 MODELS: Final = (
     "BFT-SENS-ECAT-M8",
     "BFT-ROKS-ECAT-M8",
@@ -30,7 +30,6 @@ MODELS: Final = (
     "BFT-LAXS-ECAT-M8",
     "BFT-MEGS-ECAT-M8",
 )
-"""Names of the Gen-0 models, as in SII and in object 0x1008."""
 
 
 class ObjectType(Enum):
@@ -156,8 +155,8 @@ _PDO_TYPES = {PdoType.USINT: U8, PdoType.UINT: U16, PdoType.UDINT: U32, PdoType.
 _AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _INVERTED: Mapping[SettingValue, int] = {True: 0, False: 1}
 
+# Writable on the device in every state. Never write it: the calibration is lost.
 FACTORY_CALIBRATION: Final = 0x2000
-"""Writable on the device in every state. Never write it: the calibration is lost."""
 FACTORY_CALIBRATION_ENTRIES: Final = 0x57
 
 DEVICE_NAME: Final = (0x1008, 0)
@@ -180,6 +179,7 @@ def _calibration_type(subindex: int) -> ObjectType:
     return I8 if subindex >= 0x52 else REAL32
 
 
+# Those that the firmware seen has.
 OBJECTS: Final[tuple[ObjectEntry, ...]] = (
     ObjectEntry(0x1000, 0, "Device type", U32, RO, 5001),
     ObjectEntry(0x1008, 0, "Device name", STRING, RO, MODELS[0]),
@@ -234,7 +234,6 @@ OBJECTS: Final[tuple[ObjectEntry, ...]] = (
     ObjectEntry(0x8030, 1, "Command", U8, RW, values={SAVE_PARAMETERS: "save the parameters"}),
     ObjectEntry(0x8030, 2, "Status", U8, RO, values={0: "success"}),
 )  # fmt: skip
-"""Those that the firmware seen has."""
 
 BY_ADDRESS: Final[Mapping[tuple[int, int], ObjectEntry]] = {row.address: row for row in OBJECTS}
 BY_SETTING: Final[Mapping[str, ObjectEntry]] = {row.setting: row for row in OBJECTS if row.setting}
