@@ -5,15 +5,9 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-import pytest
-
-from ethercat_server.errors import ForbiddenWriteError
-from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.slave.coe import finish
-from ethercat_server.sensor.guard import GuardedSdo
-from ethercat_server.sensor.objects.dictionary import BY_SETTING, FACTORY_CALIBRATION
+from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
 from protocol.sensor.sdo_types import SDO_TYPE_NAMES
 from tests.server.bench import Bench
 from tests.simulated_links import SimulatedServer, simulated_bus, simulated_server
@@ -73,19 +67,6 @@ def test_no_command_of_the_tool_writes_it(tmp_path: Path) -> None:
         tool_here("read", *address, "Calibration")
         tool_here("tare", *address, "--samples", 20)
         tool_here("save", *address)
-
-
-def test_nothing_below_the_tool_and_the_server_writes_it() -> None:
-    class NoSdo:
-        """Whoever comes as far as this has failed."""
-
-        clock = SYSTEM_CLOCK
-
-    sdo = GuardedSdo(cast(Any, NoSdo()))
-    for subindex in range(256):
-        with pytest.raises(ForbiddenWriteError, match="never written"):
-            finish(sdo.write(FACTORY_CALIBRATION, subindex, b"\0" * 4))
-    assert FACTORY_CALIBRATION not in {row.index for row in BY_SETTING.values()}
 
 
 def test_every_path_to_a_sensor_that_writes_is_guarded() -> None:

@@ -1,4 +1,4 @@
-"""SDO transfers by single datagrams, with a mailbox whose answers are given."""
+"""SDO transfers by single datagrams, with a mailbox whose answers are given; AL status codes in words."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 from ethercat_server.errors import SdoAbortError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
+from ethercat_server.ethercat.slave.al import AlStatus
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, T, finish
 from ethercat_server.ethercat.slave.registers import MAILBOX_IN_STATUS
 
@@ -71,3 +72,16 @@ def test_a_refusal_says_why_in_words_and_as_a_number(code: int, words: str) -> N
     bus = GivenBus((ABORTED, 0x8001, struct.pack("<I", code)))
     with pytest.raises(SdoAbortError, match=rf"sensor 0 refused writing .*{words} \(abort 0x{code:08X}\)"):
         finish(mailbox(bus).write(0x8001, 1, b"efgh"))
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (0x001B, "sync manager watchdog"),
+        (0x0035, "distributed clock: invalid sync cycle time"),
+        (0x8001, "the vendor's own code"),
+        (0x0FFF, "reserved"),
+    ],
+)
+def test_an_al_error_is_said_in_words(code: int, words: str) -> None:
+    assert str(AlStatus.of(0x14, code)).startswith(f"SAFEOP with AL status 0x{code:04X} ({words}")
