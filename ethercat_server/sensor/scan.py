@@ -31,9 +31,7 @@ _MASTER_FRAMES: Final = 3
 _TIMEOUT_S: Final = 0.02
 _ATTEMPTS: Final = 5
 _PROBE_BYTES: Final = 1
-_SII_PAUSE_S: Final = (
-    0.0002  # between two questions whether an EEPROM has read a word, which takes it 1 to 3 ms
-)
+_SII_PAUSE_S: Final = 0.0002  # between two questions whether an EEPROM has read a word: 1 to 3 ms
 _PAUSE_S: Final = 0.002
 _ACKNOWLEDGE: Final = 0x10
 # Start and length of a Bota sensor's sync managers 0 to 2, and start of the last one.
@@ -93,7 +91,7 @@ class Slave(NamedTuple):
 
 
 def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = False) -> list[Slave]:
-    """All slaves on the wire.
+    """All slaves, in their order on the wire, with their SIIs; NoSlaveError if there are none.
 
     BusError if using the bus would stop somebody else's machine: if another master is sending, or a slave
     that is not Bota's is in SAFEOP, OP or BOOT. With `force`, such slaves are taken to PREOP instead.
@@ -104,7 +102,15 @@ def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = Fals
             "it, or name the interface that the sensor is connected to; --force takes its slaves over"
         )
     check_interrupt()
-    slaves = look(bus, check_interrupt)
+    slaves = []
+    for position in range(max(bus.count_slaves(_PROBE_BYTES, _TIMEOUT_S) for _ in range(_ATTEMPTS))):
+        check_interrupt()
+        slaves.append(look_at(bus, position))
+    if not slaves:
+        raise NoSlaveError(
+            f"no EtherCAT slave answers on {bus.ifname}: check the cable, that the sensor has power and "
+            "that this is the interface it is connected to"
+        )
     at_work = [slave for slave in slaves if slave.at_work]
     if at_work and not force:
         where = ", ".join(f"{slave.position} in {slave.status.state.name}" for slave in at_work)
@@ -117,21 +123,6 @@ def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = Fals
         check_interrupt()
         stopped = _stopped(bus, slave, check_interrupt) if slave.at_work else slave
         found.append(with_sii(bus, stopped, check_interrupt))
-    return found
-
-
-def look(bus: Bus, check_interrupt: CheckInterrupt) -> list[Slave]:
-    """All slaves, in their order on the wire, without their SIIs; BusError if there are none."""
-    count = max(bus.count_slaves(_PROBE_BYTES, _TIMEOUT_S) for _ in range(_ATTEMPTS))
-    if count <= 0:
-        raise NoSlaveError(
-            f"no EtherCAT slave answers on {bus.ifname}: check the cable, that the sensor has power and "
-            "that this is the interface it is connected to"
-        )
-    found = []
-    for position in range(count):
-        check_interrupt()
-        found.append(look_at(bus, position))
     return found
 
 

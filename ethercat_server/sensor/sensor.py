@@ -64,29 +64,17 @@ class SensorState(Enum):
     @property
     def reported(self) -> str:
         """What `describe` says."""
-        return _REPORTED[self]
+        return {"STREAMING": "OP", "LOST": "LOST", "REFUSED": "REFUSED"}.get(self.name, "PREOP")
 
 
-_REPORTED: Final = {
-    SensorState.SETTING_UP: "PREOP",
-    SensorState.STREAMING: "OP",
-    SensorState.CHANGING: "PREOP",
-    SensorState.REVERTING: "PREOP",
-    SensorState.LOST: "LOST",
-    SensorState.REFUSED: "REFUSED",
-}
+_S = SensorState
 _TRANSITIONS: Final = {
-    SensorState.SETTING_UP: {SensorState.STREAMING},
-    SensorState.STREAMING: {SensorState.CHANGING, SensorState.LOST},
-    SensorState.CHANGING: {
-        SensorState.STREAMING,
-        SensorState.REVERTING,
-        SensorState.LOST,
-        SensorState.REFUSED,
-    },
-    SensorState.REVERTING: {SensorState.STREAMING, SensorState.LOST, SensorState.REFUSED},
-    SensorState.LOST: {SensorState.STREAMING, SensorState.REFUSED},
-    SensorState.REFUSED: {SensorState.STREAMING, SensorState.REFUSED},
+    _S.SETTING_UP: {_S.STREAMING},
+    _S.STREAMING: {_S.CHANGING, _S.LOST},
+    _S.CHANGING: {_S.STREAMING, _S.REVERTING, _S.LOST, _S.REFUSED},
+    _S.REVERTING: {_S.STREAMING, _S.LOST, _S.REFUSED},
+    _S.LOST: {_S.STREAMING, _S.REFUSED},
+    _S.REFUSED: {_S.STREAMING, _S.REFUSED},
 }
 
 

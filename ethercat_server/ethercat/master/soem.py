@@ -97,14 +97,6 @@ class SoemBackend:
 
     def scan(self, positions: Sequence[int], check_interrupt: CheckInterrupt) -> None:
         """See `Master`. SOEM takes every slave on the wire for its own."""
-        count = self._config_init(check_interrupt)
-        if count != len(positions):
-            raise SetUpError(
-                f"{max(count, 0)} of {len(positions)} slaves on {self.ifname} answered the scan: check cable "
-                "and power"
-            )
-
-    def _config_init(self, check_interrupt: CheckInterrupt) -> int:
         # SOEM tries every byte of the SII for long if a slave goes away meanwhile, two minutes in all, and no
         # signal is noticed before it returns. So it runs in a thread, which can be left behind.
         counts: list[int] = []
@@ -124,7 +116,12 @@ class SoemBackend:
                     )
         finally:
             self._abandoned = thread.is_alive()
-        return counts[0] if counts else 0
+        count = max(counts, default=0)
+        if count != len(positions):
+            raise SetUpError(
+                f"{max(count, 0)} of {len(positions)} slaves on {self.ifname} answered the scan: check cable "
+                "and power"
+            )
 
     def map_process_data(self, check_interrupt: CheckInterrupt) -> None:
         """See `Master`. SOEM requests SAFEOP, too."""
