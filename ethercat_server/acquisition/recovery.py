@@ -112,9 +112,7 @@ class SensorReturn:
         """Take the sensor to PREOP, write what is wanted, and back to OP; raises as `bring_back`."""
         self._left_op = True
         yield from self.slave.go(AlState.PREOP)
-        yield from set_up(self.sdo, self._sensor)
-        self.slave.map()
-        yield from self.slave.enter_op()
+        yield from self._set_up()
         self._left_op = False
         return True
 
@@ -128,8 +126,8 @@ class SensorReturn:
         data = bus.read_at(position, reg.STATION_ADDRESS, 2)
         if data is None:
             return False
-        if int.from_bytes(data, "little") in bus.stations:
-            return bool(int.from_bytes(data, "little") == bus.stations[number])
+        if (station := int.from_bytes(data, "little")) in bus.stations:
+            return station == bus.stations[number]
         yield
         status = bus.read_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
         owner = bus.read_at(position, reg.SII_OWNER, 1)
@@ -146,13 +144,17 @@ class SensorReturn:
         return bus.write_at(position, reg.STATION_ADDRESS, bus.stations[number].to_bytes(2, "little"))
 
     def _set_up_anew(self) -> Steps[None]:
-        sensor = self._sensor
+        identity = self._sensor.identity
         yield from self.slave.enter_preop()
-        found = yield from identify(self.sdo, sensor.identity.name)
-        if (found.name, found.serial) != (sensor.identity.name, sensor.identity.serial):
+        found = yield from identify(self.sdo, identity.name)
+        if (found.name, found.serial) != (identity.name, identity.serial):
             yield from self.slave.go(AlState.INIT)
             raise DifferentSensorError(found)
-        yield from set_up(self.sdo, sensor)
+        yield from self._set_up()
+
+    def _set_up(self) -> Steps[None]:
+        """From PREOP to OP."""
+        yield from set_up(self.sdo, self._sensor)
         self.slave.map()
         yield from self.slave.enter_op()
 
@@ -248,7 +250,8 @@ class Recovery:
         self._short = max(0, self._short - 1) if complete else self._short + 2
         if self._short >= 2 * _SHORT_EXCHANGES:
             self._short = 0
-            self._look_for_lost()
+            for number in self._alive():
+                self._look_at(number, counted=False)
         if self._work:
             for number in list(self._work):
                 self._step(number)
@@ -258,7 +261,10 @@ class Recovery:
             if not self._looks_at_states:
                 self._mailboxes.look_at_next()
                 return
-            self._watch_next()
+            if alive := self._alive():
+                self._watched = next((number for number in alive if number > self._watched), alive[0])
+                # One that is out may be counted in place of one that is not there any more.
+                self._look_at(self._watched, counted=not self._work)
             self._others.look_at_next()
 
     def miss(self, silent_ns: int, now_ns: int) -> None:
@@ -280,31 +286,18 @@ class Recovery:
                     self._lose_in_change(number, self._silence())
 
     def _silence(self) -> str:
-        why = self._bus.backend.why_silent()
-        return (
-            self._explain("no frame comes back", why) if why == CHECK_CABLE else f"no frame comes back: {why}"
-        )
+        why, lost = self._bus.backend.why_silent(), "no frame comes back"
+        return self._explain(lost, why) if why == CHECK_CABLE else f"{lost}: {why}"
 
     def _explain(self, reason: str, otherwise: str = "") -> str:
         return self.causes.explain(reason, self._clock.monotonic_ns(), otherwise)
 
-    def _watch_next(self) -> None:
-        if alive := self._alive():
-            self._watched = next((number for number in alive if number > self._watched), alive[0])
-            # One that is out may be counted in place of one that is not there any more.
-            self._look_at(self._watched, counted=not self._work)
-
-    def _look_for_lost(self) -> None:
-        for number in self._alive():
-            self._look_at(number, counted=False)
-
     def _look_at(self, number: int, *, counted: bool) -> None:
-        status = self._bus.slaves[number].status()
-        if status is None:
-            if counted:
-                return  # as long as the working counter is right, one datagram got lost
-            status = self._bus.slaves[number].status()
-        if status is None:
+        slave = self._bus.slaves[number]
+        status = slave.status()
+        if status is None and counted:
+            return  # as long as the working counter is right, one datagram got lost
+        if status is None and (status := slave.status()) is None:
             self._lose(number, self._explain("it does not answer"))
         elif not status.is_op:
             self._lose(number, self._explain(f"it is in {status}"))
@@ -321,14 +314,8 @@ class Recovery:
         sensor = self._sensors[number]
         self._lost_at_ns[number] = self._clock.monotonic_ns()
         log.warning("sensor %d (%s) is lost: %s", number, sensor.identity, reason)
-        self._announce(
-            event(
-                Event.SENSOR_LOST,
-                sensor=number,
-                reason=reason,
-                message=f"sensor {number} is lost: {reason}",
-            )
-        )
+        message = f"sensor {number} is lost: {reason}"
+        self._announce(event(Event.SENSOR_LOST, sensor=number, reason=reason, message=message))
 
     def _take_out(self, number: int, state: SensorState, steps: Steps[bool]) -> None:
         self._sensors[number].enter(state)

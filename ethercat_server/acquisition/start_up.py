@@ -86,15 +86,30 @@ def bring_up(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Start
     `check_interrupt` is called between the steps and may raise to give up. BusError says which sensor did
     not do what.
     """
-    found = find_sensors(bus, wanted, check_interrupt)
+    found = _find_sensors(bus, wanted, check_interrupt)
     for sensor in found.sensors:
         sdo = GuardedSdo(bus.slaves[sensor.number].sdo)
         finish(_prepare(sdo, sensor, wanted), clock=bus.clock, check_interrupt=check_interrupt)
-    enter_op(bus, found.sensors, check_interrupt)
+
+    def enter_op(again: bool) -> None:
+        if again:
+            bus.scan_again(check_interrupt)
+        for sensor, size in zip(found.sensors, bus.map_process_data(check_interrupt), strict=True):
+            try:
+                sensor.pdo_size = layout_for(size).size
+            except PdoSizeError as error:
+                # Also what it seems to be if the answer to one of the master's questions was lost.
+                raise SetUpError(f"sensor {sensor.number} ({sensor.identity.name}) maps {error}") from None
+        bus.enter_op(check_interrupt)
+
+    _try_again(enter_op)
+    for sensor in found.sensors:
+        sensor.enter(SensorState.STREAMING)
+        sensor.settle(bus.clock)
     return found
 
 
-def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Started:
+def _find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Started:
     """Find the sensors on the open `bus`, in PREOP, and ask them who they are; nothing is written."""
     slaves = look_safely(bus, check_interrupt, force=wanted.force)
     of_sensors = [slave for slave in slaves if slave.is_sensor]
@@ -121,31 +136,19 @@ def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> S
         return [_find(bus, number, slave, wanted, check_interrupt) for number, slave in enumerate(of_sensors)]
 
     sensors = _try_again(find)
-    _check_places(bus.ifname, sensors, wanted)
+    if wanted.sensor_name is not None and sensors[0].identity.name != wanted.sensor_name:
+        raise BusError(
+            f"the sensor on {bus.ifname} is a {sensors[0].identity.name}, not a {wanted.sensor_name}: "
+            "correct the name on the command line or leave it out"
+        )
+    try:
+        wanted.check_sensors({sensor.number: sensor.identity for sensor in sensors})
+    except UsageError as error:
+        raise BusError(str(error)) from None  # a sensor that is switched on later: the service tries again
     for slave in others:
         level = logging.WARNING if slave.sii is None else logging.INFO
         log.log(level, "%s is left alone: it stays in %s", slave, slave.status)
     return Started(sensors, others)
-
-
-def enter_op(bus: Bus, sensors: list[Sensor], check_interrupt: CheckInterrupt) -> None:
-    """Map the process data of all `sensors` and take them from PREOP to OP, set as they are."""
-
-    def enter(again: bool) -> None:
-        if again:
-            bus.scan_again(check_interrupt)
-        for sensor, size in zip(sensors, bus.map_process_data(check_interrupt), strict=True):
-            try:
-                sensor.pdo_size = layout_for(size).size
-            except PdoSizeError as error:
-                # Also what it seems to be if the answer to one of the master's questions was lost.
-                raise SetUpError(f"sensor {sensor.number} ({sensor.identity.name}) maps {error}") from None
-        bus.enter_op(check_interrupt)
-
-    _try_again(enter)
-    for sensor in sensors:
-        sensor.enter(SensorState.STREAMING)
-        sensor.settle(bus.clock)
 
 
 def _try_again(attempt: Callable[[bool], T]) -> T:
@@ -229,15 +232,3 @@ def _find(bus: Bus, number: int, slave: Slave, wanted: Wanted, check_interrupt: 
     who = (number, identity.name, identity.serial)
     asked = frozenset(wanted.asked_settings(*who))
     return Sensor(number, identity, wanted.wanted_settings(*who), asked, slave.position)
-
-
-def _check_places(ifname: str, sensors: list[Sensor], wanted: Wanted) -> None:
-    if wanted.sensor_name is not None and sensors[0].identity.name != wanted.sensor_name:
-        raise BusError(
-            f"the sensor on {ifname} is a {sensors[0].identity.name}, not a {wanted.sensor_name}: "
-            "correct the name on the command line or leave it out"
-        )
-    try:
-        wanted.check_sensors({sensor.number: sensor.identity for sensor in sensors})
-    except UsageError as error:
-        raise BusError(str(error)) from None  # a sensor that is switched on later: the service tries again

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ethercat_server.acquisition.start_up import AsFound, bring_up, find_sensors
+from ethercat_server.acquisition.start_up import AsFound, bring_up
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave import registers as reg
@@ -44,9 +44,9 @@ def test_a_drive_at_work_is_not_touched(drive: int, state: AlState) -> None:
 
 def test_force_takes_it_over() -> None:
     backend = chain("BOTA:OP,DRIVE:OP")
-    found = find_sensors(Bus(backend), AsFound(force=True), no_check)
+    found = bring_up(Bus(backend), AsFound(force=True), no_check)
     assert ([s.position for s in found.sensors], [o.position for o in found.others]) == ([0], [1])
-    assert [image[0x0130] & 0x0F for image in registers(backend)] == [AlState.PREOP] * 2
+    assert [image[0x0130] & 0x0F for image in registers(backend)] == [AlState.OP, AlState.PREOP]
 
 
 @pytest.mark.parametrize("pdo_size", [61, 77])
