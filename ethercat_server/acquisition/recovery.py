@@ -28,7 +28,7 @@ from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import is_sensor
 from ethercat_server.sensor.scan import OtherSlaves
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
-from ethercat_server.sensor.set_up import identify, put_right, set_up
+from ethercat_server.sensor.set_up import identify, set_up, set_up_in_op
 from protocol.control import Event, event
 from protocol.settings import SettingValue
 from protocol.text.json_text import JsonObject
@@ -87,8 +87,8 @@ class SensorReturn:
             elif status.is_op:
                 if not self._left_op:
                     self.slave.latch_events()
-                if self._sensor.unsettled:
-                    yield from put_right(self.sdo, self._sensor)
+                if self._sensor.change_interrupted:
+                    yield from set_up_in_op(self.sdo, self._sensor)
                 left_op, self._left_op = self._left_op, False
                 return left_op
             elif status.state is AlState.SAFEOP:

@@ -95,7 +95,7 @@ class Sensor:
     rate_hz: int = 0
     state: SensorState = SensorState.SETTING_UP
     settings: dict[str, SettingValue] = field(default_factory=dict)
-    """The settings in force; `hold` changes them."""
+    """The settings in force; `set_in_force` changes them."""
     meaning: dict[str, str] = field(default_factory=dict)
     """What each of them means. Kept, so that telling it takes no time from the samples."""
     offset: tuple[float, ...] | None = None
@@ -104,7 +104,7 @@ class Sensor:
     """The SINC length is a guess from a rate that CHOP may have divided: not to be written for no reason."""
     settled_at: Deadline | None = None
     """When its data will have settled; see `settle`."""
-    unsettled: bool = False
+    change_interrupted: bool = False
     """A change was interrupted: neither the former settings nor the wanted ones are in force for certain."""
 
     @property
@@ -133,7 +133,7 @@ class Sensor:
         divisor = rate_divisor(length, self.rate_hz, self.wanted.get("chop")) or 1
         return 1e9 * length * divisor / BASE_SAMPLING_RATE_HZ
 
-    def hold(self, settings: Mapping[str, SettingValue]) -> None:
+    def set_in_force(self, settings: Mapping[str, SettingValue]) -> None:
         """These settings are in force now."""
         self.settings = dict(settings)
         chop = settings.get("chop")
@@ -142,14 +142,14 @@ class Sensor:
         }
 
     @property
-    def told_offset(self) -> list[float] | None:
+    def reported_offset(self) -> list[float] | None:
         """The force/torque offset as messages carry it; None if it is not known, or no numbers."""
         offset = self.offset
         return list(offset) if offset is not None and all(map(math.isfinite, offset)) else None
 
     def in_force(self) -> dict[str, Any]:
         """What replies and events say of a change."""
-        return {"settings": dict(self.settings), "rate_hz": self.rate_hz, "offset": self.told_offset}
+        return {"settings": dict(self.settings), "rate_hz": self.rate_hz, "offset": self.reported_offset}
 
     def describe(self) -> dict[str, Any]:
         """The sensor's part of the `describe` reply."""
@@ -166,7 +166,7 @@ class Sensor:
             "settling": self.settling,
             "settings": self.settings,
             "meaning": self.meaning,
-            "offset": self.told_offset,
+            "offset": self.reported_offset,
         }
 
 

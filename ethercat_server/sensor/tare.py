@@ -112,13 +112,13 @@ def _take_back(
     """Write the old offset again; returns `error` with what came of that."""
     addition = "; the old offset is in force"
     if isinstance(error, CutOffError):
-        sensor.offset, sensor.unsettled = old, True
+        sensor.offset, sensor.change_interrupted = old, True
         addition = LATER
     else:
         try:
             sensor.offset = yield from write_offset(sdo, old)
         except BusError as worse:
-            sensor.offset, sensor.unsettled = old, True
+            sensor.offset, sensor.change_interrupted = old, True
             addition = f"; restoring the former offset failed too: {worse}; tare it again"
     if isinstance(error, RequestError):
         return RequestError(error.code, f"{error}{addition}", **error.extra)

@@ -412,7 +412,7 @@ def test_one_that_is_on_its_way_back_is_not_counted_in_place_of_another() -> Non
     simulation = Simulation(*sensors)
     simulation.run(0.3)
     simulation.sensors[0].offset = (1.0,) * 6
-    simulation.sensors[0].unsettled = True  # so that it is in OP for a while before it streams
+    simulation.sensors[0].change_interrupted = True  # so that it is in OP for a while before it streams
     simulation.recovery._lose(0, "its settings are to be put right")
     simulation.run(0.005)
     assert not simulation.sensors[0].streams
