@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -20,7 +20,6 @@ from ethercat_server.ethercat.nic.claim import claimed
 from ethercat_server.ethercat.raw_socket import packet_sockets
 from ethercat_server.ethercat.slave.sii_content import decode
 from ethercat_server.sensor.sensor import Sensor
-from protocol.settings import SettingValue
 from tests.server.commands import command, stats
 from tests.server.running import (
     ATTEMPTS,
@@ -75,7 +74,6 @@ def start(
     *commands: str,
     complaint: str = "$^",
     check_interrupt: CheckInterrupt = lambda: None,
-    settings: Mapping[str, SettingValue] = {},
 ) -> list[Sensor]:
     """Start and end, after these commands.
 
@@ -87,7 +85,7 @@ def start(
             command(sensor, text)
         with opened(veth.near) as bus:
             try:
-                return bring_up(bus, Asked(settings), check_interrupt).sensors
+                return bring_up(bus, Asked(), check_interrupt).sensors
             except BusError as error:
                 expected = re.search(complaint, str(error)) or not starved(str(error))
                 if expected or attempt == ATTEMPTS - 1:
@@ -120,33 +118,6 @@ def test_an_interface_that_goes_away_while_it_is_opened() -> None:
         ):
             backend.open()
         assert packet_sockets() == before
-
-
-@pytest.mark.parametrize("how", ["error", pytest.param("busy", marks=pytest.mark.long)])
-def test_an_eeprom_that_cannot_be_read(bench: Bench, how: str) -> None:
-    """SOEM has time-outs of its own: 2 s if each read ends with an error, 11 s if each stays busy."""
-    complaint = rf"the SII \(EEPROM\) of the slave at position 0 of {bench[0].near} cannot be read"
-    with pytest.raises(BusError, match=complaint):
-        start(bench, f"sii {how}", complaint=complaint)
-    command(bench[1], "sii ok")
-
-
-def test_a_name_that_is_no_utf_8_and_a_slave_without_a_mailbox(bench: Bench) -> None:
-    """pysoem raises UnicodeDecodeError for the one, and for the other what it finds in its error ring."""
-    (found,) = start(bench, "eeprom latin")
-    assert found.identity.name == "BFT-SENS-ECAT-M8"
-    complaint = f"sensor 0 on {bench[0].near} has no CoE mailbox, and so no objects to set it up by"
-    with pytest.raises(BusError, match=complaint):
-        start(bench, "eeprom no-mailbox", complaint=complaint)
-    command(bench[1], "eeprom ok")
-
-
-def test_an_object_that_aborts_is_named(bench: Bench) -> None:
-    """An SDO abort as pysoem raises it; INIT as it asks for it."""
-    complaint = "sinc_length = 128 did not take.*: the value is out of range .*0x06090030"
-    with pytest.raises(BusError, match=complaint):
-        start(bench, "abort 0x8006 1 0x06090030", complaint=complaint, settings={"sinc_length": 128})
-    wait_until(lambda: stats(bench[1])["al_state"] == "INIT", "INIT")
 
 
 @pytest.mark.parametrize("report", ["0x1008 0 6 0", f"{LAST_READ} 0 12", "0x1C12 0 1 0", "0x1C12 0 15 0"])

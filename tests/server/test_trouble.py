@@ -245,6 +245,23 @@ def test_a_master_that_lost_frames_has_misled_is_replaced(step: str) -> None:
     assert misled.failed == (step in ("scan", "map_process_data"))
 
 
+@pytest.mark.parametrize(
+    ("command", "complaint"),
+    [
+        ("sii error", "the SII .EEPROM. of the slave at position 0 of memory cannot be read"),
+        ("sii busy", "the SII .EEPROM. of the slave at position 0 of memory cannot be read"),
+        (
+            "abort 0x8006 1 0x06090030",
+            "sinc_length = 128 did not take.*: the value is out of range .abort 0x06090030",
+        ),
+    ],
+)
+def test_what_a_sensor_refuses_is_named(command: str, complaint: str) -> None:
+    backend = MemoryBackend()
+    backend.command(command)
+    assert re.search(complaint, refused(backend, Asked({"sinc_length": 128})))
+
+
 def test_a_start_is_given_up_between_two_transfers() -> None:
     """Nothing more is written to the sensor then; it goes to INIT."""
     backend = MemoryBackend()
