@@ -172,8 +172,8 @@ class _Reconfiguration(NamedTuple):
     asked: frozenset[str]
     done: Callable[[BusError | None], None]
     failed: BusError | None = None
+    # Once it has failed: when whoever asked gets an answer, even if the sensor is not back.
     until: Deadline | None = None
-    """Once it has failed: when whoever asked gets an answer, even if the sensor is not back."""
 
 
 class Recovery:

@@ -56,12 +56,9 @@ class Slave(NamedTuple):
 
     position: int
     status: AlStatus
-    sii: sii_content.Sii | None
-    """None if it was not read."""
-    problem: str = ""
-    """Why its SII cannot be read."""
-    at_work: bool = False
-    """It is no Bota sensor and in SAFEOP, OP or BOOT."""
+    sii: sii_content.Sii | None  # None if it was not read
+    problem: str = ""  # why its SII cannot be read
+    at_work: bool = False  # it is no Bota sensor and in SAFEOP, OP or BOOT
 
     @property
     def name(self) -> str:

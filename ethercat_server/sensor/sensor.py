@@ -53,13 +53,10 @@ class SensorState(Enum):
 
     SETTING_UP = auto()
     STREAMING = auto()
-    CHANGING = auto()
-    """Out of OP to have its settings changed."""
-    REVERTING = auto()
-    """The change failed: it gets its former settings back."""
+    CHANGING = auto()  # out of OP to have its settings changed
+    REVERTING = auto()  # the change failed: it gets its former settings back
     LOST = auto()
-    REFUSED = auto()
-    """Another sensor is connected in its place."""
+    REFUSED = auto()  # another sensor is connected in its place
 
     @property
     def reported(self) -> str:
@@ -82,30 +79,26 @@ _TRANSITIONS: Final = {
 class Sensor:
     """One sensor on the bus, as found and set up."""
 
-    number: int
-    """Among the sensors, from 0."""
+    number: int  # among the sensors, from 0
     identity: Identity
+    # The settings to be in force; written again when the sensor has lost them.
     wanted: dict[str, SettingValue]
-    """The settings to be in force; written again when the sensor has lost them."""
-    asked: frozenset[str] = frozenset()
-    """Those among them that a person asked for: these must exist."""
-    position: int = 0
-    """Among all slaves on the wire, from 0."""
+    asked: frozenset[str] = frozenset()  # those among them that a person asked for: these must exist
+    position: int = 0  # among all slaves on the wire, from 0
     pdo_size: int = 0
     rate_hz: int = 0
     state: SensorState = SensorState.SETTING_UP
+    # The settings in force; `set_in_force` changes them.
     settings: dict[str, SettingValue] = field(default_factory=dict)
-    """The settings in force; `set_in_force` changes them."""
+    # What each of them means. Kept, so that telling it takes no time from the samples.
     meaning: dict[str, str] = field(default_factory=dict)
-    """What each of them means. Kept, so that telling it takes no time from the samples."""
+    # The force/torque offset in force; written again when the sensor has lost it. None: it has none.
     offset: tuple[float, ...] | None = None
-    """The force/torque offset in force; written again when the sensor has lost it. None: it has none."""
+    # The SINC length is a guess from a rate that CHOP may have divided: not to be written for no reason.
     sinc_guessed: bool = False
-    """The SINC length is a guess from a rate that CHOP may have divided: not to be written for no reason."""
-    settled_at: Deadline | None = None
-    """When its data will have settled; see `settle`."""
+    settled_at: Deadline | None = None  # when its data will have settled; see `settle`
+    # A change was interrupted: neither the former settings nor the wanted ones are in force for certain.
     change_interrupted: bool = False
-    """A change was interrupted: neither the former settings nor the wanted ones are in force for certain."""
 
     @property
     def streams(self) -> bool:

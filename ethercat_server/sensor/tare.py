@@ -130,12 +130,9 @@ class _Window(NamedTuple):
 
     mean: list[float]
     deviation: list[float]
-    change: list[float]
-    """From the mean of the first half to that of the second."""
-    by_chance: list[float]
-    """What noise explains of that."""
-    error: list[float]
-    """Standard error of the mean."""
+    change: list[float]  # from the mean of the first half to that of the second
+    by_chance: list[float]  # what noise explains of that
+    error: list[float]  # standard error of the mean
 
 
 class _Part:

@@ -50,12 +50,9 @@ class Interface(NamedTuple):
     ifindex: int
     flags: int
     mtu: int
-    master: int
-    """Index of the bridge or bond that it is part of, 0 if none."""
-    carrier: bool
-    """What the driver says of the link."""
-    address: bytes
-    """Of the hardware."""
+    master: int  # index of the bridge or bond that it is part of, 0 if none
+    carrier: bool  # what the driver says of the link
+    address: bytes  # of the hardware
 
     @property
     def is_up(self) -> bool:
@@ -137,16 +134,12 @@ def _name(index: int) -> str:
 class Routes(NamedTuple):
     """Addresses and routes on an interface."""
 
-    addresses: tuple[str, ...] = ()
-    """With the length of their prefix; link-local ones are not among them."""
-    link_local: tuple[str, ...] = ()
-    """Those that every interface may give itself, without a network."""
-    default: bool = False
-    """The machine's default route goes here."""
-    others: tuple[str, ...] = ()
-    """Destinations of the routes that somebody made."""
+    addresses: tuple[str, ...] = ()  # with the length of their prefix; link-local ones are not among them
+    link_local: tuple[str, ...] = ()  # those that every interface may give itself, without a network
+    default: bool = False  # the machine's default route goes here
+    others: tuple[str, ...] = ()  # destinations of the routes that somebody made
+    # Those of the addresses that a network gave for some time: DHCP, or an IPv6 router.
     leased: tuple[str, ...] = ()
-    """Those of the addresses that a network gave for some time: DHCP, or an IPv6 router."""
 
     def __str__(self) -> str:
         """What makes it part of a network; empty if nothing does."""

@@ -61,10 +61,8 @@ class Emergency(NamedTuple):
     """One emergency message."""
 
     code: int
-    register: int
-    """The error register, object 0x1001."""
-    data: bytes
-    """At most five bytes of the manufacturer's."""
+    register: int  # the error register, object 0x1001
+    data: bytes  # at most five bytes of the manufacturer's
 
     @classmethod
     def parse(cls, body: bytes) -> Self | None:

@@ -44,8 +44,7 @@ class ObjectType(Enum):
     REAL32 = (0x0008, "<f")
     BIT8 = (0x0037, "<B")
     STRING = (0x0009, "")
-    OCTETS = (0x000A, "")
-    """Bytes whose meaning is not known; the value is their hexadecimal digits."""
+    OCTETS = (0x000A, "")  # bytes whose meaning is not known; the value is their hexadecimal digits
 
     def __init__(self, coe_code: int, struct_format: str) -> None:
         self.coe_code = coe_code
@@ -96,15 +95,11 @@ class ObjectEntry:
     name: str
     type: ObjectType
     access: Access
-    default: float | str = 0
-    """Factory default."""
+    default: float | str = 0  # factory default
     unit: str = ""
-    setting: str | None = None
-    """Name of the setting in `protocol.settings`."""
-    codes: Mapping[SettingValue, int] | None = None
-    """Wire value of each setting value, where they differ."""
-    values: Mapping[int, str] | None = None
-    """Wire values that mean something, for what is no setting."""
+    setting: str | None = None  # name of the setting in `protocol.settings`
+    codes: Mapping[SettingValue, int] | None = None  # wire value of each setting value, where they differ
+    values: Mapping[int, str] | None = None  # wire values that mean something, for what is no setting
 
     @property
     def address(self) -> tuple[int, int]:
