@@ -244,13 +244,15 @@ def test_one_that_does_not_say_what_it_is(caplog: pytest.LogCaptureFixture) -> N
     assert warnings == ["'nameless' at position 2 (its SII cannot be read) is left alone: it stays in INIT"]
 
 
-def test_sync_signals_that_another_master_left_are_switched_off() -> None:
-    """A sensor would wait for SYNC0."""
+def test_what_another_master_left_is_ended() -> None:
+    """A sensor would wait for SYNC0, and for its EEPROM."""
     backend = chain("BOTA:OP,EK1100")
     for at in range(2):
         memory_of(backend, at)[reg.DC_ACTIVATION + 1] = 3
+        memory_of(backend, at)[reg.SII_OWNER] = 0
     assert bring_up(Bus(backend), Asked(), lambda: None).sensors[0].streams
     assert [memory_of(backend, at)[reg.DC_ACTIVATION + 1] for at in range(2)] == [0, 3]
+    assert [memory_of(backend, at)[reg.SII_OWNER] for at in range(2)] == [1, 0]
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.4, 60.0])

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import PROCESSED_BIT, SHORTEST_FRAME, SOURCE_ADDRESS, Command, build
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.firmware import firmware
@@ -84,6 +85,19 @@ def test_settings_are_written_again_after_a_power_cut() -> None:
     client.wait_event("sensor_back")
     assert written() == at_start * 2
     assert simulation.stats()["calibration_writes"] == 0
+
+
+@pytest.mark.parametrize("fault", ["deaf 0.1", "safeop 0x1B"])
+def test_event_times_are_latched_again_if_another_master_ended_that(fault: str) -> None:
+    simulation, client = streaming()
+    life = simulation.backend.sensors.sensors[0].life
+    assert life is not None
+    memory, at = life.esc.memory, reg.SYNC_MANAGER + 3 * reg.SYNC_MANAGER_SIZE + reg.SM_ACTIVATE
+    assert memory[at] & reg.SM_LATCH_PDI
+    memory[at] &= ~reg.SM_LATCH_PDI
+    simulation.command(fault)
+    client.wait_event("sensor_back")
+    assert memory[at] & reg.SM_LATCH_PDI
 
 
 def test_a_single_lost_frame_costs_no_sensor_and_no_sample() -> None:

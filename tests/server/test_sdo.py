@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from typing import cast
 
@@ -26,6 +27,7 @@ class GivenBus:
     def __init__(self, *answers: tuple[int, int, bytes]) -> None:
         self.answers = list(answers)
         self.asked = 0
+        self.counters: list[int] = []
 
     def read_register(self, slave: int, address: int, size: int) -> bytes:
         if address == MAILBOX_IN_STATUS:
@@ -37,6 +39,7 @@ class GivenBus:
 
     def write_register(self, slave: int, address: int, data: bytes) -> bool:
         self.asked += 1
+        self.counters.append(data[5] >> 4)
         return True
 
 
@@ -59,6 +62,16 @@ def test_a_read_leaves_the_late_answer_to_a_repeated_write_alone() -> None:
 def test_a_write_leaves_the_late_answer_to_a_repeated_read_alone() -> None:
     bus = GivenBus((READ, 0x8001, b"abcd"), (WRITTEN, 0x8001, bytes(4)))
     run(bus, mailbox(bus).write(0x8001, 1, b"efgh"))
+
+
+def test_no_message_has_the_counter_of_the_one_before_or_that_soems_mapping_begins_with() -> None:
+    bus = GivenBus(*[(READ, 0x8001, b"abcd")] * 20)
+    sdo = mailbox(bus)
+    for _ in range(20):
+        bus.asked = 0
+        finish(sdo.read(0x8001, 1))
+    assert all(one != other for one, other in itertools.pairwise([1, *bus.counters, 1]))
+    assert set(bus.counters) == set(range(2, 8))
 
 
 def test_an_answer_about_another_object_is_left_alone_and_a_refusal_is_not() -> None:
