@@ -204,7 +204,7 @@ class SensorActions:
         self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.number, **sensor.in_force()))
 
     def _announce_offset(self, sensor: Sensor) -> None:
-        self._hub.broadcast(event(Event.OFFSET_CHANGED, sensor=sensor.number, offset=sensor.told_offset))
+        self._hub.broadcast(event(Event.OFFSET_CHANGED, sensor=sensor.number, offset=sensor.reported_offset))
 
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
         if save_too:

@@ -11,7 +11,7 @@ from ethercat_server.doctor.examination import examine_machine
 from ethercat_server.doctor.finding import CannotLookError, Level
 from ethercat_server.doctor.machine import nic
 from ethercat_server.doctor.machine.facts import InterfaceFacts
-from ethercat_server.ethercat.nic.ip import Routes
+from ethercat_server.ethercat.nic.interface import Routes
 from tests.doctor.made_up import CPUS, but, machine, only
 
 NAMED = "ens5"

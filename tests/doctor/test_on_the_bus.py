@@ -11,7 +11,7 @@ import pytest
 from ethercat_server.access.holder import Holder
 from ethercat_server.doctor.bus import examination
 from ethercat_server.doctor.finding import Level
-from ethercat_server.ethercat.nic.ip import Routes
+from ethercat_server.ethercat.nic.interface import Routes
 from tests.doctor.made_up import but
 from tests.doctor.running import examined
 from tests.simulated_links import SimulatedBus, registers, simulated_bus, simulated_server

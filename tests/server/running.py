@@ -196,7 +196,7 @@ _STARVED = (
     "0x00000000",  # vendor or product
     "cannot be mapped",
     "does not end",
-    "does not reach",  # after a lost frame of SOEM's set-up
+    "does not go to",  # after a lost frame of SOEM's set-up
     "maps process data of",  # as much of it as SOEM could read in its time
 )
 """What it says at start where a busy machine lets the virtual sensor's process wait for too long."""

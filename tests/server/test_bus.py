@@ -148,6 +148,13 @@ def operational(
     return bus, backend
 
 
+def inputs(backend: MemoryBackend, position: int) -> bytes:
+    """The process data that a sensor has now."""
+    life = backend.sensors.sensors[position].life
+    assert life is not None
+    return life.inputs()
+
+
 @pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
 def test_an_exchange_brings_every_sensors_process_data(lrw: bool) -> None:
     sensors = [
@@ -158,9 +165,7 @@ def test_an_exchange_brings_every_sensors_process_data(lrw: bool) -> None:
     assert exchange() == 9
     assert bus.process_data.counters == [(3,)] * 3
     for position, options in enumerate(sensors):
-        life = backend.sensors.sensors[position].life
-        assert life is not None
-        assert exchange.inputs[position] == life.inputs()
+        assert exchange.inputs[position] == inputs(backend, position)
         assert len(exchange.inputs[position]) == options.pdo_size
 
 
@@ -181,9 +186,7 @@ def test_process_data_that_does_not_fit_one_frame_goes_in_several(lrw: bool, fra
     assert len(sent) == frames
     assert max(sent) <= 1514
     for position in range(20):
-        life = backend.sensors.sensors[position].life
-        assert life is not None
-        assert exchange.inputs[position] == life.inputs()
+        assert exchange.inputs[position] == inputs(backend, position)
 
 
 def test_a_lost_frame_is_a_miss_and_the_data_stay_those_of_before() -> None:
