@@ -1,13 +1,28 @@
-"""One client's connection: its state, what it has sent so far, which DATA it wants. It never blocks."""
+"""One client's connection: its state, what it has sent so far, which DATA it wants. It never blocks.
+
+    READING <-> READY <-> ANSWERING          a client that may ask
+       |          |           |
+       v          |           |
+    HALF_CLOSED   |           |              it has closed its side and still receives its subscription
+       |          |           |
+       +----------+-----------+
+                  v
+       CLOSING -> LINGERING -> CLOSED        the server closes: sends what waits, then waits for the client
+           \\-> FLUSHING ------^              the client has closed its side: only what waits is sent
+
+From every state a connection that breaks goes to CLOSED at once.
+
+From every state a connection that breaks goes to CLOSED at once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
 from typing import Final, NamedTuple
 
 from ethercat_server.acquisition.stream import Made
 from ethercat_server.serving.outbox import Outbox, with_gap
-from ethercat_server.serving.state import TRANSITIONS, State
 from ethercat_server.serving.transport.base import Stream
 from protocol.errors import BadMessageError, RemoteProtocolError
 from protocol.framing import DataFlag, FrameDecoder, encode_json
@@ -23,6 +38,41 @@ _UNFINISHED_NS: Final = 10_000_000_000
 """Timeout for the rest of a message whose first part has arrived."""
 _LAST_REPLY_NS: Final = 1_000_000_000
 """Timeout for a connection that is being closed."""
+
+
+class State(Enum):
+    """What a connection does now."""
+
+    READING = "waits for the client's next request"
+    READY = "has received bytes that may contain whole requests; reads no more until they are taken"
+    ANSWERING = "its last request is not answered yet; what the client sent after it waits"
+    HALF_CLOSED = "the client has closed its side, but is subscribed"
+    CLOSING = "sends what waits and discards what the client still sends"
+    FLUSHING = "sends what waits; the client has closed its side"
+    LINGERING = "everything is sent and this side is closed; discards until the client has closed its own"
+    CLOSED = "nothing is left but to close the socket"
+
+    def __init__(self, _meaning: str) -> None:
+        # Read for every connection in each turn: an attribute costs less than looking a member up in a set.
+        self.reads = self.name in {"READING", "CLOSING", "LINGERING"}
+        """Whether to wait for bytes of the client."""
+        self.ending = self.name in {"CLOSING", "FLUSHING", "LINGERING", "CLOSED"}
+        """Whether no more requests are taken."""
+
+
+_ENDINGS: Final = frozenset({State.CLOSING, State.FLUSHING, State.CLOSED})
+
+TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
+    State.READING: _ENDINGS | {State.READY, State.HALF_CLOSED},
+    State.READY: _ENDINGS | {State.READING, State.ANSWERING},
+    State.ANSWERING: _ENDINGS | {State.READY},
+    State.HALF_CLOSED: _ENDINGS - {State.CLOSING},
+    State.CLOSING: frozenset({State.FLUSHING, State.LINGERING, State.CLOSED}),
+    State.FLUSHING: frozenset({State.CLOSED}),
+    State.LINGERING: frozenset({State.CLOSED}),
+    State.CLOSED: frozenset(),
+}
+"""The states that may follow each."""
 
 
 class Limits(NamedTuple):
@@ -46,13 +96,14 @@ class Unreadable(NamedTuple):
 class Subscription:
     """Which DATA a client wants. Lists are by the sensor's number."""
 
-    __slots__ = ("every", "fresh_only", "gap", "last_ns", "skipped", "wanted")
+    __slots__ = ("chooses", "every", "fresh_only", "gap", "last_ns", "skipped", "wanted")
 
     def __init__(
         self, sensor_count: int, sensors: tuple[int, ...] | None, every: int, fresh_only: bool
     ) -> None:
         self.wanted = [sensors is None or number in sensors for number in range(sensor_count)]
         self.every = every
+        self.chooses = every != 1 or not all(self.wanted)
         self.fresh_only = fresh_only
         self.skipped = [every - 1] * sensor_count
         # Nothing was sent yet, which counts as long ago even if the clock starts at zero.
@@ -60,10 +111,19 @@ class Subscription:
         self.gap = [False] * sensor_count
 
 
+class Watched(NamedTuple):
+    """File descriptors to wait for; each connection adds and removes its own."""
+
+    readers: set[int]
+    writers: set[int]
+
+
 class Connection:
     """A client's stream and everything that belongs to it."""
 
-    def __init__(self, stream: Stream, uid: int | None, monotonic_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, stream: Stream, uid: int | None, monotonic_ns: Callable[[], int], watched: Watched | None = None
+    ) -> None:
         """`uid` is the user who owns the other end, None if that is not known."""
         self.fd = stream.fileno()
         self.peer = stream.peer
@@ -72,7 +132,9 @@ class Connection:
         self.framed: FrameDecoder | None = None
         self.bare: BareJsonDecoder | None = None
         self.subscription: Subscription | None = None
-        self.outbox = Outbox(stream, monotonic_ns)
+        self._watched = watched or Watched(set(), set())
+        self._watched.readers.add(self.fd)
+        self.outbox = Outbox(stream, monotonic_ns, self._watched.writers)
         self._stream = stream
         self._monotonic_ns = monotonic_ns
         self._heard_ns = monotonic_ns()
@@ -88,6 +150,7 @@ class Connection:
     def _become(self, state: State) -> None:
         assert state in TRANSITIONS[self.state], f"{self}: {self.state} -> {state}"
         self.state = state
+        (self._watched.readers.add if state.reads else self._watched.readers.discard)(self.fd)
 
     @property
     def is_idle(self) -> bool:
@@ -211,6 +274,8 @@ class Connection:
 
     def close(self) -> None:
         """Close the stream."""
+        for descriptors in self._watched:
+            descriptors.discard(self.fd)
         self._stream.close()
 
     def _end(self, state: State) -> None:
@@ -231,16 +296,12 @@ class Connection:
 
     def offer(self, made: Sequence[Made], now_ns: int) -> None:
         """Send those DATA frames that the subscription wants, at once: one for a sensor."""
-        wants = self.subscription
-        if wants is None:
+        if (wants := self.subscription) is None:
             return
         chosen = []
         for frame, number, flags in made:
-            if not wants.wanted[number]:
-                continue
-            if flags or wants.every != 1 or wants.gap[number]:
-                choice = _choose(wants, frame, number, flags, now_ns)
-                if choice is None:
+            if flags or wants.chooses or wants.gap[number]:
+                if (choice := _choose(wants, frame, number, flags, now_ns)) is None:
                     continue
                 chosen.append((choice, number))
             else:
@@ -253,6 +314,8 @@ class Connection:
 
 def _choose(wants: Subscription, frame: bytes, number: int, flags: int, now_ns: int) -> bytes | None:
     """What a subscription gets of a DATA frame that is not like most."""
+    if not wants.wanted[number]:
+        return None
     if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[number] < _IDLE_FRAME_NS:
         return None
     if flags & _GAP:

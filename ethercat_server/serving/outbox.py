@@ -25,8 +25,9 @@ _GAP: Final = int(DataFlag.GAP)
 class Outbox:
     """The sending side of a connection."""
 
-    def __init__(self, stream: Stream, monotonic_ns: Callable[[], int]) -> None:
-        self._send = stream.send
+    def __init__(self, stream: Stream, monotonic_ns: Callable[[], int], writers: set[int]) -> None:
+        """`writers` has the descriptor of the stream while something waits."""
+        self._send, self._fd, self._writers = stream.send, stream.fileno(), writers
         self._monotonic_ns = monotonic_ns
         self.sent = 0
         """DATA frames sent."""
@@ -34,14 +35,17 @@ class Outbox:
         """DATA frames dropped because the client did not read."""
         self.broken = False
         """Sending has failed for good; everything is discarded from then on."""
-        self.waiting = False
-        """Something is queued: `flush` when the socket is writable."""
         self.progress_ns = 0
         """CLOCK_MONOTONIC when the socket last accepted something, while something is queued."""
         self._queue: deque[tuple[bytes, int]] = deque()  # message, sensor's number or NO_SENSOR for JSON
         self._queued_data = 0
         self._queued_json_bytes = 0
         self._head_sent = 0
+
+    @property
+    def waiting(self) -> bool:
+        """Something is queued: `flush` when the socket is writable."""
+        return bool(self._queue)
 
     @property
     def full(self) -> bool:
@@ -52,9 +56,13 @@ class Outbox:
     def send(self, message: bytes) -> None:
         """Send a reply or an event, or queue it."""
         if not self._queue:
-            sent = self._try(message)
+            try:
+                sent = self._send(message)
+            except OSError as error:
+                sent = self._refused(error)
             if sent == len(message) or self.broken:
                 return
+            self._wait()
             self._head_sent = sent
         self._queue.append((message, NO_SENSOR))
         self._queued_json_bytes += len(message)
@@ -66,12 +74,16 @@ class Outbox:
         """
         if not self._queue:
             message = frames[0][0] if len(frames) == 1 else b"".join([frame for frame, _ in frames])
-            sent = self._try(message)
+            try:
+                sent = self._send(message)
+            except OSError as error:
+                sent = self._refused(error)
             if sent == len(message):
                 self.sent += len(frames)
                 return ()
             if self.broken:
                 return ()
+            self._wait()
             whole = 0
             while sent >= (size := len(frames[whole][0])):
                 sent -= size
@@ -88,19 +100,15 @@ class Outbox:
                 dropped.add(self._drop_oldest_data())
         return tuple(dropped - {NO_SENSOR})
 
-    def _try(self, message: bytes) -> int:
-        """How many bytes of it the socket accepts."""
-        try:
-            sent = self._send(message)
-        except BlockingIOError:
-            sent = 0
-        except OSError:
+    def _refused(self, error: OSError) -> int:
+        """The socket accepts nothing: not now, or never again."""
+        if not isinstance(error, BlockingIOError):
             self._break()
-            return 0
-        if sent < len(message):
-            self.waiting = True
-            self.progress_ns = self._monotonic_ns()
-        return sent
+        return 0
+
+    def _wait(self) -> None:
+        self._writers.add(self._fd)
+        self.progress_ns = self._monotonic_ns()
 
     def flush(self) -> None:
         """Send what is queued, as far as the socket accepts it."""
@@ -108,10 +116,8 @@ class Outbox:
             message, number = self._queue[0]
             try:
                 sent = self._send(memoryview(message)[self._head_sent :])
-            except BlockingIOError:
-                return
-            except OSError:
-                self._break()
+            except OSError as error:
+                self._refused(error)
                 return
             self._head_sent += sent
             self.progress_ns = self._monotonic_ns()
@@ -124,11 +130,11 @@ class Outbox:
                 self._queued_data -= 1
             else:
                 self._queued_json_bytes -= len(message)
-        self.waiting = False
+        self._writers.discard(self._fd)
 
     def _break(self) -> None:
         self.broken = True
-        self.waiting = False
+        self._writers.discard(self._fd)
         self._queue.clear()
         self._queued_data = self._queued_json_bytes = self._head_sent = 0
 
