@@ -6,12 +6,14 @@ import sys
 from array import array
 from collections import Counter
 from collections.abc import Sequence
+from itertools import repeat
+from operator import rshift
 from typing import Final
 
 _POINTS: Final = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
 _WINDOW_SLOTS: Final = 10
+# A recent distribution covers the last ten slots of this length.
 SLOT_NS: Final = 1_000_000_000
-"""A recent distribution covers the last ten slots of this length."""
 # The upper bits of a float32 are its sign, its exponent and the first bits of its mantissa: of those, 5 tell
 # 32 buckets an octave apart.
 _UPPER_HALF: Final = slice(sys.byteorder == "little", None, 2)
@@ -39,9 +41,8 @@ class Distribution:
         """Sort what was recorded into its buckets; the number of all durations so far."""
         if ring := self._ring:
             self._max = max(self._max, *ring)
-            for bits, times in Counter(memoryview(ring).cast("B").cast("H")[_UPPER_HALF].tolist()).items():
-                bucket = bits >> _DROPPED_BITS
-                self._counts[0 if bucket & _SIGN else bucket] += times
+            halves = array("H", ring.tobytes())[_UPPER_HALF]
+            self._counts.update(map(rshift, halves, repeat(_DROPPED_BITS)))
             del ring[:]
         return self._counts.total()
 
@@ -54,6 +55,8 @@ class Distribution:
     def percentiles_ns(self, fractions: Sequence[float]) -> list[float]:
         """The durations that these parts (0 to 1, ascending) of all are at most; 0 if there is none."""
         total, found, seen = self.count(), list[float](), 0
+        for bucket in [each for each in self._counts if each & _SIGN]:
+            self._counts[0] += self._counts.pop(bucket)
         for bucket in sorted(self._counts):
             seen += self._counts[bucket]
             while len(found) < len(fractions) and seen >= fractions[len(found)] * total:
@@ -79,9 +82,13 @@ class RecentDistribution:
         self._slots = [Distribution()]
         self.record = self._slots[-1].record
 
+    def count(self) -> None:
+        """To be called now and then: what was recorded meanwhile is sorted."""
+        self._slots[-1].count()
+
     def roll(self) -> None:
         """A second has passed."""
-        self._slots[-1].count()
+        self.count()
         self._slots.append(Distribution())
         self.record = self._slots[-1].record
         if len(self._slots) > _WINDOW_SLOTS:

@@ -17,27 +17,33 @@ From every state a connection that breaks goes to CLOSED at once.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
 from ethercat_server.acquisition.stream import Made
-from ethercat_server.serving.outbox import Outbox, with_gap
 from ethercat_server.serving.transport.base import Stream
 from protocol.errors import BadMessageError, RemoteProtocolError
-from protocol.framing import DataFlag, FrameDecoder, encode_json
+from protocol.framing import DATA_FLAGS_OFFSET, DataFlag, FrameDecoder, encode_json
 from protocol.text.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 from protocol.text.json_text import JsonObject
 
 MAX_REQUEST_LENGTH: Final = 4096
+MAX_QUEUED_DATA: Final = 256
+MAX_QUEUED_JSON: Final = 64
+# Limits of the replies and events that wait; a client that asks and never reads is closed at them.
+MAX_QUEUED_JSON_BYTES: Final = 262_144
+
+NO_SENSOR: Final = -1
+# A `fresh_only` client gets a REPEATED frame only if it has received nothing for this long.
 _IDLE_FRAME_NS: Final = 10_000_000
-"""A `fresh_only` client gets a REPEATED frame only if it has received nothing for this long."""
 _REPEATED: Final = int(DataFlag.REPEATED)
 _GAP: Final = int(DataFlag.GAP)
+# Timeout for the rest of a message whose first part has arrived.
 _UNFINISHED_NS: Final = 10_000_000_000
-"""Timeout for the rest of a message whose first part has arrived."""
+# Timeout for a connection that is being closed.
 _LAST_REPLY_NS: Final = 1_000_000_000
-"""Timeout for a connection that is being closed."""
 
 
 class State(Enum):
@@ -62,6 +68,7 @@ class State(Enum):
 
 _ENDINGS: Final = frozenset({State.CLOSING, State.FLUSHING, State.CLOSED})
 
+# The states that may follow each.
 TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
     State.READING: _ENDINGS | {State.READY, State.HALF_CLOSED},
     State.READY: _ENDINGS | {State.READING, State.ANSWERING},
@@ -72,7 +79,6 @@ TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
     State.LINGERING: frozenset({State.CLOSED}),
     State.CLOSED: frozenset(),
 }
-"""The states that may follow each."""
 
 
 class Limits(NamedTuple):
@@ -109,6 +115,144 @@ class Subscription:
         # Nothing was sent yet, which counts as long ago even if the clock starts at zero.
         self.last_ns = [-_IDLE_FRAME_NS] * sensor_count
         self.gap = [False] * sensor_count
+
+
+class Outbox:
+    """The send queue of a connection: bounded, of whole messages.
+
+    Sending never blocks. What cannot be sent at once is queued; a full queue drops the oldest DATA frame,
+    never part of a frame and never a reply.
+    """
+
+    def __init__(self, stream: Stream, monotonic_ns: Callable[[], int], writers: set[int]) -> None:
+        """`writers` has the descriptor of the stream while something waits."""
+        self._send, self._fd, self._writers = stream.send, stream.fileno(), writers
+        self._monotonic_ns = monotonic_ns
+        self.sent = 0
+        """DATA frames sent."""
+        self.withheld = 0
+        """DATA frames dropped because the client did not read."""
+        self.broken = False
+        """Sending has failed for good; everything is discarded from then on."""
+        self.progress_ns = 0
+        """CLOCK_MONOTONIC when the socket last accepted something, while something is queued."""
+        self._queue: deque[tuple[bytes, int]] = deque()  # message, sensor's number or NO_SENSOR for JSON
+        self._queued_data = 0
+        self._queued_json_bytes = 0
+        self._head_sent = 0
+
+    @property
+    def waiting(self) -> bool:
+        """Something is queued: `flush` when the socket is writable."""
+        return bool(self._queue)
+
+    @property
+    def full(self) -> bool:
+        """Whether the limit of queued replies and events is reached."""
+        replies = len(self._queue) - self._queued_data
+        return replies >= MAX_QUEUED_JSON or self._queued_json_bytes > MAX_QUEUED_JSON_BYTES
+
+    def send(self, message: bytes) -> None:
+        """Send a reply or an event, or queue it."""
+        if not self._queue:
+            try:
+                sent = self._send(message)
+            except OSError as error:
+                sent = self._refused(error)
+            if sent == len(message) or self.broken:
+                return
+            self._wait()
+            self._head_sent = sent
+        self._queue.append((message, NO_SENSOR))
+        self._queued_json_bytes += len(message)
+
+    def send_data(self, frames: Sequence[tuple[bytes, int]]) -> Sequence[int]:
+        """Send DATA frames with their sensors' numbers, one for each, or queue them.
+
+        Returns the sensors whose next frame must carry GAP because one was dropped.
+        """
+        if not self._queue:
+            message = frames[0][0] if len(frames) == 1 else b"".join([frame for frame, _ in frames])
+            try:
+                sent = self._send(message)
+            except OSError as error:
+                sent = self._refused(error)
+            if sent == len(message):
+                self.sent += len(frames)
+                return ()
+            if self.broken:
+                return ()
+            self._wait()
+            whole = 0
+            while sent >= (size := len(frames[whole][0])):
+                sent -= size
+                whole += 1
+            self.sent += whole
+            frames = frames[whole:]
+            self._head_sent = sent
+        dropped: set[int] = set()
+        for frame, number in frames:
+            self._queue.append((with_gap(frame) if number in dropped else frame, number))
+            dropped.discard(number)
+            self._queued_data += 1
+            if self._queued_data > MAX_QUEUED_DATA:
+                dropped.add(self._drop_oldest_data())
+        return tuple(dropped - {NO_SENSOR})
+
+    def _refused(self, error: OSError) -> int:
+        """The socket accepts nothing: not now, or never again."""
+        if not isinstance(error, BlockingIOError):
+            self._break()
+        return 0
+
+    def _wait(self) -> None:
+        self._writers.add(self._fd)
+        self.progress_ns = self._monotonic_ns()
+
+    def flush(self) -> None:
+        """Send what is queued, as far as the socket accepts it."""
+        while self._queue:
+            message, number = self._queue[0]
+            try:
+                sent = self._send(memoryview(message)[self._head_sent :])
+            except OSError as error:
+                self._refused(error)
+                return
+            self._head_sent += sent
+            self.progress_ns = self._monotonic_ns()
+            if self._head_sent < len(message):
+                return
+            self._queue.popleft()
+            self._head_sent = 0
+            if number >= 0:
+                self.sent += 1
+                self._queued_data -= 1
+            else:
+                self._queued_json_bytes -= len(message)
+        self._writers.discard(self._fd)
+
+    def _break(self) -> None:
+        self.broken = True
+        self._writers.discard(self._fd)
+        self._queue.clear()
+        self._queued_data = self._queued_json_bytes = self._head_sent = 0
+
+    def _drop_oldest_data(self) -> int:
+        first = 1 if self._head_sent else 0  # a frame that is partly sent must go out whole
+        for at in range(first, len(self._queue)):
+            number = self._queue[at][1]
+            if number < 0:
+                continue
+            del self._queue[at]
+            self._queued_data -= 1
+            self.withheld += 1
+            for later in range(at, len(self._queue)):
+                frame, its_position = self._queue[later]
+                if its_position == number:
+                    self._queue[later] = (with_gap(frame), number)
+                    return NO_SENSOR
+            return number
+        return NO_SENSOR
 
 
 class Watched(NamedTuple):
@@ -329,3 +473,9 @@ def _choose(wants: Subscription, frame: bytes, number: int, flags: int, now_ns: 
         if not flags & _GAP:
             frame = with_gap(frame)
     return frame
+
+
+def with_gap(frame: bytes) -> bytes:
+    """A copy of an encoded DATA frame with the GAP flag set."""
+    flags = frame[DATA_FLAGS_OFFSET] | _GAP
+    return frame[:DATA_FLAGS_OFFSET] + bytes((flags,)) + frame[DATA_FLAGS_OFFSET + 1 :]

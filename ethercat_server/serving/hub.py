@@ -23,23 +23,23 @@ from protocol.control import ErrorCode, error_reply
 from protocol.errors import RequestError
 from protocol.text.json_text import JsonObject
 
+# Clients get at most a tenth of this thread's time, however much they ask.
 _PAUSE_RATIO: Final = 9
-"""Clients get at most a tenth of this thread's time, however much they ask."""
+# A pass that took long because this thread was not running must not silence all clients.
 _LONGEST_PAUSE_NS: Final = 20_000_000
-"""A pass that took long because this thread was not running must not silence all clients."""
+# No request is begun this shortly before a deadline; a usual one takes less.
 _REQUEST_NS: Final = 280_000
-"""No request is begun this shortly before a deadline; a usual one takes less."""
+# Clients accepted in one pass.
 _MAX_ACCEPTS: Final = 2
-"""Clients accepted in one pass."""
+# How often connections are checked for timeouts and closed.
 _SWEEP_NS: Final = 50_000_000
-"""How often connections are checked for timeouts and closed."""
 _CLOSE_NS: Final = 1_000_000_000
 _CLOSE_TURN_NS: Final = 20_000_000
 
 log = logging.getLogger(__name__)
 
+# Turns a request into its reply, or None if it comes later through `Hub.answer`; RequestError refuses it.
 Handler = Callable[[Connection, JsonObject], JsonObject | None]
-"""Turns a request into its reply, or None if it comes later through `Hub.answer`; RequestError refuses it."""
 
 
 class Hub:
@@ -95,20 +95,19 @@ class Hub:
         last_start_ns = until_ns - _REQUEST_NS
         # Where there is never time for a request, one pass is made nevertheless.
         hurried = last_start_ns <= now_ns
-        while True:
+        while hurried or now_ns < until_ns:
             reads = self._pause_ends_ns <= now_ns and (hurried or now_ns < last_start_ns)
             wake_ns = until_ns
-            if reads and (hurried or self._ready):
-                wake_ns = now_ns
-            elif now_ns < self._pause_ends_ns < until_ns:
-                wake_ns = self._pause_ends_ns
+            if hurried or self._ready or now_ns < self._pause_ends_ns:
+                if reads:
+                    wake_ns = now_ns
+                elif now_ns < self._pause_ends_ns < until_ns:
+                    wake_ns = self._pause_ends_ns
             wait_s = (wake_ns - now_ns) * 1e-9 if wake_ns > now_ns else 0.0
             ready = self._transport.wait(watched.readers if reads else (), watched.writers, wait_s)
             if ready[0] or ready[1] or (reads and self._ready):
                 self._attend(*ready, last_start_ns, reads=reads, hurried=hurried)
             hurried, now_ns = False, self._monotonic_ns()
-            if now_ns >= until_ns:
-                break
         if now_ns >= self._sweep_at_ns:
             self._sweep(now_ns)
 

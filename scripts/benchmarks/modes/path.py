@@ -1,4 +1,4 @@
-"""The way of a sample from the wire to its subscribers, counted: source lines, Python calls, files, system calls.
+"""The way of a sample from the wire to its subscribers: source lines, Python calls, files, system calls.
 
 The server runs in memory and in simulated time, so the figures are the same on every machine and in every
 run. Everything between two hand-outs counts: the loop, learning, what is done once a second. What stands for
@@ -24,7 +24,7 @@ from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.control import request
 from protocol.framing import encode_json
 
-SETTLED_S: Final = 3.0
+SETTLED_S: Final = 8.0
 SECONDS: Final = 1.0
 CLIENTS: Final = (1, 4)
 CLOCKS: Final = {"with a distributed clock": "", "without": "none"}
@@ -42,7 +42,7 @@ _SYSTEM_CALLS: Final = {
 """What each of these is in a server that has a network interface, and TCP."""
 
 
-class Path_(NamedTuple):
+class Way(NamedTuple):
     """Figures of one new sample: most are like the median; the mean is what they cost."""
 
     lines: float
@@ -109,7 +109,7 @@ class _Tracer:
         return leaves
 
 
-def count(dc: str, clients: int, seconds: float = SECONDS) -> Path_:
+def count(dc: str, clients: int, seconds: float = SECONDS) -> Way:
     """The figures of one sensor, whose controller's clock is `dc` (`--dc`), with so many subscribers."""
     backend = MemoryBackend(SensorOptions(ppm=150.0, dc=dc))
     transport = InMemoryTransport(backend.clock)
@@ -135,7 +135,7 @@ def count(dc: str, clients: int, seconds: float = SECONDS) -> Path_:
     if __name__ == "__main__":
         for key, value in sorted(tracer.where.items(), key=lambda row: -row[1])[:45]:
             print(f"{value / len(tracer.samples):8.2f} {key}")
-    return Path_(
+    return Way(
         median(lines), mean(lines), median(calls), mean(calls), median(files),
         median(system_calls), mean(system_calls),
     )  # fmt: skip
@@ -143,5 +143,5 @@ def count(dc: str, clients: int, seconds: float = SECONDS) -> Path_:
 
 if __name__ == "__main__":
     for dc in ("none", ""):
-        for n in (1,4):
+        for n in (1, 4):
             print(repr(dc), n, count(dc, n))
