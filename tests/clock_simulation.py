@@ -279,7 +279,8 @@ class ClockSimulation:
 
     def _send(self) -> None:
         sent_ns = self.now_ns
-        self.timing.sends(int(sent_ns))
+        self.timing.sent_ns, self.timing.in_flight = int(sent_ns), True
+        self.timing.unanswered += 1
         self.polls_ns.append(sent_ns)
         out_ns, took_ns = self.card.exchange(self._chance)
         if self._chance.random() < self.card.lost:

@@ -490,11 +490,10 @@ class SampleClock:
         """
         if self._skipped >= self._skips or self._timing.moved_ns != self._moved_ns:
             return False
-        estimate = self.estimate
         if self._fresh:
             self._skipped += 1
-            estimate.phase_ns += estimate.period_ns
-        elif self._sent_ns > estimate.phase_ns + self._late_ns:
+            self.estimate.phase_ns += self.estimate.period_ns
+        elif self._sent_ns > self.estimate.phase_ns + self._late_ns:
             return False
         else:
             self._hits = 0

@@ -51,7 +51,7 @@ class Outlet(Protocol):
         ...
 
     def serve(self, until_ns: int) -> None:
-        """Do what else there is to do until CLOCK_MONOTONIC is `until_ns`."""
+        """Do what else there is to do, or wait, until CLOCK_MONOTONIC is `until_ns`."""
         ...
 
 
@@ -94,8 +94,7 @@ class Schedule:
             wanted = [stream.clock.next_poll_ns() for stream in streams]
             latest_ns = min(wanted) + self._spacing_ns
             due_ns = max([each for each in wanted if each <= latest_ns])
-        lead_ns = timing.late_ns if timing.late_ns < _LONGEST_LEAD_NS else _LONGEST_LEAD_NS
-        return max(due_ns - lead_ns, timing.sent_ns + self._spacing_ns)
+        return max(due_ns - min(timing.late_ns, _LONGEST_LEAD_NS), timing.sent_ns + self._spacing_ns)
 
     def cost(self, busy_ns: int) -> None:
         """An exchange has kept the loop busy for so long."""
@@ -184,8 +183,6 @@ class Cycle:
                 if due > now or now > serve_by:
                     hub.serve(due)
                     serve_by, slept = now + _SERVE_EVERY_NS, due > now
-                    if (left := due - monotonic_ns()) > 0:  # the outlet had nothing to wait for
-                        bus.clock.sleep(left * 1e-9)
             elif now > serve_by:
                 hub.serve(now)
                 serve_by = now + _SERVE_IN_FLIGHT_NS
@@ -233,10 +230,10 @@ class Cycle:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
             if slept:  # else the answer was held up, and what is due was past when it came
                 self._recovery.causes.stood_still(late, now)
-        timing.sent_ns, timing.in_flight = sent, _ = bus.process_data.send(), True
-        if not timing.unanswered:
-            timing.unanswered_since_ns = sent
-        timing.unanswered += 1
+        if timing.unanswered == 1:
+            timing.unanswered_since_ns = timing.sent_ns
+        timing.sent_ns = sent = bus.process_data.send()
+        timing.in_flight, timing.unanswered = True, timing.unanswered + 1
         if slept:
             self._wake.record(sent - due)
             timing.woke_late_ns = sent - due

@@ -48,7 +48,7 @@ class ExchangeTiming:
         self.unanswered = 0
         """Exchanges that were sent since one was back."""
         self.unanswered_since_ns = now_ns
-        """When the first of them was sent."""
+        """When the first of them was sent, if there are several."""
         self.least_ns = math.inf
         """The shortest recent round trip."""
         self.moved_ns = 0.0
@@ -83,14 +83,6 @@ class ExchangeTiming:
         self._most_late_ns = _OUTLIER * math.sqrt(self._late_variance) + _ROOM_NS
         self.patience_ns = self.usual_ns + 3 * self.excess_ns + _PATIENCE_NS
         """After this time an answer is overdue."""
-
-    def sends(self, now_ns: int) -> None:
-        """An exchange is sent."""
-        self.sent_ns = now_ns
-        self.in_flight = True
-        if not self.unanswered:
-            self.unanswered_since_ns = now_ns
-        self.unanswered += 1
 
     def took(self, sent_ns: int, arrived_ns: int, back_ns: int) -> None:
         """Learn from an exchange whose answer began to arrive, and was there, then; from a wake-up, too."""

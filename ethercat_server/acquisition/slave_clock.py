@@ -403,8 +403,7 @@ class EventTimes:
         oldest, newest = before + self._passing_ns - _SLACK_NS, local + self._passing_ns
         self._is_next = newest < event < local + self._reading_ns and event - period_ns > oldest
         if clock.is_known and (self._is_next or oldest < event <= newest + _SLACK_NS):
-            passed = local - clock.local_at
-            at_ns = clock.time_at + passed + passed * clock.rate
+            at_ns = clock.time_at + (local - clock.local_at) * (1 + clock.rate)
             # Else the clock has jumped.
             if sent_ns - clock.doubt_ns < at_ns < back_ns + clock.doubt_ns:
                 passed_ns = (local - event) * (1 + clock.rate) + self._is_next * period_ns

@@ -70,7 +70,8 @@ class SensorStream:
         """From the estimated instant of a sample to its hand-out, while locked."""
         self.health = SampleHealth(number)
         self._discard = DISCARDED_AT_START
-        self._gap = False
+        # So many new samples to come have GAP.
+        self._gap = 0
         # Whether nothing new has come for long.
         self._silent = False
         # The last valid exchange, and whether it brought a new sample.
@@ -166,9 +167,11 @@ class SensorStream:
         # -1 takes back one that was counted after a stall but came after all.
         self.lost_samples = max(0, self.lost_samples + lost)
         flags = GAP if lost > 0 or self.clock.uncertain or self._gap else 0
-        # What ended a silence may have been held back, where it has no event: one may be missing after it.
-        events = self.clock.events
-        self._gap = self._silent and events is not None and events.has_none
+        self._gap = max(0, self._gap - 1)
+        # What ended a silence may have been held back, where it has no event, as may be the next: one may be
+        # missing after either.
+        if self._silent and (events := self.clock.events) is not None and events.has_none:
+            self._gap = 2
         self._silent = False
         return flags
 
@@ -189,7 +192,7 @@ class SensorStream:
             if before is not None and self.clock.events is not None:
                 self.clock.events.trust.was_trusted = before.trust.was_trusted
             self._discard = DISCARDED_AT_START
-            self._gap = True
+            self._gap = 1
             self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
 
     def status(self) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def simulate(
         bus.set_time(sent + _EXCHANGE_NS // 2)
         data, now = life.inputs(), sent + _EXCHANGE_NS
         valid = not (script.lost_frames and chance.random() < script.lost_frames)
-        timing.sends(sent)
+        timing.sent_ns, timing.in_flight = sent, True
         made = None
         if valid:
             made = stream.take(data, exchange := Exchange(sent, now, b"", 3, 0))

@@ -29,7 +29,7 @@ class Feeder:
         self.clock.advance(self.now)
         self.sample += new
         data = self.sample.to_bytes(61, "little")
-        self.timing.sends(self.now - took_ns)
+        self.timing.sent_ns, self.timing.in_flight = self.now - took_ns, True
         exchange = Exchange(self.now - took_ns, self.now, b"", 3, 0)
         made = self.stream.take(data, exchange) if valid else None
         self.timing.in_flight, self.timing.unanswered = False, 0

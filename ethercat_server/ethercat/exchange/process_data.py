@@ -13,13 +13,13 @@ from ethercat_server.ethercat.wire import BYTE_NS, DATAGRAM_INDEX, FRAME_HEADER,
 
 # Single datagrams and SOEM use the indices below.
 FIRST_INDEX: Final = 0x90
-_INDICES: Final = 0x100 - FIRST_INDEX
+_INDICES: Final = 0x100
 # Frames on the wire; a limit for a bus that does not answer.
 MOST_IN_FLIGHT = 100
 # A frame that is not back after this time counts as lost: its index is used again.
 _LOST_NS: Final = 100_000_000
 _TAG: Final = struct.Struct("<I")
-_NOTHING: Final = (0, 0, 0)
+_NOTHING: Final = (0, 0, -1)
 _IMPOSSIBLE: Final = 0xFFFF
 
 
@@ -59,7 +59,7 @@ class ProcessData:
         """By frame: what its bytes take on the wire."""
         self._ends = [frame.end for frame in frames]
         self._written = [frame.written for frame in frames]
-        self._tags = [frame.tag for frame in frames]
+        self._tags = [frame.tag for frame in frames] or [0]
         self.inputs = [frame.inputs for frame in frames]
         """By frame: the sensors whose inputs it carries."""
         self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
@@ -71,10 +71,9 @@ class ProcessData:
             for frame in frames
         ]
         """By frame: the highest counters of LRD and LWR."""
-        self._index = self._number = 0
+        self._index, self._number = FIRST_INDEX, 0
+        # By index: when a frame was sent that is not back, else 0; which it was; its tag, -1 once it is lost.
         self._sent = [_NOTHING] * _INDICES
-        """By index less the first: when a frame was sent that is not back, else 0; which it was; its tag, 0
-        once it is lost."""
         self.in_flight = 0
         """Frames in flight: not back, and not known to be lost."""
         self._lost = 0
@@ -94,7 +93,6 @@ class ProcessData:
 
     def send(self) -> int:
         """Send an exchange, unless too many are on the wire. Returns when."""
-        now_ns = 0
         for which, frame in enumerate(self._frames):
             index = self._index
             if self.in_flight >= MOST_IN_FLIGHT or self._sent[index][0]:
@@ -104,10 +102,10 @@ class ProcessData:
                     self.blocked_until_ns = min(sent[0] for sent in self._sent if sent[0]) + _LOST_NS
                     return now_ns
                 while self._sent[index][0]:
-                    index = (index + 1) % _INDICES
-            self._index = (index + 1) % _INDICES
+                    index = max(FIRST_INDEX, (index + 1) % _INDICES)
+            self._index = max(FIRST_INDEX, (index + 1) % _INDICES)
             self._number = number = (self._number + 1) & 0xFFFFFFFF
-            frame[DATAGRAM_INDEX] = index + FIRST_INDEX
+            frame[DATAGRAM_INDEX] = index
             _TAG.pack_into(frame, self._tags[which], number)
             self.in_flight += 1
             now_ns = self._monotonic_ns()
@@ -119,8 +117,7 @@ class ProcessData:
         """Take a frame that has arrived; None if it is no answer that is awaited."""
         if len(frame) <= DATAGRAM_INDEX or frame[FRAME_HEADER] != self._command:
             return None
-        if (index := frame[DATAGRAM_INDEX] - FIRST_INDEX) < 0:
-            return None
+        index = frame[DATAGRAM_INDEX]
         sent_ns, which, number = self._sent[index]
         at = self._tags[which]
         if len(frame) < at + _TAG.size or _TAG.unpack_from(frame, at)[0] != number:  # an older one

@@ -14,6 +14,10 @@ from statistics import mean, median
 from types import FrameType
 from typing import Any, Final, NamedTuple
 
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
 from ethercat_server.acquisition.start_up import AsFound
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.server import Server
@@ -23,10 +27,12 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.control import request
 from protocol.framing import encode_json
+from scripts.benchmarks.chain import Setup
 
 SETTLED_S: Final = 8.0
 SECONDS: Final = 1.0
 CLIENTS: Final = (1, 4)
+# What `--dc` of the virtual sensor says for each.
 CLOCKS: Final = {"with a distributed clock": "", "without": "none"}
 _ROOT: Final = Path(__file__).parents[3]
 _COUNTED: Final = (f"{_ROOT}/ethercat_server/", f"{_ROOT}/protocol/")
@@ -62,7 +68,6 @@ class _Tracer:
         self.files: set[str] = set()
         self.samples: list[tuple[int, int, int, int]] = []
         self.begun = False
-        self.where: dict[str, int] = {}
         self._system = {getattr(owner, name).__code__: n for (owner, name), n in _SYSTEM_CALLS.items()}
         self._outside: FrameType | None = None
         self._counts: dict[str, bool] = {}
@@ -91,12 +96,9 @@ class _Tracer:
         self.files.add(code.co_filename)
         return self._line
 
-    def _line(self, frame: FrameType, event: str, _argument: object) -> Callable[..., Any]:
+    def _line(self, _frame: FrameType, event: str, _argument: object) -> Callable[..., Any]:
         if event == "line":
             self.lines += 1
-            code = frame.f_code
-            key = f"{Path(code.co_filename).stem}.{code.co_qualname}"
-            self.where[key] = self.where.get(key, 0) + 1
         return self._line
 
     def _leaving(self, system_calls: int) -> Callable[..., Any]:
@@ -132,16 +134,25 @@ def count(dc: str, clients: int, seconds: float = SECONDS) -> Way:
     finally:
         sys.settrace(before)
     lines, calls, files, system_calls = zip(*tracer.samples, strict=True)
-    if __name__ == "__main__":
-        for key, value in sorted(tracer.where.items(), key=lambda row: -row[1])[:45]:
-            print(f"{value / len(tracer.samples):8.2f} {key}")
     return Way(
         median(lines), mean(lines), median(calls), mean(calls), median(files),
         median(system_calls), mean(system_calls),
     )  # fmt: skip
 
 
-if __name__ == "__main__":
-    for dc in ("none", ""):
-        for n in (1, 4):
-            print(repr(dc), n, count(dc, n))
+def measure_path(_setup: Setup, console: Console) -> dict[str, Any]:
+    """Count and print them."""
+    made = Table(title="One new sample: median / mean", title_justify="left", box=box.SIMPLE_HEAD)
+    for name in ("slave controller", "clients", "source lines", "calls", "files", "system calls"):
+        made.add_column(name, no_wrap=True)
+    rows = []
+    for clock, dc in CLOCKS.items():
+        for clients in CLIENTS:
+            way = count(dc, clients)
+            rows.append({"clock": clock, "clients": clients, **way._asdict()})
+            pairs = [(way.lines, way.mean_lines), (way.calls, way.mean_calls)]
+            cells = [f"{middle:.0f} / {average:.0f}" for middle, average in pairs]
+            system = f"{way.system_calls:.0f} / {way.mean_system_calls:.1f}"
+            made.add_row(clock, str(clients), *cells, f"{way.files:.0f}", system)
+    console.print(made)
+    return {"rows": rows}
