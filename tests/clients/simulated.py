@@ -70,7 +70,7 @@ def simulate(
         bus.set_time(sent + _EXCHANGE_NS // 2)
         data, now = life.inputs(), sent + _EXCHANGE_NS
         valid = not (script.lost_frames and chance.random() < script.lost_frames)
-        timing.sent_ns, timing.in_flight = sent, True
+        timing.sent_ns, timing.in_flight, timing.unanswered = sent, True, timing.unanswered + 1
         made = None
         if valid:
             made = stream.take(data, exchange := Exchange(sent, now, b"", 3, 0))
