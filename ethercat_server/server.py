@@ -9,11 +9,11 @@ from collections.abc import Callable
 from typing import Any
 
 from ethercat_server.acquisition.cycle import Cycle, Watchdog
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import Wanted, bring_up
 from ethercat_server.acquisition.stream import make_streams
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.scan import OtherSlaves
 from ethercat_server.serving.actions import Actions

@@ -201,6 +201,8 @@ class Recovery:
         self._changing: dict[int, _Reconfiguration] = {}
         self._short = 0
         self._watch_ns = 0
+        self.attend_at_ns = 0
+        """`attend` need not be called before if all sensors took part."""
         self._watched = 0
         # Or at the mailboxes: in turns, so that no exchange has to wait for both.
         self._looks_at_states = False
@@ -243,7 +245,7 @@ class Recovery:
                     events.retry(clock)
 
     def attend(self, complete: bool, now_ns: int) -> None:
-        """To be called after every exchange that is back; almost always it has nothing to do.
+        """To be called after an exchange that is back.
 
         `complete`: all sensors took part that are not lost.
         """
@@ -260,12 +262,13 @@ class Recovery:
             self._looks_at_states = not self._looks_at_states
             if not self._looks_at_states:
                 self._mailboxes.look_at_next()
-                return
-            if alive := self._alive():
-                self._watched = next((number for number in alive if number > self._watched), alive[0])
-                # One that is out may be counted in place of one that is not there any more.
-                self._look_at(self._watched, counted=not self._work)
-            self._others.look_at_next()
+            else:
+                if alive := self._alive():
+                    self._watched = next((number for number in alive if number > self._watched), alive[0])
+                    # One that is out may be counted in place of one that is not there any more.
+                    self._look_at(self._watched, counted=not self._work)
+                self._others.look_at_next()
+        self.attend_at_ns = 0 if self._work or self._short else self._watch_ns
 
     def miss(self, silent_ns: int, now_ns: int) -> None:
         """To be called while exchanges are not answered, and have not been for `silent_ns`.
@@ -320,6 +323,7 @@ class Recovery:
     def _take_out(self, number: int, state: SensorState, steps: Steps[bool]) -> None:
         self._sensors[number].enter(state)
         self._work[number] = steps
+        self.attend_at_ns = 0
         self._count_alive()
 
     def _count_alive(self) -> None:

@@ -48,7 +48,7 @@ class Bus(Datagrams):
     def next_on_wire(self, until_ns: int) -> bytes | None:
         """The next frame that arrives before `until_ns` and carries no process data; None if none does."""
         while (frame := super().next_on_wire(until_ns)) is not None:
-            if not self.process_data.take(frame):
+            if self.process_data.take(frame, 0) is None:
                 return frame
         return None
 

@@ -25,11 +25,11 @@ from protocol.sensor_choice import SensorChoice
 from protocol.settings import SettingValue
 from protocol.text.json_text import JsonObject
 
+# Reads that may wait for one sensor: everyone may read, and changes must still get their turn.
 _MOST_READS: Final = 8
-"""Reads that may wait for one sensor: everyone may read, and changes must still get their turn."""
 
+# A sensor does one of these at a time.
 _CHANGES: Final = frozenset({"configure", "tare"})
-"""A sensor does one of these at a time."""
 
 
 class SensorActions:

@@ -28,6 +28,7 @@ from scripts.benchmarks.modes import cards
 from scripts.benchmarks.modes.cpp import measure_cpp
 from scripts.benchmarks.modes.load import measure_load
 from scripts.benchmarks.modes.node import measure_node
+from scripts.benchmarks.modes.path import measure_path
 from scripts.benchmarks.modes.soak import soak
 from scripts.benchmarks.records import may_be_real_time
 from scripts.benchmarks.results.page import check, renew
@@ -68,6 +69,7 @@ def _compensation(setup: Setup, console: Console) -> dict[str, Any]:
 MODES: Final[dict[str, Mode]] = {
     "compensation": Mode(_compensation, "only what compensation costs the node for each sample"),
     "cpp": Mode(measure_cpp, "only the C++ client, against a bare read"),
+    "path": Mode(measure_path, "only what a sample costs the server: source lines, calls, system calls"),
     "node": Mode(
         measure_node, "only the ROS 2 node: ages beside a TCP client, CPU, first message after a stop", 15.0
     ),

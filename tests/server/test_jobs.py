@@ -12,9 +12,9 @@ from typing import Any, cast
 
 import pytest
 
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.stream import SensorStream
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
@@ -124,7 +124,7 @@ def run_tare(
         values[2] = next(force) + struct.unpack("<f", sdo.held.get((0x8000, 1), bytes(4)))[0]
         values[15] = rate_dps
         stream.process_data = layout.struct.pack(*values)
-        stream.fresh += 1
+        stream.sequence += 1
         try:
             next(steps)
         except StopIteration as stop:

@@ -12,18 +12,18 @@ import math
 from typing import Any, Final
 
 _GAIN: Final = 1 / 64
+# What follows from the averages is derived anew every so many exchanges.
 _TURNS: Final = 7
-"""What follows from the averages is derived anew every so many exchanges."""
+# The shortest round trip is that of the last one or two of these.
 _WINDOW_NS: Final = 2_000_000_000
-"""The shortest round trip is that of the last one or two of these."""
 _FIRST_GUESS_NS: Final = 100_000.0
 _FIRST_EXCESS_NS: Final = 20_000.0
 _FIRST_LATE_NS: Final = 15_000.0
 _LEAST_VARIANCE: Final = 1_000.0**2
+# The shortest round trip has become another if it changes by this; below, it is jitter.
 _MOVED_NS: Final = 20_000.0
-"""The shortest round trip has become another if it changes by this; below, it is jitter."""
+# What lies further out than so many standard deviations counts as that far: a stall is no jitter.
 _OUTLIER: Final = 4.0
-"""What lies further out than so many standard deviations counts as that far: a stall is no jitter."""
 _ROOM_NS: Final = 10_000.0
 _PATIENCE_NS: Final = 100_000.0
 
@@ -34,19 +34,21 @@ class ExchangeTiming:
     __slots__ = (
         "_excess_square", "_late_variance", "_least_now_ns", "_most_excess_ns", "_most_late_ns",
         "_roll_at_ns", "_turn", "excess_ns", "in_flight", "late_ns", "least_ns", "look_ns", "look_variance",
-        "moved_ns", "patience_ns", "sent_ns", "unanswered", "unanswered_since_ns", "usual_ns", "variance",
-        "wire_ns",
+        "moved_ns", "patience_ns", "sent_ns", "short_ns", "taking_over_ns", "unanswered",
+        "unanswered_since_ns", "usual_ns", "variance", "wire_ns", "woke_late_ns",
     )  # fmt: skip
 
     def __init__(self, now_ns: int = 0) -> None:
         self.sent_ns = now_ns
         """When the last exchange was sent."""
+        # How late the loop woke for it, if it slept before it.
+        self.woke_late_ns: float | None = None
         self.in_flight = False
         """Whether it is not back."""
         self.unanswered = 0
         """Exchanges that were sent since one was back."""
         self.unanswered_since_ns = now_ns
-        """When the first of them was sent."""
+        """When the first of them was sent, if there are several."""
         self.least_ns = math.inf
         """The shortest recent round trip."""
         self.moved_ns = 0.0
@@ -59,6 +61,10 @@ class ExchangeTiming:
         """What an exchange usually takes beyond the shortest."""
         self._excess_square = 2 * _FIRST_EXCESS_NS**2
         self._late_variance = _FIRST_LATE_NS**2
+        # An exchange that is back sooner is a short one, of which somebody wants to know when it arrived.
+        self.short_ns = 0.0
+        # Usual time from the arrival of an answer until the program has it.
+        self.taking_over_ns = 0.0
         self._least_now_ns = math.inf
         self._roll_at_ns = self._turn = 0
         self._derive()
@@ -78,20 +84,25 @@ class ExchangeTiming:
         self.patience_ns = self.usual_ns + 3 * self.excess_ns + _PATIENCE_NS
         """After this time an answer is overdue."""
 
-    def sends(self, now_ns: int) -> None:
-        """An exchange is sent."""
-        self.sent_ns = now_ns
-        self.in_flight = True
-        if not self.unanswered:
-            self.unanswered_since_ns = now_ns
-        self.unanswered += 1
+    def took(self, sent_ns: int, arrived_ns: int, back_ns: int) -> None:
+        """Learn from an exchange whose answer began to arrive, and was there, then; from a wake-up, too."""
+        if self.woke_late_ns is not None:
+            self.woke(self.woke_late_ns)
+            self.woke_late_ns = None
+        self.shorten(sent_ns, arrived_ns)
+        excess_ns = min(arrived_ns - sent_ns - self.least_ns, self._most_excess_ns)
+        self.excess_ns += _GAIN * (excess_ns - self.excess_ns)
+        self._excess_square += _GAIN * (excess_ns * excess_ns - self._excess_square)
+        took_over_ns = min(back_ns - arrived_ns, self.taking_over_ns + _ROOM_NS)
+        self.taking_over_ns += _GAIN * (took_over_ns - self.taking_over_ns)
+        self._turn -= 1
+        if self._turn < 0:
+            self._turn = _TURNS
+            self._derive()
 
-    def took(self, sent_ns: int, arrived_ns: int) -> None:
-        """An exchange is back: the answer began to arrive then."""
+    def shorten(self, sent_ns: int, arrived_ns: int) -> None:
+        """Learn from an exchange, which may be a short one, what the shortest is."""
         took_ns = arrived_ns - sent_ns
-        if sent_ns >= self.sent_ns:
-            self.in_flight = False
-        self.unanswered = 0
         before_ns = self.least_ns
         if arrived_ns >= self._roll_at_ns:
             self._roll_at_ns = arrived_ns + _WINDOW_NS
@@ -108,14 +119,6 @@ class ExchangeTiming:
             self._excess_square = max(self._excess_square + more_ns * (2 * self.excess_ns + more_ns), 0.0)
             self.excess_ns += more_ns
             self.moved_ns += more_ns / 2
-        excess_ns = took_ns - self.least_ns
-        excess_ns = min(excess_ns, self._most_excess_ns)
-        self.excess_ns += _GAIN * (excess_ns - self.excess_ns)
-        self._excess_square += _GAIN * (excess_ns * excess_ns - self._excess_square)
-        self._turn -= 1
-        if self._turn < 0:
-            self._turn = _TURNS
-            self._derive()
 
     def woke(self, late_ns: float) -> None:
         """The loop woke so long after it had wanted to."""
