@@ -9,20 +9,19 @@ from typing import Final
 
 import numpy as np
 
+from scripts.benchmarks.chain import ScriptError
 from scripts.benchmarks.statistics import Floats
-from scripts.demonstration.child import DemoError
 
 _LONGEST_US: Final = 30_000
-Curves = dict[str, Floats]
-"""Ages in ns, by what they are of."""
+Curves = Mapping[str, Floats]  # ages in ns, by program
 
 _LOOKS: Final = {
-    "yardstick, tcp": ("bare C program, C client", "0.45", "-"),
-    "project, tcp": ("this project, TCP client", "tab:blue", "-"),
-    "project, ros": ("this project, ROS subscriber", "tab:blue", "--"),
-    "driver, tcp": ("Bota's driver, its caller", "tab:red", "-"),
-    "polling, tcp": ("polling, TCP client", "tab:orange", "-"),
-    "polling, ros": ("polling, ROS subscriber", "tab:orange", "--"),
+    "bare C": ("bare C program, C client", "0.45", "-"),
+    "this": ("this project, TCP client", "tab:blue", "-"),
+    "this, ROS": ("this project, ROS subscriber", "tab:blue", "--"),
+    "Bota's driver": ("Bota's driver, its caller", "tab:red", "-"),
+    "polling": ("polling, TCP client", "tab:orange", "-"),
+    "polling, ROS": ("polling, ROS subscriber", "tab:orange", "--"),
 }
 
 
@@ -33,9 +32,9 @@ def tail(ages_ns: Floats) -> tuple[Floats, Floats]:
 
 
 def draw(configurations: Mapping[tuple[int, int], Curves], path: Path) -> None:
-    """Write the plot as PNG; DemoError if there is nothing to draw it with."""
+    """Write the plot as PNG; ScriptError if there is nothing to draw it with."""
     if find_spec("matplotlib") is None:
-        raise DemoError("there is no plot: matplotlib is missing (pip install matplotlib)")
+        raise ScriptError("there is no plot: matplotlib is missing (pip install matplotlib)")
     import matplotlib as mpl  # noqa: PLC0415 - slow, and an extra
 
     mpl.use("Agg")
