@@ -10,6 +10,7 @@ import pytest
 
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import SampleDecoder, encode
+from scripts.demonstration import program
 from scripts.demonstration.measure import Measurement, explanation, verdict
 from scripts.demonstration.program import Screen, print_summary
 
@@ -152,3 +153,13 @@ def test_counting_begins_anew() -> None:
         measurement.take_message(values(number), number * PERIOD_NS + 400_000)
     summary = measurement.summary()
     assert (summary.messages, summary.lost, summary.repeated, summary.rate_hz) == (801, 0, 0, 800.0)
+
+
+@pytest.mark.parametrize("text", ["abc", "", "0.1", "nan", "inf"])
+def test_a_wrong_time_is_refused(
+    text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["demo", "--seconds", text])
+    with pytest.raises(SystemExit):
+        program._demo()
+    assert "must be a number of seconds from 0.5" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What each file here provides: one row of the table of modes in program.py."""
+"""What each file here provides, as `MODE`: a row of the table in program.py, and so an option."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ import numpy as np
 from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import PORT, Chain, Child, Figures, Setup
 from scripts.benchmarks.modes.mode import Mode, points
+from scripts.benchmarks.records import began
 from scripts.benchmarks.statistics import Arrivals
 
 ROUNDS: Final = 3
@@ -29,7 +30,17 @@ def measure(setup: Setup, _: Any) -> list[Figures]:
         one = chain.record(ros)
         chain.wait(tcp.result.exists, "the TCP client did not end")
         everything = chain.record(chain.recorder("ros", "--all"))
-        waits: dict[str, list[float]] = {"late subscriber": []}
+        figures = compare(_arrivals(tcp), _arrivals(ros))
+    waits = measure_waits(setup)
+    return [{"rate_hz": setup.rate_hz, **figures, "one": one, "all": everything, "first_age_us": waits}]
+
+
+def measure_waits(setup: Setup) -> dict[str, list[float]]:
+    """Age, µs, of the first message after each kind of interruption, some rounds of each."""
+    waits: dict[str, list[float]] = {"late subscriber": []}
+    with Chain(setup, "the node, interrupted") as chain:
+        chain.server(chain.bus()).close()
+        chain.node()
         for _round in range(ROUNDS):
             late = chain.recorder("ros", "--depth", 1, warm_up_s=0, seconds=_SETTLE_S)
             chain.wait(late.result.exists, "nothing was received")
@@ -37,7 +48,8 @@ def measure(setup: Setup, _: Any) -> list[Figures]:
             for name, pause_s in STOPS_S.items():
                 child = next(each for each in chain.children if each.name == name)
                 recorder = chain.recorder("ros", "--depth", 1, warm_up_s=0, seconds=pause_s + 2 * _SETTLE_S)
-                chain.sleep(2 * _SETTLE_S)
+                chain.wait(began(recorder.result).exists, "nothing was received")
+                chain.sleep(_SETTLE_S)
                 os.kill(child.pid, signal.SIGSTOP)
                 try:
                     chain.sleep(pause_s)
@@ -46,8 +58,7 @@ def measure(setup: Setup, _: Any) -> list[Figures]:
                 chain.wait(recorder.result.exists, "the recording did not end")
                 found = first_after(_arrivals(recorder), pause_s)
                 waits.setdefault(f"{name} stopped for {pause_s:g} s", []).append(found)
-        figures = compare(_arrivals(tcp), _arrivals(ros))
-    return [{"rate_hz": setup.rate_hz, **figures, "one": one, "all": everything, "first_age_us": waits}]
+    return waits
 
 
 def _arrivals(recorder: Child) -> Arrivals:
@@ -80,10 +91,6 @@ def first_after(arrivals: Arrivals, pause_s: float = 0.0) -> float:
     return round(float(statistics.ages(arrivals)[first]) / 1e3, 1)
 
 
-def _first(row: Figures) -> str:
-    return "; ".join(f"{name}: {max(ages) / 1000:.1f}" for name, ages in row["first_age_us"].items())
-
-
 MODE: Final = Mode(
     "only the ROS 2 node: ages beside a TCP client, CPU, first message after a stop",
     measure,
@@ -98,7 +105,9 @@ MODE: Final = Mode(
             f"{row[topics]['cpu_percent']['node']:.1f}" for topics in ("one", "all")
         ),
         "memory, MB": lambda row: f"{row['all']['rss_mb']['node']:.0f}",
-        "first message at most, ms": _first,
+        "first message, ms: late subscriber / server / node stopped": lambda row: " / ".join(
+            f"{max(ages) / 1000:.1f}" for ages in row["first_age_us"].values()
+        ),
     },
     rates=(800, 1600),
     seconds=15.0,
