@@ -23,6 +23,7 @@ from typing import Any, Final
 import numpy as np
 import psutil
 
+from ethercat_server.errors import ServerError
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 from protocol.client import Client
 from protocol.errors import ProtocolError
@@ -242,7 +243,12 @@ class Chain:
         module = f"{PROCESSES}.recorder"
         return self.python(path.name, module, kind, path, *times, *arguments, result=path, watch=False)
 
-    def wait(self, done: Callable[[], bool], what: str = "", seconds: float = _START_TIMEOUT_S) -> None:
+    def wait(
+        self,
+        done: Callable[[], bool],
+        what: str = "a program did not get ready",
+        seconds: float = _START_TIMEOUT_S,
+    ) -> None:
         """Wait; ScriptError if a program fails or it takes too long."""
         deadline = time.monotonic() + seconds
         while not done():
@@ -255,7 +261,7 @@ class Chain:
     def sleep(self, seconds: float) -> None:
         """Let it run."""
         end = time.monotonic() + seconds
-        self.wait(lambda: time.monotonic() > end, "", seconds + 5)
+        self.wait(lambda: time.monotonic() > end, seconds=seconds + 5)
 
     def record(self, recorder: Child) -> Figures:
         """Wait for a recording to be complete; CPU and memory of each program meanwhile."""
@@ -264,7 +270,7 @@ class Chain:
         uses = {name: CpuUse(process) for name, process in self.watched.items()}
         machine = cpu_of_machine()
         end = time.monotonic() + self.setup.seconds - 0.1
-        self.wait(lambda: time.monotonic() > end or path.exists(), "", self.setup.seconds + 5)
+        self.wait(lambda: time.monotonic() > end or path.exists(), seconds=self.setup.seconds + 5)
         usage = {
             "cpu_percent": {name: use.percent() for name, use in uses.items()},
             "rss_mb": {name: round(use.process.memory_info().rss / 1e6, 1) for name, use in uses.items()},
@@ -341,7 +347,7 @@ def stoppable(run: Callable[[], int], program: str, stopped: Callable[[], int]) 
     except BrokenPipeError:  # nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (ScriptError, OSError) as error:
+    except (ScriptError, ServerError, OSError) as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 1
     finally:
