@@ -21,7 +21,6 @@ from types import FrameType
 from typing import Any, Final
 
 import numpy as np
-import psutil
 
 from ethercat_server.errors import ServerError
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
@@ -122,23 +121,24 @@ class Child:
         return None if code == 0 else f"{self.name} ended with exit code {code}"
 
 
-class CpuUse:
-    """CPU time that a process uses from now on."""
+class Usage:
+    """What a process uses from now on."""
 
-    def __init__(self, process: psutil.Process) -> None:
-        self.process = process
+    def __init__(self, pid: int) -> None:
+        self._folder = Path(f"/proc/{pid}")
         self._began_s, self._before_s = time.monotonic(), self._used_s()
 
-    def percent(self) -> float:
+    def cpu_percent(self) -> float:
         """Of one CPU."""
         return round(100 * (self._used_s() - self._before_s) / (time.monotonic() - self._began_s), 1)
 
     def _used_s(self) -> float:
-        threads = Path(f"/proc/{self.process.pid}/task").glob("*/schedstat")
-        if ran_ns := [int(thread.read_text().split()[0]) for thread in threads]:
-            return sum(ran_ns) * 1e-9
-        times = self.process.cpu_times()  # in whole ticks: coarse for a short turn
-        return float(times.user + times.system)
+        threads = self._folder.glob("task/*/schedstat")  # finer than the ticks of `stat`
+        return sum(int(thread.read_text().split()[0]) for thread in threads) * 1e-9
+
+    def rss(self) -> int:
+        """Resident memory now, bytes."""
+        return int((self._folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 class Chain:
@@ -147,7 +147,7 @@ class Chain:
     def __init__(self, setup: Setup, title: str = "") -> None:
         self.setup = setup
         self.children: list[Child] = []
-        self.watched: dict[str, psutil.Process] = {}
+        self.watched: dict[str, int] = {}  # process ids
         self._canaries: list[Child] = []
         self._number = 0
         if title:
@@ -170,13 +170,11 @@ class Chain:
         setup = self.setup
         errors = ",".join(str(setup.ppm * (-1) ** position) for position in range(setup.sensors))
         arguments = f"--sensors {setup.sensors} --signal clock --sinc {setup.sinc} --ppm={errors}"
-        known = set(psutil.Process().children())
         bus = VirtualBus(arguments, setup.priority)
         self._stack.enter_context(bus)
         self._stack.callback(self.stop)  # before the bus
-        (sensor,) = set(psutil.Process().children()) - known
-        os.sched_setaffinity(sensor.pid, own_cpus()[:1])
-        self.watched["sensor"] = sensor
+        os.sched_setaffinity(bus.pid, own_cpus()[:1])
+        self.watched["sensor"] = bus.pid
         self.canaries()
         return bus.ifname
 
@@ -185,7 +183,7 @@ class Chain:
         child = Child(name, list(map(str, command)), self.directory, result)
         self.children.append(child)
         if watch:
-            self.watched[name] = psutil.Process(child.pid)
+            self.watched[name] = child.pid
         return child
 
     def python(self, name: str, module: str, *arguments: object, **how: Any) -> Child:
@@ -267,13 +265,13 @@ class Chain:
         """Wait for a recording to be complete; CPU and memory of each program meanwhile."""
         path = recorder.result
         self.wait(lambda: began(path).exists() or path.exists(), "nothing was received")
-        uses = {name: CpuUse(process) for name, process in self.watched.items()}
+        uses = {name: Usage(pid) for name, pid in self.watched.items()}
         machine = cpu_of_machine()
         end = time.monotonic() + self.setup.seconds - 0.1
         self.wait(lambda: time.monotonic() > end or path.exists(), seconds=self.setup.seconds + 5)
         usage = {
-            "cpu_percent": {name: use.percent() for name, use in uses.items()},
-            "rss_mb": {name: round(use.process.memory_info().rss / 1e6, 1) for name, use in uses.items()},
+            "cpu_percent": {name: use.cpu_percent() for name, use in uses.items()},
+            "rss_mb": {name: round(use.rss() / 1e6, 1) for name, use in uses.items()},
             "stolen_percent": stolen_percent(machine),
         }
         self.wait(path.exists, "the recording did not end")
@@ -314,9 +312,9 @@ def own_cpus() -> tuple[int, int]:
 
 
 def cpu_of_machine() -> tuple[float, float]:
-    """CPU seconds that a hypervisor has given to others, and all that have passed."""
-    times = psutil.cpu_times()
-    return times.steal, sum(times) - times.guest - times.guest_nice
+    """Ticks of all CPUs that a hypervisor has given to others, and all that have passed."""
+    ticks = [int(word) for word in Path("/proc/stat").read_text(encoding="ascii").split()[1:9]]
+    return float(ticks[7]), float(sum(ticks))
 
 
 def stolen_percent(before: tuple[float, float]) -> float:

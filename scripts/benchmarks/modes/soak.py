@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from scripts.benchmarks.chain import PORT, Chain, Figures, Setup, Stopped
+from scripts.benchmarks.chain import PORT, Chain, Figures, Setup, Stopped, Usage
 from scripts.benchmarks.modes.comparison import Turn, together
 from scripts.benchmarks.modes.mode import Mode, losses, points
 from scripts.benchmarks.statistics import Floats
@@ -43,7 +43,7 @@ def measure(setup: Setup, minutes: float) -> list[Figures]:
                     recorder = turn.recorder("tcp", "--port", PORT)
                     usage = turn.record(recorder)
                     turns.append((turn.figures(recorder, usage)[0], np.empty(0)))
-                    memory.append((time.monotonic() - began, float(server.memory_info().rss)))
+                    memory.append((time.monotonic() - began, float(Usage(server).rss())))
         if len(memory) < _TURNS // 2:
             raise Stopped
     figures, _ = together(turns)
