@@ -59,14 +59,6 @@ def switch_latched(frame: bytearray, at: int, *, reads: bool) -> None:
         frame[data - DATAGRAM_HEADER] = Command.FPRD if reads else Command.NOP
 
 
-def latch_events(bus: Datagrams, number: int, sync_manager: int) -> bool:
-    """Have a sensor's controller latch when it writes samples, to this sync manager; False if it does not."""
-    address = reg.SYNC_MANAGER + sync_manager * reg.SYNC_MANAGER_SIZE + reg.SM_ACTIVATE
-    active = bus.read_surely(number, address, 1)[0]
-    latches = bytes([active | reg.SM_LATCH_PDI])
-    return any(bus.write_register(number, address, latches) for _ in range(_ATTEMPTS))
-
-
 def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
     """What another master has left in a sensor's controller; None if it does not answer.
 

@@ -14,10 +14,6 @@ from statistics import mean, median
 from types import FrameType
 from typing import Any, Final, NamedTuple
 
-from rich import box
-from rich.console import Console
-from rich.table import Table
-
 from ethercat_server.acquisition.start_up import AsFound
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.server import Server
@@ -27,7 +23,8 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.control import request
 from protocol.framing import encode_json
-from scripts.benchmarks.chain import Setup
+from scripts.benchmarks.chain import Figures, Setup
+from scripts.benchmarks.modes.mode import Mode
 
 SETTLED_S: Final = 8.0
 SECONDS: Final = 1.0
@@ -140,19 +137,24 @@ def count(dc: str, clients: int, seconds: float = SECONDS) -> Way:
     )  # fmt: skip
 
 
-def measure_path(_setup: Setup, console: Console) -> dict[str, Any]:
-    """Count and print them."""
-    made = Table(title="One new sample: median / mean", title_justify="left", box=box.SIMPLE_HEAD)
-    for name in ("slave controller", "clients", "source lines", "calls", "files", "system calls"):
-        made.add_column(name, no_wrap=True)
-    rows = []
-    for clock, dc in CLOCKS.items():
-        for clients in CLIENTS:
-            way = count(dc, clients)
-            rows.append({"clock": clock, "clients": clients, **way._asdict()})
-            pairs = [(way.lines, way.mean_lines), (way.calls, way.mean_calls)]
-            cells = [f"{middle:.0f} / {average:.0f}" for middle, average in pairs]
-            system = f"{way.system_calls:.0f} / {way.mean_system_calls:.1f}"
-            made.add_row(clock, str(clients), *cells, f"{way.files:.0f}", system)
-    console.print(made)
-    return {"rows": rows}
+def measure(_setup: Setup, _: Any) -> list[Figures]:
+    """A row for each clock and number of clients."""
+    return [
+        {"clock": clock, "clients": clients, **count(dc, clients)._asdict()}
+        for clock, dc in CLOCKS.items()
+        for clients in CLIENTS
+    ]
+
+
+MODE: Final = Mode(
+    "only what a sample costs the server: source lines, calls, system calls",
+    measure,
+    {
+        "slave controller": lambda row: row["clock"],
+        "clients": lambda row: str(row["clients"]),
+        "source lines": lambda row: f"{row['lines']:.0f} / {row['mean_lines']:.0f}",
+        "calls": lambda row: f"{row['calls']:.0f} / {row['mean_calls']:.0f}",
+        "files": lambda row: f"{row['files']:.0f}",
+        "system calls": lambda row: f"{row['system_calls']:.0f} / {row['mean_system_calls']:.1f}",
+    },
+)
