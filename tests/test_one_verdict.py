@@ -20,9 +20,9 @@ from bridge.stream.frame_selector import FrameCounts, FrameSelector
 from bridge.stream.link import Link
 from bridge.stream.reader import Reader
 from bridge.stream.watch import Watch
-from clients.monitor.model.server import Model
-from clients.monitor.view.table import table
-from clients.monitor.view.table import verdict as monitor_verdict
+from clients.monitor.model import Model
+from clients.monitor.screen import table
+from clients.monitor.words import verdict as monitor_verdict
 from clients.report.examine import examine
 from clients.report.page.page import as_json
 from ethercat_server.access.sensors import Sensors

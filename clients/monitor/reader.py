@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from clients.monitor.model.server import Model
+from clients.monitor.model import Model
 from protocol.address import Address
 from protocol.client import Client, ClientEvent, Connected, Disconnected
 from protocol.control import Event

@@ -17,13 +17,6 @@ from protocol.text.visible import printable
 
 PROGRAM: Final = "ethercat-record"
 _STOP_TIMEOUT_S: Final = 20.0
-"""Timeout for finishing a recording."""
-
-
-def program() -> list[str] | None:
-    """The command, beside this interpreter or on PATH; None if it is not installed."""
-    found = shutil.which(PROGRAM, path=Path(sys.executable).parent) or shutil.which(PROGRAM)
-    return None if found is None else [found]
 
 
 class Recorder:
@@ -32,7 +25,7 @@ class Recorder:
     def __init__(
         self, address: Address, directory: Path | None = None, command: Sequence[str] | None = None
     ) -> None:
-        """Recordings go to `directory`, by default the current one; `command` replaces `program()`."""
+        """Recordings go to `directory`, by default the current one; `command`: another program."""
         self._address = address
         self._directory = directory or Path.cwd()
         self._command = command
@@ -51,8 +44,9 @@ class Recorder:
 
     def start(self, now_s: float) -> tuple[str, bool]:
         """Start a recording; a message, and whether it is an error."""
-        command = self._command or program()
-        if command is None:
+        program = shutil.which(PROGRAM, path=Path(sys.executable).parent) or shutil.which(PROGRAM)
+        command = self._command or (program and [program])
+        if not command:
             return missing(PROGRAM), True
         name = time.strftime("recording-%Y%m%d-%H%M%S.mcap")
         said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
@@ -74,15 +68,15 @@ class Recorder:
 
     def stop(self) -> None:
         """Request the end; `ended` reports it."""
-        if self._process is not None:
-            self._close_input()
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()  # which it takes as the request to stop
 
     def ended(self) -> tuple[str, bool] | None:
         """A message about a recording that has ended, and whether it is an error; else None."""
         if self._process is None or self._process.poll() is None:
             return None
         code = self._process.returncode
-        self._close_input()
+        self.stop()
         self._process = None
         last = self._last_words().removeprefix(f"{PROGRAM}: ")
         if code == 0:
@@ -101,11 +95,6 @@ class Recorder:
             self._process.wait()
         found = self.ended()
         return found[0] if found else None
-
-    def _close_input(self) -> None:
-        """Which it takes as the request to stop."""
-        if self._process is not None and self._process.stdin is not None:
-            self._process.stdin.close()
 
     def _last_words(self) -> str:
         if self._said is None:

@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 
 from clients.monitor.app import Monitor
-from clients.monitor.model.server import Model
+from clients.monitor.model import Model
 from clients.monitor.recorder import Recorder
-from clients.monitor.view.glyphs import UNICODE
 from protocol.address import Address
 from tests.clients import monitor_states as made
 from tests.server.running import free_port, wait_until
@@ -36,7 +35,7 @@ class Stage:
         self.now_s = made.fed(self.model, 2)
         # Nothing listens there.
         self.address = Address("localhost", free_port())
-        self.app = Monitor(self.model, self.address, UNICODE, clock=lambda: self.now_s)
+        self.app = Monitor(self.model, self.address, clock=lambda: self.now_s)
         self.pilot: Any = None
 
     def shown(self) -> str:

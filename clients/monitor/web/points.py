@@ -18,17 +18,16 @@ from typing import Final
 
 from protocol.accounting import NOT_NEW
 from protocol.framing import DataMessage
-from protocol.pdo import LAYOUTS, STANDARD_GRAVITY, ImuUnits, PdoType
+from protocol.health.observer import COMMON
+from protocol.pdo import STANDARD_GRAVITY, ImuUnits, PdoType
 
 STEP_NS: Final = 10_000_000
 KIND: Final = 1
 HEADER: Final = struct.Struct("<BBHId")
-MOST_POINTS: Final = 4096
-"""Points that wait to be taken: 20 s."""
+MOST_POINTS: Final = 4096  # that wait to be taken: 20 s
 
-_COMMON: Final = LAYOUTS[min(LAYOUTS)]
-CHANNELS: Final = tuple(field.name for field in _COMMON.fields if field.type is PdoType.REAL)
-"""Six axes of the wrench, acceleration, angular rate, temperature."""
+# Six axes of the wrench, acceleration, angular rate, temperature.
+CHANNELS: Final = tuple(field.name for field in COMMON.fields if field.type is PdoType.REAL)
 
 Values = tuple[float, ...]
 
@@ -65,7 +64,7 @@ class Points:
 
     def take(self, frames: Iterable[DataMessage]) -> None:
         """Frames of this sensor as they came; REPEATED, INVALID and old ones bring nothing."""
-        unpack_from = _COMMON.reals.unpack_from
+        unpack_from = COMMON.reals.unpack_from
         for sequence, _, time_ns, _, flags, _, process_data in frames:
             if flags & NOT_NEW or (sequence <= self._last[0] and time_ns <= self._last[1]):
                 continue
