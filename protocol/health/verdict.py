@@ -8,21 +8,29 @@ from typing import Final, NamedTuple
 
 
 class Level(IntEnum):
-    """The three verdicts."""
+    """How bad something is. A verdict is GOOD, LOOK or TROUBLE; the others are those of a single check."""
 
     GOOD = 0
-    LOOK = 1
-    TROUBLE = 2
+    NOT_APPLICABLE = 1  # there is nothing to check, for example because the IMU is off
+    NOT_POSSIBLE = 2  # it could not be checked
+    NOTE = 3  # of little effect
+    LOOK = 4  # needs attention; the data can be used
+    TROUBLE = 5  # the data cannot be trusted, or there is none
 
     @property
     def words(self) -> str:
         """For people."""
-        return ("good", "worth a look", "trouble")[self]
+        return "worth a look" if self is Level.LOOK else self.name.lower().replace("_", " ")
 
     @property
     def key(self) -> str:
-        """For programs."""
-        return self.name.lower()
+        """For programs, and for style sheets."""
+        return self.name.lower().replace("_", "-")
+
+    @property
+    def symbol(self) -> str:
+        """A symbol beside the words, so that nothing depends on color."""
+        return "✓-?i!✗"[self]
 
 
 class About(Enum):
