@@ -30,7 +30,7 @@ class Recorder:
         self._directory = directory or Path.cwd()
         self._command = command
         self._process: subprocess.Popen[bytes] | None = None
-        self._said: IO[bytes] | None = None
+        self._said: IO[bytes]  # what it prints
         self._since_s = 0.0
 
     @property
@@ -75,10 +75,13 @@ class Recorder:
         """A message about a recording that has ended, and whether it is an error; else None."""
         if self._process is None or self._process.poll() is None:
             return None
-        code = self._process.returncode
+        code, said = self._process.returncode, self._said
         self.stop()
         self._process = None
-        last = self._last_words().removeprefix(f"{PROGRAM}: ")
+        said.seek(0)
+        lines = said.read()[-4096:].decode(errors="replace").strip().splitlines() or [""]
+        said.close()
+        last = printable(lines[-1]).removeprefix(f"{PROGRAM}: ")
         if code == 0:
             return f"Recorded {last}" if last else "The recording has ended", False
         return f"The recording failed: {last or f'exit code {code}'}", True
@@ -95,12 +98,3 @@ class Recorder:
             self._process.wait()
         found = self.ended()
         return found[0] if found else None
-
-    def _last_words(self) -> str:
-        if self._said is None:
-            return ""
-        self._said.seek(0)
-        lines = self._said.read()[-4096:].decode(errors="replace").strip().splitlines()
-        self._said.close()
-        self._said = None
-        return printable(lines[-1]) if lines else ""

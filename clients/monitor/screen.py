@@ -116,9 +116,7 @@ def table(state: State) -> list[str]:
     if server.replay:
         lines.append(f"  REPLAY of {server.replay}")
     facts = [f"{name.lower()} {value}" for name, value in words.server_facts(server)]
-    lines += [f"  {wrong}"] if wrong else textwrap.wrap(
-        "; ".join(facts), _TABLE_WIDTH, initial_indent="  ", subsequent_indent="  "
-    )  # fmt: skip
+    lines += [f"  {wrong}"] if wrong else [f"  {'; '.join(row)}" for row in (facts[:5], facts[5:]) if row]
     lines += [f"  client {words.client(client)}" for client in state.clients]
     for sensor in state.sensors:
         rows = [*_panel(sensor, (), _TABLE_WIDTH, trace=False), *_alerts(sensor, 1 << 16, 1 << 16)]

@@ -12,7 +12,6 @@ import pytest
 from clients.monitor.model import Client, Model, Range, State
 from clients.monitor.screen import KEYS, Look, bar, render, scale_for, table, traces
 from clients.monitor.words import json_line
-from clients.numbers import duration, quantity
 from protocol.framing import DataMessage
 from tests.clients import monitor_states as made
 from tests.clients.captures import DOCS, captures
@@ -158,18 +157,6 @@ def _texts(svg: str) -> list[str]:
 )
 def test_the_scale_is_a_round_number_that_shows_everything(reach: float, scale: float) -> None:
     assert scale_for([Range(-reach, 0.0)], 5.0) == scale
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.9, "0 s"), (59.9, "59 s"), (65, "1m05s"), (3725, "1h02m"), (90061, "1d01h")]
-)
-def test_durations(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
-
-
-@pytest.mark.parametrize("value", [0.0, -0.0, 1.5, -12345678.9, 3.4e38, -3.4e38, float("nan"), float("inf")])
-def test_no_number_leaves_its_column(value: float) -> None:
-    assert len(quantity(value, 2, 9)) == 9
 
 
 def test_whatever_a_sensor_sends_is_shown() -> None:

@@ -242,6 +242,8 @@ def test_a_page_of_another_site_gets_nothing(chromium: Page, web: Web) -> None:
         )
         assert chromium.value(tried.format(f"127.0.0.1:{other.port}")) == "open"
         assert chromium.value(tried.format(f"localhost:{web.port}")) == "refused"
+        chromium.open("about:blank")
+        chromium.wait_for("location.href === 'about:blank'")
 
 
 @pytest.mark.long
