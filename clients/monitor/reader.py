@@ -22,10 +22,8 @@ from protocol.framing import DataMessage
 BATCH_S: Final = 0.05
 _STATUS_EVERY_S: Final = 1.0
 _NEXT_SAMPLE_S: Final = 0.1
-_MOST_PILED: Final = 1000
-"""More were not read in time: what comes next has waited, too."""
-_ANSWER_TIMEOUT_S: Final = 10.0
-"""Timeout for a reply of the server."""
+_MOST_PILED: Final = 1000  # more were not read in time: what comes next has waited, too
+_ANSWER_TIMEOUT_S: Final = 10.0  # timeout for a reply of the server
 
 
 class Reader:
@@ -39,10 +37,8 @@ class Reader:
         self._batch_s = batch_s
         self._closing = threading.Event()
         self._changed = threading.Condition()
-        self.attempts = 0
-        """Number of failed connections."""
-        self.statuses = 0
-        """Number of replies to `status`."""
+        self.attempts = 0  # number of failed connections
+        self.statuses = 0  # number of replies to `status`
         self._thread = threading.Thread(target=self._run, name="reader", daemon=True)
 
     def start(self) -> None:

@@ -47,14 +47,10 @@ class Finding(NamedTuple):
 
     level: Level
     about: About
-    key: str
-    """The same for the same thing at another time."""
-    found: str
-    """A clause that begins with a capital and has no full stop."""
-    remedy: str
-    """What to do: likewise."""
-    size: float = 0.0
-    """How much of it there is, to compare it with the same at another time."""
+    key: str  # the same for the same thing at another time
+    found: str  # a clause that begins with a capital and has no full stop
+    remedy: str  # what to do: likewise
+    size: float = 0.0  # how much of it there is, to compare it with the same at another time
 
     @property
     def sentence(self) -> str:
@@ -66,8 +62,7 @@ class Verdict(NamedTuple):
     """What all findings come to."""
 
     level: Level
-    findings: tuple[Finding, ...]
-    """The worst first."""
+    findings: tuple[Finding, ...]  # the worst first
 
     @property
     def headline(self) -> str:
