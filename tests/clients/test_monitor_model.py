@@ -301,13 +301,6 @@ def test_the_servers_clients_have_rates_and_one_of_them_is_this(model: Model) ->
     assert state.server.uptime_s == 4568
 
 
-def test_the_clock_is_told_as_the_server_says_it(model: Model) -> None:
-    model.take_status(status(mode="oversampling"), START_S)
-    clock = only(model, START_S).clock
-    assert clock is not None
-    assert clock.mode == "oversampling"
-
-
 def test_without_the_calibration_matrix_the_units_are_counts() -> None:
     model = Model(made.ADDRESS)
     model.connected(description(calibration_matrix=False, imu_active=0), made.OWN_PEER, START_S)
