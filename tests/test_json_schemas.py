@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from clients.identify.program import run as identify
-from clients.monitor.model.state import State
-from clients.monitor.view.json_line import json_line
+from clients.monitor.model import State
+from clients.monitor.words import json_line
 from clients.report.cli import main as report
 from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.tool.cli import COMMANDS

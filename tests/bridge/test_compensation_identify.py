@@ -9,7 +9,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
-from bridge.diagnostics.health import Level
+from diagnostic_msgs.msg import DiagnosticStatus
+
 from ft_compensation.quantities import NO_PAYLOAD
 from protocol.pdo import STANDARD_GRAVITY
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, sensed
@@ -246,8 +247,8 @@ def test_a_tool_that_was_lost_is_a_warning_and_nothing_is_changed(
         hold(server, up, payload=NO_PAYLOAD)
         node.run(2.5)
     words = "a tool of 0.00 kg would explain the measurements in"
-    node.until(f"{words} 6 orientations, but tool_mass is 0.80 kg", compensation=Level.WARN)
+    node.until(f"{words} 6 orientations, but tool_mass is 0.80 kg", compensation=DiagnosticStatus.WARN[0])
     assert node.log.count(words) == 1
     assert node.parameters("tool_mass") == [TOOL.mass]
     assert node.set_parameter("tool_mass", 0.0)[0]
-    node.until("nothing is subtracted", compensation=Level.OK)
+    node.until("nothing is subtracted", compensation=DiagnosticStatus.OK[0])
