@@ -15,7 +15,6 @@ from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.health import judge as judge_node
 from bridge.diagnostics.health import stream_verdict
 from bridge.diagnostics.observer import Observer
-from bridge.stream.connection import Connection, SensorInfo
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
 from bridge.stream.link import Link
 from bridge.stream.reader import Reader
@@ -28,7 +27,8 @@ from clients.report.page.page import as_json
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor.bus.server_view import ServerView
 from ethercat_server.doctor.finding import Level as Found
-from protocol.accounting import NOT_NEW
+from protocol.accounting import NOT_NEW, StreamAccounting
+from protocol.client.client import Client
 from protocol.framing import DataFlag, DataMessage
 from protocol.health.judge import Observation, judge
 from protocol.health.limits import LIMITS
@@ -209,23 +209,25 @@ def report(stream: Stream) -> Said:
 def node(stream: Stream) -> Said:
     clock = SimpleNamespace(now_ns=stream.start_ns)
     clock.monotonic = lambda: clock.now_ns * 1e-9
-    connection = cast(Connection, SimpleNamespace(same_machine=True))
-    link, counts, watch = Link("server", 0, cast(Any, clock)), FrameCounts(), Watch(0)
-    selector = FrameSelector(0, counts, same_clock=True)
-    selector.accounting.rate_hz = float(ROW["rate_hz"])
+    client, counts, watch = Client(1, sensors=[0]), FrameCounts(), Watch()
+    client.session.same_machine = True
+    link, accounting = Link(client, 0, cast(Any, clock)), StreamAccounting(counts)
+    selector = FrameSelector(counts, same_clock=True)
+    accounting.rate_hz = float(ROW["rate_hz"])
     reader = SimpleNamespace(link=link, counts=counts, watch=watch, not_finite=0, newest_ns=-1)
     observer = Observer(cast(Reader, reader), CompensationState)
-    link.connected(connection, SensorInfo(0, "", "", "", "OP", rate=float(ROW["rate_hz"])))
+    link.connected({"sensors": [ROW]})
     observer._poll = cast(Any, SimpleNamespace(collect=lambda _: None, status=STATUS, owed_s=lambda _: 0.0))
     observer.look(clock.monotonic())
     decode = SampleDecoder(61).decode
     for at_ns, frames in stream.batches():
         clock.now_ns = at_ns
-        watch.see(frames)
-        for new in selector.select(frames, at_ns):
+        fresh = accounting.select_new(frames, 0)
+        watch.see(fresh)
+        for new in selector.select(fresh, at_ns) if fresh else ():
             watch.sample = decode(new.process_data)
             reader.not_finite += not watch.sample.is_finite
-        reader.newest_ns = selector.accounting.new_ns
+        reader.newest_ns = accounting.new_ns
         for newest in frames[-1:]:
             if not newest.flags & NOT_NEW:
                 watch.ages.append(at_ns - newest.monotonic_ns)

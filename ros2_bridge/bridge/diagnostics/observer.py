@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Final
 
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.server_status import ServerStatus
 from bridge.diagnostics.snapshot import ServerCounts, Snapshot
-from bridge.stream.connection import find_sensor
 from bridge.stream.frame_selector import FrameCounts
 from bridge.stream.reader import Reader
 from bridge.stream.watch import Flags
-from protocol.errors import ConnectionFailedError
 from protocol.health.observer import p99
 
 _SHORTEST_RATE_S: Final = 0.8
@@ -41,10 +39,9 @@ class Observer:
     def look(self, now_s: float) -> Snapshot:
         """How things are now."""
         link, reader = self._link, self._reader
-        connection = link.connection
-        described = self._poll.collect(connection)
+        described = self._poll.collect(link)
         if described is not None:
-            self._take_description(described)
+            link.described(described)
         counts = dataclasses.replace(reader.counts)
         if link.epoch != self._epoch:
             self._epoch, self._rate_hz = link.epoch, None
@@ -59,7 +56,7 @@ class Observer:
         return Snapshot(
             sensor=link.sensor,
             address=link.address,
-            connected=connection is not None,
+            connected=link.is_connected,
             problem=link.problem,
             is_reachable=link.is_reachable,
             connection_s=now_s - link.since_s,
@@ -89,10 +86,9 @@ class Observer:
 
     def measure(self, now_s: float) -> None:
         """Work out rate and ages of the interval that ends; before `look`."""
-        connection = self._link.connection
         ages = self._reader.watch.take_ages()
         self._age_us = None
-        if ages and connection is not None and connection.same_machine:
+        if ages and self._link.is_connected and self._link.client.session.same_machine:
             self._age_us = ages[len(ages) // 2] / 1e3, (p99(ages) or 0) / 1e3
         if self._link.epoch != self._epoch:
             return
@@ -114,12 +110,6 @@ class Observer:
         elif not reported.connected:
             self._then_server = None  # the next server counts from 0
         self._poll.ask(now_s)
-
-    def _take_description(self, description: Mapping[str, Any]) -> None:
-        try:
-            self._link.described(find_sensor(description, self._link.sensor))
-        except ConnectionFailedError:
-            return  # not there any more: its frames will say so
 
 
 def _difference(now: FrameCounts, then: FrameCounts) -> FrameCounts:

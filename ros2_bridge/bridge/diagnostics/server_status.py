@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from concurrent.futures import Future
 from typing import Any
 
-from bridge.stream.connection import Connection
+from bridge.stream.link import Link
 from protocol.errors import ConnectionFailedError
 from protocol.text.json_text import JsonObject
 
@@ -16,14 +16,16 @@ class ServerStatus:
 
     def __init__(self) -> None:
         self.status: Mapping[str, Any] = {}
-        self._connection: Connection | None = None
+        self._link: Link | None = None
+        self._connects = 0
         self._waiting: dict[str, Future[JsonObject]] = {}
         self._asked_s = 0.0
 
-    def collect(self, connection: Connection | None) -> Mapping[str, Any] | None:
+    def collect(self, link: Link) -> JsonObject | None:
         """Take what was answered; returns a `describe` reply, once."""
-        if connection is not self._connection:
-            self._connection, self.status, self._waiting = connection, {}, {}
+        if not link.is_connected or link.connects != self._connects:
+            self._connects, self.status, self._waiting = link.connects, {}, {}
+        self._link = link
         described = None
         for action in [action for action, reply in self._waiting.items() if reply.done()]:
             reply = self._waiting.pop(action)
@@ -37,12 +39,12 @@ class ServerStatus:
 
     def ask(self, now_s: float) -> None:
         """Ask again, unless an answer is still owed."""
-        if self._connection is None or self._waiting:
+        if self._link is None or not self._link.is_connected or self._waiting:
             return
         self._asked_s = now_s
         try:
             for action in ("status", "describe"):
-                self._waiting[action] = self._connection.send_request(action)
+                self._waiting[action] = self._link.client.request(action)
         except ConnectionFailedError:
             self._waiting = {}  # the reader will notice
 

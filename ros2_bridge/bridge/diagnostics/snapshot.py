@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from bridge.diagnostics.compensation_state import CompensationState
-from bridge.stream.connection import SensorInfo
 from bridge.stream.frame_selector import FrameCounts
+from bridge.stream.link import SensorInfo
 from bridge.stream.watch import Flags
 from protocol.health.judge import Observation, emergency
 
