@@ -10,7 +10,7 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.health import Level, Status, judge, text_of
-from bridge.diagnostics.snapshot import ServerCounts, Snapshot
+from bridge.diagnostics.observer import ServerCounts, Snapshot
 from bridge.stream.frame_selector import FrameCounts
 from bridge.stream.link import SensorInfo
 from bridge.stream.watch import Flags, Watch

@@ -271,7 +271,10 @@ class Client:
     """A framed connection that keeps everything, and looks into refused replies too."""
 
     def __init__(self, port: int) -> None:
-        self.sock = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
+        try:
+            self.sock = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
+        except ConnectionError as error:
+            raise ConnectionFailedError(str(error)) from None
         self._decoder = FrameDecoder()
         self.events: list[JsonObject] = []
         self.frames: list[DataMessage] = []

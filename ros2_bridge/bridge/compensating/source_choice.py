@@ -12,7 +12,7 @@ from bridge.compensating.gravity_sources import (
     SensorSource,
     Source,
 )
-from bridge.compensating.orientation_listener import OrientationListener, check_can_listen
+from bridge.compensating.orientations import OrientationListener, check_can_listen
 from bridge.parameters.compensation import CompensationParameters
 from ft_compensation.attitude.tilt import GyroscopeOffset
 

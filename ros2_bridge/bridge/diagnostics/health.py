@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from bridge.diagnostics.snapshot import SLOW_ANSWER_S, Snapshot, mapping, row_of
+from bridge.diagnostics.observer import SLOW_ANSWER_S, Snapshot, mapping, row_of
 from protocol.health import verdict as health
 from protocol.health.judge import SATURATIONS
 from protocol.health.judge import judge as judge_stream
