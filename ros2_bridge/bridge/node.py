@@ -24,8 +24,7 @@ from bridge import real_time
 from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics.monitor import Monitor
-from bridge.parameters.declare import declare, warn_of_others
-from bridge.parameters.live import LiveParameters
+from bridge.parameters.declare import LiveParameters, declare, warn_of_others
 from bridge.parameters.row import ParameterError
 from bridge.parameters.sensor_settings import SettingsParameters
 from bridge.parameters.table import Parameters

@@ -16,11 +16,11 @@ from rclpy.node import Node
 from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper
 from bridge.compensating.gravity_sources import NoSource, Source
 from bridge.compensating.obstacles import Obstacles
+from bridge.compensating.orientations import SourceChoice, is_same_source
 from bridge.compensating.own_offset import OwnOffset
-from bridge.compensating.source_choice import SourceChoice, is_same_source
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.parameters.compensation import CompensationParameters
-from bridge.parameters.live import LiveParameters
+from bridge.parameters.declare import LiveParameters
 from bridge.parameters.row import ParameterError
 from bridge.parameters.table import Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan

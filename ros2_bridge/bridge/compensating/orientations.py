@@ -13,14 +13,27 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, Protocol
 
 from geometry_msgs.msg import PoseStamped, QuaternionStamped
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from bridge.compensating.gravity_sources import Oriented
-from bridge.parameters.compensation import TOPIC_SOURCES, OrientationParameters, Quaternion
+from bridge.compensating.gravity_sources import (
+    AccelerometerSource,
+    ListenerSource,
+    NoSource,
+    Oriented,
+    SensorSource,
+    Source,
+)
+from bridge.parameters.compensation import (
+    TOPIC_SOURCES,
+    CompensationParameters,
+    OrientationParameters,
+    Quaternion,
+)
 from bridge.parameters.row import ParameterError
+from ft_compensation.attitude.tilt import GyroscopeOffset
 
 _NORM_TOLERANCE: Final = 0.01
 _NS_PER_S: Final = 1_000_000_000
@@ -242,3 +255,54 @@ class OrientationListener:
             if self._mounting is not None:
                 quaternion = multiply(quaternion, self._mounting)
             self.latest, self.problem = Oriented(quaternion, found.stamp_ns), ""
+
+
+class SourceChoice:
+    """Opens the source of gravity that the parameters name, and closes the previous one."""
+
+    def __init__(self, node: Node, frame: str) -> None:
+        """`frame` is the sensor's, for TF."""
+        self.source: Source = NoSource()
+        self.listener: OrientationListener | None = None
+        """The listener of a source that uses a topic or TF."""
+        self._node, self._frame = node, frame
+        self._listening = MutuallyExclusiveCallbackGroup()
+        self._gyroscope = GyroscopeOffset()
+
+    def check(self, wanted: CompensationParameters) -> None:
+        """ParameterError if it is not available on this machine."""
+        check_can_listen(self._node, wanted.orientation, self.listener)
+
+    def open(self, wanted: CompensationParameters) -> None:
+        """Open the source that is wanted; ParameterError if it is not available."""
+        self.close()
+        self.source = self._opened(wanted)
+
+    def _opened(self, wanted: CompensationParameters) -> Source:
+        name = wanted.orientation.source
+        if name == "none":
+            return NoSource()
+        if name == "accelerometer":
+            return AccelerometerSource(wanted, self._gyroscope)
+        if name == "sensor":
+            return SensorSource(wanted)
+        self.listener = OrientationListener(self._node, wanted.orientation, self._frame, self._listening)
+        return ListenerSource(wanted, self.listener)
+
+    def another_sensor(self, wanted: CompensationParameters) -> None:
+        """Forget the previous sensor's IMU."""
+        self._gyroscope = GyroscopeOffset()
+        if isinstance(self.source, AccelerometerSource):
+            self.source = AccelerometerSource(wanted, self._gyroscope)
+
+    def close(self) -> None:
+        """Stop listening for orientations."""
+        if self.listener is not None:
+            self.listener.close()
+            self.listener = None
+
+
+def is_same_source(one: CompensationParameters, other: CompensationParameters) -> bool:
+    """Whether they ask for the same source."""
+    parts = [(each.orientation, each.accelerometer, each.gravity) for each in (one, other)]
+    return parts[0] == parts[1]
