@@ -237,9 +237,7 @@ class Session:
             if self._missing and not (found and self.connections):
                 text = ", ".join(map(str, self._missing))
                 has = ", ".join(map(str, there[:16])) or "none"
-                raise ConnectionFailedError(
-                    f"the server has no sensor {text} (it has: {has}): ask for one that it has"
-                )
+                raise ConnectionFailedError(f"the server has no sensor {text} (it has: {has})")
             values["sensors"] = found
         self._subscribing, sent = self.ask("subscribe", **values)
         return sent

@@ -311,7 +311,7 @@ def test_an_event_is_a_sentence(message: JsonObject, said: str) -> None:
         ({"protocol": "\x1b[2J" * 100}, "protocol"),
         ({"sensors": None}, "no sensor 0 (it has: none)"),
         ({"sensors": [1, "x", None, {"sensor": False}]}, "no sensor 0 (it has: none)"),
-        ({"sensors": [{"sensor": 3}]}, "no sensor 0 (it has: 3)"),
+        ({"sensors": [{"sensor": 3}]}, "no sensor 0 (it has: 3): set the parameter 'sensor' to one it has"),
     ],
 )
 def test_a_server_that_does_not_fit_is_named_once_and_tried_again(

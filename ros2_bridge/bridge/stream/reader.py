@@ -212,6 +212,8 @@ class Reader:
             self._problem = None
             self._warn_of_aliases()
         elif isinstance(event, Disconnected):
+            if event.reason.startswith("the server has no sensor"):
+                event = event._replace(reason=f"{event.reason}: set the parameter 'sensor' to one it has")
             link.disconnected(event)
             self._log_problem(event)
         else:
