@@ -24,8 +24,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu
 
 from bridge.compensating.gravity_sources import ListenerSource, Oriented, SensorSource
-from bridge.compensating.orientation_listener import OrientationListener
-from bridge.compensating.orientation_messages import (
+from bridge.compensating.orientations import (
+    OrientationListener,
     Tf,
     UnusableError,
     check_tf,
@@ -458,7 +458,7 @@ def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node
     module = types.ModuleType("tf2_ros")
     vars(module).update(names)
     monkeypatch.setitem(sys.modules, "tf2_ros", module)
-    from bridge.compensating.orientation_messages import open_tf
+    from bridge.compensating.orientations import open_tf
 
     check_tf()
     tf = open_tf(ros_node)

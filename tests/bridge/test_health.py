@@ -10,9 +10,9 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.health import Status, judge, text_of
-from bridge.diagnostics.snapshot import ServerCounts, Snapshot
-from bridge.stream.connection import SensorInfo
+from bridge.diagnostics.observer import ServerCounts, Snapshot
 from bridge.stream.frame_selector import FrameCounts
+from bridge.stream.link import SensorInfo
 from bridge.stream.watch import Flags, Watch
 from protocol.framing import DataMessage
 from protocol.health.limits import LIMITS
@@ -156,14 +156,13 @@ def test_values_are_printable_text() -> None:
 
 
 def test_flags_of_one_frame_are_kept_until_taken() -> None:
-    watch = Watch(0)
+    watch = Watch()
 
-    def see(sensor: int = 0, **fields: float) -> None:
-        watch.see([DataMessage(1, 0, 0, sensor, 0, 3, encode(61, fields))])
+    def see(**fields: float) -> None:
+        watch.see([DataMessage(1, 0, 0, 0, 0, 3, encode(61, fields))])
 
     see(warnings=1, status=2)
     see(warnings=4, force_torque_saturated=8)
-    see(sensor=1, warnings=64)
     see()
     assert watch.take_flags() == (2, 5, 8, 0, 0)
     assert watch.take_flags() == (0, 0, 0, 0, 0)

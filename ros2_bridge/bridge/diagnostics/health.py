@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from bridge.diagnostics.snapshot import SLOW_ANSWER_S, Snapshot, mapping, row_of
+from bridge.diagnostics.observer import SLOW_ANSWER_S, Snapshot, mapping, row_of
 from protocol.health.judge import SATURATIONS
 from protocol.health.judge import judge as judge_stream
 from protocol.health.limits import Limits

@@ -16,8 +16,7 @@ from rclpy.node import Node
 
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.health import Status, judge, text_of
-from bridge.diagnostics.observer import Observer
-from bridge.diagnostics.snapshot import Snapshot
+from bridge.diagnostics.observer import Observer, Snapshot
 from bridge.publishing.messages import Outputs, create_publisher
 from bridge.stream.reader import Reader
 from protocol.health.limits import Limits
