@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import gc
 import select
-import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,10 +18,10 @@ from protocol.client import make_real_time
 from protocol.control import request
 from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from protocol.pdo import SampleDecoder
-from scripts.benchmarks.records import Recording, connect, sleep_until
+from scripts.benchmarks.records import PORT, Recording, connect, sleep_until
 
 SIZE: Final = 61
-DEPTH: Final = 50
+_DEPTH: Final = 50
 
 
 def tcp(arguments: argparse.Namespace, recording: Recording) -> None:
@@ -50,15 +49,10 @@ def polling(arguments: argparse.Namespace, recording: Recording) -> None:
         while True:
             due += period_ns * max(1, (now - due) // period_ns)
             sleep_until(due)
-            data = poll(connection)
+            data = connection.recv(SIZE) if select.select([connection], [], [], 0)[0] else b""
             now = time.monotonic_ns()
             if len(data) == SIZE and not recording.take(0, *decode_clock(decode(data).array), 0, now):
                 return
-
-
-def poll(connection: socket.socket) -> bytes:
-    """One message if there is one: what the polling design does at each tick of its timer."""
-    return connection.recv(SIZE) if select.select([connection], [], [], 0)[0] else b""
 
 
 def ros(arguments: argparse.Namespace, recording: Recording) -> None:
@@ -89,7 +83,7 @@ def ros(arguments: argparse.Namespace, recording: Recording) -> None:
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
     handles = [
-        node.create_subscription(kind, topic, lambda _message: None, arguments.depth).handle
+        node.create_subscription(kind, topic, lambda _message: None, _DEPTH).handle
         for kind, topic, _ in kinds
     ]
     with node.context.handle:
@@ -115,14 +109,13 @@ def main() -> None:
     kinds = {"tcp": tcp, "polling": polling, "ros": ros}
     parser.add_argument("kind", choices=kinds)
     parser.add_argument("path", type=Path)
-    parser.add_argument("--warm-up", type=float, default=1.0)
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--port", type=int)
+    parser.add_argument("warm_up", type=float)
+    parser.add_argument("seconds", type=float)
+    parser.add_argument("--port", type=int, default=PORT)
     parser.add_argument("--rate", type=float)
     parser.add_argument("--rt-priority", type=int, default=0, help="of all its threads")
     parser.add_argument("--arrays", nargs="*", default=(), help="topics of arrays; the sensors' positions")
     parser.add_argument("--all", action="store_true", help="every topic of the node's")
-    parser.add_argument("--depth", type=int, default=DEPTH)
     arguments = parser.parse_args()
     recording = Recording(arguments.path, arguments.warm_up, arguments.seconds)
     gc.disable()
