@@ -461,7 +461,8 @@ def check_force_torque(series: Series, noise: Noise) -> Check:
             "limits are in N and Nm.",
             "Enable calibration_matrix and record again.",
         )
-    return _judge(NOISE_NAME, noise, range(6), "Small forces are hidden by it, and a controller reacts to it.",
+    return _judge(NOISE_NAME, noise, range(6),
+                  "Small forces are hidden by it, and a controller reacts to it.",
                   "Record again with the sensor stationary and unloaded. If it persists, check cable, "
                   "shield and supply, then contact the manufacturer.")  # fmt: skip
 
