@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from clients.errors import RecordingError, ReportError
 from clients.report import subjects
 from clients.report.checks import Examination, examine
-from clients.report.cli import ReportOptions
+from clients.report.options import ReportOptions
 from clients.report.page import as_json, render
 from clients.report.series import Subject
 from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError

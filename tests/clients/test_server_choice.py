@@ -10,7 +10,7 @@ import pytest
 from clients.monitor import options as monitor
 from clients.record import options as record
 from clients.replay import options as replay
-from clients.report import cli as report
+from clients.report import options as report
 from ethercat_server.access import sensors
 from protocol.program.server_choice import default_server, is_address, own_server
 
