@@ -49,7 +49,8 @@ def draw(configurations: Mapping[tuple[int, int], Mapping[str, Floats]], path: P
             xscale="log", yscale="log", xlim=(10, _LONGEST_US), ylim=(5e-5, 1.3),
             xlabel="age of the sample on arrival, µs", ylabel="part of the samples that is older",
         )  # fmt: skip
-    figure.legend(shown.values(), shown.keys(), loc="lower center", ncols=3, frameon=False)
+    columns = 1 + len(configurations)
+    figure.legend(shown.values(), shown.keys(), loc="lower center", ncols=columns, frameon=False)
     figure.tight_layout(rect=(0, 0.15, 1, 1))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90, facecolor="white")  # a page in dark colors shows it as well

@@ -105,29 +105,26 @@ class Screen:
         if now_s - self._at_s >= 0.9:
             self._rate_hz = (measurement.messages - self._messages) / (now_s - self._at_s)
             self._messages, self._at_s = measurement.messages, now_s
-        rows = {
-            f"{name}, {unit}": [f"{value:+.{digits}f}" for value in getattr(measurement.latest, vector)]
+        lost, age = measurement.lost + measurement.lost_before, f"{measurement.age_ns / 1e6:.2f} ms"
+        rows = [
+            (name, unit, [f"{value:+.{digits}f}" for value in getattr(measurement.latest, vector)])
             for name, vector, unit, digits in _ROWS
-        }
-        figures = {
-            "Messages a second": f"{self._rate_hz:.1f}",
-            "Age at the subscriber": f"{measurement.age_ns / 1e6:.2f} ms",
-            "Lost": f"{measurement.lost + measurement.lost_before}",
-            "Repeated": f"{measurement.repeated}",
-        }
+        ]
         if self.live is None:
-            words = [f"{name} {value}" for name, value in figures.items()]
-            print(*words, *(f"{name} {' '.join(xyz)}" for name, xyz in rows.items()), sep="  ", flush=True)
+            values = "  ".join(f"{unit} {' '.join(xyz)}" for _, unit, xyz in rows)
+            figures = f"{self._rate_hz:7.1f} Hz  age {age}  lost {lost}  repeated {measurement.repeated}"
+            print(f"{figures}  {values}", flush=True)
             return
         table = Table(title=self._title, title_justify="left", caption="Ctrl-C ends it")
         table.add_column("", min_width=22)
         for axis in "xyz":
             table.add_column(axis, justify="right", min_width=10)
-        for name, xyz in rows.items():
-            table.add_row(name, *xyz)
+        for name, unit, xyz in rows:
+            table.add_row(f"{name}, {unit}", *xyz)
         table.add_section()
-        for name, value in figures.items():
-            table.add_row(name, value)
+        table.add_row("Messages a second", f"{self._rate_hz:.1f}")
+        table.add_row("Age at the subscriber", age)
+        table.add_row("Lost, repeated", str(lost), str(measurement.repeated))
         self.live.update(table, refresh=True)
 
 
@@ -144,8 +141,10 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
         ("  between server and subscriber", summary.lost),
         ("  of both, while the machine stopped", summary.lost_in_stops),
         ("Repeated", summary.repeated),
-        ("Age at the subscriber, p50 / p99", "{:.2f} / {:.2f} ms".format(*summary.age_ms)),
-        ("Age at a TCP client, p50 / p99", "{:.2f} / {:.2f} ms".format(*summary.tcp_age_ms)),
+        ("Age at the subscriber, p50", f"{summary.age_ms[0]:.2f} ms"),
+        ("Age at the subscriber, p99", f"{summary.age_ms[1]:.2f} ms"),
+        ("Age at a TCP client, p50", f"{summary.tcp_age_ms[0]:.2f} ms"),
+        ("Age at a TCP client, p99", f"{summary.tcp_age_ms[1]:.2f} ms"),
         ("All finite", "yes" if summary.all_finite else "NO"),
         ("All decoded right", "yes" if summary.all_decoded_right else "NO"),
     ):
