@@ -18,7 +18,6 @@ import threading
 import time
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -34,9 +33,8 @@ from protocol.pdo import SampleDecoder, encode
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import ScriptError, Setup
-from scripts.benchmarks.modes import comparison, node, server
+from scripts.benchmarks.modes import comparison, server
 from scripts.benchmarks.processes import masters, recorder
-from scripts.benchmarks.processes.relay import Delay
 from scripts.benchmarks.records import Recording, began, write
 from scripts.benchmarks.statistics import Arrivals, Ints
 from tests.clients.running import signalled
@@ -155,18 +153,6 @@ def test_a_repeated_sample_is_as_old_as_when_it_was_returned_first() -> None:
     assert found.tolist() == [300, 400, 500]
 
 
-def test_messages_of_the_node_are_compared_with_the_clients_samples() -> None:
-    tcp = arrivals(range(1000))
-    number, instant, stamp, received = (
-        column[np.r_[5:400, 403:600, 599:990]] for column in arrivals(range(1000), age=400_000)
-    )
-    instant[600] += 1
-    figures = node.compare(tcp, Arrivals(number, instant, stamp, received))
-    assert (figures["samples"], figures["lost"], figures["repeated"]) == (985, 3, 1)
-    assert figures["decoded_wrongly"] == 1
-    assert (figures["tcp_age_us"]["p50"], figures["ros_age_us"]["p50"]) == (100, 400)
-
-
 def test_memory_slope_leaves_the_start_out() -> None:
     seconds = np.arange(0, 3600.0, 10)
     rss = np.where(seconds < 300, 10e6, 20e6 + seconds / 3600 * 5000)
@@ -199,29 +185,27 @@ def test_the_table_has_what_there_is() -> None:
 
 def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     load = {"loops": 4, "chain": "TCP, ordinary", "hand_out_us": AGES, "age_us": AGES}
-    error = {"p50": -3, "p99_absolute": 9}
     content = {
         "date": "2026-11-23T01:02:03", "cpus_used": 2, "kernel": "6.1.0-x", "python": "3.11.2",
         "idle_states": True, "stolen_percent": 0.5, "comparison": ROWS, "load": [{**ABOUT, **COUNTS, **load}],
-        "cards": [{**ABOUT, "card": "2 ms", "lost_percent": 0, "age_us": AGES, "stamp_error_us": error}],
     }  # fmt: skip
     page = tmp_path / "page.md"
-    names = ("load", "node", "comparison", "cards")
+    names = ("comparison", "load")
     blocks = "".join(f"<!-- measured: {name} -->\nold\n<!-- end -->\n" for name in names)
     page.write_text(f"above\n{blocks}below\n")
     for _ in range(2):
         benchmark.renew(page, content)
         text = page.read_text()
-        assert text.startswith("above\n<!-- measured: load -->\n| beside loops |")
-        assert "| 800 Hz, 4 loops: TCP, ordinary | 1 (1) | 80 / 120 / 150 | 80 / 120 / 150 |" in text
-        assert "<!-- measured: node -->\nNot measured: there was no ROS 2.\n<!-- end -->" in text
-        assert "<!-- measured: comparison -->\n**Your controller gets a sample 80 µs (p99 120)" in text
+        assert text.startswith(
+            "above\n<!-- measured: comparison -->\n**Your controller gets a sample 80 µs (p99 120)"
+        )
         assert "A bare C program: 40 µs (p99 60)." in text
-        assert "of one run: 2026-11-23, 2 CPUs, Linux 6.1.0, Python 3.11.2, with idle states." in text
-        assert text.endswith("| 800 Hz, 2 ms | 0 | 80 | -3 / 9 |\n<!-- end -->\nbelow\n")
-    for wrong in ("no place", text * 2, text.replace("cards", "others")):
+        assert "are of one run: 2026-11-23, 2 CPUs, Linux 6.1.0, Python 3.11.2, with idle states." in text
+        row = "| 800 Hz, 4 loops: TCP, ordinary | 1 (1) | 80 / 120 / 150 | 80 / 120 / 150 |"
+        assert text.endswith(f"{row}\n<!-- end -->\nbelow\n")
+    for wrong in ("no place", text * 2, text.replace("load", "others")):
         page.write_text(wrong)
-        with pytest.raises(ScriptError, match="once for each of comparison, load, node, cards"):
+        with pytest.raises(ScriptError, match="once for each of comparison, load"):
             benchmark.renew(page, content)
         assert page.read_text() == wrong
     benchmark.check(ROOT / "docs" / "benchmark.md")
@@ -236,8 +220,7 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
         (["--rt-priority", "99"], "--rt-priority"),
         (["--load", "0"], "--load"),
         (["--load", "65"], "--load"),
-        (["--cards", "0.5"], "0.05, 0.44, 0.86, 2, 3"),
-        (["--node", "--path"], "not allowed with"),
+        (["--soak", "1", "--path"], "not allowed with"),
     ],
 )
 def test_wrong_arguments_are_refused(wrong: list[str], why: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -252,24 +235,13 @@ def test_wrong_arguments_are_refused(wrong: list[str], why: str, capsys: pytest.
     [
         ([], "comparison", False),
         (["--vendor"], "comparison", True),
-        (["--cards"], "cards", ()),
-        (["--cards", "0.05,3"], "cards", [0.05, 3.0]),
         (["--load", "4"], "load", 4),
         (["--soak", "2"], "soak", 2.0),
-        (["--node"], "node", True),
     ],
 )
 def test_an_option_measures_only_what_it_names(given: list[str], mode: str, argument: object) -> None:
     options = benchmark.parse(given)
     assert (options.mode, options.argument) == (mode, argument)
-
-
-def test_cards_are_measured_with_one_sensor_and_long_round_trips_at_800_hz() -> None:
-    assert {card.round_trip_ms for card in server.cards_for(800, ())} == {0.05, 0.44, 0.86, 2, 3}
-    assert {card.round_trip_ms for card in server.cards_for(1600, ())} == {0.05, 0.44, 0.86, 2}
-    assert list(map(str, server.cards_for(800, (0.05, 2.0)))) == ["0.05 ms", "2 ms", "2 ms ± 200 µs"]
-    with pytest.raises(ScriptError, match="one sensor"):
-        server.cards(replace(SETUP, sensors=2), ())
 
 
 # -- its programs
@@ -398,28 +370,6 @@ def test_the_c_master_looks_once_at_each_sample_and_not_before_it_is_there(
     assert len(statistics.read_numbers(tmp_path / "own", 2)) >= 46
 
 
-def departures(delay: Delay, count: int) -> list[float]:
-    """When frames leave that arrive every 10 µs, all of them under way at once; relative to their arrival."""
-    for number in range(count):
-        delay.put(bytes([number]), number * 10_000)
-    left = []
-    for number in range(count):
-        left.append(delay.due_ns)
-        assert delay.take() == bytes([number])
-    assert delay.due_ns == math.inf
-    assert left == sorted(left), "in their order"
-    return [due - number * 10_000 for number, due in enumerate(left)]
-
-
-def test_every_frame_is_delayed_alike_but_for_the_jitter() -> None:
-    assert departures(Delay(400_000), 3) == [400_000] * 3
-    delays = departures(Delay(400_000, 100_000, seed=1), 200)
-    assert 300_000 <= min(delays) < 350_000, "no frame leaves earlier"
-    assert 450_000 < max(delays) <= 500_000
-    assert delays == departures(Delay(400_000, 100_000, seed=1), 200)
-    assert delays != departures(Delay(400_000, 100_000, seed=2), 200)
-
-
 def test_without_a_compiler_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     with pytest.raises(ScriptError, match="apt install gcc"):
@@ -509,7 +459,7 @@ def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     said, _ = running.communicate(timeout=400)
     assert running.returncode == 0, said
     text = Path(page).read_text()
-    for what in ("400 Hz, 2 | this, ROS", "400 Hz, 4 loops: wrench, ", "400 Hz, 0.86 ms", "400 Hz | "):
+    for what in ("400 Hz, 2 | this, ROS", "400 Hz, 4 loops: wrench, "):
         assert f"| {what}" in text, what
     content = json.loads((tmp_path / "b.json").read_text())
     assert all(map(math.isfinite, numbers(content)))
@@ -521,7 +471,6 @@ def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
             assert 0 < figures["age_us"]["p50"] <= figures["age_us"]["p99"] <= figures["age_us"]["max"]
             assert figures["rss_mb"]["server"] > 1
     assert {"server", "node 0", "node 1"} < set(programs[2, "this, ROS"]["cpu_percent"])
-    assert content["node"][0]["samples"] > 1
     project = programs[1, "this"]
     # Some may be lost to a busy machine, but only while it kept the server from running at all.
     unexplained = project["lost"] - project["lost_in_stops"]

@@ -31,7 +31,7 @@ from scripts.benchmarks.chain import (
     stolen_percent,
     stoppable,
 )
-from scripts.benchmarks.modes import comparison, node, path, server
+from scripts.benchmarks.modes import comparison, path, server
 from scripts.benchmarks.modes.mode import Mode
 from scripts.benchmarks.plot import draw
 from scripts.benchmarks.records import may_be_real_time
@@ -40,12 +40,9 @@ from scripts.benchmarks.records import may_be_real_time
 MODES: Final[Mapping[str, Mode]] = {
     "comparison": comparison.MODE,
     "load": server.LOAD,
-    "node": node.MODE,
-    "cards": server.CARD,
     "path": path.MODE,
     "soak": server.SOAK,
 }
-NEEDS_ROS: Final = ("node",)
 MOST_CPUS: Final = 4  # CPUs used: each of them runs a canary
 _WIDTH: Final = 108  # minimum width of the tables
 _QUICK_SECONDS: Final = 3.0
@@ -86,11 +83,9 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
     if options.ros and find_spec("rclpy") is None:
         console.print("no ROS 2 here (rclpy): only up to a TCP client")
         options.ros = False
-    if options.mode in NEEDS_ROS and not options.ros:
-        raise ScriptError(f"--{options.mode} needs ROS 2 (rclpy): install the extra 'ros' or source ROS 2")
     wanted = {options.mode: options.argument}
     if options.page:
-        wanted |= {name: MODES[name].page for name in _ON_PAGE[1:] if options.ros or name not in NEEDS_ROS}
+        wanted |= {name: MODES[name].page for name in _ON_PAGE[1:]}
     began, machine = time.monotonic(), cpu_of_machine()
     results = {name: measure(name, argument, options) for name, argument in wanted.items()}
     ages: dict[tuple[int, int], dict[str, Any]] = {}
@@ -169,17 +164,15 @@ def check(path: Path) -> None:
 def renew(path: Path, content: Mapping[str, Any]) -> None:
     """Put what was measured into the page, between the comments that name it."""
     check(path)
-    idle = "with" if content["idle_states"] else "without"
     where = (
-        f"All figures on this page are of one run: {content['date'][:10]}, {content['cpus_used']} CPUs, "
-        f"Linux {content['kernel'].split('-')[0]}, Python {content['python']}, {idle} idle states. "
+        f"All figures on this page but those with another date are of one run: {content['date'][:10]}, "
+        f"{content['cpus_used']} CPUs, Linux {content['kernel'].split('-')[0]}, Python {content['python']}, "
+        f"{'with' if content['idle_states'] else 'without'} idle states. "
         f"A hypervisor took {content['stolen_percent']} % of the time meanwhile."
     )
 
     def measured(match: re.Match[str]) -> str:
         name = match[2]
-        if name not in content:
-            return f"{match[1]}Not measured: there was no ROS 2.\n{match[3]}"
         text = markdown(MODES[name], content[name])
         if name == "comparison":
             text = "\n\n".join((comparison.answer(content[name]), text, where))

@@ -56,16 +56,14 @@ def polling(arguments: argparse.Namespace, recording: Recording) -> None:
 
 
 def ros(arguments: argparse.Namespace, recording: Recording) -> None:
-    """A subscriber: of `wrench`, of all topics of a node (only `wrench` is recorded), or of arrays.
+    """A subscriber: of `wrench`, or of arrays.
 
     It waits for and takes messages itself, because rclpy's executor takes longer for that than everything
     else on the way: what is measured is to be the way to the subscriber, not the subscriber.
     """
     import rclpy  # noqa: PLC0415 - the arguments come first
-    from diagnostic_msgs.msg import DiagnosticArray  # noqa: PLC0415
     from geometry_msgs.msg import WrenchStamped  # noqa: PLC0415
     from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: PLC0415
-    from sensor_msgs.msg import Imu, Temperature  # noqa: PLC0415
     from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
 
     def wrench(message: Any) -> tuple[float, ...]:
@@ -75,11 +73,6 @@ def ros(arguments: argparse.Namespace, recording: Recording) -> None:
     kinds: list[tuple[Any, str, Callable[[Any], Any]]]
     kinds = [(Float64MultiArray, topic, lambda message: message.data) for topic in arguments.arrays]
     kinds = kinds or [(WrenchStamped, "wrench", wrench)]
-    recorded = len(kinds)
-    if arguments.all:
-        rest = {"/sensone_sensor_data": Float64MultiArray, "imu/data_raw": Imu, "temperature": Temperature,
-                "/diagnostics": DiagnosticArray}  # fmt: skip
-        kinds += [(kind, topic, tuple) for topic, kind in rest.items()]
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
     handles = [
@@ -97,8 +90,7 @@ def ros(arguments: argparse.Namespace, recording: Recording) -> None:
         for position, (handle, (kind, _, values)) in enumerate(zip(handles, kinds, strict=True)):
             while goes_on and (taken := handle.take_message(kind, False)) is not None:
                 now = time.monotonic_ns()
-                if position < recorded:
-                    goes_on = recording.take(position, *decode_clock(values(taken[0])), 0, now)
+                goes_on = recording.take(position, *decode_clock(values(taken[0])), 0, now)
     node.destroy_node()
     rclpy.try_shutdown()
 
@@ -115,7 +107,6 @@ def main() -> None:
     parser.add_argument("--rate", type=float)
     parser.add_argument("--rt-priority", type=int, default=0, help="of all its threads")
     parser.add_argument("--arrays", nargs="*", default=(), help="topics of arrays; the sensors' positions")
-    parser.add_argument("--all", action="store_true", help="every topic of the node's")
     arguments = parser.parse_args()
     recording = Recording(arguments.path, arguments.warm_up, arguments.seconds)
     gc.disable()
