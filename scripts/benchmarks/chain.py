@@ -127,36 +127,28 @@ class Usage:
         return float((self._folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-class Chain:
+class Chain(contextlib.ExitStack):
     """A context in which programs run, and with which all of them end. `title` is printed."""
 
     def __init__(self, setup: Setup, title: str = "") -> None:
+        super().__init__()
         self.setup = setup
         self.children: list[Child] = []
         self.watched: dict[str, int] = {}  # process ids
         self._canaries: list[Child] = []
+        self.directory = Path(tempfile.mkdtemp(dir=os.environ.get("DEMO_DIRECTORY")))
+        self.callback(shutil.rmtree, self.directory, ignore_errors=True)
+        self.callback(self.stop)
         if title:
             print(f"{setup}: {title}", file=sys.stderr, flush=True)
-
-    def __enter__(self) -> Chain:
-        """Make its directory."""
-        self.directory = Path(tempfile.mkdtemp(dir=os.environ.get("DEMO_DIRECTORY")))
-        self._stack = contextlib.ExitStack()
-        self._stack.callback(shutil.rmtree, self.directory, ignore_errors=True)
-        self._stack.callback(self.stop)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """End everything."""
-        self._stack.close()
 
     def bus(self) -> str:
         """Start a virtual bus and the canaries; its interface. The sensors have a CPU to themselves."""
         setup = self.setup
         errors = ",".join(str(PPM * (-1) ** position) for position in range(setup.sensors))
         arguments = f"--sensors {setup.sensors} --signal clock --sinc {setup.sinc} --ppm={errors}"
-        bus = self._stack.enter_context(VirtualBus(arguments, setup.priority))
-        self._stack.callback(self.stop)  # before the bus
+        bus = self.enter_context(VirtualBus(arguments, setup.priority))
+        self.callback(self.stop)  # before the bus
         os.sched_setaffinity(bus.pid, own_cpus()[:1])
         self.watched["sensor"] = bus.pid
         self.canaries()
@@ -184,10 +176,10 @@ class Chain:
                 self.python(path.name, f"{PROCESSES}.canary", path, *how, result=path, watch=False)
             )
 
-    def server(self, ifname: str | None = None) -> Client:
-        """Start ethercat-server, on a bus if none is given; a connection to it once its sensors stream."""
+    def server(self) -> Client:
+        """Start ethercat-server on a bus; a connection to it once its sensors stream."""
         self.python(
-            "server", "ethercat_server.daemon.cli", ifname or self.bus(), PORT,
+            "server", "ethercat_server.daemon.cli", self.bus(), PORT,
             "--set", f"sinc_length={self.setup.sinc}",
             "--rt-priority", self.setup.priority, "--cpu", own_cpus()[1],
         )  # fmt: skip
@@ -208,7 +200,7 @@ class Chain:
         def ready() -> bool:
             with contextlib.suppress(ProtocolError):
                 found.append(Client(PORT, stream=False, raw=True, reconnect=False).connect())
-                self._stack.callback(found[-1].close)
+                self.callback(found[-1].close)
                 return len(found[-1].description["sensors"]) == sensors
             return False
 
@@ -222,21 +214,17 @@ class Chain:
                  for word in ("-p", each)]  # fmt: skip
         self.python(name, "bridge.client", "--ros-args", "-r", f"__node:=bridge_{position}", *given)
 
-    def recorder(self, kind: str, *arguments: object, warm_up_s: float = WARM_UP_S) -> Child:
+    def recorder(self, kind: str, *arguments: object) -> Child:
         """Start a recorder (processes/recorder.py, or of kind `c` the program given) that ends by itself."""
         path = self.directory / f"{kind}-{len(self.children)}"
-        times = (path, warm_up_s, self.setup.seconds)
+        times = (path, WARM_UP_S, self.setup.seconds)
         if kind == "c":
             return self.start(path.name, *arguments, PORT, *times, result=path, watch=False)
         module = f"{PROCESSES}.recorder"
         return self.python(path.name, module, kind, *times, *arguments, result=path, watch=False)
 
-    def wait(
-        self,
-        done: Callable[[], bool],
-        what: str = "a program did not get ready",
-        seconds: float = _START_TIMEOUT_S,
-    ) -> None:
+    def wait(self, done: Callable[[], bool], what: str = "a program did not get ready",
+             seconds: float = _START_TIMEOUT_S) -> None:  # fmt: skip
         """Wait; ScriptError if a program fails or it takes too long."""
         deadline = time.monotonic() + seconds
         while not done():
@@ -257,7 +245,7 @@ class Chain:
         `memory` gets the server's with the time, s and bytes.
         """
         path, seconds = recorder.result, self.setup.seconds
-        self.wait(lambda: began(path).exists() or path.exists(), "nothing was received")
+        self.wait(began(path).exists, "nothing was received")
         uses = {name: Usage(pid) for name, pid in self.watched.items()}
         machine, end = cpu_of_machine(), time.monotonic() + seconds - 0.1
 
