@@ -136,15 +136,6 @@ def test_namespace_log_level_and_text_that_looks_like_a_number(launch: Launch) -
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("file", ["bridge.launch.py", "demo.launch.py", "two_sensors.launch.py"])
-def test_a_parameter_file_that_is_not_there_is_refused(launch: Launch, file: str) -> None:
-    launched = launch(file, "params_file:=nofile.yaml", SERVER)
-    assert launched.process.wait(PATIENCE_S) == 1
-    assert f"params_file: there is no file {ROOT / 'nofile.yaml'}" in launched.log
-    assert "process started" not in launched.log
-
-
-@pytest.mark.ros
 @pytest.mark.parametrize("name", ARGUMENTS)
 def test_the_arguments_that_are_listed(launch: Launch, name: str) -> None:
     launched = launch(f"{name}.launch.py", "--show-args")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import pytest
@@ -13,9 +13,9 @@ import yaml
 
 from tests.ros_package.package_files import PACKAGE
 
-CONFIG = PACKAGE / "config"
+CONFIG: Final = PACKAGE / "config"
 # Topics of the node in the root namespace, with their types.
-TOPICS = {
+TOPICS: Final = {
     "/sensone_sensor_data": "std_msgs/Float64MultiArray",
     "/wrench": "geometry_msgs/WrenchStamped",
     "/wrench_compensated": "geometry_msgs/WrenchStamped",
@@ -29,61 +29,34 @@ TOPICS = {
 
 def assert_shown(topic: str, fields: list[str]) -> None:
     """The topic is the node's, and its messages have the field (if ROS is there to tell)."""
-    assert topic in TOPICS
     package, name = TOPICS[topic].split("/")
     messages = pytest.importorskip(f"{package}.msg", reason="ROS messages are missing")
-    value = functools.reduce(getattr, fields, getattr(messages, name)())
-    assert isinstance(value, float), fields
+    assert isinstance(functools.reduce(getattr, fields, getattr(messages, name)()), float), fields
 
 
-def plotjuggler() -> ElementTree.Element:
-    return ElementTree.parse(CONFIG / "plotjuggler_layout.xml").getroot()
-
-
-def plotjuggler_topics() -> set[str]:
-    selected = plotjuggler().find("Plugins/plugin/selected_topics")
-    assert selected is not None
-    return set(str(selected.get("value")).split(";"))
-
-
-def test_plotjuggler_subscribes_to_topics_of_the_node() -> None:
-    root = plotjuggler()
-    assert root.tag == "root"
-    assert plotjuggler_topics() <= set(TOPICS)
+def test_plotjuggler_plots_fields_of_the_nodes_topics() -> None:
+    root = ElementTree.parse(CONFIG / "plotjuggler_layout.xml").getroot()
     streamer, plugin = root.find("previouslyLoaded_Streamer"), root.find("Plugins/plugin")
+    selected = root.find("Plugins/plugin/selected_topics")
     assert streamer is not None
     assert plugin is not None
+    assert selected is not None
     assert streamer.get("name") == plugin.get("ID") == "ROS2 Topic Subscriber"
-
-
-def test_plotjuggler_splits_its_tabs_into_as_many_as_there_are() -> None:
-    for splitter in plotjuggler().iter("DockSplitter"):
-        count = len(splitter)
-        assert splitter.get("count") == str(count)
+    subscribed = set(str(selected.get("value")).split(";"))
+    shown = set()
+    for curve in [str(curve.get("name")) for curve in root.iter("curve")]:
+        (topic,) = [topic for topic in subscribed if curve.startswith(topic + "/")]
+        assert_shown(topic, curve.removeprefix(topic + "/").split("/"))
+        shown.add(topic)
+    assert shown == subscribed
+    for splitter in root.iter("DockSplitter"):
         sizes = [float(size) for size in str(splitter.get("sizes")).split(";")]
-        assert len(sizes) == count
+        assert (splitter.get("count"), len(sizes)) == (str(len(splitter)), len(splitter))
         assert sum(sizes) == pytest.approx(1, abs=1e-3)
 
 
-def test_plotjuggler_curves_are_fields_of_the_topics_it_subscribes_to() -> None:
-    curves = [str(curve.get("name")) for curve in plotjuggler().iter("curve")]
-    assert curves
-    shown = set()
-    for curve in curves:
-        (topic,) = [topic for topic in plotjuggler_topics() if curve.startswith(topic + "/")]
-        assert_shown(topic, curve.removeprefix(topic + "/").split("/"))
-        shown.add(topic)
-    assert shown == plotjuggler_topics()
-
-
-def foxglove() -> dict[str, Any]:
-    layout = json.loads((CONFIG / "foxglove_layout.json").read_text())
-    assert isinstance(layout, dict)
-    return layout
-
-
 def panels(node: Any) -> Iterator[str]:
-    """The panels of a layout tree."""
+    """The panels of a Foxglove layout tree."""
     if isinstance(node, str):
         yield node
         return
@@ -93,41 +66,30 @@ def panels(node: Any) -> Iterator[str]:
     yield from panels(node["second"])
 
 
-def test_foxglove_has_each_panel_once() -> None:
-    layout = foxglove()
+def test_foxglove_has_each_panel_once_and_plots_fields_of_the_nodes_topics() -> None:
+    layout = json.loads((CONFIG / "foxglove_layout.json").read_text())
     by_id = layout["configById"]
     placed = list(panels(layout["layout"]))
     for name in [name for name in placed if name.startswith("Tab!")]:
         for tab in by_id[name]["tabs"]:
             placed += panels(tab["layout"])
     assert sorted(placed) == sorted(by_id)
-
-
-def test_foxglove_plots_fields_of_the_node_s_topics() -> None:
-    values = [path["value"] for panel in foxglove()["configById"].values() for path in panel.get("paths", ())]
+    values = [path["value"] for panel in by_id.values() for path in panel.get("paths", ())]
     assert values
     for value in values:
         topic, *fields = value.split(".")
         assert_shown(topic, fields)
-
-
-def test_foxglove_shows_the_diagnostics() -> None:
-    named = {
-        panel["topicToRender"] for panel in foxglove()["configById"].values() if "topicToRender" in panel
-    }
+    named = {panel["topicToRender"] for panel in by_id.values() if "topicToRender" in panel}
     assert named == {"/diagnostics"}
 
 
 def test_rviz_shows_the_wrenches() -> None:
     manager = yaml.safe_load((CONFIG / "wrench.rviz").read_text())["Visualization Manager"]
-    wrenches = [
-        display for display in manager["Displays"] if display["Class"] == "rviz_default_plugins/Wrench"
-    ]
-    topics = {display["Topic"]["Value"] for display in wrenches}
-    assert topics == {"/wrench", "/wrench_compensated"}
+    shown = {
+        display["Topic"]["Value"]: display["Class"] for display in manager["Displays"] if "Topic" in display
+    }
+    assert shown == dict.fromkeys(("/wrench", "/wrench_compensated"), "rviz_default_plugins/Wrench")
     (model,) = [display for display in manager["Displays"] if display["Class"].endswith("/RobotModel")]
     assert model["Description Topic"]["Value"] == "/robot_description"  # of robot_state_publisher
-    named = {display["Topic"]["Value"] for display in manager["Displays"] if "Topic" in display}
-    assert named == topics
     assert all("Topic" not in tool for tool in manager["Tools"])
     assert manager["Global Options"]["Fixed Frame"] == "base_link"  # of urdf/example.urdf.xacro

@@ -12,12 +12,22 @@ import pytest
 
 from tests.server import readable
 from tests.server.running import ATTEMPTS, Server, Veth, needs_bus, starved, virtual_sensor
-from tests.systemd.confined import NOBODY, with_capabilities
 from tests.systemd.staging import CAPABILITIES, SERVER_UNIT, values
 
 pytestmark = [pytest.mark.bus, needs_bus]
 
+NOBODY = 65534
 BITS = {"CAP_NET_ADMIN": 12, "CAP_NET_RAW": 13, "CAP_IPC_LOCK": 14, "CAP_SYS_NICE": 23}
+
+
+def with_capabilities(capabilities: Iterable[str]) -> list[str]:
+    """A command that becomes the one behind it: another user, no right beyond `capabilities`."""
+    given = ",".join(["-all", *(f"+{name.removeprefix('CAP_').lower()}" for name in capabilities)])
+    return [
+        "prlimit", "--memlock=65536", "--rtprio=0",
+        "setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", "--no-new-privs",
+        f"--inh-caps={given}", f"--ambient-caps={given}", f"--bounding-set={given}",
+    ]  # fmt: skip
 
 
 def confined(ifname: str, capabilities: Iterable[str]) -> Server:

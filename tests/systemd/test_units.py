@@ -59,49 +59,43 @@ def test_little_is_exposed(unit: Path) -> None:
     assert checked.returncode == 0, checked.stdout + checked.stderr
 
 
-def test_the_server_has_exactly_four_capabilities() -> None:
-    for key in ("AmbientCapabilities", "CapabilityBoundingSet"):
-        assert [entry.split() for entry in values(SERVER_UNIT, key)] == [list(CAPABILITIES)]
-    assert values(BRIDGE_UNIT, "CapabilityBoundingSet") == [""]
-    assert not values(BRIDGE_UNIT, "AmbientCapabilities")
+@pytest.mark.parametrize(
+    ("unit", "key", "expected"),
+    [
+        (SERVER_UNIT, "AmbientCapabilities", [" ".join(CAPABILITIES)]),
+        (SERVER_UNIT, "CapabilityBoundingSet", [" ".join(CAPABILITIES)]),
+        (SERVER_UNIT, "RestrictRealtime", []),
+        (SERVER_UNIT, "LimitRTPRIO", ["99"]),
+        (SERVER_UNIT, "LimitMEMLOCK", ["infinity"]),
+        (SERVER_UNIT, "RuntimeDirectory", [lock.DIRECTORY.relative_to("/run").name]),
+        (SERVER_UNIT, "RuntimeDirectoryPreserve", ["yes"]),  # other instances use it
+        (SERVER_UNIT, "Restart", ["on-failure"]),
+        (BRIDGE_UNIT, "AmbientCapabilities", []),
+        (BRIDGE_UNIT, "CapabilityBoundingSet", [""]),
+        (BRIDGE_UNIT, "RestrictRealtime", []),
+        (BRIDGE_UNIT, "LimitMEMLOCK", ["infinity"]),
+        (BRIDGE_UNIT, "Restart", ["on-failure"]),
+        # The node does not depend on the server.
+        *((BRIDGE_UNIT, key, []) for key in ("Requires", "BindsTo", "PartOf", "Requisite")),
+    ],
+)
+def test_a_unit_says(unit: Path, key: str, expected: list[str]) -> None:
+    assert values(unit, key) == expected
 
 
-def test_the_server_may_have_real_time_priority_and_locked_memory() -> None:
-    assert not values(SERVER_UNIT, "RestrictRealtime")
-    assert values(SERVER_UNIT, "LimitRTPRIO") == ["99"]
-    assert values(SERVER_UNIT, "LimitMEMLOCK") == ["infinity"]
-
-
-def test_so_may_the_node_but_below_the_servers() -> None:
-    assert not values(BRIDGE_UNIT, "RestrictRealtime")
-    assert values(BRIDGE_UNIT, "LimitMEMLOCK") == ["infinity"]
+def test_the_nodes_real_time_priority_is_below_the_servers() -> None:
     (limit,) = values(BRIDGE_UNIT, "LimitRTPRIO")
     (node,) = (row.default for row in PARAMETERS if row.name == "rt_priority")
     assert isinstance(node, int)
     assert node <= int(limit) < realtime.DEFAULT_PRIORITY
 
 
-def test_the_locks_of_the_interfaces_have_their_directory() -> None:
-    assert values(SERVER_UNIT, "RuntimeDirectory") == [lock.DIRECTORY.relative_to("/run").name]
-    assert values(SERVER_UNIT, "RuntimeDirectoryPreserve") == ["yes"], "other instances use it"
-
-
-def test_a_usage_error_is_not_tried_again() -> None:
+def test_a_usage_error_is_not_tried_again_and_each_service_has_a_user_of_its_own() -> None:
     for unit in (SERVER_UNIT, BRIDGE_UNIT):
-        assert values(unit, "Restart") == ["on-failure"]
         (prevented,) = values(unit, "RestartPreventExitStatus")
         assert "2" in prevented.split()
-
-
-def test_the_node_does_not_depend_on_the_server() -> None:
-    for key in ("Requires", "BindsTo", "PartOf", "Requisite"):
-        assert not values(BRIDGE_UNIT, key)
-
-
-def test_each_service_has_a_user_of_its_own() -> None:
-    users = [
-        line.split()[1] for line in (UNITS / "ethercat-server.sysusers.conf").read_text().splitlines()[1:]
-    ]
+    lines = (UNITS / "ethercat-server.sysusers.conf").read_text().splitlines()[1:]
+    users = [line.split()[1] for line in lines]
     assert users == values(SERVER_UNIT, "User") + values(BRIDGE_UNIT, "User")
 
 
