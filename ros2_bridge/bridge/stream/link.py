@@ -18,8 +18,7 @@ from protocol.control import Event, six_numbers
 from protocol.errors import SettingError
 from protocol.settings import SETTINGS, SettingValue
 from protocol.text.json_text import JsonObject
-from protocol.text.untrusted import number, rows
-from protocol.text.visible import printable
+from protocol.text.untrusted import number, printable, rows
 
 _MOST_HZ: Final = 1e6
 
