@@ -77,7 +77,7 @@ class PayloadWatch:
         return not self.due_s - 1.0 < time_s < self.due_s
 
     def look(self, force: Vector3, gravity: Vector3, angular_rate: Vector3, time_s: float) -> None:
-        """Take a sample: force left after compensation, N; gravity, m/s²; rad/s."""
+        """Take a sample: force left after compensation, N; gravity (of slow motion), m/s²; rad/s."""
         if self._looks and not -1.0 < time_s - self.due_s < 1.0:
             self._restart()  # what was interrupted, or another time
         self.due_s = time_s + _LOOK_S

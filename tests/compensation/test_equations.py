@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import random
@@ -13,7 +14,8 @@ import pytest
 
 from ethercat_server.virtual_sensor.measurement import scene
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
+from ft_compensation.quantities import ZERO, Payload, Wrench
+from ft_compensation.specific_force import ImuSpecificForce
 from protocol.pdo import STANDARD_GRAVITY
 from tests.compensation import equations
 
@@ -160,16 +162,16 @@ def test_the_fast_path_agrees_in_thousands_of_cases(cases: list[Case]) -> None:
         compensator = Compensator(Payload.of(case.mass, case.center))
         compensator.set_bias(Wrench.of(case.bias))
         (fx, fy, fz), (mx, my, mz), (gx, gy, gz) = case.force, case.torque, case.gravity_in_sensor
-        stages = compensator.compensate((fx, fy, fz), (mx, my, mz), (gx, gy, gz))
+        stages = compensator.compensate((fx, fy, fz), (mx, my, mz), (-gx, -gy, -gz))
         for got, wanted in (
-            (stages.gravity, [*case.gravity_force, *case.gravity_torque]),
+            (stages.tool, [*case.gravity_force, *case.gravity_torque]),
             (stages.final, [*case.final_force, *case.final_torque]),
         ):
             assert max(abs(a - b) for a, b in zip(got.values, wanted, strict=True)) < AGREEMENT
-        assert stages.inertia == NO_WRENCH
 
 
-def test_the_inertial_term_is_the_same_on_both_paths() -> None:
+def test_weight_and_inertia_are_the_same_on_both_paths() -> None:
+    """The specific force at the center of gravity has both in it, whatever gravity is."""
     draw = np.random.default_rng(5)
     n = 200
     force, torque, gravity, acceleration, rate = draw.normal(0, 5, (5, n, 3))
@@ -178,15 +180,15 @@ def test_the_inertial_term_is_the_same_on_both_paths() -> None:
         force, torque, bias=bias, mass=1.7, center=center, gravity=gravity,
         acceleration=acceleration, angular_rate=rate, imu_position=imu,
     )  # fmt: skip
-    compensator = Compensator(Payload(1.7, center), Wrench.of(bias), inertia=True, imu_position=imu)
+    lever = (center[0] - imu[0], center[1] - imu[1], center[2] - imu[2])
+    compensator = Compensator(Payload(1.7, center), Wrench.of(bias))
     for i in range(n):
-        stages = compensator.compensate(
-            *(tuple(row[i].tolist()) for row in (force, torque, gravity, acceleration, rate))
-        )
+        felt = ImuSpecificForce(lever).follow((*acceleration[i].tolist(),), (*rate[i].tolist(),), 0.0)
+        assert felt is not None
+        stages = compensator.compensate((*force[i].tolist(),), (*torque[i].tolist(),), felt)
+        both = arrays.gravity_force[i] + arrays.inertia_force[i]
         assert stages.corrected.force == pytest.approx(arrays.corrected_force[i], abs=AGREEMENT)
-        assert stages.corrected.torque == pytest.approx(arrays.corrected_torque[i], abs=AGREEMENT)
-        assert stages.inertia.force == pytest.approx(arrays.inertia_force[i], abs=AGREEMENT)
-        assert stages.inertia.torque == pytest.approx(arrays.inertia_torque[i], abs=AGREEMENT)
+        assert stages.tool.force == pytest.approx(both, abs=AGREEMENT)
         assert stages.final.force == pytest.approx(arrays.final_force[i], abs=AGREEMENT)
         assert stages.final.torque == pytest.approx(arrays.final_torque[i], abs=AGREEMENT)
 
@@ -206,11 +208,11 @@ def test_angular_acceleration_where_it_is_known() -> None:
 
 
 def test_every_stage_adds_up_to_what_was_measured() -> None:
-    compensator = Compensator(Payload(1.0, (0.1, 0.2, 0.3)), Wrench.of(range(6)), inertia=True)
+    compensator = Compensator(Payload(1.0, (0.1, 0.2, 0.3)), Wrench.of(range(6)))
     measured = Wrench((5.0, 6.0, 7.0), (0.5, 0.6, 0.7))
-    stages = compensator.compensate(*measured, (0.0, 0.0, -9.8), (0.1, 0.2, 9.9), (0.3, 0.2, 0.1))
+    stages = compensator.compensate(*measured, (0.1, 0.2, 9.9))
     for i in range(6):
-        parts = [part.values[i] for part in (stages.bias, stages.gravity, stages.inertia, stages.final)]
+        parts = [part.values[i] for part in (stages.bias, stages.tool, stages.final)]
         assert sum(parts) == pytest.approx(measured.values[i])
         assert stages.corrected.values[i] == pytest.approx(measured.values[i] - parts[0])
 
@@ -221,11 +223,9 @@ def test_signs_are_those_of_the_sensor(seconds: float) -> None:
     reading = scene.Scene(0, noise=False).reading(0, 0, seconds)
     fx, fy, fz, mx, my, mz = reading.force_torque
     ax, ay, az = (STANDARD_GRAVITY * part for part in reading.acceleration)
-    gx, gy, gz = equations.gravity_in_sensor_from_quaternion(
-        reading.orientation, (0.0, 0.0, -STANDARD_GRAVITY)
+    stages = Compensator(Payload(scene.TOOL_MASS, scene.TOOL_CENTRE)).compensate(
+        (fx, fy, fz), (mx, my, mz), (ax, ay, az)
     )
-    compensator = Compensator(Payload(scene.TOOL_MASS, scene.TOOL_CENTRE), inertia=True)
-    stages = compensator.compensate((fx, fy, fz), (mx, my, mz), (gx, gy, gz), (ax, ay, az))
     contact = scene.contact_force(seconds)
     assert stages.final.force == pytest.approx(contact, abs=1e-9)
     assert stages.final.torque == pytest.approx(scene.cross(scene.CONTACT_POINT, contact), abs=1e-9)
@@ -233,8 +233,8 @@ def test_signs_are_those_of_the_sensor(seconds: float) -> None:
 
 def test_a_hanging_tool_pulls_down() -> None:
     """Upright sensor, 1 kg: the load on the sensor points down, along gravity."""
-    stages = Compensator(Payload(1.0, ZERO)).compensate((0.0, 0.0, -9.8), ZERO, (0.0, 0.0, -9.8))
-    assert stages.gravity.force == (0.0, 0.0, -9.8)
+    stages = Compensator(Payload(1.0, ZERO)).compensate((0.0, 0.0, -9.8), ZERO, (0.0, 0.0, 9.8))
+    assert stages.tool.force == (0.0, 0.0, -9.8)
     assert stages.final.force == ZERO
 
 
@@ -263,10 +263,17 @@ def test_compensation_is_quick() -> None:
     import time
     import timeit
 
-    compensator = Compensator(Payload(1.0, (0.1, 0.2, 0.3)), inertia=True)
+    compensator, imu = Compensator(Payload(1.0, (0.1, 0.2, 0.3))), ImuSpecificForce((0.1, 0.2, 0.3))
     v = (1.0, 2.0, 3.0)
 
     def cost(call: Callable[[], object]) -> float:
         return min(timeit.repeat(call, timer=time.thread_time, number=200, repeat=20))
 
-    assert cost(lambda: compensator.compensate(v, v, v, v, v)) < 2 * cost(lambda: sum(range(1000)))
+    times = itertools.count()
+
+    def compensate() -> None:
+        felt = imu.follow(v, v, next(times) / 800)
+        assert felt is not None
+        compensator.compensate(v, v, felt)
+
+    assert cost(compensate) < 2 * cost(lambda: sum(range(1000)))

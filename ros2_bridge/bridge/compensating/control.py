@@ -14,10 +14,10 @@ from typing import Final
 from rclpy.node import Node
 
 from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper
-from bridge.compensating.gravity_sources import NoSource, Source
 from bridge.compensating.obstacles import Obstacles
 from bridge.compensating.own_offset import OwnOffset
 from bridge.compensating.source_choice import SourceChoice, is_same_source
+from bridge.compensating.tool_sources import NoSource, Source
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.live import LiveParameters
@@ -26,10 +26,10 @@ from bridge.parameters.table import Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
 from bridge.stream.link import Link
 from bridge.stream.watch import Watch
-from ft_compensation.bias import BiasRamp, Taken
+from ft_compensation.bias import BiasRamp, Taken, force_bound_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.payload_watch import PayloadWatch
-from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, length, wrench_text
+from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
 
 _MEASURED: Final = ("tare", "identified")
 """Where a bias comes from that is one even if it is zero."""
@@ -57,6 +57,8 @@ class CompensationControl:
         self.sensors = 1
         """How many have been there: what was measured on one is of no use with another."""
         self.ending = False
+        self._model = ""
+        """Of the sensor that is or was there."""
         self._log = node.get_logger()
         self._choice = SourceChoice(node, parameters.frame_id)
         self._keeper = BiasKeeper(self._log)
@@ -82,7 +84,7 @@ class CompensationControl:
 
         ParameterError if it cannot be had.
         """
-        self._choice.open(self.parameters)
+        self._choice.open(self.parameters, self._model)
         self.output.stops_on_saturation = self.parameters.on_saturation == "stop"
         self._make_plan()
 
@@ -112,7 +114,7 @@ class CompensationControl:
 
     @property
     def source(self) -> Source:
-        """Where gravity is taken from."""
+        """Where the weight of the tool is taken from."""
         return self._choice.source
 
     @property
@@ -136,10 +138,8 @@ class CompensationControl:
             why_partly=output.problem,
             source=source.describe,
             age_s=source.age_s(output.time_s),
-            tilt=source.tilt,
+            bound=force_bound_95(payload, self.parameters.accelerometer) if source.is_imu else None,
             payload=payload,
-            weight=payload.mass * length(self.parameters.gravity),
-            inertia=self.parameters.compensate_inertia,
             bias=self.bias,
             origin=self.origin,
             is_ramping=self.is_ramping,
@@ -147,7 +147,7 @@ class CompensationControl:
             stops_on_saturation=output.stops_on_saturation,
             problem=self.obstacles.conflict(self.parameters)
             or self._own_offset.doubt()
-            or self._ramp.taken.doubt(payload, length(self.parameters.gravity))
+            or self._ramp.taken.doubt(payload)
             or self.keeping
             or (watch.finding if watch is not None else ""),
         )
@@ -206,11 +206,7 @@ class CompensationControl:
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted
         if not is_same_source(wanted, was):
-            try:
-                self._choice.open(wanted)
-            except ParameterError as error:  # too late to refuse the parameter
-                self._log.error(str(error))
-                self._choice.source = NoSource(str(error))
+            self._open_source()
         self.output.tune(wanted)
         self._ramp.seconds = wanted.bias_ramp_time
         before = self.bias
@@ -233,27 +229,29 @@ class CompensationControl:
             self._keeper.forget()
         self._keeper.keep(self._ramp, wanted, self._own_offset.to_keep)
 
+    def _open_source(self) -> None:
+        try:
+            self._choice.open(self.parameters, self._model)
+        except ParameterError as error:  # too late to refuse the parameter
+            self._log.error(str(error))
+            self._choice.source = NoSource(str(error))
+
     def _say_weighed(self, change: Wrench) -> None:
         """The payload is another one, and so the bias of a tare, by `change`."""
-        parameters = self.parameters
-        if warning := self._ramp.taken.warning(change, parameters.payload, length(parameters.gravity)):
+        if warning := self._ramp.taken.warning(change, self.parameters.payload):
             self._log.warning(warning)
         self._guard.trigger()  # the parameter follows
 
     def _make_plan(self) -> None:
         wanted = self.parameters
         has_weight = wanted.payload.mass > 0.0
-        compensator = Compensator(
-            wanted.payload,
-            inertia=wanted.compensate_inertia and has_weight,
-            imu_position=wanted.imu_position,
-            accelerometer=wanted.accelerometer.reading,
-        )
         watched = wanted.payload, self.bias, self.sensors
         if watched != self._watched:
             self._watched = watched
             self._watch = PayloadWatch(wanted.payload, self._log.warning, wanted.rest) if has_weight else None
-        self.output.plan = Plan(self._choice.source, compensator, self._ramp, has_weight, self._watch)
+        self.output.plan = Plan(
+            self._choice.source, Compensator(wanted.payload), self._ramp, has_weight, self._watch
+        )
 
     def _is_same_sensor(self) -> bool:
         info = self.link.info
@@ -275,10 +273,11 @@ class CompensationControl:
                 # What was before in its history was the other's too.
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
                 self._make_plan()
-            if is_another:
-                self._choice.another_sensor(self.parameters)
+            if self._model != info.name:
+                self._model = info.name
+                self._open_source()
                 self._make_plan()
-                self.sensors += 1
+            self.sensors += is_another
             if not self.keeping and self.bias != NO_WRENCH:
                 self._keeper.keep(self._ramp, self.parameters, self._own_offset.to_keep)
         self._follow_offset()

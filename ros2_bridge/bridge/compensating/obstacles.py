@@ -4,21 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from bridge.compensating.gravity_sources import (
-    IMU_IS_OFF,
-    AccelerometerSource,
-    Listening,
-    NoSource,
-    SensorSource,
-    Source,
-)
+from bridge.compensating.tool_sources import IMU_IS_OFF, ImuSource, Listening, NoSource, Source
 from bridge.parameters.compensation import CompensationParameters
 from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.stream.link import Link
 from bridge.stream.watch import Watch
 
 _SATURATED: Final = "force or torque is saturated, and on_saturation is stop"
-_OF_THE_IMU: Final = ("accelerometer", "sensor")
 
 
 class Obstacles:
@@ -27,9 +19,9 @@ class Obstacles:
     def __init__(self, link: Link, watch: Watch) -> None:
         self._link, self._watch = link, watch
 
-    def conflict(self, parameters: CompensationParameters, *, needs_gravity: bool = False) -> str | None:
-        """A setting of the sensor that conflicts with compensation or, if `needs_gravity`, with knowing
-        gravity in the frame of the wrench."""
+    def conflict(self, parameters: CompensationParameters, *, needs_tool: bool = False) -> str | None:
+        """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
+        specific force in the frame of the wrench."""
         settings = self._link.settings
         if settings.get("calibration_matrix") is False:
             return (
@@ -41,20 +33,19 @@ class Obstacles:
                 "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
                 "or set tool_mass to 0"
             )
-        return self._blind(parameters) if needs_gravity else None
+        return self._blind(parameters) if needs_tool else None
 
     def hold(self, parameters: CompensationParameters, output: CompensatedOutput) -> None:
-        """Stop `output` while gravity is needed and cannot be known."""
+        """Stop `output` while the specific force is needed and cannot be known."""
         output.hold = self._blind(parameters) if parameters.payload.mass else None
 
     def _blind(self, parameters: CompensationParameters) -> str | None:
-        is_imu = parameters.orientation.source in _OF_THE_IMU or parameters.compensate_inertia
-        if not is_imu or self._link.settings.get("coordinate_system") is not True:
+        if parameters.orientation.source != "imu" or self._link.settings.get("coordinate_system") is not True:
             return None
         return (
             "settings.coordinate_system is on, so the wrench is in a frame configured in the sensor, and the "
             "rotation from the IMU to it is unknown: switch it off, or take the orientation of that frame "
-            "from the robot (orientation_source) and set compensate_inertia to false"
+            "from the robot (gravity_source)"
         )
 
     def stopping(
@@ -71,7 +62,7 @@ class Obstacles:
             return None
         if output.is_saturated:
             return output.hold or _SATURATED
-        return output.hold or output.broken or source.why_none(output.time_s, output.stamp_s)
+        return output.hold or source.why_none(output.time_s, output.stamp_s)
 
     def _foreseen(
         self,
@@ -90,11 +81,9 @@ class Obstacles:
             latest, limit_s = listener.latest, parameters.orientation.stale_after
             fits = latest is not None and abs(stamp_s - latest.stamp_ns * 1e-9) <= limit_s
             return None if fits or sample is None else source.why_none(output.time_s, stamp_s)
-        if isinstance(source, SensorSource) and sample is not None and sample.orientation is None:
-            return source.why_none(output.time_s, stamp_s)
         is_off = self._link.settings.get("imu_active") == 0 or (
             sample is not None and not any(sample.acceleration)
         )
-        if isinstance(source, AccelerometerSource) and is_off:
+        if isinstance(source, ImuSource) and is_off:
             return IMU_IS_OFF
         return None

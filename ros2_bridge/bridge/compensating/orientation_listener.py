@@ -13,7 +13,6 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from bridge.compensating.gravity_sources import Oriented
 from bridge.compensating.orientation_messages import (
     TOPIC_KINDS,
     Tf,
@@ -24,6 +23,7 @@ from bridge.compensating.orientation_messages import (
     open_tf,
     read_message,
 )
+from bridge.compensating.tool_sources import Oriented
 from bridge.parameters.compensation import TOPIC_SOURCES, OrientationParameters
 from bridge.parameters.row import ParameterError
 

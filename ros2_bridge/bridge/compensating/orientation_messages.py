@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple, Protocol
 from geometry_msgs.msg import PoseStamped, QuaternionStamped
 from sensor_msgs.msg import Imu
 
-from bridge.compensating.gravity_sources import Oriented
+from bridge.compensating.tool_sources import Oriented
 from bridge.parameters.compensation import Quaternion
 from bridge.parameters.row import ParameterError
 
@@ -39,7 +39,7 @@ TOPIC_KINDS: Final = {
     "topic_quaternion": TopicKind(QuaternionStamped, lambda message: message.quaternion),
     "topic_imu": TopicKind(Imu, lambda message: message.orientation),
 }
-"""By the value of the parameter `orientation_source`."""
+"""By the value of the parameter `gravity_source`."""
 
 
 def read_message(kind: TopicKind, message: Any) -> Oriented:
@@ -103,9 +103,7 @@ def look_up(tf: Tf, base: str, frame: str) -> Oriented:
     return Oriented(unit(found.transform.rotation), stamp_ns or time.time_ns())
 
 
-def check_tf(
-    wanted: str = "parameter orientation_source is 'tf'", instead: str = "take another source"
-) -> None:
+def check_tf(wanted: str = "parameter gravity_source is 'tf'", instead: str = "take another source") -> None:
     """ParameterError if tf2_ros is missing. `wanted`: what needs it, `instead`: what to do without it."""
     try:
         import tf2_ros  # noqa: F401, PLC0415 - only where it is asked for: not everybody has it

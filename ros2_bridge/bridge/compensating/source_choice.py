@@ -1,20 +1,15 @@
-"""Opens the source of gravity that the parameters name, and closes the previous one."""
+"""Opens the source of the tool's specific force that the parameters name, and closes the previous one."""
 
 from __future__ import annotations
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
-from bridge.compensating.gravity_sources import (
-    AccelerometerSource,
-    ListenerSource,
-    NoSource,
-    SensorSource,
-    Source,
-)
 from bridge.compensating.orientation_listener import OrientationListener, check_can_listen
+from bridge.compensating.tool_sources import ImuSource, ListenerSource, NoSource, Source
 from bridge.parameters.compensation import CompensationParameters
-from ft_compensation.attitude.tilt import GyroscopeOffset
+from protocol.pdo import Vector3
+from protocol.sensor.frames import IMU_HEIGHTS
 
 
 class SourceChoice:
@@ -27,33 +22,22 @@ class SourceChoice:
         """The listener of a source that uses a topic or TF."""
         self._node, self._frame = node, frame
         self._listening = MutuallyExclusiveCallbackGroup()
-        self._gyroscope = GyroscopeOffset()
 
     def check(self, wanted: CompensationParameters) -> None:
         """ParameterError if it is not available on this machine."""
         check_can_listen(self._node, wanted.orientation, self.listener)
 
-    def open(self, wanted: CompensationParameters) -> None:
-        """Open the source that is wanted; ParameterError if it is not available."""
+    def open(self, wanted: CompensationParameters, model: str) -> None:
+        """Open the source that is wanted, for a sensor of this model; ParameterError if that cannot be."""
         self.close()
-        self.source = self._opened(wanted)
-
-    def _opened(self, wanted: CompensationParameters) -> Source:
         name = wanted.orientation.source
         if name == "none":
-            return NoSource()
-        if name == "accelerometer":
-            return AccelerometerSource(wanted, self._gyroscope)
-        if name == "sensor":
-            return SensorSource(wanted)
-        self.listener = OrientationListener(self._node, wanted.orientation, self._frame, self._listening)
-        return ListenerSource(wanted, self.listener)
-
-    def another_sensor(self, wanted: CompensationParameters) -> None:
-        """Forget the previous sensor's IMU."""
-        self._gyroscope = GyroscopeOffset()
-        if isinstance(self.source, AccelerometerSource):
-            self.source = AccelerometerSource(wanted, self._gyroscope)
+            self.source = NoSource()
+        elif name == "imu":
+            self.source = ImuSource(wanted, imu_position(wanted, model))
+        else:
+            self.listener = OrientationListener(self._node, wanted.orientation, self._frame, self._listening)
+            self.source = ListenerSource(wanted, self.listener)
 
     def close(self) -> None:
         """Stop listening for orientations."""
@@ -62,7 +46,17 @@ class SourceChoice:
             self.listener = None
 
 
+def imu_position(wanted: CompensationParameters, model: str) -> Vector3:
+    """The IMU's position in frame_id, m: as given, else as the drawings of the model have it."""
+    if any(wanted.imu_position):
+        return wanted.imu_position
+    return 0.0, 0.0, IMU_HEIGHTS.get(model[4:8], 0.0)
+
+
 def is_same_source(one: CompensationParameters, other: CompensationParameters) -> bool:
     """Whether they ask for the same source."""
-    parts = [(each.orientation, each.accelerometer, each.gravity) for each in (one, other)]
+    parts = [
+        (each.orientation, each.accelerometer, each.gravity, each.imu_position, each.payload)
+        for each in (one, other)
+    ]
     return parts[0] == parts[1]

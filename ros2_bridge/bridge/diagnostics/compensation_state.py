@@ -22,12 +22,9 @@ class CompensationState(NamedTuple):
     source: str = "none"
     age_s: float = math.inf
     """Of the orientation."""
-    tilt: float | None = None
-    """The tilt of gravity that is not exceeded in 95 % of cases, rad; None if unknown."""
-    weight: float = 0.0
-    """Of the payload, N."""
+    bound: float | None = None
+    """N: in 95 % of cases the accelerometer's own errors are a smaller force; None where it is not used."""
     payload: Payload = Payload()
-    inertia: bool = False
     bias: Wrench = NO_WRENCH
     origin: str = "parameter"
     """Where the bias comes from."""
@@ -43,25 +40,21 @@ class CompensationState(NamedTuple):
         """What to say when all is well."""
         parts = ["bias"] if self.bias != NO_WRENCH else []
         if self.payload.mass:
-            parts += ["gravity", "inertia"] if self.inertia else ["gravity"]
+            parts += ["weight and inertia of the tool"] if self.source == "imu" else ["weight of the tool"]
         if not parts:
             text = "nothing is subtracted: there is no bias and no tool_mass"
-        elif len(parts) == 1:
-            text = f"{parts[0]} is subtracted"
         else:
-            text = f"{', '.join(parts[:-1])} and {parts[-1]} are subtracted"
+            text = f"subtracted: {' and '.join(parts)}"
         return text if self.has_subscribers else f"{text}; nobody has subscribed"
 
     @property
     def values(self) -> dict[str, object]:
         """By name."""
         uses_source = bool(self.payload.mass) and self.has_subscribers
-        tilt = self.tilt if uses_source else None
         return {
-            "orientation_source": self.source,
+            "gravity_source": self.source,
             "orientation_age_s": round(self.age_s, 4) if uses_source and math.isfinite(self.age_s) else "",
-            "gravity_tilt_deg": "" if tilt is None else round(math.degrees(tilt), 2),
-            "gravity_tilt_force": "" if tilt is None else round(2.0 * self.weight * math.sin(0.5 * tilt), 3),
+            "accelerometer_force": "" if self.bound is None else round(self.bound, 3),
             "tool_mass": round(self.payload.mass, 4),
             "tool_center_of_gravity": _numbers(self.payload.center),
             "tared": self.bias != NO_WRENCH,

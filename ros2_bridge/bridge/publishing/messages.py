@@ -168,9 +168,8 @@ class StageTopic(WrenchTopic):
 
 def make_stages(node: Node, frame_id: str) -> list[StageTopic]:
     """The topics of the compensation."""
-    stages = ("final", "bias", "gravity", "inertia")
-    names = ("wrench_compensated", "compensation/bias", "compensation/gravity", "compensation/inertia")
-    return [StageTopic(node, name, frame_id, stage) for name, stage in zip(names, stages, strict=True)]
+    stages = {"wrench_compensated": "final", "compensation/bias": "bias", "compensation/tool": "tool"}
+    return [StageTopic(node, name, frame_id, stage) for name, stage in stages.items()]
 
 
 class TemperatureOutput(Topic):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from rclpy.node import Node
 
 from bridge.compensating.control import CompensationControl
@@ -11,9 +9,8 @@ from bridge.publishing.compensated_wrench import RestWindow
 from bridge.services.triggers import create_triggers
 from bridge.services.window import take_window
 from bridge.stream.requests import Requests
-from ft_compensation.bias import Taken, estimate_bias, gravity_of, tilt_95
-from ft_compensation.quantities import NO_WRENCH, CompensationError, length, wrench_text
-from ft_compensation.stationary import StationaryMeans
+from ft_compensation.bias import Taken, check_at_rest, estimate_bias
+from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, length, wrench_text
 from protocol.pdo import Vector3
 
 
@@ -27,35 +24,32 @@ class BiasServices:
 
     def _tare(self) -> str:
         control = self._control
-        window = take_window(control, self._requests, needs_gravity=control.parameters.payload.mass > 0)
-        means = window.means()
         payload = control.parameters.payload
+        window = take_window(control, self._requests, needs_tool=payload.mass > 0)
+        means = window.means()
         try:
-            gravity: Vector3 | None = self._gravity(window, means)
+            felt: Vector3 | None = self._specific_force(window)
         except CompensationError:
             if payload.mass:
                 raise
-            gravity = None  # until there is a tool_mass nobody needs it
-        control.set_bias(estimate_bias(means, payload, gravity), "tare", Taken(payload, gravity))
-        if not payload.mass or gravity is None:
+            felt = None  # until there is a tool_mass nobody needs it
+        control.set_bias(estimate_bias(means, payload, felt or ZERO), "tare", Taken(payload, felt))
+        if payload.mass:
+            weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
+        else:
             weight = (
                 "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds in "
                 "this orientation only"
             )
-        else:
-            weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
-            if window.source.is_accelerometer:
-                tilt = tilt_95(gravity, control.parameters.accelerometer.reading)
-                force = payload.mass * length(gravity) * tilt
-                weight += f"; gravity may be tilted by {math.degrees(tilt):.1f}° (95 %), {force:.1g} N of it"
         return self._said(f"bias of {means.samples} samples: {wrench_text(control.bias)}; {weight}")
 
-    def _gravity(self, window: RestWindow, means: StationaryMeans) -> Vector3:
+    def _specific_force(self, window: RestWindow) -> Vector3:
         parameters = self._control.parameters
-        if conflict := self._control.obstacles.conflict(parameters, needs_gravity=True):
+        if conflict := self._control.obstacles.conflict(parameters, needs_tool=True):
             raise CompensationError(conflict)
-        acceleration = parameters.accelerometer.reading.correct(means.acceleration)
-        return window.gravity() or gravity_of(acceleration, length(parameters.gravity))
+        felt = window.specific_force()
+        check_at_rest(felt, length(parameters.gravity))
+        return felt
 
     def _clear(self) -> str:
         self._control.set_bias(NO_WRENCH, "cleared")

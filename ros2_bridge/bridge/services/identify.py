@@ -41,10 +41,7 @@ class IdentifyServices:
 
     def _start(self) -> str:
         if self._control.parameters.orientation.source == "none":
-            raise CompensationError(
-                "orientation_source is none, so a pose says nothing: set it first (accelerometer needs "
-                "nothing but the sensor)"
-            )
+            raise CompensationError("gravity_source is none, so a pose says nothing: set it, such as to imu")
         before = f", the {len(self._session.poses)} poses before are dropped" if self._session else ""
         self._session = IdentificationSession(length(self._control.parameters.gravity))
         self._sensor = self._sensor_now()
@@ -57,9 +54,10 @@ class IdentifyServices:
 
     def _add_pose(self) -> str:
         session = self._started()
-        window = take_window(self._control, self._requests, needs_gravity=True)
+        window = take_window(self._control, self._requests, needs_tool=True)
         means = window.means()
-        text = session.add(means, window.gravity())
+        x, y, z = window.specific_force()
+        text = session.add(means, None if window.source.is_imu else (-x, -y, -z))
         self._result = None
         return self._said(text)
 

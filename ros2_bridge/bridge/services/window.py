@@ -18,13 +18,13 @@ _LOOK_S: Final = 0.05
 _SETTLED_WITHIN_S: Final = 10.0
 
 
-def take_window(control: CompensationControl, requests: Requests, *, needs_gravity: bool) -> RestWindow:
+def take_window(control: CompensationControl, requests: Requests, *, needs_tool: bool) -> RestWindow:
     """The samples of the next `rest.duration`, whole, once the sensor's data has settled; blocks the caller
     and never the stream.
 
     CompensationError if they do not come or mean nothing.
     """
-    if (conflict := control.obstacles.conflict(control.parameters, needs_gravity=needs_gravity)) is not None:
+    if (conflict := control.obstacles.conflict(control.parameters, needs_tool=needs_tool)) is not None:
         raise CompensationError(conflict)
     link = control.link
     if link.connection is None:

@@ -1,0 +1,166 @@
+"""The specific force at the tool, sample by sample: what the reader asks. No ROS.
+
+The reader alone calls `specific_force`. `why_none` and `age_s` are for the diagnostics' thread.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, Protocol
+
+from bridge.parameters.compensation import CompensationParameters, Quaternion
+from ft_compensation.orientation import QuaternionGravity
+from ft_compensation.specific_force import ImuSpecificForce
+from protocol.pdo import Sample, Vector3
+
+IMU_IS_OFF = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
+_NOT_FINITE = "the IMU sends NaN or infinity: see the status stream"
+
+
+class Oriented(NamedTuple):
+    """An orientation and its time, ns since the Unix epoch."""
+
+    quaternion: Quaternion
+    stamp_ns: int
+
+
+class Source(Protocol):
+    """The specific force at the tool's center of gravity, m/s² in the sensor's frame."""
+
+    describe: str
+    """Its name for people."""
+    is_imu: bool
+    """Whether it is measured, with what the tool accelerates; else it is minus gravity."""
+
+    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:
+        """m/s², for this sample; None if what is known is too old, or nothing is.
+
+        Args:
+            sample: the next one.
+            time_s: its time by a clock that nobody sets.
+            stamp_s: its time by the wall clock, which others stamp their orientations by.
+        """
+
+    def why_none(self, time_s: float, stamp_s: float) -> str:
+        """The reason for None, a sentence."""
+
+    def age_s(self, time_s: float) -> float:
+        """How old the orientation in use is; 0 where there is none."""
+
+
+class NoSource:
+    """There is none: `gravity_source` is `none`, or what it is set to cannot be had."""
+
+    describe = "none"
+    is_imu = False
+
+    def __init__(self, why: str = "gravity_source is none") -> None:
+        self._why = why
+
+    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
+        """None."""
+        return None
+
+    def why_none(self, time_s: float, stamp_s: float) -> str:  # noqa: ARG002
+        """What to do."""
+        return (
+            f"{self._why}, so the weight of the tool is not known: set gravity_source to a source, or set "
+            "tool_mass to 0"
+        )
+
+    def age_s(self, time_s: float) -> float:  # noqa: ARG002
+        """Infinite."""
+        return math.inf
+
+
+class ImuSource:
+    """The sensor's own accelerometer and gyroscope."""
+
+    describe = "imu"
+    is_imu = True
+
+    def __init__(self, parameters: CompensationParameters, imu_position: Vector3) -> None:
+        """`imu_position` is the IMU's, m from the wrench origin."""
+        center = parameters.payload.center
+        (cx, cy, cz), (x, y, z) = center, imu_position
+        self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), parameters.accelerometer)
+        self._broken = ""
+
+    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
+        """Of this sample."""
+        found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
+        if found is None:
+            self._broken = _NOT_FINITE
+        elif not any(sample.acceleration):
+            self._broken = IMU_IS_OFF
+            return None
+        return found
+
+    def why_none(self, time_s: float, stamp_s: float) -> str:  # noqa: ARG002
+        """The IMU is off or broken."""
+        return self._broken
+
+    def age_s(self, time_s: float) -> float:  # noqa: ARG002
+        """Every sample brings its own."""
+        return 0.0
+
+
+class Listening(Protocol):
+    """What is used of an `OrientationListener`."""
+
+    latest: Oriented | None
+    problem: str
+    describe: str
+
+
+class ListenerSource:
+    """A topic or TF: the latest orientation, carried on to the sample's time by the gyroscope."""
+
+    is_imu = False
+
+    def __init__(self, parameters: CompensationParameters, listener: Listening) -> None:
+        self._listener = listener
+        self._limit_s = parameters.orientation.stale_after
+        self._turn = QuaternionGravity(parameters.gravity, stale_after_s=self._limit_s)
+        self._taken: Oriented | None = None
+        self.describe = listener.describe
+
+    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:
+        """From the latest orientation, if its time is close to the sample's."""
+        self._turn.follow(sample.angular_rate, time_s)
+        latest = self._listener.latest
+        if latest is not self._taken and latest is not None:
+            self._taken = latest
+            then_s = latest.stamp_ns * 1e-9 - stamp_s + time_s
+            if not self._turn.update(latest.quaternion, then_s):
+                # The publisher's clock went back, or it is another publisher: what came last is what counts.
+                self._turn.reset()
+                self._turn.update(latest.quaternion, then_s)
+        found = self._turn.gravity(time_s)
+        return None if found is None else (-found[0], -found[1], -found[2])
+
+    def why_none(self, time_s: float, stamp_s: float) -> str:  # noqa: ARG002
+        """Nothing has come, it stopped, it is of no use, or its stamps are of another time."""
+        latest, name = self._listener.latest, self.describe
+        if latest is None:
+            return f"no orientation from {name}: {self._listener.problem}"
+        behind_s = stamp_s - latest.stamp_ns * 1e-9
+        if behind_s < 0:
+            return (
+                f"the orientation from {name} is stamped {_seconds(-behind_s)} after the sample (limit "
+                f"{self._limit_s:g} s): the clocks of the two computers differ"
+            )
+        problem = self._listener.problem
+        return (
+            f"the latest orientation from {name} is {_seconds(behind_s)} older than the sample (limit "
+            f"{self._limit_s:g} s)"
+            + (f": {problem}" if problem else ": it has stopped, is slow, or has another clock")
+        )
+
+    def age_s(self, time_s: float) -> float:
+        """Between the stamps of sample and orientation."""
+        return self._turn.age_s(time_s)
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.3f} s" if value < 100 else f"{value:.3g} s"
