@@ -9,13 +9,13 @@ from collections.abc import Callable
 from typing import Any
 
 from ethercat_server.acquisition.cycle import Cycle, Watchdog
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import Wanted, bring_up
 from ethercat_server.acquisition.stream import make_streams
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.sensor.others import Others
+from ethercat_server.sensor.scan import OtherSlaves
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.sensor_actions import SensorActions
@@ -65,7 +65,7 @@ class Server:
         self.sensors, slaves = bring_up(bus, wanted, check_interrupt)
         timing = ExchangeTiming(bus.clock.monotonic_ns())
         self.streams = make_streams(bus, self.sensors, timing)
-        self.others = Others(bus, slaves)
+        self.others = OtherSlaves(bus, slaves)
         self.recovery = Recovery(bus, self.sensors, self.streams, hub.broadcast, self.others)
         self.jobs = Jobs(bus, self.sensors)
         self.cycle = Cycle(

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from ethercat_server.acquisition.hardware.event_times import EventTimes
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.timing.sample_clock import SampleClock
+from ethercat_server.acquisition.clock import SampleClock
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.slave_clock import EventTimes
 from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
 
 SECOND: Final = 1e9
@@ -267,7 +267,7 @@ class ClockSimulation:
                 continue
             if due_ns > self.now_ns:
                 self.now_ns = self._awake(due_ns + self._chance.expovariate(1) * self.machine.wake_ns)
-                timing.woke(self.now_ns - due_ns)
+                timing.woke_late_ns = self.now_ns - due_ns
             self._send()
             self.now_ns += _SEND_NS
         return self
@@ -279,7 +279,8 @@ class ClockSimulation:
 
     def _send(self) -> None:
         sent_ns = self.now_ns
-        self.timing.sends(int(sent_ns))
+        self.timing.sent_ns, self.timing.in_flight = int(sent_ns), True
+        self.timing.unanswered += 1
         self.polls_ns.append(sent_ns)
         out_ns, took_ns = self.card.exchange(self._chance)
         if self._chance.random() < self.card.lost:
@@ -294,18 +295,20 @@ class ClockSimulation:
         clock, number = self.clock, exchange.number
         sent, arrived, back = int(exchange.sent_ns), int(exchange.back_ns), int(self.now_ns)
         fresh = number > (self.samples[-1].number if self.samples else -1)
-        if clock.events is not None and exchange.latched is not None:
-            clock.events.took(exchange.latched, sent, back, fresh, clock.period_ns)
+        clock.take(sent, back, exchange.latched, fresh=fresh)
         if fresh:
-            clock.predict(sent, back)
             told = clock.uncertainty_ns, clock.locked, clock.steps, clock.uncertain
             self.samples.append(Sample(number, self.instants_ns[number], back, clock.instant_ns, *told))
-        self.timing.took(sent, arrived)
-        clock.observe(sent, arrived, fresh)
-        if clock.events is not None and exchange.latched is not None:
-            clock.events.learn(sent, arrived)
-            if clock.events.trust.is_due(back):
-                clock.events.retry(_DISTRIBUTED)
+        self.timing.in_flight, self.timing.unanswered = sent < self.timing.sent_ns, 0
+        if not clock.goes_on():
+            self.timing.took(sent, arrived, arrived)
+            clock.learn(arrived)
+        elif back - sent < self.timing.short_ns:
+            self.timing.shorten(sent, arrived)
+            if clock.events is not None:
+                clock.events.learn(sent, arrived, 0)
+        if clock.events is not None and exchange.latched is not None and clock.events.trust.is_due(back):
+            clock.events.retry(_DISTRIBUTED)
         if not clock.locked:
             self.unlocked_ns.append(back)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from scripts.demonstration.program import loopback_up
+from scripts.benchmarks.chain import loopback_up
 
 _DOMAINS = 101
 """ROS domains whose ports every system leaves free."""

@@ -23,9 +23,10 @@ class Exchange:
             left_ns = until_ns - clock.monotonic_ns()
             if left_ns <= 0 or (frame := self.bus.backend.receive(left_ns * 1e-9)) is None:
                 return -1
-            if process_data.take(frame) > began_ns:
+            answer = process_data.take(frame, clock.monotonic_ns())
+            if answer is not None and answer.sent_ns > began_ns:
                 awaited -= 1
-                total += process_data.wkc
-                for at in process_data.inputs[process_data.which]:
-                    self.inputs[at.number] = process_data.frame[at.start : at.end]
+                total += answer.wkc
+                for at in process_data.inputs[answer.which]:
+                    self.inputs[at.number] = frame[at.start : at.end]
         return total

@@ -24,11 +24,12 @@ from ethercat_server.acquisition.start_up import AsFound, Wanted
 from ethercat_server.doctor.bus import examination
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.datagrams import ByPosition
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.coe import finish
-from ethercat_server.ethercat.slave.sii import ByPosition, read_sii
+from ethercat_server.ethercat.slave.sii import read_sii
 from ethercat_server.process import realtime
-from ethercat_server.sensor import look
+from ethercat_server.sensor import scan
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
@@ -90,7 +91,7 @@ class SimulatedBus:
         return [(row["index"], row["subindex"], row["hex"]) for row in self.stats(position)["sdo_writes"]]
 
 
-_READ_IMAGE = look.read_image
+_READ_IMAGE = scan.read_image
 
 
 def _read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda: None) -> bytes:
@@ -118,7 +119,7 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     options = options_from(build_parser().parse_args(["lo", *map(str, arguments)]))
     bus = SimulatedBus(MemoryBackend(*options.slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(look, "read_image", _read_image)
+        patch.setattr(scan, "read_image", _read_image)
         for module in (raw, examination):
             patch.setattr(module, "open_bus", lambda _ifname, **_: contextlib.closing(Bus(bus.backend)))
 

@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -27,19 +27,16 @@ import pytest
 from rich.console import Console
 
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.control import request
-from protocol.framing import encode_json
 from protocol.pdo import encode
-from scripts.benchmarks import chains, comparison, idle_states, statistics
 from scripts.benchmarks import program as benchmark
-from scripts.benchmarks.chain import Setup
-from scripts.benchmarks.modes.soak import Tally, slope_kb_per_hour
-from scripts.benchmarks.processes import client, polling
+from scripts.benchmarks import statistics
+from scripts.benchmarks.chain import ScriptError, Setup
+from scripts.benchmarks.modes import comparison, vendor
+from scripts.benchmarks.modes.soak import slope_kb_per_hour
+from scripts.benchmarks.processes import recorder
+from scripts.benchmarks.program import check, renew
 from scripts.benchmarks.records import Recording, began, write
-from scripts.benchmarks.results.page import check, renew
-from scripts.benchmarks.results.report import print_configuration, rows
 from scripts.benchmarks.statistics import Arrivals, Counts, Ints
-from scripts.demonstration.child import DemoError
 from tests.clients.running import signalled
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, needs_bus, wait_until
@@ -66,21 +63,17 @@ def stop(first: float, last: float) -> Ints:
 # -- lost, repeated, and whose fault it was
 
 
-def test_everything_once() -> None:
-    assert statistics.count(arrivals(*range(5, 105)), PERIOD, NO_STOPS) == Counts(100, 100, 0, 0, 0)
-
-
-def test_lost_and_repeated() -> None:
-    stream = arrivals(5, 6, 6, 7, 10, 11, 11, 11)
-    assert statistics.count(stream, PERIOD, NO_STOPS) == Counts(7, 8, lost=2, lost_in_stops=0, repeated=3)
-
-
-def test_a_late_one_is_not_lost() -> None:
-    assert statistics.count(arrivals(5, 7, 6, 8), PERIOD, NO_STOPS) == Counts(4, 4, 0, 0, 0)
-
-
-def test_nothing_arrived() -> None:
-    assert statistics.count(arrivals(), PERIOD, NO_STOPS) == Counts(0, 0, 0, 0, 0)
+@pytest.mark.parametrize(
+    ("numbers", "counts"),
+    [
+        (range(5, 105), Counts(100, 100, 0, 0, 0)),
+        ((5, 6, 6, 7, 10, 11, 11, 11), Counts(7, 8, lost=2, lost_in_stops=0, repeated=3)),
+        ((5, 7, 6, 8), Counts(4, 4, 0, 0, 0)),  # a late one is not lost
+        ((), Counts(0, 0, 0, 0, 0)),
+    ],
+)
+def test_what_is_lost_and_repeated(numbers: Sequence[int], counts: Counts) -> None:
+    assert statistics.count(arrivals(*numbers), PERIOD, NO_STOPS) == counts
 
 
 @pytest.mark.parametrize(
@@ -164,7 +157,7 @@ def test_turns_alternate() -> None:
 
         return take
 
-    setup = Setup(800, 1, 6.0, 0.0, 0, ppm=0.0)
+    setup = Setup(800, 1, 6.0, 0)
     taken = comparison.in_turns(setup, [program("a"), program("b")])
     assert order == [("a", 2.0), ("b", 2.0)] * 3
     assert [len(each) for each in taken] == [3, 3]
@@ -186,15 +179,6 @@ def test_recording_begins_after_the_warm_up(tmp_path: Path) -> None:
     assert statistics.read_numbers(path, 5)[:, 4].tolist() == [n * 500_000_000 for n in range(2, 7)]
 
 
-def test_soak_tally() -> None:
-    tally = Tally()
-    for number in (2**24 - 2, 2**24 - 1, 0, 3, 3):
-        tally.take(0, number, 10**9, 80_000, PERIOD)
-    tally.take(1, 500, 10**9, 80_000, PERIOD)
-    assert (tally.arrivals, tally.repeated) == (6, 1)
-    assert tally.losses == [10**9 - PERIOD, 10**9 - 2 * PERIOD]
-
-
 def test_memory_slope_leaves_the_start_out() -> None:
     seconds = np.arange(0, 3600.0, 10)
     rss = np.where(seconds < 300, 10e6, 20e6 + seconds / 3600 * 5000)
@@ -202,46 +186,40 @@ def test_memory_slope_leaves_the_start_out() -> None:
 
 
 AGES = {"p50": 80.0, "p99": 120.0, "p999": 150.0}
-RESULT: dict[str, Any] = {
-    "rate_hz": 800,
-    "sensors": 1,
-    "project": {
-        "tcp": {"made": 200, "lost": 1, "lost_in_stops": 1, "age_us": AGES, "cpu_percent": {"server": 9.0}}
+ABOUT = {"rate_hz": 800, "sensors": 1}
+COUNTS = {"made": 200, "lost": 1, "lost_in_stops": 1}
+ROWS: list[dict[str, Any]] = [
+    {**ABOUT, "program": "this", **COUNTS, "age_us": AGES, "cpu_percent": {"server": 9.0}},
+    {**ABOUT, "program": "bare C", **COUNTS, "age_us": {"p50": 40.0, "p99": 60.0}},
+    {
+        **ABOUT,
+        "program": "this / C",
+        "ratio": {name: {"median": number} for number, name in enumerate(comparison.RATIOS, 2)},
     },
-    "yardstick": {"tcp": {"made": 200, "lost": 0, "lost_in_stops": 0, "age_us": {"p50": 40.0, "p99": 60.0}}},
-    "ratio": {"tcp": {name: {"median": 2.0} for name in comparison.RATIOS}},
-    "missing": {"driver": "it cannot be had"},
-}
+    {**ABOUT, "program": "Bota's driver", "missing": "it cannot be had"},
+]
 
 
-def test_table_has_what_there_is() -> None:
-    table = {row.name: row.cells for row in rows(RESULT)}
-    assert table["lost"] == ("1 (0.5%)", "0", "")
-    assert table["age, p50, µs"] == ("80.0", "40.0", "2.00")
-    assert table["age, p99, µs"] == ("120", "60.0", "2.00")
-    assert "Up to a ROS subscriber" not in table
+def test_the_table_has_what_there_is() -> None:
+    _, this, bare_c, ratio, driver = benchmark.cells(comparison.MODE, ROWS)
+    assert this == ["800 Hz, 1", "this", "1 (1) of 200", "80.0", "120", "150", "-", "9.0", "-"]
+    assert bare_c[3:6] == ["40.0", "60.0", "-"]
+    assert ratio[2:] == ["", "2.00", "3.00", "4.00", "", "5.00", ""]
+    assert driver[2] == "it cannot be had"
     shown = io.StringIO()
-    print_configuration(RESULT, Console(file=shown, width=100))
-    assert "no column 'Bota's driver': it cannot be had" in shown.getvalue()
-
-
-def card(server: str, lost: float) -> dict[str, Any]:
-    about = {"rate_hz": 800, "card": {"round_trip_ms": 2, "jitter_us": 200}, "server": server}
-    return {**about, "lost_percent": lost, "age_us": AGES, "stamp_error_us": {"p50": -3, "p99_absolute": 9}}
+    Console(file=shown, width=108).print(benchmark.table(comparison.MODE, ROWS))
+    assert "…" not in shown.getvalue(), "it fits the narrowest table"
 
 
 def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
-    machine = {"cpus_used": 2, "kernel": "6.1.0-x", "python": "3.11.2"}
-    chain = {"lost": 3, "lost_in_stops": 2, "hand_out_us": AGES, "age_us": AGES}
+    load = {"loops": 4, "chain": "TCP, ordinary", "hand_out_us": AGES, "age_us": AGES}
+    error = {"p50": -3, "p99_absolute": 9}
+    card = {"lost_percent": 0, "age_us": AGES, "stamp_error_us": error}
     content = {
-        "date": "2026-11-23T01:02:03",
-        "machine": machine,
-        "idle_states": True,
-        "stolen_percent": 0.5,
-        "configurations": [RESULT],
-        "load": {"rate_hz": 800, "loops": 4, "chains": {"TCP, ordinary": chain}},
-        "cards": [card("this", 0), card("one at a time", 13)],
-    }
+        "date": "2026-11-23T01:02:03", "cpus_used": 2, "kernel": "6.1.0-x", "python": "3.11.2",
+        "idle_states": True, "stolen_percent": 0.5, "comparison": ROWS, "load": [{**ABOUT, **COUNTS, **load}],
+        "cards": [{**ABOUT, "card": "2 ms", "this": card, "one at a time": {**card, "lost_percent": 13}}],
+    }  # fmt: skip
     page = tmp_path / "page.md"
     names = ("load", "node", "comparison", "cards")
     blocks = "".join(f"<!-- measured: {name} -->\nold\n<!-- end -->\n" for name in names)
@@ -249,16 +227,16 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     for _ in range(2):
         renew(page, content)
         text = page.read_text()
-        assert text.startswith("above\n<!-- measured: load -->\n| 800 Hz beside 4 loops |")
-        assert "| TCP, ordinary | 3 (2) | 80 / 120 / 150 | 80 / 120 / 150 |" in text
+        assert text.startswith("above\n<!-- measured: load -->\n| beside loops |")
+        assert "| 800 Hz, 4 loops: TCP, ordinary | 1 (1) | 80 / 120 / 150 | 80 / 120 / 150 |" in text
         assert "<!-- measured: node -->\nNot measured: there was no ROS 2.\n<!-- end -->" in text
-        assert "<!-- measured: comparison -->\n**Your controller gets a sample 80 µs" in text
-        assert "| lost | 1 (0.5%), in stalls 1 | 0 |  |" in text
-        assert "| 800 Hz, 1 virtual sensor | 1 of 200 | 80 / 120 | 2.0 / 2.0 | 9.0 | 2.0 |" in text
-        assert text.endswith("| 800 Hz, 2 ms ± 200 µs | 0 (13) | 80 (80) | 3 / 9 |\n<!-- end -->\nbelow\n")
+        assert "<!-- measured: comparison -->\n**Your controller gets a sample 80 µs (p99 120)" in text
+        assert "A bare C program: 40 µs (p99 60)." in text
+        assert "of one run: 2026-11-23, 2 CPUs, Linux 6.1.0, Python 3.11.2, with idle states." in text
+        assert text.endswith("| 800 Hz, 2 ms | 0 (13) | 80 (80) | -3 / 9 |\n<!-- end -->\nbelow\n")
     for wrong in ("no place", text * 2, text.replace("cards", "others")):
         page.write_text(wrong)
-        with pytest.raises(DemoError, match="once for each of comparison, load, node, cards"):
+        with pytest.raises(ScriptError, match="once for each of comparison, load, node, cards"):
             renew(page, content)
         assert page.read_text() == wrong
 
@@ -268,13 +246,40 @@ def test_the_documentations_page_can_be_renewed() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [["--rates", "801"], ["--sensors", "0"], ["--seconds", "x"], ["--rt-priority", "99"]]
+    ("wrong", "why"),
+    [
+        (["--rates", "801"], "--rates"),
+        (["--sensors", "0"], "--sensors"),
+        (["--seconds", "x"], "--seconds"),
+        (["--rt-priority", "99"], "--rt-priority"),
+        (["--load", "0"], "--load"),
+        (["--load", "65"], "--load"),
+        (["--cards", "0.5"], "0.05, 0.44, 0.86, 2, 3"),
+        (["--node", "--cpp"], "not allowed with"),
+    ],
 )
-def test_wrong_arguments_are_refused(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_arguments_are_refused(wrong: list[str], why: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as refused:
         benchmark.parse(wrong)
     assert refused.value.code == 2
-    assert wrong[0] in capsys.readouterr().err
+    assert why in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "mode", "argument"),
+    [
+        ([], "comparison", False),
+        (["--vendor"], "comparison", True),
+        (["--cards"], "cards", ()),
+        (["--cards", "0.05,3"], "cards", [0.05, 3.0]),
+        (["--load", "4"], "load", 4),
+        (["--soak", "2"], "soak", 2.0),
+        *[([f"--{name}"], name, True) for name in ("node", "cpp", "compensation")],
+    ],
+)
+def test_an_option_measures_only_what_it_names(given: list[str], mode: str, argument: object) -> None:
+    options = benchmark.parse(given)
+    assert (options.mode, options.argument) == (mode, argument)
 
 
 # -- its programs, as threads
@@ -287,24 +292,23 @@ def clock_data(number: int, instant: int | None = None) -> bytes:
     return encode(61, dict(zip(("force.x", "force.y", "force.z", "torque.x"), values, strict=True)))
 
 
-@contextlib.contextmanager
-def running(program: Callable[[argparse.Namespace], None], **options: object) -> Iterator[threading.Thread]:
-    thread = threading.Thread(target=program, args=(argparse.Namespace(**options),))
+def recorded(program: Callable[..., None], path: Path, seconds: float, **options: object) -> threading.Thread:
+    """A recorder in a thread."""
+
+    def run() -> None:
+        recording = Recording(path, 0.0, seconds)
+        program(argparse.Namespace(**options), recording)
+        recording.write()
+
+    thread = threading.Thread(target=run)
     thread.start()
-    yield thread
-    thread.join(PATIENCE_S)
-    assert not thread.is_alive()
+    return thread
 
 
 def test_the_client_records_every_sample_and_its_age(tmp_path: Path) -> None:
-    recording = Recording(path := tmp_path / "records", 0.0, 0.1)
-    with (
-        served(SensorOptions(signal="clock"), sinc_length=256) as server,
-        socket.create_connection(("127.0.0.1", server.port)) as connection,
-    ):
-        connection.sendall(encode_json(request("subscribe")))
-        client.record(connection, recording)
-    recording.write()
+    path = tmp_path / "records"
+    with served(SensorOptions(signal="clock"), sinc_length=256) as server:
+        recorded(recorder.tcp, path, 0.1, port=server.port).join(PATIENCE_S)
     figures, ages = statistics.summary(statistics.read_arrivals(path), 5_000_000, NO_STOPS)
     assert figures["made"] == figures["arrivals"] + figures["lost"] > 1
     assert figures["repeated"] == 0
@@ -314,13 +318,13 @@ def test_the_client_records_every_sample_and_its_age(tmp_path: Path) -> None:
 def test_the_polling_client_takes_what_is_there_when_it_looks(tmp_path: Path) -> None:
     path, count = tmp_path / "records", itertools.count()
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        port = listener.getsockname()[1]
-        with running(polling.client, path=path, port=port, rate=1000, warm_up=0.0, seconds=0.05) as looks:
-            sender, _ = listener.accept()
-            with sender, contextlib.suppress(ConnectionError):
-                while looks.is_alive():
-                    sender.sendall(clock_data(next(count) // 2))
-                    time.sleep(0.001)
+        looks = recorded(recorder.polling, path, 0.05, port=listener.getsockname()[1], rate=1000)
+        sender, _ = listener.accept()
+        with sender, contextlib.suppress(ConnectionError):
+            while looks.is_alive():
+                sender.sendall(clock_data(next(count) // 2))
+                time.sleep(0.001)
+    looks.join(PATIENCE_S)
     (found,) = statistics.read_arrivals(path)
     counts = statistics.count(found, 1e6, NO_STOPS)
     assert counts.lost == 0, "it reads one after the other"
@@ -333,39 +337,49 @@ def test_idle_states_are_off_as_long_as_the_device_is_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device = tmp_path / "cpu_dma_latency"
-    monkeypatch.setattr(idle_states, "_LATENCY", device)
-    with idle_states.no_idle_states() as held:
+    monkeypatch.setattr(benchmark, "_LATENCY", device)
+    with benchmark.no_idle_states() as held:
         assert held
         assert device.read_bytes() == b"\0\0\0\0"
-    monkeypatch.setattr(idle_states, "_LATENCY", tmp_path / "missing" / "device")
-    with idle_states.no_idle_states() as held:
+    monkeypatch.setattr(benchmark, "_LATENCY", tmp_path / "missing" / "device")
+    with benchmark.no_idle_states() as held:
         assert not held
 
 
 # -- the thing itself
 
 
-def test_what_was_measured_is_shown_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("installed", [True, False])
+def test_what_was_measured_is_shown_and_written(
+    installed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     figures, ages = statistics.summary([arrivals(*range(5, 105))], PERIOD, NO_STOPS)
     measured = {**figures, "rss_mb": {"server": 40.0}, "cpu_percent": {"server": 5.0}}, ages
-    for chain in ("yardstick", "project_tcp", "polling_tcp"):
-        monkeypatch.setattr(chains, chain, lambda *_: measured)
+    for program in ("bare_c", "project", "polling"):
+        monkeypatch.setattr(comparison, program, lambda *_, **__: measured)
     monkeypatch.setattr(comparison, "build", lambda _: tmp_path)
+    monkeypatch.setattr(vendor, "installed", lambda: installed)
+    monkeypatch.setattr(vendor, "measure_driver", lambda _: measured)
     monkeypatch.setenv("DEMO_DIRECTORY", str(tmp_path))
-    monkeypatch.setattr(comparison, "virtual_bus", lambda _: contextlib.nullcontext(("ecat0", 1)))
     monkeypatch.setattr(benchmark, "loopback_up", lambda: None)
     monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)
     files = ("--json", str(tmp_path / "b.json"), "--plot", str(tmp_path / "b.png"))
     shown = io.StringIO()
-    options = benchmark.parse([*files, "--no-ros", "--rates", "800", "--sensors", "1", "--rt-priority", "0"])
+    options = benchmark.parse(
+        [*files, "--vendor", "--no-ros", "--rates", "800", "--sensors", "1", "--rt-priority", "0"]
+    )
     benchmark.run(options, Console(file=shown, width=100), idle_states=True)
     content = json.loads((tmp_path / "b.json").read_text())
-    (result,) = content["configurations"]
     assert all(map(math.isfinite, numbers(content)))
-    assert (result["rate_hz"], result["sensors"]) == (800, 1)
-    assert result["polling"]["tcp"]["made"] == 100
+    assert [row["program"] for row in content["comparison"]] == [
+        "this", "this, C client", "bare C", "this / C", *["Bota's driver"] * installed, "polling",
+        *["Bota's driver"] * (not installed),
+    ]  # fmt: skip
+    assert {(row["rate_hz"], row["sensors"]) for row in content["comparison"]} == {(800, 1)}
+    assert content["comparison"][-1 - (not installed)]["made"] == 100
+    assert ("bota-driver==1.1.16" in content["comparison"][-1].get("missing", "")) == (not installed)
     assert content["idle_states"]
-    assert "Up to a TCP client" in shown.getvalue()
+    assert "0 (0) of 300" in shown.getvalue()
     assert (tmp_path / "b.png").exists() == (find_spec("matplotlib") is not None)
 
 
@@ -404,19 +418,18 @@ def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     said, _ = running.communicate(timeout=400)
     assert running.returncode == 0, said
     text = Path(page).read_text()
-    assert all(
-        f"| 400 Hz{what} |" in text for what in (", 2 virtual sensors", " beside 4 loops", ", 0.86 ms")
-    )
-    assert "| the node | 800 Hz | 1600 Hz |" in text
+    for what in ("400 Hz, 2 | this, ROS", "400 Hz, 4 loops: wrench, ", "400 Hz, 0.86 ms", "400 Hz | "):
+        assert f"| {what}" in text, what
     content = json.loads((tmp_path / "b.json").read_text())
     assert all(map(math.isfinite, numbers(content)))
-    one, two = content["configurations"]
-    assert "polling" not in two
-    for figures in (one["project"]["ros"], two["project"]["ros"], one["polling"]["ros"]):
+    programs = {(row["sensors"], row["program"]): row for row in content["comparison"]}
+    assert (2, "polling") not in programs
+    for key in ((1, "this, ROS"), (2, "this, ROS"), (1, "polling, ROS")):
+        figures = programs[key]
         assert figures["made"] > 1
         assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"]
-    assert {"server", "node 0", "node 1"} < set(two["project"]["ros"]["cpu_percent"])
-    assert "Up to a ROS subscriber" in said
+    assert {"server", "node 0", "node 1"} < set(programs[2, "this, ROS"]["cpu_percent"])
+    assert content["node"][0]["samples"] > 1
 
 
 @needs_bus
@@ -428,24 +441,21 @@ def test_a_short_run(tmp_path: Path) -> None:
     said, _ = running.communicate(timeout=90)
     assert running.returncode == 0, said
     content = json.loads((tmp_path / "b.json").read_text())
-    (result,) = content["configurations"]
     assert all(map(math.isfinite, numbers(content)))
-    assert (result["rate_hz"], result["sensors"]) == (800, 1)
-    for program in ("project", "polling"):
-        figures = result[program]["tcp"]
+    rows = {row["program"]: row for row in content["comparison"]}
+    for program in {"this", "bare C", "polling"} & rows.keys():
+        figures = rows[program]
         assert figures["made"] > 1
         assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"]
         assert 0 < figures["age_us"]["p50"] <= figures["age_us"]["p99"] <= figures["age_us"]["max"]
         assert figures["rss_mb"]["server"] > 1
-    if "yardstick" not in result["missing"]:
-        assert result["yardstick"]["tcp"]["made"] > 1
-        assert result["ratio"]["tcp"]["age_p50"]["median"] > 0
-    project = result["project"]["tcp"]
+    if "missing" not in rows["bare C"]:
+        assert rows["this / C"]["ratio"]["age_p50"]["median"] > 0
+    project = rows["this"]
     # Some may be lost to a busy machine, but only while it kept the server from running at all.
     unexplained = project["lost"] - project["lost_in_stops"]
     assert unexplained <= project["server"]["missed_deadlines"] + project["server"]["lost_frames"]
     assert project["repeated"] == 0
-    assert "Up to a TCP client" in said
     assert (tmp_path / "b.png").exists() == (find_spec("matplotlib") is not None)
 
 

@@ -10,8 +10,9 @@ import pytest
 
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import SampleDecoder, encode
-from scripts.demonstration.measure import Measurement, explanation, percentile, verdict
-from scripts.demonstration.show import Screen, print_summary
+from scripts.demonstration import program
+from scripts.demonstration.measure import Measurement, explanation, verdict
+from scripts.demonstration.program import Screen, print_summary
 
 PERIOD_NS = 1_250_000
 SECOND_NS = 1_000_000_000
@@ -38,8 +39,7 @@ def test_a_good_run() -> None:
     summary = measured().summary()
     assert (summary.messages, summary.lost, summary.repeated) == (801, 0, 0)
     assert summary.rate_hz == 800.0
-    assert summary.age_p50_ms == summary.age_p99_ms == 0.4
-    assert summary.tcp_age_p50_ms == 0.2
+    assert (summary.age_ms, summary.tcp_age_ms) == ((0.4, 0.4), (0.2, 0.2))
     assert verdict(summary, 800) is None
 
 
@@ -155,7 +155,11 @@ def test_counting_begins_anew() -> None:
     assert (summary.messages, summary.lost, summary.repeated, summary.rate_hz) == (801, 0, 0, 800.0)
 
 
-def test_percentile() -> None:
-    assert percentile([], 0.5) == 0
-    assert percentile([3, 1, 2], 0.5) == 2
-    assert percentile(list(range(100)), 0.99) == 99
+@pytest.mark.parametrize("text", ["abc", "", "0.1", "nan", "inf"])
+def test_a_wrong_time_is_refused(
+    text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["demo", "--seconds", text])
+    with pytest.raises(SystemExit):
+        program._demo()
+    assert "must be a number of seconds from 0.5" in capsys.readouterr().err

@@ -20,7 +20,6 @@ from clients import program
 from ethercat_server import programs
 from ethercat_server.virtual_sensor.cli import main as virtual_sensor
 from protocol.program.output import never_fail
-from scripts.demonstration.program import _seconds as demo_seconds
 from tests.ended import run_here
 
 ROOT: Final = Path(__file__).parent.parent
@@ -172,12 +171,6 @@ def test_what_is_missing_comes_from_where_this_came_from(
     monkeypatch.setattr(program, "_CHECKOUT", Path("/no/checkout"))
     monkeypatch.setattr(program, "distribution", lambda _: SimpleNamespace(read_text=lambda _: text))
     assert program.missing("numpy.linalg") == what.replace("PIP", f"{sys.executable} -m pip install")
-
-
-@pytest.mark.parametrize("text", ["abc", "", "0.1", "nan", "inf"])
-def test_a_wrong_time_of_the_demo_is_said(text: str) -> None:
-    with pytest.raises(Exception, match="must be a number of seconds"):
-        demo_seconds(text)
 
 
 @pytest.mark.parametrize(

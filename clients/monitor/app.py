@@ -18,19 +18,16 @@ from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
 
-from clients.monitor.model.server import Model, clock_text
-from clients.monitor.model.state import SensorState, State
+from clients.monitor.model import Model, State, clock_text
 from clients.monitor.recorder import Recorder
-from clients.monitor.tare import WAYS, start_tare
-from clients.monitor.view.glyphs import Glyphs
-from clients.monitor.view.screen import Look, render
+from clients.monitor.screen import Look, render
+from clients.monitor.tare import start_tare
 from clients.numbers import duration
 from clients.program import call_on
 from protocol.address import Address
 
 REFRESH_S: Final = 0.1
-_ANSWERS: Final = {"y": "tare", "u": "undo", "c": "clear"}
-"""Keys that answer the question whether to tare, and what they do."""
+_ANSWERS: Final = {"y": "tare", "u": "undo", "c": "clear"}  # to the question whether to tare
 
 
 class View(Widget):
@@ -45,19 +42,16 @@ class View(Widget):
 
     def show(self, rows: list[Text]) -> None:
         """Show these rows."""
-        width = self.size.width
-        if len(rows) != len(self._rows):
-            self._rows, self._strips = [], []
+        width, before = self.size.width, self._rows
+        self._rows = rows
+        if len(rows) != len(before):
+            self._strips = [self._strip(row, width) for row in rows]
             self.refresh()
+            return
         for y, row in enumerate(rows):
-            if y < len(self._rows):
-                if row == self._rows[y]:
-                    continue
+            if row != before[y]:
                 self._strips[y] = self._strip(row, width)
                 self.refresh(Region(0, y, width, 1))
-            else:
-                self._strips.append(self._strip(row, width))
-        self._rows = rows
 
     def _strip(self, row: Text, width: int) -> Strip:
         return Strip(row.render(self.app.console)).adjust_cell_length(width)
@@ -68,7 +62,7 @@ class View(Widget):
 
 
 class Monitor(App[None]):
-    """Connects the keys, the model and the view."""
+    """Connects keys, model and view. The caller closes `recorder` once the terminal is restored."""
 
     TITLE = "ethercat-monitor"
     CSS = "Screen, View { background: ansi_default; color: ansi_default; width: 100%; height: 100%; }"
@@ -79,8 +73,8 @@ class Monitor(App[None]):
         self,
         model: Model,
         address: Address,
-        glyphs: Glyphs,
         *,
+        ascii_only: bool = False,
         seconds: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -90,14 +84,12 @@ class Monitor(App[None]):
         self._model = model
         self._address = address
         self._clock = clock
-        self._look = Look(glyphs=glyphs)
+        self._look = Look(ascii=ascii_only)
         self._view = View()
         self._seconds = seconds
         self.recorder = Recorder(address)
-        """The caller closes it after the terminal is restored."""
         self._state: State | None = None
-        self._to_tare: int | None = None
-        """The position that the question is about."""
+        self._to_tare = 0  # the position that the question is about
 
     def compose(self) -> ComposeResult:
         """The only widget."""
@@ -106,7 +98,7 @@ class Monitor(App[None]):
     def on_mount(self) -> None:
         """Start the timers and the signal handlers."""
         call_on(asyncio.get_running_loop(), self.exit, "SIGTERM", "SIGHUP")
-        self.app_resume_signal.subscribe(self, lambda _: self.repaint())
+        self.app_resume_signal.subscribe(self, lambda _: self._view.refresh())
         self.set_interval(REFRESH_S, self.draw)
         if self._seconds is not None:
             self.set_timer(self._seconds, self.exit)
@@ -118,20 +110,14 @@ class Monitor(App[None]):
     def draw(self) -> None:
         """Show the current state, or that of the time of the pause."""
         now_s = self._clock()
-        ended = self.recorder.ended()
-        if ended is not None:
+        if ended := self.recorder.ended():
             self._say(*ended)
         state = self._model.state(now_s)
         if self._look.paused and self._state is not None:
             state = replace(self._state, message=state.message)
         self._state = state
         recording = f"REC {duration(self.recorder.seconds(now_s))}" if self.recorder.running else ""
-        look = replace(self._look, recording=recording)
-        self._view.show(render(state, look, *self._view.size))
-
-    def repaint(self) -> None:
-        """Draw everything again, after something else has written to the terminal."""
-        self._view.refresh()
+        self._view.show(render(state, replace(self._look, recording=recording), *self._view.size))
 
     def action_help_quit(self) -> None:
         """Ctrl-C quits, instead of Textual's hint at another key."""
@@ -142,57 +128,50 @@ class Monitor(App[None]):
         if event.key in {"ctrl+c", "ctrl+q", "ctrl+z"}:
             return
         event.stop()
+        look, key = self._look, (event.character or "").lower()
         if event.key == "ctrl+l":
-            self.repaint()
-        elif self._look.question:
-            self._answer((event.character or "").lower())
-        elif self._look.help:
-            self._look = replace(self._look, help=False)
-        elif self._look.warnings and event.character != "w":
-            self._look = replace(self._look, warnings=0)
-        else:
-            action = {
-                "t": self._ask_tare,
-                "r": self._record,
-                "p": self._pause,
-                " ": self._pause,
-                "0": self._reset,
-                "n": self._next,
-                "w": self._warnings,
-                "?": self._help,
-                "h": self._help,
-                "q": self.exit,
-            }.get((event.character or "").lower())
-            if action is not None:
-                action()
+            self._view.refresh()
+        elif look.question:
+            self._answer(key)
+        elif look.help or (look.warnings and key != "w"):
+            self._look = replace(look, help=False, warnings=0)
+        elif key == "t":
+            self._ask_tare()
+        elif key == "r":
+            self._record()
+        elif key in {"p", " "}:
+            self._look = replace(look, paused="" if look.paused else clock_text())
+        elif key == "0":
+            self._model.reset()
+            self._say("Peaks and past warnings are reset")
+        elif key == "n":
+            self._next()
+        elif key == "w":
+            self._look = replace(look, warnings=look.warnings + 1)
+        elif key in {"?", "h"}:
+            self._look = replace(look, help=True)
+        elif key == "q":
+            self.exit()
         self.draw()
 
-    def _selected(self) -> SensorState | None:
-        sensors = self._state.sensors if self._state else ()
-        return sensors[self._look.selected % len(sensors)] if sensors else None
-
     def _say(self, text: str, bad: bool = False) -> None:
-        self._model.say(f"{clock_text()} {text}", bad=bad)
+        self._model.say(f"{clock_text()} {text}", bad)
 
     def _ask_tare(self) -> None:
-        sensor = self._selected()
-        if sensor is None or self._state is None or not self._state.server.connected:
+        state = self._state
+        if state is None or not state.sensors or not state.server.connected:
             self._say("No sensor to tare: not connected to the server", True)
             return
-
-        self._to_tare = sensor.position
+        self._to_tare = state.sensors[self._look.selected % len(state.sensors)].position
         answers = "y: yes, u: undo the last tare, c: clear it, any other key: no"
-        self._look = replace(self._look, question=f"Tare sensor {sensor.position}? {answers}")
+        self._look = replace(self._look, question=f"Tare sensor {self._to_tare}? {answers}")
 
     def _answer(self, key: str) -> None:
-        position, self._to_tare = self._to_tare, None
         self._look = replace(self._look, question="")
-        way = _ANSWERS.get(key)
-        if way is None or position is None:
-            self._say("Not tared")
+        if key in _ANSWERS:
+            start_tare(self._address, self._to_tare, self._say, _ANSWERS[key])
         else:
-            self._say(WAYS[way].begins.format(position))
-            start_tare(self._address, position, self._say, way)
+            self._say("Not tared")
 
     def _record(self) -> None:
         if self.recorder.running:
@@ -201,22 +180,9 @@ class Monitor(App[None]):
         else:
             self._say(*self.recorder.start(self._clock()))
 
-    def _pause(self) -> None:
-        self._look = replace(self._look, paused="" if self._look.paused else clock_text())
-
-    def _reset(self) -> None:
-        self._model.reset()
-        self._say("Peaks and past warnings are reset")
-
     def _next(self) -> None:
         count = len(self._state.sensors) if self._state else 0
         if count < 2:
             self._say("There is only one sensor" if count else "There is no sensor")
         else:
             self._look = replace(self._look, selected=(self._look.selected + 1) % count)
-
-    def _warnings(self) -> None:
-        self._look = replace(self._look, warnings=self._look.warnings + 1)
-
-    def _help(self) -> None:
-        self._look = replace(self._look, help=True)

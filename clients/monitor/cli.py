@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 
 from clients.monitor.options import parse
-from clients.monitor.program import run
 from clients.program import discard_output, not_installed
 
 
@@ -15,6 +14,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the monitor; returns its exit code."""
     options = parse(argv)
     try:
+        from clients.monitor.program import run  # noqa: PLC0415 - needs the extra
+
         return run(options)
     except OSError as error:
         if error.errno not in (errno.EPIPE, errno.EIO):  # the reader or the terminal was closed

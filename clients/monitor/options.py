@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import ipaddress
 from collections.abc import Sequence
 from typing import Final
 
 from clients.arguments import add_imu_units, add_server, address, parser, seconds, server_of
-from clients.monitor.web.access import is_loopback
 from protocol.address import DEFAULT_HOST, Address
 from protocol.pdo import ImuUnits
 
@@ -52,6 +52,16 @@ def parse(argv: Sequence[str] | None) -> Options:
     if options.web is not None and (options.once or options.json):
         made.error("--web cannot be combined with --once or --json")
     return options
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host, without port, is this machine."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _loopback(text: str) -> Address:

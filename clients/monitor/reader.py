@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from clients.monitor.model.server import Model
+from clients.monitor.model import Model
 from protocol.address import Address
 from protocol.client import Client, ClientEvent, Connected, Disconnected
 from protocol.control import Event
@@ -22,10 +22,8 @@ from protocol.framing import DataMessage
 BATCH_S: Final = 0.05
 _STATUS_EVERY_S: Final = 1.0
 _NEXT_SAMPLE_S: Final = 0.1
-_MOST_PILED: Final = 1000
-"""More were not read in time: what comes next has waited, too."""
-_ANSWER_TIMEOUT_S: Final = 10.0
-"""Timeout for a reply of the server."""
+_MOST_PILED: Final = 1000  # more were not read in time: what comes next has waited, too
+_ANSWER_TIMEOUT_S: Final = 10.0  # timeout for a reply of the server
 
 
 class Reader:
@@ -38,11 +36,8 @@ class Reader:
         self._model = model
         self._batch_s = batch_s
         self._closing = threading.Event()
-        self._changed = threading.Condition()
-        self.attempts = 0
-        """Number of failed connections."""
-        self.statuses = 0
-        """Number of replies to `status`."""
+        self._tried = threading.Event()  # there was a reply to `status`, or a failed connection
+        self._answered = False
         self._thread = threading.Thread(target=self._run, name="reader", daemon=True)
 
     def start(self) -> None:
@@ -57,9 +52,8 @@ class Reader:
 
     def wait_for_answer(self, timeout_s: float) -> bool:
         """Wait for the first reply to `status` or failed connection; whether there was a reply."""
-        with self._changed:
-            self._changed.wait_for(lambda: self.statuses or self.attempts, timeout_s)
-            return self.statuses > 0
+        self._tried.wait(timeout_s)
+        return self._answered
 
     def _run(self) -> None:
         status_at_s = 0.0
@@ -104,9 +98,7 @@ class Reader:
             if not end.reachable:
                 reason = UnreachableError(end.reason).at(self._client.address)
             self._model.gone(reason, now_s)
-            with self._changed:
-                self.attempts += 1
-                self._changed.notify_all()
+            self._tried.set()
 
     def _ask_status(self, client: Client) -> None:
         try:
@@ -115,6 +107,5 @@ class Reader:
             return  # an event says why
         except RefusedError:
             pass
-        with self._changed:
-            self.statuses += 1
-            self._changed.notify_all()
+        self._answered = True
+        self._tried.set()

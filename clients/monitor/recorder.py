@@ -17,13 +17,6 @@ from protocol.text.visible import printable
 
 PROGRAM: Final = "ethercat-record"
 _STOP_TIMEOUT_S: Final = 20.0
-"""Timeout for finishing a recording."""
-
-
-def program() -> list[str] | None:
-    """The command, beside this interpreter or on PATH; None if it is not installed."""
-    found = shutil.which(PROGRAM, path=Path(sys.executable).parent) or shutil.which(PROGRAM)
-    return None if found is None else [found]
 
 
 class Recorder:
@@ -32,12 +25,12 @@ class Recorder:
     def __init__(
         self, address: Address, directory: Path | None = None, command: Sequence[str] | None = None
     ) -> None:
-        """Recordings go to `directory`, by default the current one; `command` replaces `program()`."""
+        """Recordings go to `directory`, by default the current one; `command`: another program."""
         self._address = address
         self._directory = directory or Path.cwd()
         self._command = command
         self._process: subprocess.Popen[bytes] | None = None
-        self._said: IO[bytes] | None = None
+        self._said: IO[bytes]  # what it prints
         self._since_s = 0.0
 
     @property
@@ -51,8 +44,9 @@ class Recorder:
 
     def start(self, now_s: float) -> tuple[str, bool]:
         """Start a recording; a message, and whether it is an error."""
-        command = self._command or program()
-        if command is None:
+        program = shutil.which(PROGRAM, path=Path(sys.executable).parent) or shutil.which(PROGRAM)
+        command = self._command or (program and [program])
+        if not command:
             return missing(PROGRAM), True
         name = time.strftime("recording-%Y%m%d-%H%M%S.mcap")
         said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
@@ -74,17 +68,20 @@ class Recorder:
 
     def stop(self) -> None:
         """Request the end; `ended` reports it."""
-        if self._process is not None:
-            self._close_input()
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()  # which it takes as the request to stop
 
     def ended(self) -> tuple[str, bool] | None:
         """A message about a recording that has ended, and whether it is an error; else None."""
         if self._process is None or self._process.poll() is None:
             return None
-        code = self._process.returncode
-        self._close_input()
+        code, said = self._process.returncode, self._said
+        self.stop()
         self._process = None
-        last = self._last_words().removeprefix(f"{PROGRAM}: ")
+        said.seek(0)
+        lines = said.read()[-4096:].decode(errors="replace").strip().splitlines() or [""]
+        said.close()
+        last = printable(lines[-1]).removeprefix(f"{PROGRAM}: ")
         if code == 0:
             return f"Recorded {last}" if last else "The recording has ended", False
         return f"The recording failed: {last or f'exit code {code}'}", True
@@ -101,17 +98,3 @@ class Recorder:
             self._process.wait()
         found = self.ended()
         return found[0] if found else None
-
-    def _close_input(self) -> None:
-        """Which it takes as the request to stop."""
-        if self._process is not None and self._process.stdin is not None:
-            self._process.stdin.close()
-
-    def _last_words(self) -> str:
-        if self._said is None:
-            return ""
-        self._said.seek(0)
-        lines = self._said.read()[-4096:].decode(errors="replace").strip().splitlines()
-        self._said.close()
-        self._said = None
-        return printable(lines[-1]) if lines else ""

@@ -6,7 +6,7 @@ import contextlib
 import threading
 from array import array
 from collections.abc import Callable, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from protocol.address import Address
 from protocol.client import Client
@@ -17,25 +17,21 @@ from protocol.text.json_text import JsonObject
 from protocol.text.untrusted import number, rows, whole
 
 _TIMEOUT_S: Final = 60.0
-_OFFSET: Final = 0x8000
-"""The sensor's force/torque offset, in sub-indices 1 to 6."""
-_ZERO: Final = (0.0,) * 6
+_OFFSET: Final = 0x8000  # the sensor's force/torque offset, in sub-indices 1 to 6
 
-Say = Callable[[str, bool], None]
-"""Takes a message, and whether it is an error."""
+Say = Callable[[str, bool], None]  # takes a message, and whether it is an error
 
-
-class Way(NamedTuple):
-    """What can be done about a tare."""
-
-    begins: str
-    """What to say, for the sensor's position, when it begins."""
-    do: Callable[[Address, int], tuple[str, bool]]
+WAYS: Final = {
+    "tare": "Taring sensor {}: keep it stationary",
+    "undo": "Undoing the tare of sensor {}",
+    "clear": "Clearing the offset of sensor {}",
+}  # what can be done, and what is said when it begins
 
 
 def start_tare(address: Address, position: int, say: Say, way: str = "tare") -> threading.Thread:
     """Do one of WAYS with the sensor at `position`; the thread, which is returned, says the result."""
-    do = WAYS[way].do
+    say(WAYS[way].format(position), False)
+    do = {"tare": tare, "undo": undo, "clear": clear}[way]
     thread = threading.Thread(target=lambda: say(*do(address, position)), name="tare", daemon=True)
     thread.start()
     return thread
@@ -66,14 +62,9 @@ def undo(address: Address, position: int) -> tuple[str, bool]:
 
 def clear(address: Address, position: int) -> tuple[str, bool]:
     """Set the offset to zero; as `tare`."""
-    return _set_offset(address, position, lambda *_: _ZERO, f"offset of sensor {position} was {{}}cleared")
-
-
-WAYS: Final = {
-    "tare": Way("Taring sensor {}: keep it stationary", tare),
-    "undo": Way("Undoing the tare of sensor {}", undo),
-    "clear": Way("Clearing the offset of sensor {}", clear),
-}
+    return _set_offset(
+        address, position, lambda *_: (0.0,) * 6, f"offset of sensor {position} was {{}}cleared"
+    )
 
 
 def _set_offset(

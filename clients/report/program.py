@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from clients.errors import RecordingError, ReportError
-from clients.report.checks.check import Level
 from clients.report.examine import Examination, examine
 from clients.report.options import ReportOptions
 from clients.report.page.page import as_json, render
 from clients.report.subjects import live, recorded
 from clients.report.subjects.subject import Subject
 from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
+from protocol.health.verdict import Level
 from protocol.program.new_file import NewFile
 from protocol.program.version import VERSION
 
@@ -68,6 +68,6 @@ def _summary(examinations: Sequence[Examination]) -> str:
         lines += [f"  {remark}" for remark in subject.remarks]
         for check in each.checks:
             if check.level >= Level.NOT_POSSIBLE:
-                lines.append(f"  {check.level.word}: {check.name}: {check.found}")
+                lines.append(f"  {check.level.words}: {check.name}: {check.found}")
                 lines += [f"    {check.remedy}"] if check.remedy else []
     return "\n".join(lines)

@@ -12,15 +12,13 @@ from collections.abc import Iterator
 from ethercat_server.access.adapters import promiscuity_kept
 from ethercat_server.errors import BusError, UsageError
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.mailbox.mailbox import Mailbox
+from ethercat_server.ethercat.datagrams import ByPosition
 from ethercat_server.ethercat.open_bus import open_bus
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import MailboxSdo
-from ethercat_server.ethercat.slave.sii import ByPosition
-from ethercat_server.sensor import look
 from ethercat_server.sensor.guard import GuardedSdo
-from ethercat_server.sensor.scan import look_safely
+from ethercat_server.sensor.scan import Slave, look_safely, read_image
 from ethercat_server.sensor.sensor import Found, Identity
 from ethercat_server.virtual_sensor.virtual_bus import VIRTUAL_INTERFACE, VirtualBus
 
@@ -34,7 +32,7 @@ def open_interface(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
         yield cleanup.enter_context(open_bus(ifname, allow_ip=allow_ip))
 
 
-def look_on(ifname: str) -> list[look.Slave]:
+def look_on(ifname: str) -> list[Slave]:
     """The slaves on `ifname`; ServerError if it cannot be looked at.
 
     Frames of another master are waited for first; nothing is asked if there are some.
@@ -49,7 +47,7 @@ def read_images(ifname: str, *, force: bool, allow_ip: bool) -> dict[int, bytes 
         images: dict[int, bytes | BusError] = {}
         for slave in look_safely(bus, lambda: None, force=force):
             try:
-                images[slave.position] = look.read_image(bus, slave.position)
+                images[slave.position] = read_image(bus, slave.position)
             except BusError as error:
                 images[slave.position] = error
         return images
@@ -77,4 +75,4 @@ def open_slave(bus: Bus, wanted: str) -> tuple[Found, GuardedSdo]:
     out, back = struct.unpack_from("<HH", rows), struct.unpack_from("<HH", rows, reg.SYNC_MANAGER_SIZE)
     serial = slave.sii["serial"] if slave.sii else 0
     found = Found(slave.position, Identity(slave.name, serial, "", ""), "slave")
-    return found, GuardedSdo(MailboxSdo(Mailbox(ByPosition(bus), slave.position, (out, back))))
+    return found, GuardedSdo(MailboxSdo(ByPosition(bus), slave.position, (out, back)))

@@ -1,37 +1,46 @@
-"""The acquisition loop: exchange, hand out, serve the sockets until the next exchange is due.
+"""The acquisition loop: exchange, hand out, learn, serve the sockets until the next exchange is due.
 
-The schedule says when that is, as an absolute time on CLOCK_MONOTONIC; answers are handed out whenever they
-arrive, so that a slow network card has several exchanges on their way. One thread does everything, and
-`_step`, `_receive`, `_hand_out` and `_learn` are all of the hot path outside `SensorStream.take`, its `learn`
-and `Connection.offer`.
+Each sensor has a clock of its own, an exchange reads all of them: `Schedule` says when one is due. Answers
+are handed out whenever they arrive, so that a slow network card has several exchanges on their way. One
+thread does everything. docs/architecture.md draws the way of a sample; `scripts/benchmark --path` counts what
+it takes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import cycle
 from typing import Any, Final, Protocol
 
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.health.round_trip import RoundTripHealth
 from ethercat_server.acquisition.histogram import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import Made, SensorStream
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.timing.schedule import Schedule
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.exchange.distributed_clock import LATCHED
+from ethercat_server.ethercat.exchange.process_data import DUPLICATE, Exchange
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
+# Sockets are served this often even if every deadline has passed,
 _SERVE_EVERY_NS: Final = 10_000_000
-"""Sockets are served this often even if every deadline has passed."""
+# and, without waiting, while an exchange is on its way.
 _SERVE_IN_FLIGHT_NS: Final = 2_000_000
-"""Sockets are served this often, without waiting, while an exchange is on its way."""
-_REALTIME_EVERY_NS: Final = 20_000_000
-"""Interval between looks at whether CLOCK_REALTIME was set."""
+# Interval between chores: such as looks at whether CLOCK_REALTIME was set.
+_CHORES_EVERY_NS: Final = 20_000_000
+# Time between two exchanges while all sensors are lost.
 _RECOVERY_STEP_NS: Final = 500_000
-"""Time between two exchanges while all sensors are lost."""
+# Interval between summaries of the distributions, which take some 100 µs each.
 _SUMMARY_NS: Final = 200_000_000
-"""Interval between summaries of the distributions, which take some 100 µs each."""
+_COST_GAIN: Final = 1 / 64
+_FIRST_COST_NS: Final = 50_000.0
+# Part of the time that exchanges may take.
+_BUDGET: Final = 1 / 4
+# What a poll may wait for another, in shortest sample periods.
+_LARGEST_WAIT: Final = 0.3
+# By how much polls are brought forward at most because this machine wakes late.
+_LONGEST_LEAD_NS: Final = 200_000.0
 
 
 class Outlet(Protocol):
@@ -42,7 +51,7 @@ class Outlet(Protocol):
         ...
 
     def serve(self, until_ns: int) -> None:
-        """Do what else there is to do until CLOCK_MONOTONIC is `until_ns`."""
+        """Do what else there is to do, or wait, until CLOCK_MONOTONIC is `until_ns`."""
         ...
 
 
@@ -57,6 +66,45 @@ class Watchdog(Protocol):
     def feed(self) -> None:
         """The loop runs."""
         ...
+
+
+class Schedule:
+    """When the next exchange is due, for all sensors of a bus.
+
+    Polls that lie close together are merged: the earlier one waits for the later, by no more than the time
+    that four exchanges cost this machine, as measured. So three quarters of its time are left.
+
+    Attributes:
+        shortest_ns: the shortest sample period; it changes with the rates.
+        one_by_one: whether the answer to an exchange is usually back before the next one is due.
+    """
+
+    def __init__(self, streams: Sequence[SensorStream], timing: ExchangeTiming) -> None:
+        self._streams = streams
+        self._timing = timing
+        self._cost_ns = _FIRST_COST_NS
+        self.roll()
+
+    def next_ns(self) -> float:
+        """When the next exchange is due."""
+        streams, timing = self._streams, self._timing
+        if len(streams) == 1:
+            due_ns = streams[0].clock.next_poll_ns()
+        else:
+            wanted = [stream.clock.next_poll_ns() for stream in streams]
+            latest_ns = min(wanted) + self._spacing_ns
+            due_ns = max([each for each in wanted if each <= latest_ns])
+        return max(due_ns - min(timing.late_ns, _LONGEST_LEAD_NS), timing.sent_ns + self._spacing_ns)
+
+    def cost(self, busy_ns: int) -> None:
+        """An exchange has kept the loop busy for so long."""
+        self._cost_ns += _COST_GAIN * (busy_ns - self._cost_ns)
+
+    def roll(self) -> None:
+        """Once a second."""
+        self.shortest_ns = min(stream.clock.period_ns for stream in self._streams)
+        self._spacing_ns = min(self._cost_ns / _BUDGET, _LARGEST_WAIT * self.shortest_ns)
+        self.one_by_one = all(stream.clock.one_by_one for stream in self._streams)
 
 
 class Cycle:
@@ -83,21 +131,28 @@ class Cycle:
         self._streams = streams
         self._hub = hub
         self._recovery = recovery
-        self._cycles = 0
         self._missed_deadlines = 0
         self._timing = timing
         self._schedule = Schedule(streams, timing)
         self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
         timing.wire_ns = max(self._wire_ns)
         self._round_trip = RoundTripHealth(timing, bus.ifname)
-        carried = bus.process_data.inputs
-        self._carried = [[(*at, sensors[at.number], streams[at.number]) for at in each] for each in carried]
-        """By frame of the exchange: where it carries what of which sensor."""
-        self._streams_of = [[streams[at.number] for at in each] for each in carried]
-        self._answered = self._complete = False
-        """Whether the last step took an answer, and whether all sensors took part in it that are not lost."""
+        # By frame of the exchange: where it carries what of which sensor.
+        self._carried = [
+            [
+                (at.start, at.end, at.untouched, at.latched, sensors[at.number], streams[at.number])
+                for at in each
+            ]
+            for each in bus.process_data.inputs
+        ]
+        # What the last step took, and whether all sensors took part in it that are not lost.
+        self._answer: Exchange | None = None
+        self._complete = False
         self._wake = RecentDistribution()
         self._exchange = RecentDistribution()
+        self._everyone = [self._wake, self._exchange, *(stream.age for stream in streams)]
+        self._in_turn = cycle(self._everyone)
+        self._idle_at_ns = 0.0
         self._started_ns = bus.clock.monotonic_ns()
         self._summarize_at_ns = 0
         self._summaries: list[tuple[dict[str, float], dict[str, float]]] = []
@@ -115,10 +170,9 @@ class Cycle:
             self._bus.next_frame = self._bus.next_on_wire
 
     def _run(self) -> None:
-        bus, hub, recovery, jobs, watchdog = self._bus, self._hub, self._recovery, self._jobs, self._watchdog
-        timing, monotonic_ns, sleep = self._timing, bus.clock.monotonic_ns, bus.clock.sleep
-        realtime_offset = self._streams[0].realtime_offset
-        serve_by = roll_at = feed_at = look_at = 0
+        bus, hub, recovery, jobs, timing = self._bus, self._hub, self._recovery, self._jobs, self._timing
+        monotonic_ns, serve_by = bus.clock.monotonic_ns, 0
+        self._chores_at_ns = self._roll_at_ns = self._feed_at_ns = 0
         while not self.stopping:
             due = self._due_ns()
             if jobs.waiting:
@@ -128,46 +182,33 @@ class Cycle:
             if not timing.in_flight:
                 if due > now or now > serve_by:
                     hub.serve(due)
-                    serve_by = now + _SERVE_EVERY_NS
-                    if (left := due - monotonic_ns()) > 0:  # the outlet had nothing to wait for
-                        sleep(left * 1e-9)
-                    slept = due > now
+                    serve_by, slept = now + _SERVE_EVERY_NS, due > now
             elif now > serve_by:
                 hub.serve(now)
                 serve_by = now + _SERVE_IN_FLIGHT_NS
-            self._answered = False
             self._step(due, (now if timing.in_flight else due) + _SERVE_EVERY_NS, slept=slept)
             now = monotonic_ns()
-            if self._answered:
-                recovery.attend(self._complete, now)
+            if self._answer is not None:
+                if now >= recovery.attend_at_ns or not self._complete:
+                    recovery.attend(self._complete, now)
             elif timing.unanswered > 1:
                 recovery.miss(now - timing.unanswered_since_ns, now)
-            if now >= roll_at:
-                roll_at = now + SLOT_NS
-                self._roll()
-            if now >= look_at:
-                look_at = now + _REALTIME_EVERY_NS
-                realtime_offset.follow()
-            if now >= feed_at:
-                feed_at = now + watchdog.feed_every_ns
-                watchdog.feed()
+            if now >= self._chores_at_ns:
+                self._do_chores(now)
 
     def _due_ns(self) -> int:
         """When the next exchange is due."""
         if self._recovery.all_lost:
             return self._timing.sent_ns + _RECOVERY_STEP_NS
-        due = int(self._schedule.next_ns())
-        blocked_until = self._bus.process_data.blocked_until_ns
-        return due if due > blocked_until else blocked_until
+        return max(int(self._schedule.next_ns()), self._bus.process_data.blocked_until_ns)
 
     def _next_frame(self, until_ns: int) -> bytes | None:
         """The next frame before `until_ns` that answers no exchange; the exchanges go on meanwhile."""
         while True:
             in_time = self._bus.clock.monotonic_ns() < until_ns
-            self._answered = False
             if (frame := self._step(self._due_ns(), until_ns)) is not None:
                 return frame
-            if not (in_time or self._answered):  # what had arrived by then is taken though this is late
+            if not (in_time or self._answer):  # what had arrived by then is taken though this is late
                 return None
 
     def _step(self, due: int, until_ns: int, *, slept: bool = False) -> bytes | None:
@@ -176,26 +217,28 @@ class Cycle:
         After it is sent its answer is awaited, until yet another one is due. Returns a frame that answers no
         exchange. `slept`: the loop has slept until it was due.
         """
+        self._answer = frame = None
         bus, timing, monotonic_ns = self._bus, self._timing, self._bus.clock.monotonic_ns
-        frame, now = None, monotonic_ns()
+        now = monotonic_ns()
         wait = (due if due < until_ns else until_ns) - now
         if wait > 0 or bus.process_data.in_flight or until_ns <= now:
             frame = self._receive(wait)
-            if self._answered or (now := monotonic_ns()) < due:
+            if self._answer or (now := monotonic_ns()) < due:
                 return frame
             slept = slept or wait > 0
         if (late := now - due) > self._schedule.shortest_ns:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
             if slept:  # else the answer was held up, and what is due was past when it came
                 self._recovery.causes.stood_still(late, now)
-        timing.sends(sent := bus.process_data.send())
-        self._cycles += 1
+        if timing.unanswered == 1:
+            timing.unanswered_since_ns = timing.sent_ns
+        timing.sent_ns = sent = bus.process_data.send()
+        timing.in_flight, timing.unanswered = True, timing.unanswered + 1
         if slept:
-            timing.woke(sent - due)
             self._wake.record(sent - due)
-        for stream in self._streams:
-            if now >= stream.idle_at_ns and (made := stream.idle(now)):
-                self._hub.publish(((made[0], stream.number, made[1]),), now)
+            timing.woke_late_ns = sent - due
+        if now >= self._idle_at_ns:
+            self._show_silence(now)
         if frame is None:
             most = int(timing.patience_ns) if self._schedule.one_by_one else self._due_ns() - monotonic_ns()
             if (wait := min(most, until_ns - now)) > 0:
@@ -205,70 +248,94 @@ class Cycle:
     def _receive(self, wait: int) -> bytes | None:
         """Wait for a frame, `wait` ns at most, and hand it out; returns one that answers no exchange."""
         bus = self._bus
-        frame = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0)
-        back = bus.clock.monotonic_ns()
+        frame, back = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0), bus.clock.monotonic_ns()
         if frame is None:
             return None
-        while (sent := bus.process_data.take(frame)) < 0:
+        while (exchange := bus.process_data.take(frame, back)) is DUPLICATE:
             # The answer may be behind duplicates of others: they must not pile up.
             if back > self._timing.sent_ns + _SERVE_EVERY_NS:
                 return None
             frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
             if frame is None:
                 return None
-        if not sent:
+        if exchange is None:
             self._recovery.causes.stray(frame, back)
             return frame
-        self._hand_out(sent, back)
-        self._learn(sent, back)
-        if len(self._streams) > 1:
-            self._schedule.cost(bus.clock.monotonic_ns() - back)
+        self._answer = exchange
+        self._hand_out(exchange)
+        self._learn(exchange)
         return None
 
-    def _learn(self, sent: int, back: int) -> None:
-        """Learn from the exchange that was taken last, once its samples are on their way."""
-        timing, arrived = self._timing, self._bus.backend.arrived_ns()
-        if not sent < arrived < back:  # the kernel does not say, or CLOCK_REALTIME was set
-            arrived = back
-        which = self._bus.process_data.which
-        arrived = max(sent, arrived - self._wire_ns[which])
-        if (late := back - sent - timing.usual_ns) > self._schedule.shortest_ns:  # the computer stood still
-            self._missed_deadlines += int(late // self._schedule.shortest_ns)
-            self._recovery.causes.stood_still(back - arrived - self._wire_ns[which], back)
-        timing.took(sent, arrived)
-        self._exchange.record(back - sent)
-        for stream in self._streams_of[which]:
-            if stream.learns:
-                stream.learn(arrived)
+    def _show_silence(self, now: int) -> None:
+        """Hand out frames of the sensors that have been silent for too long."""
+        for stream in self._streams:
+            if now >= stream.idle_at_ns and (made := stream.idle(now)):
+                self._hub.publish((made,), now)
+        self._idle_at_ns = min(stream.idle_at_ns for stream in self._streams)
 
-    def _hand_out(self, sent: int, back: int) -> None:
-        """Hand out what the exchange that was taken last brought."""
-        process_data = self._bus.process_data
-        frame, wkc, which = process_data.frame, process_data.wkc, process_data.which
-        self._answered = True
+    def _hand_out(self, exchange: Exchange) -> None:
+        """Hand out what an exchange brought."""
+        _, back, frame, wkc, which = exchange
         self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
         new: list[Made] = []
-        for number, start, end, untouched, at, sensor, stream in self._carried[which]:
-            if back < stream.clock.quiet_until_ns:
+        for start, end, untouched, at, sensor, stream in self._carried[which]:
+            if back < stream.clock.estimate.phase_ns - stream.clock.quiet_ns:
                 continue  # the poll was for another sensor
             data = frame[start:end]
             # One that is out may be counted in place of one that is not there any more.
             if not complete or sensor.state is not SensorState.STREAMING or data == untouched:
                 stream.invalid(wkc)
-            elif made := stream.take(data, wkc, sent, back, LATCHED.unpack_from(frame, at) if at else None):
-                new.append((made[0], number, made[1]))
+            elif made := stream.take(data, exchange, LATCHED.unpack_from(frame, at) if at else None):
+                new.append(made)
         if new:
             self._hub.publish(new, back)
 
+    def _learn(self, exchange: Exchange) -> None:
+        """Learn from an exchange, once its samples are on their way."""
+        sent, back, _, _, which = exchange
+        timing = self._timing
+        timing.in_flight, timing.unanswered = sent < timing.sent_ns, 0
+        self._exchange.record(back - sent)
+        lessons = [row[-1].clock for row in self._carried[which] if row[-1].finish(exchange)]
+        if not lessons and timing.short_ns < back - sent < timing.usual_ns + self._schedule.shortest_ns:
+            return
+        arrived = self._bus.backend.arrived_ns()
+        if not sent < arrived < back:  # the kernel does not say, or CLOCK_REALTIME was set
+            arrived = back
+        if (late := back - sent - timing.usual_ns) > self._schedule.shortest_ns:  # the computer stood still
+            self._missed_deadlines += int(late // self._schedule.shortest_ns)
+            self._recovery.causes.stood_still(back - arrived, back)
+        arrived = max(sent, arrived - self._wire_ns[which])
+        if lessons:
+            timing.took(sent, arrived, back)
+            for clock in lessons:
+                clock.learn(arrived)
+            self._schedule.cost(self._bus.clock.monotonic_ns() - back)
+        else:
+            timing.shorten(sent, arrived)
+            for row in self._carried[which]:
+                row[-1].learn_short(exchange, arrived)
+
+    def _do_chores(self, now: int) -> None:
+        """What is done now and then, a little at a time."""
+        self._chores_at_ns = now + _CHORES_EVERY_NS
+        self._streams[0].realtime_offset.follow()
+        next(self._in_turn).count()
+        if now >= self._feed_at_ns:
+            self._feed_at_ns = now + self._watchdog.feed_every_ns
+            self._watchdog.feed()
+        if now >= self._roll_at_ns:
+            self._roll_at_ns = now + SLOT_NS
+            self._roll()
+
     def _roll(self) -> None:
         """Once a second."""
-        self._wake.roll()
-        self._exchange.roll()
+        for distribution in self._everyone:
+            distribution.roll()
         self._schedule.roll()
         self._round_trip.check()
         self._recovery.check()
         for stream in self._streams:
-            stream.age.roll()
             stream.check()
             if stream.clock.events is None:
                 self._bus.process_data.read_latched(stream.number, reads=False)
@@ -279,11 +346,10 @@ class Cycle:
         now_ns = self._bus.clock.monotonic_ns()
         if now_ns >= self._summarize_at_ns:
             self._summarize_at_ns = now_ns + _SUMMARY_NS
-            everyone = (self._wake, self._exchange, *(stream.age for stream in self._streams))
-            self._summaries = [distribution.summaries_us() for distribution in everyone]
+            self._summaries = [distribution.summaries_us() for distribution in self._everyone]
         (wake, recent_wake), (exchange, recent_exchange), *ages = self._summaries
         return {
-            "cycles": self._cycles,
+            "cycles": self._bus.process_data.sent,
             "round_trip": self._timing.describe(),
             "missed_deadlines": self._missed_deadlines,
             "lost_frames": self._bus.process_data.lost,

@@ -18,17 +18,15 @@ from ethercat_server.sensor.sensor import Sensor
 from protocol.control import ErrorCode
 from protocol.errors import RequestError
 
-_STEP_NS: Final = 300_000
-"""A step is begun only with this much time left: an exchange and a margin."""
+_STEP_NS: Final = 300_000  # a step is begun only with this much time left: an exchange and a margin
+# A step is taken at least this often, even on a bus that leaves no time.
 _AT_LEAST_EVERY_NS: Final = 20_000_000
-"""A step is taken at least this often, even on a bus that leaves no time."""
 _MOST_WAITING: Final = 32
 _AWAY: Final = "is lost, or was taken out of OP to be set up"
 
 log = logging.getLogger(__name__)
 
-Done = Callable[[Any, RequestError | None], None]
-"""Called with the job's result, or with why there is none."""
+Done = Callable[[Any, RequestError | None], None]  # called with the job's result, or with why there is none
 
 
 class _Job(NamedTuple):

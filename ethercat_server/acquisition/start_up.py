@@ -6,17 +6,16 @@ What the sensors must be is checked before anything is written to one of them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple, Protocol, TypeVar
 
 from ethercat_server.errors import BusError, SdoAbortError, SetUpError, UsageError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.slave.coe import BlockingSdo, Sdo, finish
+from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
 from ethercat_server.sensor.guard import GuardedSdo
-from ethercat_server.sensor.look import Slave
 from ethercat_server.sensor.objects import dictionary
-from ethercat_server.sensor.scan import look_safely, scan, unreadable
+from ethercat_server.sensor.scan import Slave, look_safely
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState, is_known_model
 from ethercat_server.sensor.set_up import identify, read_in_force, read_offset, set_up
 from protocol.errors import PdoSizeError, SettingError
@@ -24,8 +23,8 @@ from protocol.pdo import layout_for
 from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
 
 T = TypeVar("T")
-T_co = TypeVar("T_co", covariant=True)
 _ATTEMPTS: Final = 3
+_MAILBOX_BYTES: Final = range(16, 1487)
 
 log = logging.getLogger(__name__)
 
@@ -87,26 +86,30 @@ def bring_up(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Start
     `check_interrupt` is called between the steps and may raise to give up. BusError says which sensor did
     not do what.
     """
-    found = find_sensors(bus, wanted, check_interrupt)
+    found = _find_sensors(bus, wanted, check_interrupt)
     for sensor in found.sensors:
-        sdo = GuardedSdo(BlockingSdo(bus, sensor.number, check_interrupt))
-        if isinstance(wanted, AsFound):
-            finish(read_in_force(sdo, sensor), clock=bus.clock)
-            if "sinc_length" not in sensor.wanted:
-                raise BusError(
-                    f"sensor {sensor.number} does not report its sampling rate: power it off and on"
-                )
-        else:
-            if wanted.keep_unset:
-                _keep_unset(sdo, sensor)
-            finish(set_up(sdo, sensor), clock=bus.clock)
-        _tell_offset(sdo, sensor)
-    check_interrupt()
-    enter_op(bus, found.sensors, check_interrupt)
+        sdo = GuardedSdo(bus.slaves[sensor.number].sdo)
+        finish(_prepare(sdo, sensor, wanted), clock=bus.clock, check_interrupt=check_interrupt)
+
+    def enter_op(again: bool) -> None:
+        if again:
+            bus.scan_again(check_interrupt)
+        for sensor, size in zip(found.sensors, bus.map_process_data(check_interrupt), strict=True):
+            try:
+                sensor.pdo_size = layout_for(size).size
+            except PdoSizeError as error:
+                # Also what it seems to be if the answer to one of the master's questions was lost.
+                raise SetUpError(f"sensor {sensor.number} ({sensor.identity.name}) maps {error}") from None
+        bus.enter_op(check_interrupt)
+
+    _try_again(enter_op)
+    for sensor in found.sensors:
+        sensor.enter(SensorState.STREAMING)
+        sensor.settle(bus.clock)
     return found
 
 
-def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Started:
+def _find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Started:
     """Find the sensors on the open `bus`, in PREOP, and ask them who they are; nothing is written."""
     slaves = look_safely(bus, check_interrupt, force=wanted.force)
     of_sensors = [slave for slave in slaves if slave.is_sensor]
@@ -114,71 +117,67 @@ def find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> S
     unread = next((slave for slave in others if slave.sii is None), None)
     if unread is not None and (not of_sensors or unread.position < of_sensors[-1].position):
         # It may be a sensor: those behind it would have other numbers, and settings, than they should.
-        raise BusError(unreadable(bus.ifname, unread))
+        raise BusError(
+            f"the SII (EEPROM) of the slave at position {unread.position} of {bus.ifname} cannot be read, so "
+            "it does not say what it is: power it off and on; if that does not help, its EEPROM is damaged"
+        )
     if not of_sensors:
-        raise BusError(_none_of_ours(bus.ifname, others))
+        raise BusError(
+            f"no Bota Gen-0 sensor (vendor 0x{dictionary.VENDOR_ID:08X}, product {dictionary.PRODUCT_CODE}) "
+            f"is on {bus.ifname}, only {', '.join(map(str, others))}: check the sensor's cable and power, "
+            "and that this is the interface it is connected to"
+        )
+    for number, slave in enumerate(of_sensors):
+        _check_mailboxes(bus.ifname, number, slave)
 
-    def find(*, again: bool) -> list[Sensor]:
-        scan(bus, slaves, check_interrupt, again=again)
+    def find(again: bool) -> list[Sensor]:
+        positions, sii = [slave.position for slave in of_sensors], [slave.sii for slave in slaves]
+        bus.scan(positions, sii, check_interrupt, again=again)
         return [_find(bus, number, slave, wanted, check_interrupt) for number, slave in enumerate(of_sensors)]
 
-    sensors = _again(find)
-    _check_places(bus.ifname, sensors, wanted)
+    sensors = _try_again(find)
+    if wanted.sensor_name is not None and sensors[0].identity.name != wanted.sensor_name:
+        raise BusError(
+            f"the sensor on {bus.ifname} is a {sensors[0].identity.name}, not a {wanted.sensor_name}: "
+            "correct the name on the command line or leave it out"
+        )
+    try:
+        wanted.check_sensors({sensor.number: sensor.identity for sensor in sensors})
+    except UsageError as error:
+        raise BusError(str(error)) from None  # a sensor that is switched on later: the service tries again
     for slave in others:
         level = logging.WARNING if slave.sii is None else logging.INFO
         log.log(level, "%s is left alone: it stays in %s", slave, slave.status)
     return Started(sensors, others)
 
 
-def enter_op(bus: Bus, sensors: list[Sensor], check_interrupt: CheckInterrupt) -> None:
-    """Map the process data of all `sensors` and take them from PREOP to OP, set as they are."""
-
-    def enter(*, again: bool) -> None:
-        if again:
-            bus.scan(bus.spare, bus.positions, check_interrupt)
-        for sensor, size in zip(sensors, bus.master.map_process_data(check_interrupt), strict=True):
-            try:
-                sensor.pdo_size = layout_for(size).size
-            except PdoSizeError as error:
-                # Also what it seems to be if the answer to one of the master's questions was lost.
-                raise SetUpError(f"sensor {sensor.number} ({sensor.identity.name}) maps {error}") from None
-        bus.go_operational(check_interrupt)
-
-    _again(enter)
-    for sensor in sensors:
-        sensor.enter(SensorState.STREAMING)
-        sensor.settle(bus.clock)
-
-
-class Attempt(Protocol[T_co]):
-    """Part of the start; `again` after it has failed."""
-
-    def __call__(self, *, again: bool) -> T_co:
-        """SetUpError for what lost frames explain."""
-
-
-def _again(attempt: Attempt[T]) -> T:
-    """What `attempt` returns; a failure that lost frames explain is tried again."""
+def _try_again(attempt: Callable[[bool], T]) -> T:
+    """What `attempt` returns; SetUpError, which lost frames explain, has it called with True."""
     for number in range(_ATTEMPTS - 1):
         try:
-            return attempt(again=number > 0)
+            return attempt(number > 0)
         except SetUpError as error:
             log.warning("%s: trying again", error)
-    return attempt(again=True)
+    return attempt(True)
 
 
-def _none_of_ours(ifname: str, others: list[Slave]) -> str:
-    return (
-        f"no Bota Gen-0 sensor (vendor 0x{dictionary.VENDOR_ID:08X}, product {dictionary.PRODUCT_CODE}) is "
-        f"on {ifname}, only {', '.join(map(str, others))}: check the sensor's cable and power, and that this "
-        "is the interface it is connected to"
-    )
+def _prepare(sdo: Sdo, sensor: Sensor, wanted: Wanted) -> Steps[None]:
+    """In PREOP: write what is wanted, or only read what is in force."""
+    if isinstance(wanted, AsFound):
+        yield from read_in_force(sdo, sensor)
+        if "sinc_length" not in sensor.wanted:
+            raise BusError(f"sensor {sensor.number} does not report its sampling rate: power it off and on")
+    else:
+        if wanted.keep_unset:
+            yield from _keep_unset(sdo, sensor)
+        yield from set_up(sdo, sensor)
+    yield from _note_offset(sdo, sensor)
 
 
-def _keep_unset(sdo: Sdo, sensor: Sensor) -> None:
+def _keep_unset(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     """Want what the sensor has where nobody asked for anything; BusError if the two are inconsistent."""
     asked = dict(sensor.wanted)
-    finish(read_in_force(sdo, sensor, asked), clock=sdo.clock)
+    yield from read_in_force(sdo, sensor, asked)
     kept = {name: value for name, value in sensor.wanted.items() if name not in asked}
     sensor.wanted = {"sinc_length": start_up_defaults()["sinc_length"], **kept, **asked}
     try:
@@ -194,27 +193,37 @@ def _keep_unset(sdo: Sdo, sensor: Sensor) -> None:
     log.info("sensor %d keeps what nobody set: %s", sensor.number, ", ".join(texts) or "the defaults")
 
 
-def _tell_offset(sdo: Sdo, sensor: Sensor) -> None:
+def _note_offset(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     """A tare of before, saved or not, is in all samples: it is to be known, and to outlive a power cut."""
     try:
-        offset = finish(read_offset(sdo), clock=sdo.clock)
+        offset = sensor.offset = yield from read_offset(sdo)
     except SdoAbortError:
         return
-    sensor.offset = offset
     rows = [dictionary.BY_ADDRESS[dictionary.FORCE_TORQUE_OFFSET, sub] for sub in range(1, 7)]
     texts = [f"{row.name} {value:g} {row.unit}" for row, value in zip(rows, offset, strict=True) if value]
     if texts:
         log.info("sensor %d has a tare in force (saved or not): %s", sensor.number, ", ".join(texts))
 
 
-def _find(bus: Bus, number: int, slave: Slave, wanted: Wanted, check_interrupt: CheckInterrupt) -> Sensor:
-    if not slave.has_coe:
+def _check_mailboxes(ifname: str, number: int, slave: Slave) -> None:
+    """BusError for mailboxes that no master can use: pysoem would not notice."""
+    assert slave.sii is not None
+    sizes = [size for _, size in slave.sii["mailboxes"].values()]
+    if not slave.has_coe or not any(sizes):
         raise BusError(
-            f"sensor {number} on {bus.ifname} has no CoE mailbox, and so no objects to set it up by: its "
-            "EEPROM is damaged"
+            f"sensor {number} on {ifname} has no CoE mailbox, and so no objects to set it up by: its EEPROM "
+            "is damaged"
         )
-    steps = identify(BlockingSdo(bus, number, check_interrupt), slave.name)
-    identity = finish(steps, clock=bus.clock)
+    if not all(size in _MAILBOX_BYTES for size in sizes):
+        raise BusError(
+            f"the SII (EEPROM) of the slave at position {slave.position} of {ifname} has mailboxes of "
+            f"{' and '.join(map(str, sizes))} bytes, which no frame can carry: its EEPROM is damaged"
+        )
+
+
+def _find(bus: Bus, number: int, slave: Slave, wanted: Wanted, check_interrupt: CheckInterrupt) -> Sensor:
+    steps = identify(bus.slaves[number].sdo, slave.name)
+    identity = finish(steps, clock=bus.clock, check_interrupt=check_interrupt)
     if not is_known_model(identity.name):
         raise BusError(
             f"sensor {number} on {bus.ifname} is a {identity.name!r}, a model this server does not know: "
@@ -223,15 +232,3 @@ def _find(bus: Bus, number: int, slave: Slave, wanted: Wanted, check_interrupt: 
     who = (number, identity.name, identity.serial)
     asked = frozenset(wanted.asked_settings(*who))
     return Sensor(number, identity, wanted.wanted_settings(*who), asked, slave.position)
-
-
-def _check_places(ifname: str, sensors: list[Sensor], wanted: Wanted) -> None:
-    if wanted.sensor_name is not None and sensors[0].identity.name != wanted.sensor_name:
-        raise BusError(
-            f"the sensor on {ifname} is a {sensors[0].identity.name}, not a {wanted.sensor_name}: "
-            "correct the name on the command line or leave it out"
-        )
-    try:
-        wanted.check_sensors({sensor.number: sensor.identity for sensor in sensors})
-    except UsageError as error:
-        raise BusError(str(error)) from None  # a sensor that is switched on later: the service tries again

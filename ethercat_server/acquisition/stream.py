@@ -11,24 +11,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from ethercat_server.acquisition.hardware.event_times import EventTimes
+from ethercat_server.acquisition.clock import SILENT_PERIODS, SampleClock
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.health.samples import SampleHealth
 from ethercat_server.acquisition.histogram import RecentDistribution
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.timing.sample_clock import SILENT_PERIODS, SampleClock
+from ethercat_server.acquisition.slave_clock import EventTimes
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, RealtimeOffset
 from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
+from ethercat_server.ethercat.exchange.process_data import DUPLICATE, Exchange
 from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.sensor.sensor import Sensor
 from protocol.framing import DataFlag, encode_data
 from protocol.pdo import is_finite
 
+# Bota's own driver discards the first three frames after entering OP.
 DISCARDED_AT_START: Final = 3
-"""Bota's own driver discards the first three frames after entering OP."""
 
+# A DATA frame, the number of its sensor, its flags.
 Made = tuple[bytes, int, int]
-"""A DATA frame, the number of its sensor, its flags."""
 
 REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))
 
@@ -61,7 +62,6 @@ class SensorStream:
         self._handed_out = b""
         """What the last frame carried: a REPEATED or INVALID one carries it again."""
         self.sequence = 0
-        self.fresh = 0
         self.repeated = 0
         self.invalid_frames = 0
         self.lost_samples = 0
@@ -70,18 +70,14 @@ class SensorStream:
         """From the estimated instant of a sample to its hand-out, while locked."""
         self.health = SampleHealth(number)
         self._discard = DISCARDED_AT_START
-        self._gap = False
-        self._silent = self._held_back = False
-        """Whether nothing new has come for long; whether what ended that may have been held back: it has no
-        event at that time."""
-        self.learns = False
-        """Whether `learn` has something to do."""
-        self._seen = (0, 0, False)
-        """The last exchange, as `learn` needs it: sent, back, fresh."""
-        self._wkc = self._short_wkc = 0
-        """Working counters of the last valid exchange, and of one since then that was not; 0 for none."""
-        self._valid_ns = 0
-        """When the last valid exchange was back."""
+        # So many new samples to come have GAP.
+        self._gap = 0
+        # Whether nothing new has come for long.
+        self._silent = False
+        # The last valid exchange, and whether it brought a new sample.
+        self._exchange, self._fresh = DUPLICATE, False
+        # The working counter of an exchange since then that was not valid; 0 for none.
+        self._short_wkc = 0
         self._moment_ns = 0
         """Of the newest sample."""
         self.idle_at_ns = 0.0
@@ -91,63 +87,59 @@ class SensorStream:
         events = latching and EventTimes(latching, self._timing, self._passing_ns)
         return SampleClock(period_ns, self._timing, events, self._passing_ns)
 
-    def take(
-        self, data: bytes, wkc: int, sent_ns: int, back_ns: int, latched: Latched | None = None
-    ) -> tuple[bytes, int] | None:
-        """The frame that a valid exchange gives, and its flags; None if it gives none.
+    @property
+    def fresh(self) -> int:
+        """Frames that brought a new sample."""
+        return self.sequence - self.repeated - self.invalid_frames
 
-        `learn` must follow if `learns`. `sent_ns` and `back_ns` are CLOCK_MONOTONIC before and after the
-        exchange; `latched` is what the slave controller has latched.
+    def take(self, data: bytes, exchange: Exchange, latched: Latched | None = None) -> Made | None:
+        """The frame that a valid exchange gives; None if it gives none.
+
+        `finish` must follow. `latched` is what the slave controller has latched.
         """
-        clock = self.clock
-        if sent_ns < self._seen[0]:  # overtaken
+        sent_ns, back_ns, _, wkc, _ = exchange
+        if sent_ns < self._exchange.sent_ns:  # overtaken
             return None
-        fresh = data != self.process_data
-        self._seen = sent_ns, back_ns, fresh
-        self._wkc, self._valid_ns = wkc, back_ns
-        self.learns = True
-        if latched is not None and clock.events is not None:
-            clock.events.took(latched, sent_ns, back_ns, fresh, clock.period_ns)
+        clock, self._exchange = self.clock, exchange
+        self._fresh = fresh = data != self.process_data
+        clock.take(sent_ns, back_ns, latched, fresh=fresh)
         if not fresh:
             return None
         self.process_data = data
-        clock.predict(sent_ns, back_ns)
-        self.idle_at_ns = back_ns + SILENT_PERIODS * clock.period_ns
+        self.idle_at_ns = back_ns + SILENT_PERIODS * clock.estimate.period_ns
         if self._discard:
             self._discard -= 1
             return None
         self._handed_out = data
-        flags = self._new_sample()
-        moment_ns = int(clock.instant_ns)
-        if moment_ns <= self._moment_ns:  # the one before was dated too young
-            moment_ns = self._moment_ns + 1
-        self._moment_ns = moment_ns
-        return self._frame(moment_ns, flags, wkc)
+        flags = self._count_lost() if self._silent or self._gap or clock.steps != 1 or clock.uncertain else 0
+        # If it does not rise, the one before was dated too young.
+        self._moment_ns = moment_ns = max(int(clock.instant_ns), self._moment_ns + 1)
+        stamp_ns, sequence = moment_ns + self.realtime_offset.ns, self.sequence
+        self.sequence += 1
+        return encode_data(sequence, stamp_ns, moment_ns, self.number, flags, wkc, data), self.number, flags
 
-    def learn(self, arrived_ns: int) -> None:
-        """What the last exchange teaches, which can wait until its frame is on its way.
-
-        `arrived_ns` is when its answer began to arrive.
-        """
-        self.learns = False
-        sent_ns, back_ns, fresh = self._seen
-        clock = self.clock
-        locked, events = clock.locked, clock.events
-        clock.observe(sent_ns, arrived_ns, fresh)
-        if events is not None:
-            events.learn(sent_ns, arrived_ns)
-        if fresh:
-            if locked:
-                self.age.record(back_ns - int(clock.instant_ns))
+    def finish(self, exchange: Exchange) -> bool:
+        """Count what an exchange brought, once that is handed out; whether `clock.learn` must follow."""
+        if exchange is not self._exchange:
+            return False
+        if self._fresh:
+            if self.clock.locked:
+                self.age.record(exchange.back_ns - self.clock.instant_ns)
             if self._handed_out is self.process_data and not is_finite(self.process_data):
                 self.health.not_finite += 1
+        return not self.clock.goes_on()
+
+    def learn_short(self, exchange: Exchange, arrived_ns: int) -> None:
+        """An exchange needed no `clock.learn`, but was a short one: it tells the slave's time well."""
+        if exchange is self._exchange and self.clock.events is not None:
+            self.clock.events.learn(exchange.sent_ns, arrived_ns, 0)
 
     def invalid(self, wkc: int) -> None:
         """An exchange brought nothing of this sensor."""
         self._short_wkc = wkc
 
-    def idle(self, now_ns: int) -> tuple[bytes, int] | None:
-        """The frame that shows the sensor's silence, and its flags; None before its first sample."""
+    def idle(self, now_ns: int) -> Made | None:
+        """The frame that shows the sensor's silence; None before its first sample."""
         if not self.process_data:
             return None
         self._silent = True
@@ -155,32 +147,32 @@ class SensorStream:
         period_ns = self.clock.period_ns
         # The next slot is counted from this one, but a stall makes one frame, not a burst.
         self.idle_at_ns = max(self.idle_at_ns + period_ns, float(now_ns))
-        # One lost frame is no news: INVALID is what nothing valid came for in two periods.
-        if now_ns - self._valid_ns < max(2 * period_ns, self._timing.patience_ns):
+        # A single lost frame is no news: a frame is INVALID once nothing valid has come for two periods.
+        if now_ns - self._exchange.back_ns < max(2 * period_ns, self._timing.patience_ns):
             self._discard = 0  # what was to be discarded has passed: a sensor that is stuck is to be seen too
             self.repeated += 1
-            return self._frame(now_ns, REPEATED, self._wkc)
-        self.invalid_frames += 1
-        wkc, self._short_wkc = self._short_wkc, 0
-        return self._frame(now_ns, INVALID, wkc)
-
-    def _frame(self, moment_ns: int, flags: int, wkc: int) -> tuple[bytes, int]:
-        stamp_ns, sequence = moment_ns + self.realtime_offset.ns, self.sequence
+            flags, wkc = REPEATED, self._exchange.wkc
+        else:
+            self.invalid_frames += 1
+            flags, wkc = INVALID, self._short_wkc
+            self._short_wkc = 0
+        stamp_ns, sequence = now_ns + self.realtime_offset.ns, self.sequence
         self.sequence += 1
-        made = encode_data(sequence, stamp_ns, moment_ns, self.number, flags, wkc, self._handed_out)
-        return made, flags
+        made = encode_data(sequence, stamp_ns, now_ns, self.number, flags, wkc, self._handed_out)
+        return made, self.number, flags
 
-    def _new_sample(self) -> int:
-        self.fresh += 1
+    def _count_lost(self) -> int:
+        """The flags of a new sample that may not be the next one after that before it."""
         lost = self.clock.steps - 1 if self.sequence else 0
         # -1 takes back one that was counted after a stall but came after all.
         self.lost_samples = max(0, self.lost_samples + lost)
-        # What was held back is dated too young: one may be missing after it.
-        flags = GAP if lost > 0 or self.clock.uncertain or self._gap or self._held_back else 0
-        self._gap = self._held_back = False
-        if self._silent:
-            events, self._silent = self.clock.events, False
-            self._held_back = events is not None and events.has_none
+        flags = GAP if lost > 0 or self.clock.uncertain or self._gap else 0
+        self._gap = max(0, self._gap - 1)
+        # What ended a silence may have been held back, where it has no event, as may be the next: one may be
+        # missing after either.
+        if self._silent and (events := self.clock.events) is not None and events.has_none:
+            self._gap = 2
+        self._silent = False
         return flags
 
     def check(self) -> None:
@@ -200,7 +192,7 @@ class SensorStream:
             if before is not None and self.clock.events is not None:
                 self.clock.events.trust.was_trusted = before.trust.was_trusted
             self._discard = DISCARDED_AT_START
-            self._gap = True
+            self._gap = 1
             self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
 
     def status(self) -> dict[str, Any]:

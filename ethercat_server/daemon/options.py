@@ -14,7 +14,7 @@ from ethercat_server import __version__
 from ethercat_server.daemon.config_file import EMPTY, read_config
 from ethercat_server.daemon.server_settings import KEEP, SERVER_SETTINGS, ServerSetting
 from ethercat_server.errors import UsageError
-from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
+from ethercat_server.ethercat.nic.interface import ALLOW_IP, ALLOW_IP_HELP
 from protocol.errors import SettingError
 from protocol.program.completion import add_completion
 from protocol.sensor_choice import SensorChoice

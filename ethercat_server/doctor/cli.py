@@ -16,7 +16,7 @@ from ethercat_server.daemon.options import VIRTUAL_INTERFACE
 from ethercat_server.daemon.server_settings import SERVER_SETTINGS
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.nic.claim import MAX_NAME_LENGTH
-from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
+from ethercat_server.ethercat.nic.interface import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import command_line
 from protocol.program.completion import add_completion
 

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import IntEnum
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
+from protocol.health.verdict import Level
 
-class Level(IntEnum):
-    """Severity; the worst one determines the exit code."""
-
-    OK = 0
-    SKIPPED = 1
-    """Could not be checked, or not by this user."""
-    NOTE = 2
-    """Little effect, or only under load."""
-    WARNING = 3
-    """Loses samples or increases their age."""
-    BAD = 4
-    """Sensors cannot be read, or not reliably."""
+# As the doctor calls the levels.
+NAMES: Final = {
+    Level.GOOD: "ok",
+    Level.NOT_POSSIBLE: "skipped",
+    Level.NOTE: "note",
+    Level.LOOK: "warning",
+    Level.TROUBLE: "bad",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +38,7 @@ class Finding:
         return {
             "subject": self.subject,
             "check": self.check,
-            "level": self.level.name.lower(),
+            "level": NAMES[self.level],
             "found": self.found,
             "why": self.why,
             "commands": list(self.commands),
@@ -61,7 +57,7 @@ def cannot_look(why: str) -> NoReturn:
 
 def ok(found: str, why: str = "", /, **values: Any) -> Finding:
     """Nothing to fix."""
-    return Finding(Level.OK, found, why, (), values)
+    return Finding(Level.GOOD, found, why, (), values)
 
 
 def note(found: str, why: str, /, *commands: str, **values: Any) -> Finding:
@@ -71,14 +67,14 @@ def note(found: str, why: str, /, *commands: str, **values: Any) -> Finding:
 
 def warning(found: str, why: str, /, *commands: str, **values: Any) -> Finding:
     """Loses samples or increases their age."""
-    return Finding(Level.WARNING, found, why, commands, values)
+    return Finding(Level.LOOK, found, why, commands, values)
 
 
 def bad(found: str, why: str, /, *commands: str, **values: Any) -> Finding:
     """Sensors cannot be read, or not reliably."""
-    return Finding(Level.BAD, found, why, commands, values)
+    return Finding(Level.TROUBLE, found, why, commands, values)
 
 
 def skipped(why: str) -> Finding:
     """Not checked."""
-    return Finding(Level.SKIPPED, f"not checked: {why}")
+    return Finding(Level.NOT_POSSIBLE, f"not checked: {why}")

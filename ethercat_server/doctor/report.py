@@ -10,36 +10,36 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, TextIO
 
-from ethercat_server.doctor.finding import Finding, Level
-from protocol.health import verdict as health
+from ethercat_server.doctor.finding import NAMES, Finding
+from protocol.health.verdict import Level
 from protocol.text.visible import visible
 
 _COLORS: Final = {
-    Level.OK: "\x1b[32m", Level.SKIPPED: "\x1b[2m", Level.NOTE: "\x1b[36m", Level.WARNING: "\x1b[33m",
-    Level.BAD: "\x1b[1;31m",
+    Level.GOOD: "\x1b[32m", Level.NOT_POSSIBLE: "\x1b[2m", Level.NOTE: "\x1b[36m", Level.LOOK: "\x1b[33m",
+    Level.TROUBLE: "\x1b[1;31m",
 }  # fmt: skip
 _END: Final = "\x1b[0m"
 _CLEAR_LINE: Final = "\x1b[K"
 _BOLD: Final = "\x1b[1m"
-_LEVEL_WIDTH: Final = max(len(level.name) for level in Level)
+_LEVEL_WIDTH: Final = max(map(len, NAMES.values()))
 _NAME_WIDTH: Final = 20
 _INDENT: Final = " " * (2 + _LEVEL_WIDTH + 2 + _NAME_WIDTH + 2)
 _USUAL_WIDTH: Final = 120
 _LEAST_TEXT: Final = 30
-EXIT_CODES: Final = {Level.OK: 0, Level.SKIPPED: 0, Level.NOTE: 0, Level.WARNING: 0, Level.BAD: 1}
-_VERDICTS: Final = {Level.WARNING: health.Level.LOOK, Level.BAD: health.Level.TROUBLE}
+EXIT_CODES: Final = {Level.GOOD: 0, Level.NOT_POSSIBLE: 0, Level.NOTE: 0, Level.LOOK: 0, Level.TROUBLE: 1}
 _MOST_REPEATED: Final = 8
 """Findings that the end repeats: with the verdict they fit 80 x 24."""
 
 
 def worst(findings: Iterable[Finding]) -> Level:
     """The worst level, skipped checks aside."""
-    return max((f.level for f in findings if f.level is not Level.SKIPPED), default=Level.OK)
+    return max((f.level for f in findings if f.level is not Level.NOT_POSSIBLE), default=Level.GOOD)
 
 
-def verdict(findings: Iterable[Finding]) -> health.Level:
+def verdict(findings: Iterable[Finding]) -> Level:
     """What all findings come to; notes are nothing to look at."""
-    return _VERDICTS.get(worst(findings), health.Level.GOOD)
+    found = worst(findings)
+    return found if found in {Level.LOOK, Level.TROUBLE} else Level.GOOD
 
 
 def wants_color(stream: TextIO, environment: Mapping[str, str]) -> bool:
@@ -76,7 +76,7 @@ class Report:
         if finding.subject != self._subject:
             self._say(("\n" if self._subject else "") + self._painted(finding.subject, _BOLD))
             self._subject = finding.subject
-        level = finding.level.name.lower().ljust(_LEVEL_WIDTH)
+        level = NAMES[finding.level].ljust(_LEVEL_WIDTH)
         first, *rest = self._lines(finding.found)
         head = self._painted(level, _COLORS[finding.level])
         self._say(f"  {head}  {finding.check.ljust(_NAME_WIDTH)}  {first}")
@@ -87,15 +87,15 @@ class Report:
 
     def summary(self, findings: Sequence[Finding]) -> None:
         """The verdict, with what matters once more, for the rest may have scrolled away."""
-        counts = {level: sum(f.level is level for f in findings) for level in reversed(Level)}
+        counts = {level: sum(f.level is level for f in findings) for level in reversed(NAMES)}
         text = ", ".join(f"{count} {_counted(level, count)}" for level, count in counts.items() if count)
         level = worst(findings)
         self._say(f"\n{self._painted(verdict(findings).words.capitalize(), _COLORS[level])}: {text}")
-        matters = [f for f in findings if f.level >= Level.WARNING]
+        matters = [f for f in findings if f.level >= Level.LOOK]
         matters.sort(key=lambda finding: -finding.level)
         width = self._width + len(_INDENT)
         for finding in matters[:_MOST_REPEATED]:
-            name = finding.level.name.lower().ljust(_LEVEL_WIDTH)
+            name = NAMES[finding.level].ljust(_LEVEL_WIDTH)
             text = f"  {name}  {finding.subject}, {finding.check}: {finding.found}"
             lines = textwrap.wrap(
                 text, width, subsequent_indent=" " * (4 + _LEVEL_WIDTH), max_lines=2, placeholder=" ..."
@@ -119,8 +119,8 @@ class Report:
 
 
 def _counted(level: Level, count: int) -> str:
-    name = level.name.lower()
-    return f"{name}s" if level in {Level.NOTE, Level.WARNING} and count != 1 else name
+    name = NAMES[level]
+    return f"{name}s" if level in {Level.NOTE, Level.LOOK} and count != 1 else name
 
 
 def printable(text: str) -> str:
@@ -141,6 +141,6 @@ def _lines(text: str) -> str:
 
 def as_json(header: Mapping[str, Any], findings: Sequence[Finding]) -> str:
     """The whole report as one object."""
-    found = {**header, "verdict": verdict(findings).key, "worst": worst(findings).name.lower()}
+    found = {**header, "verdict": verdict(findings).key, "worst": NAMES[worst(findings)]}
     found |= {"findings": [f.as_json() for f in findings]}
     return json.dumps(found, indent=2, ensure_ascii=False, default=str)

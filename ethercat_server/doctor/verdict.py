@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import Any, Final
 
 from ethercat_server.acquisition.health.round_trip import SLOW_US, cost
-from ethercat_server.doctor.finding import Finding, Level, bad, note, ok, warning
+from ethercat_server.doctor.finding import Finding, bad, note, ok, warning
 from protocol.health.limits import LIMITS
+from protocol.health.verdict import Level
 
 _PERIOD_US: Final = 1250.0
 """The sample period at the factory setting, 800 Hz."""
@@ -93,4 +94,4 @@ def _by_age(p99_us: float) -> Callable[..., Finding]:
 
 def as_cause(finding: Finding) -> Finding:
     """The same about a server that streams: its stream has a verdict, this may be the cause."""
-    return replace(finding, level=min(finding.level, Level.WARNING))
+    return replace(finding, level=min(finding.level, Level.LOOK))

@@ -2,8 +2,8 @@
 
 Two backends have it: `master.soem.SoemBackend`, a network interface opened by pysoem, and
 `simulation.backend.MemoryBackend`, in which the virtual sensor answers without sockets, processes or
-real time. Two masters set the sensors up: pysoem where there are only sensors, and
-`master.datagrams.DatagramMaster` where they share the wire. Everything above runs on any of these.
+real time. pysoem scans and maps the sensors where it can, `master.mapping` in memory and where they share
+the wire. Everything above runs on any of these.
 """
 
 from __future__ import annotations
@@ -13,42 +13,21 @@ from typing import Protocol
 
 from ethercat_server.ethercat.clock import Clock
 
-CheckInterrupt = Callable[[], None]
-"""Called while something takes long; may raise to give it up."""
+CheckInterrupt = Callable[[], None]  # called while something takes long; may raise to give it up
 
 
 class Master(Protocol):
-    """Takes the sensors to OP. They are numbered from 0; the master writes to no other slave.
+    """A master of the backend's own, for a wire with nothing but sensors: it writes to every slave.
 
     Errors are BusErrors, each one sentence. Used by one thread.
     """
 
     def scan(self, positions: Sequence[int], check_interrupt: CheckInterrupt, /) -> None:
-        """Give a station address to the sensors, which are at these positions on the wire."""
+        """Give station addresses and mailboxes to the sensors, which are at these positions on the wire."""
         ...
 
-    def enter_preop(self, check_interrupt: CheckInterrupt, /) -> None:
-        """Take every sensor to PREOP; BusError names one that does not go there."""
-        ...
-
-    def sdo_read(self, number: int, index: int, subindex: int, /) -> bytes:
-        """Upload an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
-        ...
-
-    def sdo_write(self, number: int, index: int, subindex: int, data: bytes, /) -> None:
-        """Download an object; raises as `sdo_read`."""
-        ...
-
-    def map_process_data(self, check_interrupt: CheckInterrupt, /) -> list[int]:
-        """Map the process data and request SAFEOP; returns each sensor's input size in bytes."""
-        ...
-
-    def go_operational(self, check_interrupt: CheckInterrupt, /) -> None:
-        """Take every sensor to OP, exchanging process data; BusError names one that refuses."""
-        ...
-
-    def release(self) -> None:
-        """Take the sensors to INIT, if they were scanned."""
+    def map_process_data(self, check_interrupt: CheckInterrupt, /) -> None:
+        """Write sync managers and FMMUs of the sensors, which are in PREOP."""
         ...
 
 
@@ -59,7 +38,7 @@ class Backend(Protocol):
 
     @property
     def master(self) -> Master | None:
-        """A master of its own, which may be used where there are sensors only; None if it has none."""
+        """None if it has none."""
         ...
 
     @property

@@ -5,73 +5,119 @@ Exchanges are `ProcessData`'s; single datagrams go between them (`Datagrams`).
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
 from typing import Final
 
-from ethercat_server.errors import SetUpError
 from ethercat_server.ethercat.backend import Backend, CheckInterrupt, Master
 from ethercat_server.ethercat.datagrams import Datagrams
-from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, latch_events, read_clock
-from ethercat_server.ethercat.exchange.frames import Area, fit_a_frame
+from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, read_clock
+from ethercat_server.ethercat.exchange.frames import fit_a_frame
 from ethercat_server.ethercat.exchange.process_data import ProcessData
-from ethercat_server.ethercat.mailbox.emergencies import Emergencies
+from ethercat_server.ethercat.master import mapping
 from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.slave.coe import Steps, finish
+from ethercat_server.ethercat.slave.controller import SlaveController
+from ethercat_server.ethercat.slave.emergencies import Emergencies
+from ethercat_server.ethercat.slave.sii_content import Sii
 
-_U16: Final = struct.Struct("<H")
-_SYNC_MANAGER: Final = struct.Struct("<2xHBxBx")
-"""Length, control, activation."""
+_MOST_EMERGENCIES: Final = 16
+_PAUSE_S: Final = 0.001
+_INIT_ATTEMPTS: Final = 5
 
 
 class Bus(Datagrams):
-    """An EtherCAT bus through `backend`. Its sensors are numbered from 0. Used by one thread."""
+    """An EtherCAT bus through `backend`. Its sensors are numbered from 0. Used by one thread.
+
+    Attributes:
+        positions: where the sensors are on the wire, by number.
+        slaves: their slave controllers.
+        emergencies: what they report unasked.
+        process_data: the exchange, once they are mapped.
+    """
 
     def __init__(self, backend: Backend) -> None:
         super().__init__(backend)
-        self.master: Master
-        """Whoever scanned it."""
-        self.spare: Master
-        """Who scans it again if that went wrong: one that repeats what lost frames spoil."""
-        self._is_scanned = False
         self.emergencies = Emergencies(backend.clock)
-        """What the sensors report unasked."""
         self.positions: list[int] = []
-        """Where the sensors are on the wire: by number, as everything below."""
-        self.fmmus: list[bytes] = []
-        """FMMU registers as they must be in OP."""
+        self.slaves: list[SlaveController] = []
         self.process_data = ProcessData((), backend)
-        """The exchange, once the sensors are mapped."""
+        self._sii: Sequence[Sii | None] = ()  # of all slaves on the wire
+        self._soem: Master | None = None
 
     def next_on_wire(self, until_ns: int) -> bytes | None:
         """The next frame that arrives before `until_ns` and carries no process data; None if none does."""
         while (frame := super().next_on_wire(until_ns)) is not None:
-            if not self.process_data.take(frame):
+            if self.process_data.take(frame, 0) is None:
                 return frame
         return None
 
-    # -- until OP
+    def scan(
+        self,
+        positions: Sequence[int],
+        sii: Sequence[Sii | None],
+        check_interrupt: CheckInterrupt,
+        *,
+        again: bool = False,
+    ) -> None:
+        """Number the sensors at these positions and take them to PREOP. `sii`: of every slave, theirs known.
 
-    def scan(self, master: Master, positions: Sequence[int], check_interrupt: CheckInterrupt) -> None:
-        """Number the sensors at these positions and have `master` take them to PREOP."""
-        self.master, self._is_scanned = master, True
-        master.scan(positions, check_interrupt)
-        self.positions = list(positions)
+        pysoem is the master where there are sensors only; other slaves are not written to. `again`: after a
+        failure, with the master that repeats what lost frames spoil.
+        """
+        self._soem = self.backend.master if len(positions) == len(sii) and not again else None
+        self.positions, self._sii, self.slaves = list(positions), sii, []
+        if self._soem is not None:
+            self._soem.scan(positions, check_interrupt)
+        else:
+            mapping.assign_stations(self, positions, self._others())
         self.stations = [
-            _U16.unpack(self.read_surely_at(position, reg.STATION_ADDRESS, 2))[0] for position in positions
+            int.from_bytes(self.read_surely_at(position, reg.STATION_ADDRESS, 2), "little")
+            for position in positions
         ]
-        master.enter_preop(check_interrupt)
+        for number, content in enumerate(self._sensors_sii()):
+            mailboxes = content["mailboxes"]["out"], content["mailboxes"]["in"]
+            slave = SlaveController(self, number, mailboxes, self.emergencies)
+            self.slaves.append(slave)
+            # SOEM has cleared it, and set its mailboxes up.
+            steps = slave.enter_preop() if self._soem is None else slave.go(AlState.PREOP)
+            self._run(steps, check_interrupt)
 
-    def go_operational(self, check_interrupt: CheckInterrupt) -> None:
-        """Take every sensor from SAFEOP to OP; BusError names one that refuses."""
-        self._lay_out_exchange()
-        self.master.go_operational(check_interrupt)
+    def scan_again(self, check_interrupt: CheckInterrupt) -> None:
+        """See `scan`."""
+        self.scan(self.positions, self._sii, check_interrupt, again=True)
 
-    def close(self) -> None:
-        """Take the sensors to INIT if they were scanned, and close the wire."""
-        if self._is_scanned:
-            self._is_scanned = False
-            self.master.release()
-        self.backend.close()
+    def map_process_data(self, check_interrupt: CheckInterrupt) -> list[int]:
+        """Map the process data of all sensors, which are in PREOP; returns the bytes of each one's inputs."""
+        for slave in self.slaves:  # pysoem takes an emergency that it meets in the mapping for a failure
+            self._run(slave.sdo.drain(_MOST_EMERGENCIES), check_interrupt)
+        if self._soem is not None:
+            self._soem.map_process_data(check_interrupt)
+        else:
+            logical = mapping.free_logical(self, self._others())
+            mapping.map_process_data(self.slaves, self._sensors_sii(), logical, check_interrupt)
+        return [slave.read_mapping() for slave in self.slaves]
+
+    def enter_op(self, check_interrupt: CheckInterrupt) -> None:
+        """Take all sensors to OP, exchanging process data, without which they do not go there."""
+        lrw = not any(slave.features & reg.NO_LRW for slave in self.slaves)
+        for slave in self.slaves:
+            if not fit_a_frame(slave.areas, lrw=lrw):
+                raise slave.unmapped()
+        stations = [
+            station if slave.latch_events() else None
+            for station, slave in zip(self.stations, self.slaves, strict=True)
+        ]
+        areas = [slave.areas for slave in self.slaves]
+        self.process_data = ProcessData(areas, self.backend, lrw=lrw, stations=stations)
+        waiting = [slave.enter_op() for slave in self.slaves]
+        while waiting:
+            check_interrupt()
+            self.process_data.send()
+            waiting = [steps for steps in waiting if not _is_done(steps)]
+            self.clock.sleep(_PAUSE_S)
+        for slave in self.slaves:
+            slave.attempts = 1
 
     def read_clock(self, number: int) -> DistributedClock | None:
         """The clock of a sensor's controller, from now on read with its process data; None if it has none."""
@@ -79,39 +125,29 @@ class Bus(Datagrams):
             return None
         return read_clock(self, number, at)
 
-    def _lay_out_exchange(self) -> None:
-        """Read from the FMMUs which logical addresses are whose process data."""
-        areas: list[list[Area]] = []
-        self.fmmus = []
-        features = [self._features(number) for number in range(len(self.stations))]
-        lrw = not any(each & reg.NO_LRW for each in features)
-        latching: list[int | None] = []
+    def close(self) -> None:
+        """Take the sensors to INIT if they were scanned, and close the wire."""
         for number in range(len(self.stations)):
-            count = min(self.read_surely(number, reg.FMMU_AND_SM_COUNT, 2)[0], reg.MOST_FMMUS)
-            self.fmmus.append(self.read_surely(number, reg.FMMU, count * reg.FMMU_SIZE))
-            rows = (reg.FMMU_LAYOUT.unpack_from(self.fmmus[-1], at * reg.FMMU_SIZE) for at in range(count))
-            areas.append([Area(row[0], row[0] + row[1], row[6]) for row in rows if row[7] & 1])
-            kinds, managers = {area.kind for area in areas[-1]}, self._sync_managers(number)
-            if kinds != managers.keys() or reg.FMMU_READ not in kinds or not fit_a_frame(areas[-1], lrw=lrw):
-                # SOEM writes them once, and does not look whether that worked.
-                raise SetUpError(f"sensor {number} did not answer when it was mapped: check cable and power")
-            latches = features[number] & reg.DC_AVAILABLE and latch_events(
-                self, number, managers[reg.FMMU_READ]
+            any(
+                self.write_register(number, reg.AL_CONTROL, AlState.INIT.request())
+                for _ in range(_INIT_ATTEMPTS)
             )
-            latching.append(self.stations[number] if latches else None)
-        self.process_data = ProcessData(areas, self.backend, lrw=lrw, stations=latching)
+        self.stations = []
+        self.backend.close()
 
-    def _features(self, number: int) -> int:
-        """What the slave controller of a sensor can do."""
-        return int(_U16.unpack(self.read_surely(number, reg.FEATURES, 2))[0])
+    def _others(self) -> list[int]:
+        return [position for position in range(len(self._sii)) if position not in self.positions]
 
-    def _sync_managers(self, number: int) -> dict[int, int]:
-        """Which sync manager of a sensor has its inputs, its outputs: by the kind of their FMMUs."""
-        count = min(self.read_surely(number, reg.FMMU_AND_SM_COUNT, 2)[1], reg.MOST_SYNC_MANAGERS)
-        data = self.read_surely(number, reg.SYNC_MANAGER, count * reg.SYNC_MANAGER_SIZE)
-        rows = [_SYNC_MANAGER.unpack_from(data, at * reg.SYNC_MANAGER_SIZE) for at in range(count)]
-        return {
-            reg.FMMU_WRITE if control & reg.SM_WRITE else reg.FMMU_READ: at
-            for at, (length, control, active) in enumerate(rows)
-            if length and active & 1 and not control & reg.SM_MAILBOX
-        }
+    def _sensors_sii(self) -> list[Sii]:
+        return [content for at, content in enumerate(self._sii) if at in self.positions and content]
+
+    def _run(self, steps: Steps[None], check_interrupt: CheckInterrupt) -> None:
+        finish(steps, _PAUSE_S, self.clock, check_interrupt)
+
+
+def _is_done(steps: Steps[None]) -> bool:
+    try:
+        next(steps)
+    except StopIteration:
+        return True
+    return False

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from typing import Final, Protocol
 
-_NS: Final = 1_000_000_000
 _READS: Final = 5
 
 
@@ -67,14 +66,9 @@ class Deadline:
 
     def __init__(self, clock: Clock, seconds: float) -> None:
         self._clock = clock
-        self._at_ns = clock.monotonic_ns() + int(seconds * _NS)
+        self._at_ns = clock.monotonic_ns() + int(seconds * 1e9)
 
     @property
     def passed(self) -> bool:
         """Whether it is in the past."""
         return self._clock.monotonic_ns() > self._at_ns
-
-    @property
-    def left_s(self) -> float:
-        """Seconds until then; negative once it has passed."""
-        return (self._at_ns - self._clock.monotonic_ns()) / _NS

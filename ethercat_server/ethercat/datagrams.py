@@ -6,22 +6,35 @@ is never taken for another one's answer.
 
 from __future__ import annotations
 
-import functools
 import struct
-from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend
+from ethercat_server.ethercat.clock import Clock
 from ethercat_server.ethercat.late_answers import LateAnswers
 from ethercat_server.ethercat.wire import FIRST_DATA, SHORTEST_FRAME, Command, build, is_answer
 
+# SOEM uses the indices below, and the exchange of process data those from `process_data.FIRST_INDEX` on.
 FIRST_INDEX: Final = 0x80
-"""SOEM uses the indices below, and the exchange of process data those from `process_data.FIRST_INDEX` on."""
 _INDICES: Final = 0x10
 _TIMEOUT_S: Final = 0.02
 _REGISTER_ATTEMPTS: Final = 20
 _U16: Final = struct.Struct("<H")
+
+
+class Registers(Protocol):
+    """How registers and mailboxes of slaves are reached: by number, as on a `Bus`, or `ByPosition`."""
+
+    @property
+    def clock(self) -> Clock:
+        """The time that passes meanwhile."""
+
+    def read_register(self, number: int, address: int, size: int, /) -> bytes | None:
+        """None if the slave did not do it."""
+
+    def write_register(self, number: int, address: int, data: bytes, /) -> bool:
+        """False if the slave did not do it."""
 
 
 class Datagrams:
@@ -49,19 +62,19 @@ class Datagrams:
 
     def read_register(self, number: int, address: int, size: int) -> bytes | None:
         """Read ESC registers or a mailbox of a sensor with one datagram; None if it did not do it."""
-        return self._read(Command.FPRD, self.stations[number], address, size, _TIMEOUT_S)
+        return self._read(Command.FPRD, self.stations[number], address, size)
 
     def write_register(self, number: int, address: int, data: bytes) -> bool:
         """Write ESC registers or a mailbox of a sensor with one datagram; False if it did not."""
-        return self._write(Command.FPWR, self.stations[number], address, data, _TIMEOUT_S)
+        return self._write(Command.FPWR, self.stations[number], address, data)
 
     def read_at(self, position: int, address: int, size: int) -> bytes | None:
         """Read ESC registers of the slave at a position, scanned or not; None if it did not do it."""
-        return self._read(Command.APRD, -position, address, size, _TIMEOUT_S)
+        return self._read(Command.APRD, -position, address, size)
 
     def write_at(self, position: int, address: int, data: bytes) -> bool:
         """Write ESC registers of the slave at a position, scanned or not; False if it did not do it."""
-        return self._write(Command.APWR, -position, address, data, _TIMEOUT_S)
+        return self._write(Command.APWR, -position, address, data)
 
     def count_slaves(self, size: int, timeout_s: float) -> int:
         """How many slaves answer a broadcast read of `size` bytes from register 0 on; -1 if it is lost.
@@ -80,39 +93,32 @@ class Datagrams:
 
     def read_surely(self, number: int, address: int, size: int) -> bytes:
         """Read ESC registers of a sensor; BusError if it does not answer."""
-        data = self._attempt(functools.partial(self.read_register, number, address, size))
-        if data is None:
-            raise BusError(f"sensor {number} does not answer: check cable and power")
-        return data
+        for _ in range(_REGISTER_ATTEMPTS):
+            if (data := self.read_register(number, address, size)) is not None:
+                return data
+        raise BusError(f"sensor {number} does not answer: check cable and power")
+
+    def read_surely_at(self, position: int, address: int, size: int) -> bytes:
+        """Read ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
+        for _ in range(_REGISTER_ATTEMPTS):
+            if (data := self.read_at(position, address, size)) is not None:
+                return data
+        raise self._unanswered(position)
 
     def write_surely_at(self, position: int, address: int, data: bytes) -> None:
         """Write ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
         if not any(self.write_at(position, address, data) for _ in range(_REGISTER_ATTEMPTS)):
             raise self._unanswered(position)
 
-    def read_surely_at(self, position: int, address: int, size: int) -> bytes:
-        """Read ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
-        data = self._attempt(functools.partial(self.read_at, position, address, size))
-        if data is None:
-            raise self._unanswered(position)
-        return data
-
     def _unanswered(self, position: int) -> BusError:
         return BusError(f"slave {position} on {self.ifname} does not answer: check cable and power")
 
-    def _attempt(self, read: Callable[[], bytes | None]) -> bytes | None:
-        """Read again while datagrams are lost, a bounded number of times."""
-        for _ in range(_REGISTER_ATTEMPTS):
-            if (data := read()) is not None:
-                return data
-        return None
-
-    def _read(self, command: Command, adp: int, address: int, size: int, timeout_s: float) -> bytes | None:
-        answer = self._datagram(command, adp, address, bytes(size), timeout_s)
+    def _read(self, command: Command, adp: int, address: int, size: int) -> bytes | None:
+        answer = self._datagram(command, adp, address, bytes(size), _TIMEOUT_S)
         return answer[1] if answer is not None and answer[0] == 1 else None
 
-    def _write(self, command: Command, adp: int, address: int, data: bytes, timeout_s: float) -> bool:
-        answer = self._datagram(command, adp, address, data, timeout_s)
+    def _write(self, command: Command, adp: int, address: int, data: bytes) -> bool:
+        answer = self._datagram(command, adp, address, data, _TIMEOUT_S)
         return answer is not None and answer[0] == 1
 
     def _datagram(
@@ -133,3 +139,11 @@ class Datagrams:
                 return _U16.unpack_from(answer, end)[0], answer[FIRST_DATA:end]
             self._late.note(answer)
         return None
+
+
+class ByPosition:
+    """The registers of slaves that have no station address, in place of those of a `Bus`."""
+
+    def __init__(self, bus: Datagrams) -> None:
+        self.clock = bus.clock
+        self.read_register, self.write_register = bus.read_at, bus.write_at

@@ -11,10 +11,10 @@ from ethercat_server.ethercat.clock import Clock
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX
 
 _LONGEST_TIMEOUT_S: Final = 0.25
+# On a bus whose answers come late the timeout is this many times the longest recent round trip.
 _LATE_FACTOR: Final = 2.0
-"""On a bus whose answers come late the timeout is this many times the longest recent round trip."""
+# Below it, frames are in time.
 _SHORTEST_TIMEOUT_S: Final = 0.0003
-"""Below it, frames are in time."""
 
 
 class LateAnswers:

@@ -16,6 +16,5 @@ def open_bus(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
     with claimed(ifname, allow_ip=allow_ip):
         backend = SoemBackend(ifname)
         with contextlib.closing(Bus(backend)) as bus:
-            backend.on_emergency = bus.emergencies.note
             backend.open()
             yield bus

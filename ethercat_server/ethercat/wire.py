@@ -19,18 +19,18 @@ DATAGRAM_HEADER: Final = 10
 COUNTER_SIZE: Final = 2
 TYPE_DATAGRAMS: Final = 1
 SOURCE_ADDRESS: Final = 6
+# The address that frames of this project come from, SOEM's too.
 SOURCE: Final = b"\x01" * 6
-"""The address that frames of this project come from, SOEM's too."""
+# Offset of the first datagram's index in a frame.
 DATAGRAM_INDEX: Final = FRAME_HEADER + 1
-"""Offset of the first datagram's index in a frame."""
+# Offset of the first datagram's data.
 FIRST_DATA: Final = FRAME_HEADER + DATAGRAM_HEADER
-"""Offset of the first datagram's data."""
+# What a byte takes at 100 Mbit/s.
 BYTE_NS: Final = 80
-"""What a byte takes at 100 Mbit/s."""
+# Bytes on Ethernet, without the checksum.
 SHORTEST_FRAME: Final = 60
-"""Bytes on Ethernet, without the checksum."""
+# Set in the first byte of the source address by the first slave that a frame passes.
 PROCESSED_BIT: Final = 0x02
-"""Set in the first byte of the source address by the first slave that a frame passes."""
 
 _LENGTH_MASK = 0x07FF
 _MORE_FOLLOW = 0x8000

@@ -1,1 +1,0 @@
-"""A Bota sensor: its objects, settings, offset. May import `ethercat` and `protocol`."""

@@ -18,10 +18,10 @@ from protocol.settings import SETTINGS, SettingValue, check_combination
 
 _SAVE_TIMEOUT_S: Final = 5.0
 
+# How the sentence of a change that failed goes on.
 IN_FORCE: Final = "; the former settings are in force"
 LATER: Final = "; it gets its former settings when it is back"
 _AGAIN: Final = "configure it again"
-"""How the sentence of a change that failed goes on."""
 
 
 class Change:
@@ -51,7 +51,7 @@ def apply_in_op(sdo: Sdo, sensor: Sensor, change: Change) -> Steps[None]:
             yield from write_setting(sdo, sensor, name)
         yield from read_settings(sdo, sensor)
     except BusError as error:
-        sensor.wanted, sensor.asked, sensor.unsettled = before, asked, True
+        sensor.wanted, sensor.asked, sensor.change_interrupted = before, asked, True
         if isinstance(error, CutOffError):
             raise extended(error, LATER) from None
         try:
@@ -60,7 +60,7 @@ def apply_in_op(sdo: Sdo, sensor: Sensor, change: Change) -> Steps[None]:
                     yield from write_setting(sdo, sensor, name, sensor.settings[name])
         except BusError as worse:
             raise extended(error, f"; restoring the former settings failed too: {worse}; {_AGAIN}") from None
-        sensor.unsettled = False
+        sensor.change_interrupted = False
         raise extended(error, IN_FORCE) from None
 
 

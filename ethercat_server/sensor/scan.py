@@ -1,38 +1,113 @@
-"""Scans a bus: finds the sensors, leaves the others alone, and takes the sensors to PREOP."""
+"""Looks at a bus: which slaves there are, which of them are sensors, whose the others are, who is at work.
+
+Looking disturbs nobody: frames of other masters are counted, registers and SIIs (EEPROMs) are read. Not the
+SII of a slave in SAFEOP, OP or BOOT, for reading takes writes to its controller; what is Bota's is then told
+from its sync managers.
+"""
 
 from __future__ import annotations
 
 import logging
+import struct
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.master.datagrams import DatagramMaster
+from ethercat_server.ethercat.datagrams import ByPosition
 from ethercat_server.ethercat.slave import registers as reg
-from ethercat_server.ethercat.slave import times
-from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.sensor.look import Slave, check_no_master, look, look_at, with_sii
+from ethercat_server.ethercat.slave import sii_content
+from ethercat_server.ethercat.slave.al import STATE_S, AlState, AlStatus
+from ethercat_server.ethercat.slave.coe import finish
+from ethercat_server.ethercat.slave.sii import read_sii
+from ethercat_server.sensor.objects.dictionary import is_sensor
+from protocol.pdo import LAYOUTS
 
+_LISTEN_S: Final = 0.1
+# Frames in this time that are a master's cycle; fewer may be the last ones of a server that was killed.
+_MASTER_FRAMES: Final = 3
+_TIMEOUT_S: Final = 0.02
+_ATTEMPTS: Final = 5
+_PROBE_BYTES: Final = 1
+_SII_PAUSE_S: Final = 0.0002  # between two questions whether an EEPROM has read a word: 1 to 3 ms
 _PAUSE_S: Final = 0.002
 _ACKNOWLEDGE: Final = 0x10
-_MAILBOX_BYTES: Final = range(16, 1487)
+# Start and length of a Bota sensor's sync managers 0 to 2, and start of the last one.
+_MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
+_INPUTS: Final = 0x1180
+_SYNC_MANAGER: Final = struct.Struct("<HH4x")
+_NAMELESS: Final = "nameless"
+_KNOWN: Final = ("vendor", "product", "revision", "name")  # what `describe` says of a slave from its SII
+_MOST_LISTED: Final = 64
+_ABSENT_AFTER: Final = 3  # unanswered reads in a row; a single lost datagram says nothing
+_ABSENT: Final = "ABSENT"
 
 log = logging.getLogger(__name__)
 
 
+class NoSlaveError(BusError):
+    """No slave answers."""
+
+
+class Slave(NamedTuple):
+    """One slave on the wire, of any vendor."""
+
+    position: int
+    status: AlStatus
+    sii: sii_content.Sii | None  # None if it was not read
+    problem: str = ""  # why its SII cannot be read
+    at_work: bool = False  # it is no Bota sensor and in SAFEOP, OP or BOOT
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return (self.sii and self.sii["name"]) or _NAMELESS
+
+    @property
+    def is_sensor(self) -> bool:
+        """Whether it is a Bota Gen-0 sensor."""
+        return self.sii is not None and is_sensor(self.sii["vendor"], self.sii["product"])
+
+    @property
+    def has_coe(self) -> bool:
+        """Whether it has a mailbox with CoE, and so objects."""
+        return self.sii is not None and "CoE" in self.sii["protocols"]
+
+    def as_json(self) -> dict[str, Any]:
+        """Its part of `others` in the `describe` reply."""
+        known = dict.fromkeys(_KNOWN) if self.sii is None else {key: self.sii[key] for key in _KNOWN}
+        return {"position": self.position, **known, "state": self.status.state.name}
+
+    def __str__(self) -> str:
+        who = "its SII cannot be read"
+        if self.sii is not None:
+            who = f"vendor 0x{self.sii['vendor']:08X}, product 0x{self.sii['product']:08X}"
+        return f"{self.name!r} at position {self.position} ({who})"
+
+
 def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = False) -> list[Slave]:
-    """All slaves on the wire.
+    """All slaves, in their order on the wire, with their SIIs; NoSlaveError if there are none.
 
     BusError if using the bus would stop somebody else's machine: if another master is sending, or a slave
     that is not Bota's is in SAFEOP, OP or BOOT. With `force`, such slaves are taken to PREOP instead.
     """
-    if not force:
-        check_no_master(bus)
+    if not force and (count := bus.listen(_LISTEN_S)) >= _MASTER_FRAMES:
+        raise BusError(
+            f"another EtherCAT master is sending on {bus.ifname} ({count} frames in {_LISTEN_S:g} s): stop "
+            "it, or name the interface that the sensor is connected to; --force takes its slaves over"
+        )
     check_interrupt()
-    slaves = look(bus, check_interrupt)
+    slaves = []
+    for position in range(max(bus.count_slaves(_PROBE_BYTES, _TIMEOUT_S) for _ in range(_ATTEMPTS))):
+        check_interrupt()
+        slaves.append(look_at(bus, position))
+    if not slaves:
+        raise NoSlaveError(
+            f"no EtherCAT slave answers on {bus.ifname}: check the cable, that the sensor has power and "
+            "that this is the interface it is connected to"
+        )
     at_work = [slave for slave in slaves if slave.at_work]
     if at_work and not force:
         where = ", ".join(f"{slave.position} in {slave.status.state.name}" for slave in at_work)
@@ -48,38 +123,70 @@ def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = Fals
     return found
 
 
-def scan(bus: Bus, slaves: Sequence[Slave], check_interrupt: CheckInterrupt, *, again: bool = False) -> None:
-    """Take these slaves to PREOP, numbered in this order. `slaves` has all that are on the wire.
-
-    pysoem is the master where all are sensors; where there are others, they are not written to. `again`:
-    after a failure, with the master that repeats what lost frames spoil.
-    """
-    numbered = [slave for slave in slaves if slave.is_sensor] or list(slaves)
-    for slave in numbered:
-        _check_sii(bus.ifname, slave)
-    bus.spare = DatagramMaster(bus, [slave.sii for slave in slaves])
-    own = None if again or len(numbered) < len(slaves) else bus.backend.master
-    bus.scan(own or bus.spare, [slave.position for slave in numbered], check_interrupt)
+def look_at(bus: Bus, position: int) -> Slave:
+    """The slave at `position`, without its SII; BusError if it does not answer."""
+    status = AlStatus.parse(bus.read_surely_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE))
+    busy = status.is_above_preop or status.state is AlState.BOOT  # its firmware may be being written
+    at_work = busy and not _has_sensors_managers(bus, position)
+    return Slave(position, status, None, at_work=at_work)
 
 
-def _check_sii(ifname: str, slave: Slave) -> None:
-    """BusError if nothing is known of it, or if it says what no master can do: pysoem would not notice."""
-    if slave.sii is None:
-        raise BusError(unreadable(ifname, slave))
-    sizes = [size for _, size in slave.sii["mailboxes"].values()]
-    if any(sizes) and not all(size in _MAILBOX_BYTES for size in sizes):
-        raise BusError(
-            f"the SII (EEPROM) of the slave at position {slave.position} of {ifname} has mailboxes of "
-            f"{' and '.join(map(str, sizes))} bytes, which no frame can carry: its EEPROM is damaged"
-        )
+def with_sii(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt = lambda: None) -> Slave:
+    """The same slave with its SII; access to the SII returns to its owner afterwards."""
+    try:
+        content = sii_content.decode(read_image(bus, slave.position, check_interrupt))
+    except BusError as error:
+        return slave._replace(problem=str(error))
+    if not content["vendor"] and not content["product"]:
+        return slave._replace(problem="its SII is empty")
+    return slave._replace(sii=content)
 
 
-def unreadable(ifname: str, slave: Slave) -> str:
-    """The sentence about a slave of which nothing is known."""
-    return (
-        f"the SII (EEPROM) of the slave at position {slave.position} of {ifname} cannot be read, so it does "
-        "not say what it is: power it off and on; if that does not help, its EEPROM is damaged"
-    )
+def read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda: None) -> bytes:
+    """The SII of the slave at `position`; BusError if it cannot be read."""
+    owner = bus.read_surely_at(position, reg.SII_OWNER, 1)
+    registers = ByPosition(bus)
+
+    def read(word: int, words: int) -> bytes:
+        steps = read_sii(registers, position, word, words, owner)
+        return finish(steps, pause_s=_SII_PAUSE_S, clock=bus.clock, check_interrupt=check_interrupt)
+
+    return sii_content.read_image(read)
+
+
+class OtherSlaves:
+    """The slaves beside the sensors: left alone, looked at now and then for their presence."""
+
+    def __init__(self, bus: Bus, slaves: Sequence[Slave]) -> None:
+        self._bus = bus
+        self._slaves = slaves
+        self.rows: list[dict[str, Any]] = [slave.as_json() for slave in slaves[:_MOST_LISTED]]
+        """`others` of the `describe` reply; kept up to date."""
+        self._unanswered = [0] * len(self.rows)
+        self._turn = -1
+
+    def look_at_next(self) -> None:
+        """Read the AL state of the next one, with one datagram."""
+        if not self.rows:
+            return
+        self._turn = turn = (self._turn + 1) % len(self.rows)
+        row, slave = self.rows[turn], self._slaves[turn]
+        data = self._bus.read_at(slave.position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
+        if data is not None:
+            if row["state"] == _ABSENT:
+                log.info("%s is back", slave)
+            row["state"], self._unanswered[turn] = AlStatus.parse(data).state.name, 0
+            return
+        self._unanswered[turn] += 1
+        if self._unanswered[turn] == _ABSENT_AFTER:
+            row["state"] = _ABSENT
+            log.warning("%s does not answer any more", slave)
+
+
+def _has_sensors_managers(bus: Bus, position: int) -> bool:
+    data = bus.read_surely_at(position, reg.SYNC_MANAGER, 4 * reg.SYNC_MANAGER_SIZE)
+    *others, inputs = _SYNC_MANAGER.iter_unpack(data)
+    return tuple(others) == _MAILBOXES_AND_OUTPUTS and inputs in [(_INPUTS, size) for size in LAYOUTS]
 
 
 def _stopped(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:
@@ -87,7 +194,7 @@ def _stopped(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:
     position = slave.position
     request = (AlState.PREOP | _ACKNOWLEDGE).to_bytes(2, "little")
     bus.write_surely_at(position, reg.AL_CONTROL, request)
-    deadline = Deadline(bus.clock, times.STATE_S[AlState.PREOP])
+    deadline = Deadline(bus.clock, STATE_S[AlState.PREOP])
     while (now := look_at(bus, position)).at_work:
         check_interrupt()
         if deadline.passed:

@@ -13,10 +13,9 @@ from ethercat_server.ethercat.clock import Clock, Deadline
 from protocol.sensor.meaning import value_meaning
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
 
+# How long Bota's own driver lets a sensor settle: new filter settings, and the data after entering OP.
 SETTLING_S: Final = 0.5
-"""How long Bota's own driver lets a sensor settle: new filter settings, and the data after entering OP."""
-SETTLING_SAMPLES: Final = 8
-"""At the lowest rates: how many samples the filters take, and a new offset."""
+SETTLING_SAMPLES: Final = 8  # at the lowest rates: how many samples the filters take, and a new offset
 _MODEL_NAME: Final = re.compile(r"BFT-[A-Z]{4}-ECAT-M8")
 
 
@@ -54,40 +53,25 @@ class SensorState(Enum):
 
     SETTING_UP = auto()
     STREAMING = auto()
-    CHANGING = auto()
-    """Out of OP to have its settings changed."""
-    REVERTING = auto()
-    """The change failed: it gets its former settings back."""
+    CHANGING = auto()  # out of OP to have its settings changed
+    REVERTING = auto()  # the change failed: it gets its former settings back
     LOST = auto()
-    REFUSED = auto()
-    """Another sensor is connected in its place."""
+    REFUSED = auto()  # another sensor is connected in its place
 
     @property
     def reported(self) -> str:
         """What `describe` says."""
-        return _REPORTED[self]
+        return {"STREAMING": "OP", "LOST": "LOST", "REFUSED": "REFUSED"}.get(self.name, "PREOP")
 
 
-_REPORTED: Final = {
-    SensorState.SETTING_UP: "PREOP",
-    SensorState.STREAMING: "OP",
-    SensorState.CHANGING: "PREOP",
-    SensorState.REVERTING: "PREOP",
-    SensorState.LOST: "LOST",
-    SensorState.REFUSED: "REFUSED",
-}
+_S = SensorState
 _TRANSITIONS: Final = {
-    SensorState.SETTING_UP: {SensorState.STREAMING},
-    SensorState.STREAMING: {SensorState.CHANGING, SensorState.LOST},
-    SensorState.CHANGING: {
-        SensorState.STREAMING,
-        SensorState.REVERTING,
-        SensorState.LOST,
-        SensorState.REFUSED,
-    },
-    SensorState.REVERTING: {SensorState.STREAMING, SensorState.LOST, SensorState.REFUSED},
-    SensorState.LOST: {SensorState.STREAMING, SensorState.REFUSED},
-    SensorState.REFUSED: {SensorState.STREAMING, SensorState.REFUSED},
+    _S.SETTING_UP: {_S.STREAMING},
+    _S.STREAMING: {_S.CHANGING, _S.LOST},
+    _S.CHANGING: {_S.STREAMING, _S.REVERTING, _S.LOST, _S.REFUSED},
+    _S.REVERTING: {_S.STREAMING, _S.LOST, _S.REFUSED},
+    _S.LOST: {_S.STREAMING, _S.REFUSED},
+    _S.REFUSED: {_S.STREAMING, _S.REFUSED},
 }
 
 
@@ -95,30 +79,26 @@ _TRANSITIONS: Final = {
 class Sensor:
     """One sensor on the bus, as found and set up."""
 
-    number: int
-    """Among the sensors, from 0."""
+    number: int  # among the sensors, from 0
     identity: Identity
+    # The settings to be in force; written again when the sensor has lost them.
     wanted: dict[str, SettingValue]
-    """The settings to be in force; written again when the sensor has lost them."""
-    asked: frozenset[str] = frozenset()
-    """Those among them that a person asked for: these must exist."""
-    position: int = 0
-    """Among all slaves on the wire, from 0."""
+    asked: frozenset[str] = frozenset()  # those among them that a person asked for: these must exist
+    position: int = 0  # among all slaves on the wire, from 0
     pdo_size: int = 0
     rate_hz: int = 0
     state: SensorState = SensorState.SETTING_UP
+    # The settings in force; `set_in_force` changes them.
     settings: dict[str, SettingValue] = field(default_factory=dict)
-    """The settings in force; `hold` changes them."""
+    # What each of them means. Kept, so that telling it takes no time from the samples.
     meaning: dict[str, str] = field(default_factory=dict)
-    """What each of them means. Kept, so that telling it takes no time from the samples."""
+    # The force/torque offset in force; written again when the sensor has lost it. None: it has none.
     offset: tuple[float, ...] | None = None
-    """The force/torque offset in force; written again when the sensor has lost it. None: it has none."""
+    # The SINC length is a guess from a rate that CHOP may have divided: not to be written for no reason.
     sinc_guessed: bool = False
-    """The SINC length is a guess from a rate that CHOP may have divided: not to be written for no reason."""
-    settled_at: Deadline | None = None
-    """When its data will have settled; see `settle`."""
-    unsettled: bool = False
-    """A change was interrupted: neither the former settings nor the wanted ones are in force for certain."""
+    settled_at: Deadline | None = None  # when its data will have settled; see `settle`
+    # A change was interrupted: neither the former settings nor the wanted ones are in force for certain.
+    change_interrupted: bool = False
 
     @property
     def streams(self) -> bool:
@@ -146,7 +126,7 @@ class Sensor:
         divisor = rate_divisor(length, self.rate_hz, self.wanted.get("chop")) or 1
         return 1e9 * length * divisor / BASE_SAMPLING_RATE_HZ
 
-    def hold(self, settings: Mapping[str, SettingValue]) -> None:
+    def set_in_force(self, settings: Mapping[str, SettingValue]) -> None:
         """These settings are in force now."""
         self.settings = dict(settings)
         chop = settings.get("chop")
@@ -155,14 +135,14 @@ class Sensor:
         }
 
     @property
-    def told_offset(self) -> list[float] | None:
+    def reported_offset(self) -> list[float] | None:
         """The force/torque offset as messages carry it; None if it is not known, or no numbers."""
         offset = self.offset
         return list(offset) if offset is not None and all(map(math.isfinite, offset)) else None
 
     def in_force(self) -> dict[str, Any]:
         """What replies and events say of a change."""
-        return {"settings": dict(self.settings), "rate_hz": self.rate_hz, "offset": self.told_offset}
+        return {"settings": dict(self.settings), "rate_hz": self.rate_hz, "offset": self.reported_offset}
 
     def describe(self) -> dict[str, Any]:
         """The sensor's part of the `describe` reply."""
@@ -179,7 +159,7 @@ class Sensor:
             "settling": self.settling,
             "settings": self.settings,
             "meaning": self.meaning,
-            "offset": self.told_offset,
+            "offset": self.reported_offset,
         }
 
 

@@ -19,8 +19,7 @@ from ethercat_server.sensor.sensor import SETTLING_S, Identity, Sensor
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor, sinc_length_of
 from protocol.text.visible import visible
 
-_LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]
-"""sinc_length."""
+_LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]  # sinc_length
 _OFFSETS: Final = tuple((dictionary.FORCE_TORQUE_OFFSET, sub) for sub in range(1, 7))
 
 NO_SETTINGS: Final[Mapping[str, SettingValue]] = {}
@@ -75,10 +74,10 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
         )  # fmt: skip
     yield from read_settings(sdo, sensor)
     yield from _restore_offset(sdo, sensor)
-    sensor.unsettled = False
+    sensor.change_interrupted = False
 
 
-def put_right(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+def set_up_in_op(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     """After a change that was cut off in OP: write what is wanted, as far as OP takes it; see `set_up`."""
     for name in dictionary.SETTING_WRITE_ORDER:
         if name not in sensor.wanted or SETTINGS[name].preop_only:
@@ -88,7 +87,7 @@ def put_right(sdo: Sdo, sensor: Sensor) -> Steps[None]:
             yield from write_setting(sdo, sensor, name)
     yield from _restore_offset(sdo, sensor)
     yield from read_settings(sdo, sensor)
-    sensor.unsettled = False
+    sensor.change_interrupted = False
 
 
 def write_setting(sdo: Sdo, sensor: Sensor, name: str, value: SettingValue | None = None) -> Steps[None]:
@@ -203,7 +202,7 @@ def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
         except ValueError as error:
             log.warning("sensor %d: %s", sensor.number, error)
     held["sinc_length"] = sensor.wanted["sinc_length"]
-    sensor.hold(held)
+    sensor.set_in_force(held)
 
 
 def read_in_force(sdo: Sdo, sensor: Sensor, asked: Mapping[str, SettingValue] = NO_SETTINGS) -> Steps[None]:
@@ -218,7 +217,7 @@ def read_in_force(sdo: Sdo, sensor: Sensor, asked: Mapping[str, SettingValue] = 
     sensor.wanted = {"sinc_length": held or 0}
     yield from read_settings(sdo, sensor)
     if not held:
-        sensor.hold({name: value for name, value in sensor.settings.items() if name != "sinc_length"})
+        sensor.set_in_force({name: value for name, value in sensor.settings.items() if name != "sinc_length"})
     sensor.wanted = dict(sensor.settings)
 
 

@@ -7,13 +7,15 @@ moved. So is one that makes an axis worse: further from its target than before, 
 errors of the difference of the two means. The standard error of a mean is the larger of two estimates: from
 single samples, and from the means of eight parts of its window, which covers noise that the sensor's filters
 have correlated.
+
+At rest is judged apart from `ft_compensation`, in raw units and by sums, which hold up no exchange.
 """
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
 from ethercat_server.errors import BusError, CutOffError, extended
@@ -28,30 +30,21 @@ from protocol.pdo import layout_for
 LATER: Final = "; it gets its old offset when it is back"
 _NAMES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz", "Rx", "Ry", "Rz")
 _CHANNELS: Final = len(_NAMES)
+# Fields of the process data with force and torque, and with the angular rate.
 _LOAD: Final = slice(2, 8)
 _RATE: Final = slice(13, 16)
-"""Fields of the process data with force and torque, and with the angular rate."""
-LEAST_SAMPLES: Final = 20
-"""Fewer would not show whether the sensor is stationary."""
-_REST_FORCE_N: Final = 1.0
-_REST_TORQUE_NM: Final = 0.05
-_REST_RATE_DPS: Final = 3.0
-"""Limits of the standard deviation for a stationary sensor, above Bota's own limits for a healthy one."""
-_LIMITS: Final = (_REST_FORCE_N,) * 3 + (_REST_TORQUE_NM,) * 3 + (_REST_RATE_DPS,) * 3
+LEAST_SAMPLES: Final = 20  # fewer would not show whether the sensor is stationary
+# Standard deviations (N, Nm, deg/s) of a stationary sensor, above Bota's own limits for a healthy one.
+_LIMITS: Final = (1.0,) * 3 + (0.05,) * 3 + (3.0,) * 3
+# N and Nm: what a mean may move within a window, and be off target after a tare, beyond noise.
 _STEADY: Final = (0.3,) * 3 + (0.01,) * 3
-"""N and Nm: what a mean may move within a window, and be off target after a tare, beyond noise."""
 _UNITS: Final = ("N",) * 3 + ("Nm",) * 3 + ("deg/s",) * 3
+# Of the mean angular rate: beyond it a robot is plainly moving. The residual tells what a slower turn costs.
 _REST_TURN_DPS: Final = math.degrees(0.5)
-"""Length of the mean angular rate: beyond it a robot is plainly moving. The residual tells what a slower turn
-costs."""
-_BY_CHANCE: Final = 5.0
-"""Standard errors by which two means must differ to differ significantly."""
-_PARTS: Final = 8
-"""Parts of a window whose means give the standard error of the whole window's."""
-_ROUNDING: Final = 1e-6
-"""Share of a reading by which REAL32 arithmetic in the sensor may be off."""
-_PATIENCE: Final = 4.0
-"""Timeout for samples, in multiples of their nominal duration."""
+_BY_CHANCE: Final = 5.0  # standard errors by which two means must differ to differ significantly
+_PARTS: Final = 8  # parts of a window whose means give the standard error of the whole window's
+_ROUNDING: Final = 1e-6  # share of a reading by which REAL32 arithmetic in the sensor may be off
+_PATIENCE: Final = 4.0  # timeout for samples, in multiples of their nominal duration
 
 
 class Samples(Protocol):
@@ -119,13 +112,13 @@ def _take_back(
     """Write the old offset again; returns `error` with what came of that."""
     addition = "; the old offset is in force"
     if isinstance(error, CutOffError):
-        sensor.offset, sensor.unsettled = old, True
+        sensor.offset, sensor.change_interrupted = old, True
         addition = LATER
     else:
         try:
             sensor.offset = yield from write_offset(sdo, old)
         except BusError as worse:
-            sensor.offset, sensor.unsettled = old, True
+            sensor.offset, sensor.change_interrupted = old, True
             addition = f"; restoring the former offset failed too: {worse}; tare it again"
     if isinstance(error, RequestError):
         return RequestError(error.code, f"{error}{addition}", **error.extra)
@@ -137,44 +130,42 @@ class _Window(NamedTuple):
 
     mean: list[float]
     deviation: list[float]
-    change: list[float]
-    """From the mean of the first half to that of the second."""
-    by_chance: list[float]
-    """What noise explains of that."""
-    error: list[float]
-    """Standard error of the mean."""
+    change: list[float]  # from the mean of the first half to that of the second
+    by_chance: list[float]  # what noise explains of that
+    error: list[float]  # standard error of the mean
 
 
-class _Block:
-    """Sums over some samples."""
+class _Part:
+    """Sums over part of a window."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self) -> None:
         self.taken = 0
-        self.sums = [0.0] * channels
-        self.squares = [0.0] * channels
+        self.sums = [0.0] * _CHANNELS
+        self.squares = [0.0] * _CHANNELS
 
     def add(self, row: Sequence[float]) -> None:
         self.taken += 1
-        for position, value in enumerate(row):
-            self.sums[position] += value
-            self.squares[position] += value * value
+        for channel, value in enumerate(row):
+            self.sums[channel] += value
+            self.squares[channel] += value * value
 
-    def statistics(self) -> Iterator[tuple[float, float]]:
-        """Mean and variance of each channel."""
-        for total, squares in zip(self.sums, self.squares, strict=True):
-            mean = total / self.taken
-            yield mean, max(0.0, squares / self.taken - mean * mean)
+
+def _statistics(parts: Sequence[_Part]) -> list[tuple[float, float]]:
+    """Mean and variance of each channel."""
+    taken = sum(part.taken for part in parts)
+    means = [sum(part.sums[n] for part in parts) / taken for n in range(_CHANNELS)]
+    squares = [sum(part.squares[n] for part in parts) / taken for n in range(_CHANNELS)]
+    return [(mean, max(0.0, square - mean * mean)) for mean, square in zip(means, squares, strict=True)]
 
 
 def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[_Window]:
     """Over the next samples."""
     unpack = layout_for(sensor.pdo_size).struct.unpack
     deadline = _patience(clock, sensor, samples)
-    seen = stream.fresh
-    whole, halves = _Block(_CHANNELS), (_Block(_CHANNELS), _Block(_CHANNELS))
-    parts = [_Block(_CHANNELS) for _ in range(_PARTS)]
+    seen, taken = stream.fresh, 0
+    parts = [_Part() for _ in range(_PARTS)]
     first: list[float] = []
-    while whole.taken < samples:
+    while taken < samples:
         yield
         if deadline.passed:
             raise RequestError(
@@ -192,26 +183,21 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
         first = first or row
         # From the first on, so that a large load does not drown its small changes.
         row = [value - start for value, start in zip(row, first, strict=True)]
-        halves[2 * whole.taken >= samples].add(row)
-        parts[_PARTS * whole.taken // samples].add(row)
-        whole.add(row)
-    found = list(whole.statistics())
-    mean = [m + start for (m, _), start in zip(found, first, strict=True)]
+        parts[_PARTS * taken // samples].add(row)
+        taken += 1
+    found, halves = _statistics(parts), (parts[: _PARTS // 2], parts[_PARTS // 2 :])
     change, by_chance = [], []
-    for (one, noise), (other, more_noise) in zip(*(half.statistics() for half in halves), strict=True):
+    for (one, noise), (other, more_noise) in zip(*map(_statistics, halves), strict=True):
         change.append(abs(other - one))
-        by_chance.append(_BY_CHANCE * math.sqrt((noise + more_noise) / halves[0].taken))
+        by_chance.append(_BY_CHANCE * math.sqrt((noise + more_noise) / sum(part.taken for part in halves[0])))
     deviation = [math.sqrt(variance) for _, variance in found]
+    means = zip(*([mean for mean, _ in _statistics([part])] for part in parts), strict=True)
     error = [
-        max(alone / math.sqrt(samples), statistics.stdev(means) / math.sqrt(_PARTS))
-        for alone, means in zip(deviation, _means(parts), strict=True)
+        max(alone / math.sqrt(samples), statistics.stdev(each) / math.sqrt(_PARTS))
+        for alone, each in zip(deviation, means, strict=True)
     ]
+    mean = [m + start for (m, _), start in zip(found, first, strict=True)]
     return _Window(mean, deviation, change, by_chance, error)
-
-
-def _means(parts: Sequence[_Block]) -> list[tuple[float, ...]]:
-    """The means of the parts, channel by channel."""
-    return list(zip(*([mean for mean, _ in part.statistics()] for part in parts), strict=True))
 
 
 def _wait(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[None]:

@@ -18,8 +18,8 @@ from protocol.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, pars
 from protocol.errors import RequestError
 from protocol.text.json_text import JsonObject
 
+# With more sensors `describe` omits the meaning of their settings: a reply has at most 65536 bytes.
 _MOST_EXPLAINED: Final = 32
-"""With more sensors `describe` omits the meaning of their settings: a reply has at most 65536 bytes."""
 
 log = logging.getLogger(__name__)
 

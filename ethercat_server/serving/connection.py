@@ -1,28 +1,84 @@
-"""One client's connection: its state, what it has sent so far, which DATA it wants. It never blocks."""
+"""One client's connection: its state, what it has sent so far, which DATA it wants. It never blocks.
+
+    READING <-> READY <-> ANSWERING          a client that may ask
+       |          |           |
+       v          |           |
+    HALF_CLOSED   |           |              it has closed its side and still receives its subscription
+       |          |           |
+       +----------+-----------+
+                  v
+       CLOSING -> LINGERING -> CLOSED        the server closes: sends what waits, then waits for the client
+           \\-> FLUSHING ------^              the client has closed its side: only what waits is sent
+
+From every state a connection that breaks goes to CLOSED at once.
+
+From every state a connection that breaks goes to CLOSED at once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
 from typing import Final, NamedTuple
 
 from ethercat_server.acquisition.stream import Made
-from ethercat_server.serving.outbox import Outbox, with_gap
-from ethercat_server.serving.state import TRANSITIONS, State
 from ethercat_server.serving.transport.base import Stream
 from protocol.errors import BadMessageError, RemoteProtocolError
-from protocol.framing import DataFlag, FrameDecoder, encode_json
+from protocol.framing import DATA_FLAGS_OFFSET, DataFlag, FrameDecoder, encode_json
 from protocol.text.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 from protocol.text.json_text import JsonObject
 
 MAX_REQUEST_LENGTH: Final = 4096
+MAX_QUEUED_DATA: Final = 256
+MAX_QUEUED_JSON: Final = 64
+# Limits of the replies and events that wait; a client that asks and never reads is closed at them.
+MAX_QUEUED_JSON_BYTES: Final = 262_144
+
+NO_SENSOR: Final = -1
+# A `fresh_only` client gets a REPEATED frame only if it has received nothing for this long.
 _IDLE_FRAME_NS: Final = 10_000_000
-"""A `fresh_only` client gets a REPEATED frame only if it has received nothing for this long."""
 _REPEATED: Final = int(DataFlag.REPEATED)
 _GAP: Final = int(DataFlag.GAP)
+# Timeout for the rest of a message whose first part has arrived.
 _UNFINISHED_NS: Final = 10_000_000_000
-"""Timeout for the rest of a message whose first part has arrived."""
+# Timeout for a connection that is being closed.
 _LAST_REPLY_NS: Final = 1_000_000_000
-"""Timeout for a connection that is being closed."""
+
+
+class State(Enum):
+    """What a connection does now."""
+
+    READING = "waits for the client's next request"
+    READY = "has received bytes that may contain whole requests; reads no more until they are taken"
+    ANSWERING = "its last request is not answered yet; what the client sent after it waits"
+    HALF_CLOSED = "the client has closed its side, but is subscribed"
+    CLOSING = "sends what waits and discards what the client still sends"
+    FLUSHING = "sends what waits; the client has closed its side"
+    LINGERING = "everything is sent and this side is closed; discards until the client has closed its own"
+    CLOSED = "nothing is left but to close the socket"
+
+    def __init__(self, _meaning: str) -> None:
+        # Read for every connection in each turn: an attribute costs less than looking a member up in a set.
+        self.reads = self.name in {"READING", "CLOSING", "LINGERING"}
+        """Whether to wait for bytes of the client."""
+        self.ending = self.name in {"CLOSING", "FLUSHING", "LINGERING", "CLOSED"}
+        """Whether no more requests are taken."""
+
+
+_ENDINGS: Final = frozenset({State.CLOSING, State.FLUSHING, State.CLOSED})
+
+# The states that may follow each.
+TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
+    State.READING: _ENDINGS | {State.READY, State.HALF_CLOSED},
+    State.READY: _ENDINGS | {State.READING, State.ANSWERING},
+    State.ANSWERING: _ENDINGS | {State.READY},
+    State.HALF_CLOSED: _ENDINGS - {State.CLOSING},
+    State.CLOSING: frozenset({State.FLUSHING, State.LINGERING, State.CLOSED}),
+    State.FLUSHING: frozenset({State.CLOSED}),
+    State.LINGERING: frozenset({State.CLOSED}),
+    State.CLOSED: frozenset(),
+}
 
 
 class Limits(NamedTuple):
@@ -46,13 +102,14 @@ class Unreadable(NamedTuple):
 class Subscription:
     """Which DATA a client wants. Lists are by the sensor's number."""
 
-    __slots__ = ("every", "fresh_only", "gap", "last_ns", "skipped", "wanted")
+    __slots__ = ("chooses", "every", "fresh_only", "gap", "last_ns", "skipped", "wanted")
 
     def __init__(
         self, sensor_count: int, sensors: tuple[int, ...] | None, every: int, fresh_only: bool
     ) -> None:
         self.wanted = [sensors is None or number in sensors for number in range(sensor_count)]
         self.every = every
+        self.chooses = every != 1 or not all(self.wanted)
         self.fresh_only = fresh_only
         self.skipped = [every - 1] * sensor_count
         # Nothing was sent yet, which counts as long ago even if the clock starts at zero.
@@ -60,10 +117,157 @@ class Subscription:
         self.gap = [False] * sensor_count
 
 
+class Outbox:
+    """The send queue of a connection: bounded, of whole messages.
+
+    Sending never blocks. What cannot be sent at once is queued; a full queue drops the oldest DATA frame,
+    never part of a frame and never a reply.
+    """
+
+    def __init__(self, stream: Stream, monotonic_ns: Callable[[], int], writers: set[int]) -> None:
+        """`writers` has the descriptor of the stream while something waits."""
+        self._send, self._fd, self._writers = stream.send, stream.fileno(), writers
+        self._monotonic_ns = monotonic_ns
+        self.sent = 0
+        """DATA frames sent."""
+        self.withheld = 0
+        """DATA frames dropped because the client did not read."""
+        self.broken = False
+        """Sending has failed for good; everything is discarded from then on."""
+        self.progress_ns = 0
+        """CLOCK_MONOTONIC when the socket last accepted something, while something is queued."""
+        self._queue: deque[tuple[bytes, int]] = deque()  # message, sensor's number or NO_SENSOR for JSON
+        self._queued_data = 0
+        self._queued_json_bytes = 0
+        self._head_sent = 0
+
+    @property
+    def waiting(self) -> bool:
+        """Something is queued: `flush` when the socket is writable."""
+        return bool(self._queue)
+
+    @property
+    def full(self) -> bool:
+        """Whether the limit of queued replies and events is reached."""
+        replies = len(self._queue) - self._queued_data
+        return replies >= MAX_QUEUED_JSON or self._queued_json_bytes > MAX_QUEUED_JSON_BYTES
+
+    def send(self, message: bytes) -> None:
+        """Send a reply or an event, or queue it."""
+        if not self._queue:
+            try:
+                sent = self._send(message)
+            except OSError as error:
+                sent = self._refused(error)
+            if sent == len(message) or self.broken:
+                return
+            self._wait()
+            self._head_sent = sent
+        self._queue.append((message, NO_SENSOR))
+        self._queued_json_bytes += len(message)
+
+    def send_data(self, frames: Sequence[tuple[bytes, int]]) -> Sequence[int]:
+        """Send DATA frames with their sensors' numbers, one for each, or queue them.
+
+        Returns the sensors whose next frame must carry GAP because one was dropped.
+        """
+        if not self._queue:
+            message = frames[0][0] if len(frames) == 1 else b"".join([frame for frame, _ in frames])
+            try:
+                sent = self._send(message)
+            except OSError as error:
+                sent = self._refused(error)
+            if sent == len(message):
+                self.sent += len(frames)
+                return ()
+            if self.broken:
+                return ()
+            self._wait()
+            whole = 0
+            while sent >= (size := len(frames[whole][0])):
+                sent -= size
+                whole += 1
+            self.sent += whole
+            frames = frames[whole:]
+            self._head_sent = sent
+        dropped: set[int] = set()
+        for frame, number in frames:
+            self._queue.append((with_gap(frame) if number in dropped else frame, number))
+            dropped.discard(number)
+            self._queued_data += 1
+            if self._queued_data > MAX_QUEUED_DATA:
+                dropped.add(self._drop_oldest_data())
+        return tuple(dropped - {NO_SENSOR})
+
+    def _refused(self, error: OSError) -> int:
+        """The socket accepts nothing: not now, or never again."""
+        if not isinstance(error, BlockingIOError):
+            self._break()
+        return 0
+
+    def _wait(self) -> None:
+        self._writers.add(self._fd)
+        self.progress_ns = self._monotonic_ns()
+
+    def flush(self) -> None:
+        """Send what is queued, as far as the socket accepts it."""
+        while self._queue:
+            message, number = self._queue[0]
+            try:
+                sent = self._send(memoryview(message)[self._head_sent :])
+            except OSError as error:
+                self._refused(error)
+                return
+            self._head_sent += sent
+            self.progress_ns = self._monotonic_ns()
+            if self._head_sent < len(message):
+                return
+            self._queue.popleft()
+            self._head_sent = 0
+            if number >= 0:
+                self.sent += 1
+                self._queued_data -= 1
+            else:
+                self._queued_json_bytes -= len(message)
+        self._writers.discard(self._fd)
+
+    def _break(self) -> None:
+        self.broken = True
+        self._writers.discard(self._fd)
+        self._queue.clear()
+        self._queued_data = self._queued_json_bytes = self._head_sent = 0
+
+    def _drop_oldest_data(self) -> int:
+        first = 1 if self._head_sent else 0  # a frame that is partly sent must go out whole
+        for at in range(first, len(self._queue)):
+            number = self._queue[at][1]
+            if number < 0:
+                continue
+            del self._queue[at]
+            self._queued_data -= 1
+            self.withheld += 1
+            for later in range(at, len(self._queue)):
+                frame, its_position = self._queue[later]
+                if its_position == number:
+                    self._queue[later] = (with_gap(frame), number)
+                    return NO_SENSOR
+            return number
+        return NO_SENSOR
+
+
+class Watched(NamedTuple):
+    """File descriptors to wait for; each connection adds and removes its own."""
+
+    readers: set[int]
+    writers: set[int]
+
+
 class Connection:
     """A client's stream and everything that belongs to it."""
 
-    def __init__(self, stream: Stream, uid: int | None, monotonic_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, stream: Stream, uid: int | None, monotonic_ns: Callable[[], int], watched: Watched | None = None
+    ) -> None:
         """`uid` is the user who owns the other end, None if that is not known."""
         self.fd = stream.fileno()
         self.peer = stream.peer
@@ -72,7 +276,9 @@ class Connection:
         self.framed: FrameDecoder | None = None
         self.bare: BareJsonDecoder | None = None
         self.subscription: Subscription | None = None
-        self.outbox = Outbox(stream, monotonic_ns)
+        self._watched = watched or Watched(set(), set())
+        self._watched.readers.add(self.fd)
+        self.outbox = Outbox(stream, monotonic_ns, self._watched.writers)
         self._stream = stream
         self._monotonic_ns = monotonic_ns
         self._heard_ns = monotonic_ns()
@@ -88,6 +294,7 @@ class Connection:
     def _become(self, state: State) -> None:
         assert state in TRANSITIONS[self.state], f"{self}: {self.state} -> {state}"
         self.state = state
+        (self._watched.readers.add if state.reads else self._watched.readers.discard)(self.fd)
 
     @property
     def is_idle(self) -> bool:
@@ -211,6 +418,8 @@ class Connection:
 
     def close(self) -> None:
         """Close the stream."""
+        for descriptors in self._watched:
+            descriptors.discard(self.fd)
         self._stream.close()
 
     def _end(self, state: State) -> None:
@@ -231,16 +440,12 @@ class Connection:
 
     def offer(self, made: Sequence[Made], now_ns: int) -> None:
         """Send those DATA frames that the subscription wants, at once: one for a sensor."""
-        wants = self.subscription
-        if wants is None:
+        if (wants := self.subscription) is None:
             return
         chosen = []
         for frame, number, flags in made:
-            if not wants.wanted[number]:
-                continue
-            if flags or wants.every != 1 or wants.gap[number]:
-                choice = _choose(wants, frame, number, flags, now_ns)
-                if choice is None:
+            if flags or wants.chooses or wants.gap[number]:
+                if (choice := _choose(wants, frame, number, flags, now_ns)) is None:
                     continue
                 chosen.append((choice, number))
             else:
@@ -253,6 +458,8 @@ class Connection:
 
 def _choose(wants: Subscription, frame: bytes, number: int, flags: int, now_ns: int) -> bytes | None:
     """What a subscription gets of a DATA frame that is not like most."""
+    if not wants.wanted[number]:
+        return None
     if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[number] < _IDLE_FRAME_NS:
         return None
     if flags & _GAP:
@@ -266,3 +473,9 @@ def _choose(wants: Subscription, frame: bytes, number: int, flags: int, now_ns: 
         if not flags & _GAP:
             frame = with_gap(frame)
     return frame
+
+
+def with_gap(frame: bytes) -> bytes:
+    """A copy of an encoded DATA frame with the GAP flag set."""
+    flags = frame[DATA_FLAGS_OFFSET] | _GAP
+    return frame[:DATA_FLAGS_OFFSET] + bytes((flags,)) + frame[DATA_FLAGS_OFFSET + 1 :]

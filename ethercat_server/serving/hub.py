@@ -16,31 +16,30 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from ethercat_server.acquisition.stream import Made
-from ethercat_server.serving.connection import Connection, Limits, Unreadable
+from ethercat_server.serving.connection import Connection, Limits, State, Unreadable, Watched
 from ethercat_server.serving.permissions import Permissions
-from ethercat_server.serving.state import State
 from ethercat_server.serving.transport.base import Transport
 from protocol.control import ErrorCode, error_reply
 from protocol.errors import RequestError
 from protocol.text.json_text import JsonObject
 
+# Clients get at most a tenth of this thread's time, however much they ask.
 _PAUSE_RATIO: Final = 9
-"""Clients get at most a tenth of this thread's time, however much they ask."""
+# A pass that took long because this thread was not running must not silence all clients.
 _LONGEST_PAUSE_NS: Final = 20_000_000
-"""A pass that took long because this thread was not running must not silence all clients."""
+# No request is begun this shortly before a deadline; a usual one takes less.
 _REQUEST_NS: Final = 280_000
-"""No request is begun this shortly before a deadline; a usual one takes less."""
+# Clients accepted in one pass.
 _MAX_ACCEPTS: Final = 2
-"""Clients accepted in one pass."""
+# How often connections are checked for timeouts and closed.
 _SWEEP_NS: Final = 50_000_000
-"""How often connections are checked for timeouts and closed."""
 _CLOSE_NS: Final = 1_000_000_000
 _CLOSE_TURN_NS: Final = 20_000_000
 
 log = logging.getLogger(__name__)
 
+# Turns a request into its reply, or None if it comes later through `Hub.answer`; RequestError refuses it.
 Handler = Callable[[Connection, JsonObject], JsonObject | None]
-"""Turns a request into its reply, or None if it comes later through `Hub.answer`; RequestError refuses it."""
 
 
 class Hub:
@@ -55,6 +54,7 @@ class Hub:
         self._monotonic_ns = monotonic_ns
         self._handler: Handler | None = None
         self._subscribers: list[Connection] = []
+        self._watched = Watched(set(), set())
         self._ready: deque[Connection] = deque()
         """Those in State.READY, in the order of their turns."""
         self._pause_ends_ns = 0
@@ -63,6 +63,7 @@ class Hub:
     def start(self, handler: Handler) -> None:
         """Begin to accept; until now clients waited in the kernel's queue."""
         self._handler = handler
+        self._watched.readers.update(self._transport.listening())
 
     def publish(self, made: Sequence[Made], now_ns: int) -> None:
         """Send DATA frames to every subscriber that wants them."""
@@ -90,39 +91,41 @@ class Hub:
 
     def serve(self, until_ns: int) -> None:
         """Serve the clients until the clock is at `until_ns`; once, without waiting, if that has passed."""
-        now_ns = self._monotonic_ns()
+        watched, now_ns = self._watched, self._monotonic_ns()
         last_start_ns = until_ns - _REQUEST_NS
-        # Where there is no time for a request one pass is made all the same: it may stay like this.
+        # Where there is never time for a request, one pass is made nevertheless.
         hurried = last_start_ns <= now_ns
-        while True:
-            self._serve_once(now_ns, last_start_ns, until_ns, hurried)
-            hurried = False
-            now_ns = self._monotonic_ns()
-            if now_ns >= until_ns:
-                break
+        while hurried or now_ns < until_ns:
+            reads = self._pause_ends_ns <= now_ns and (hurried or now_ns < last_start_ns)
+            wake_ns = until_ns
+            if hurried or self._ready or now_ns < self._pause_ends_ns:
+                if reads:
+                    wake_ns = now_ns
+                elif now_ns < self._pause_ends_ns < until_ns:
+                    wake_ns = self._pause_ends_ns
+            wait_s = (wake_ns - now_ns) * 1e-9 if wake_ns > now_ns else 0.0
+            ready = self._transport.wait(watched.readers if reads else (), watched.writers, wait_s)
+            if ready[0] or ready[1] or (reads and self._ready):
+                self._attend(*ready, last_start_ns, reads=reads, hurried=hurried)
+            hurried, now_ns = False, self._monotonic_ns()
         if now_ns >= self._sweep_at_ns:
             self._sweep(now_ns)
 
-    def _serve_once(self, now_ns: int, last_start_ns: int, until_ns: int, hurried: bool) -> None:
-        """Wait for something to do and do it."""
-        reads = self._pause_ends_ns <= now_ns and (hurried or now_ns < last_start_ns)
-        wake_ns = until_ns
-        if reads and (hurried or self._ready):
-            wake_ns = now_ns
-        elif now_ns < self._pause_ends_ns:
-            wake_ns = min(self._pause_ends_ns, until_ns)
-        readers: list[int] = []
-        if reads and self._handler is not None:
-            readers = [fd for fd, c in self.connections.items() if c.state.reads]
-            readers += self._transport.listening()
-        writers = [fd for fd, c in self.connections.items() if c.outbox.waiting]
-        readable, writable = self._transport.wait(readers, writers, max(0, wake_ns - now_ns) * 1e-9)
+    def _attend(
+        self,
+        readable: Sequence[int],
+        writable: Sequence[int],
+        last_start_ns: int,
+        *,
+        reads: bool,
+        hurried: bool,
+    ) -> None:
+        """Send what waits; then read and answer if `reads`, unless it is too late to begin."""
         for fd in writable:
             self.connections[fd].outbox.flush()
-        if readable or (reads and self._ready):
-            began_ns = self._monotonic_ns()
-            if began_ns >= last_start_ns and not hurried:
-                return  # what came too late to be begun has its turn after the exchange
+        began_ns = self._monotonic_ns()
+        # What came too late to be begun has its turn after the exchange.
+        if reads and (hurried or began_ns < last_start_ns):
             self._read(readable)
             self._answer_some(last_start_ns)
             ended_ns = self._monotonic_ns()
@@ -144,7 +147,7 @@ class Hub:
         for _ in range(_MAX_ACCEPTS):
             if (stream := self._transport.accept(fd)) is None:
                 return
-            connection = Connection(stream, stream.peer_uid(), self._monotonic_ns)
+            connection = Connection(stream, stream.peer_uid(), self._monotonic_ns, self._watched)
             if self._make_room(connection.uid):
                 self.connections[connection.fd] = connection
             else:
@@ -221,6 +224,7 @@ class Hub:
 
     def close(self) -> None:
         """Send what waits, for a bounded time, then close everything."""
+        self._watched.readers.difference_update(self._transport.listening())
         self._transport.stop_listening()
         for connection in self.connections.values():
             connection.finish()

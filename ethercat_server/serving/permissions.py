@@ -15,12 +15,12 @@ from ethercat_server.errors import UsageError
 from ethercat_server.serving.connection import Connection
 
 MAX_CLIENTS: Final = 64
+# Clients among them that must be of users who may control, so that the others cannot use all of them up.
 RESERVED_FOR_CONTROL: Final = 16
-"""Clients among them that must be of users who may control, so that the others cannot use all of them up."""
+# Clients of one user who may not control.
 MAX_CLIENTS_PER_USER: Final = 16
-"""Clients of one user who may not control."""
+# Clients of those users that must be the first of theirs: the bridge's is such a user.
 RESERVED_FOR_THE_FIRST: Final = 16
-"""Clients of those users that must be the first of theirs: the bridge's is such a user."""
 
 
 class Permissions:

@@ -25,11 +25,11 @@ from protocol.sensor_choice import SensorChoice
 from protocol.settings import SettingValue
 from protocol.text.json_text import JsonObject
 
+# Reads that may wait for one sensor: everyone may read, and changes must still get their turn.
 _MOST_READS: Final = 8
-"""Reads that may wait for one sensor: everyone may read, and changes must still get their turn."""
 
+# A sensor does one of these at a time.
 _CHANGES: Final = frozenset({"configure", "tare"})
-"""A sensor does one of these at a time."""
 
 
 class SensorActions:
@@ -204,7 +204,7 @@ class SensorActions:
         self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.number, **sensor.in_force()))
 
     def _announce_offset(self, sensor: Sensor) -> None:
-        self._hub.broadcast(event(Event.OFFSET_CHANGED, sensor=sensor.number, offset=sensor.told_offset))
+        self._hub.broadcast(event(Event.OFFSET_CHANGED, sensor=sensor.number, offset=sensor.reported_offset))
 
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
         if save_too:

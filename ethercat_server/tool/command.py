@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
 from ethercat_server.access.sensors import Sensors, open_sensors
-from ethercat_server.ethercat.nic.ip import ALLOW_IP, ALLOW_IP_HELP
+from ethercat_server.ethercat.nic.interface import ALLOW_IP, ALLOW_IP_HELP
 from protocol.program.server_choice import HELP
 
 DONE: Final = 0

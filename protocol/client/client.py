@@ -16,6 +16,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from types import TracebackType
 from typing import Final
 
@@ -248,11 +249,8 @@ class Client:
         RefusedError if it is refused, NoReplyError if no reply comes in `timeout_s`, ConnectionFailedError if
         there is no connection or it ends.
         """
-        if not self.session.connected:
-            raise ConnectionFailedError(self.session.problem)
-        future, data = self.session.ask(action, **values)
+        future = self.request(action, **values)
         try:
-            self._send(data)
             deadline_ns = self.channel.monotonic_ns() + round(timeout_s * 1e9)
             over = threading.Event()
             future.add_done_callback(lambda _: over.set())
@@ -270,6 +268,21 @@ class Client:
         if reply.get("ok") is not True:
             raise RefusedError.of(reply)
         return reply
+
+    def request(self, action: str, **values: object) -> Future[JsonObject]:
+        """Send a request; the future gets the reply, granted or not. From any thread.
+
+        ConnectionFailedError if there is no connection; also the future's, if it ends before the reply.
+        """
+        if not self.session.connected:
+            raise ConnectionFailedError(self.session.problem)
+        future, data = self.session.ask(action, **values)
+        try:
+            self._send(data)
+        except ConnectionFailedError:
+            self.session.forget(future)
+            raise
+        return future
 
     # -- one step at a time
 

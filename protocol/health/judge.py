@@ -18,44 +18,30 @@ from protocol.text.visible import printable
 class Observation(NamedTuple):
     """What was seen of one sensor's stream in some time. None and 0 where nothing is known."""
 
-    seconds: float = 0.0
-    """How long it was observed."""
-    samples: int = 0
-    """New ones."""
-    lost: int = 0
-    """Samples that did not come: lost on the bus or in the server, or not read in time."""
+    seconds: float = 0.0  # how long it was observed
+    samples: int = 0  # new ones
+    lost: int = 0  # samples that did not come: lost on the bus or in the server, or not read in time
     repeated: int = 0
-    invalid: int = 0
-    """Frames."""
-    silent_s: float = 0.0
-    """The longest time without a new sample, up to the end of the observation."""
-    rate_hz: float | None = None
-    """New samples a second, by their stamps."""
+    invalid: int = 0  # frames
+    silent_s: float = 0.0  # the longest time without a new sample, up to the end of the observation
+    rate_hz: float | None = None  # new samples a second, by their stamps
     nominal_hz: float = 0.0
-    age_p99_us: float | None = None
-    """Of the samples on arrival; None on another machine than the server's."""
-    not_finite: int = 0
-    """Samples with values that are not finite."""
+    age_p99_us: float | None = None  # of the samples on arrival; None on another machine than the server's
+    not_finite: int = 0  # samples with values that are not finite
+    # The bits of the warnings register that were set in any sample; likewise of the saturation fields.
     warnings: int = 0
-    """The bits of the warnings register that were set in any sample; likewise of the saturation fields."""
     force_torque_saturated: int = 0
     acceleration_saturated: int = 0
     angular_rate_saturated: int = 0
     temperature: float | None = None
-    locked: bool | None = None
-    """Whether the server follows the sensor's clock."""
+    locked: bool | None = None  # whether the server follows the sensor's clock
     recoveries: int = 0
-    missed_deadlines: int = 0
-    """By the server's loop, in sampling periods."""
+    missed_deadlines: int = 0  # by the server's loop, in sampling periods
     reconnects: int = 0
-    is_lost: bool = False
-    """The server says that it has lost the sensor."""
-    state: str = "OP"
-    """The sensor's AL state."""
-    server_silent: bool = False
-    """The server itself owes an answer."""
-    emergency: str = ""
-    """What the sensor's newest emergency says, if it is new and not over."""
+    is_lost: bool = False  # the server says that it has lost the sensor
+    state: str = "OP"  # the sensor's AL state
+    server_silent: bool = False  # the server itself owes an answer
+    emergency: str = ""  # what the sensor's newest emergency says, if it is new and not over
     settings: Mapping[str, object] = {}
 
 
@@ -63,8 +49,7 @@ class Saturation(NamedTuple):
     """One saturation field of the process data."""
 
     field: str
-    axes: tuple[str, ...]
-    """Of its bits, lowest first."""
+    axes: tuple[str, ...]  # of its bits, lowest first
     flag: WarningFlag
 
 
@@ -75,14 +60,14 @@ SATURATIONS: Final = (
     Saturation("acceleration_saturated", ("ax", "ay", "az"), WarningFlag.ACCELERATION_SATURATED),
     Saturation("angular_rate_saturated", ("ωx", "ωy", "ωz"), WarningFlag.ANGULAR_RATE_SATURATED),
 )
+# Bits of an emergency's code; none of them in one that says that an error is over.
 _ERROR_CLASS: Final = 0xFF00
-"""Bits of an emergency's code; none of them in one that says that an error is over."""
+# AL states that are, or may be, those of a sensor that streams.
 _STREAMING: Final = frozenset({"OP", "?", ""})
-"""AL states that are, or may be, those of a sensor that streams."""
 _CABLE: Final = "Check its cable and power"
 _STOOD_STILL: Final = "The server's computer stood still meanwhile, check it with ethercat-doctor"
+# Missed deadlines that amount to this time explain why a sensor did not answer, or left OP.
 _STANDSTILL_S: Final = 0.02
-"""Missed deadlines that amount to this time explain why a sensor did not answer, or left OP."""
 
 
 def judge(seen: Observation, limits: Limits = LIMITS) -> Verdict:

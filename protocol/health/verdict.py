@@ -8,21 +8,29 @@ from typing import Final, NamedTuple
 
 
 class Level(IntEnum):
-    """The three verdicts."""
+    """How bad something is. A verdict is GOOD, LOOK or TROUBLE; the others are those of a single check."""
 
     GOOD = 0
-    LOOK = 1
-    TROUBLE = 2
+    NOT_APPLICABLE = 1  # there is nothing to check, for example because the IMU is off
+    NOT_POSSIBLE = 2  # it could not be checked
+    NOTE = 3  # of little effect
+    LOOK = 4  # needs attention; the data can be used
+    TROUBLE = 5  # the data cannot be trusted, or there is none
 
     @property
     def words(self) -> str:
         """For people."""
-        return ("good", "worth a look", "trouble")[self]
+        return "worth a look" if self is Level.LOOK else self.name.lower().replace("_", " ")
 
     @property
     def key(self) -> str:
-        """For programs."""
-        return self.name.lower()
+        """For programs, and for style sheets."""
+        return self.name.lower().replace("_", "-")
+
+    @property
+    def symbol(self) -> str:
+        """A symbol beside the words, so that nothing depends on color."""
+        return "✓-?i!✗"[self]
 
 
 class About(Enum):
@@ -39,14 +47,10 @@ class Finding(NamedTuple):
 
     level: Level
     about: About
-    key: str
-    """The same for the same thing at another time."""
-    found: str
-    """A clause that begins with a capital and has no full stop."""
-    remedy: str
-    """What to do: likewise."""
-    size: float = 0.0
-    """How much of it there is, to compare it with the same at another time."""
+    key: str  # the same for the same thing at another time
+    found: str  # a clause that begins with a capital and has no full stop
+    remedy: str  # what to do: likewise
+    size: float = 0.0  # how much of it there is, to compare it with the same at another time
 
     @property
     def sentence(self) -> str:
@@ -58,8 +62,7 @@ class Verdict(NamedTuple):
     """What all findings come to."""
 
     level: Level
-    findings: tuple[Finding, ...]
-    """The worst first."""
+    findings: tuple[Finding, ...]  # the worst first
 
     @property
     def headline(self) -> str:

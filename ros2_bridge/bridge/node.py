@@ -24,8 +24,7 @@ from bridge import real_time
 from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics.monitor import Monitor
-from bridge.parameters.declare import declare, warn_of_others
-from bridge.parameters.live import LiveParameters
+from bridge.parameters.declare import LiveParameters, declare, warn_of_others
 from bridge.parameters.row import ParameterError
 from bridge.parameters.sensor_settings import SettingsParameters
 from bridge.parameters.table import Parameters
@@ -35,9 +34,10 @@ from bridge.services.identify import IdentifyServices
 from bridge.services.sensor import Services
 from bridge.signals import call_on_stop_signal
 from bridge.spinning import OrdinaryExecutor, PromptExecutor, Spinner
-from bridge.stream.connection import Connection
+from bridge.stream.link import RequestFailedError
 from bridge.stream.reader import Reader
-from bridge.stream.requests import RefusedError, RequestFailedError, Requests
+from bridge.stream.requests import RequestRefusedError, Requests
+from protocol.client.channel import Channel
 
 SUPERVISOR_TOPIC = "/supervisor_status_data"
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
@@ -54,8 +54,8 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
     """The node `bridge`. What ends it sets `exit_code` and calls `on_finish`."""
 
     clock: Clock = SYSTEM_CLOCK
-    connect: Callable[[str, int], Connection] = Connection
-    """How to connect. Tests have a clock and a connection of their own."""
+    channel: Channel | None = None
+    """Tests have a clock and a channel of their own."""
 
     def __init__(self, arguments: Sequence[str] | None = None) -> None:
         """ParameterError or InvalidTopicNameException if a parameter is wrong.
@@ -69,11 +69,11 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         compensated = make_compensated(self, parameters, lambda: self.reader.link.rate_hz)
         outputs = make(self, parameters, compensated)
         self.reader = Reader(
-            parameters, outputs, self.get_logger(), self.fail, connect=self.connect, clock=self.clock
+            parameters, outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
         link = self.reader.link
         # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
-        self.requests = Requests(parameters, link)
+        self.requests = Requests(link)
         self.sensor_settings = SettingsParameters(self, link, self.requests)
         live = LiveParameters(self)
         self.compensation = CompensationControl(
@@ -143,7 +143,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.get_logger().info("the supervisor stops the force/torque sensors")
         try:
             self.get_logger().info(self.requests.shut_server_down())
-        except RefusedError as error:
+        except RequestRefusedError as error:
             self.get_logger().error(str(error))
             self.finish(SERVER_GOES_ON)
         except RequestFailedError as error:

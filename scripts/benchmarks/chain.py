@@ -1,35 +1,51 @@
-"""Runs one chain of programs at a time on a virtual bus, with canaries beside it, and returns its figures."""
+"""One chain of processes, for the benchmark and the demo: a virtual bus, its master, clients, canaries."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import fcntl
 import os
 import shutil
+import signal
+import socket
+import struct
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any, Final
 
 import numpy as np
-import psutil
 
+from ethercat_server.errors import ServerError
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 from protocol.client import Client
 from protocol.errors import ProtocolError
 from scripts.benchmarks import statistics
 from scripts.benchmarks.records import began
 from scripts.benchmarks.statistics import Floats, Ints
-from scripts.demonstration.child import Child, DemoError
 
 PORT: Final = 12001
-SERVER: Final = "ethercat_server.daemon.cli"
-OVERSAMPLING_HZ: Final = 51200
-"""The sensor's rate is this over its SINC length."""
-_PATIENCE_S: Final = 30.0
-_MEGABYTE: Final = 1e6
+OVERSAMPLING_HZ: Final = 51200  # the sensor's rate is this over its SINC length
+PROCESSES: Final = "scripts.benchmarks.processes"
+WARM_UP_S: Final = 1.0
+_START_TIMEOUT_S: Final = 30.0
+_STOP_TIMEOUT_S: Final = 8.0
+_PR_SET_PDEATHSIG: Final = 1
+Figures = dict[str, Any]
+
+
+class ScriptError(Exception):
+    """The benchmark or the demo cannot go on; the text is one sentence."""
+
+
+class Stopped(Exception):  # noqa: N818 - not an error
+    """Ctrl-C or SIGTERM."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +55,11 @@ class Setup:
     rate_hz: int
     sensors: int
     seconds: float
-    warm_up_s: float
     priority: int
-    ppm: float
-    signal: str = "clock"
-    step: Callable[[], None] = lambda: None
-    """Called some times a second."""
+    """SCHED_FIFO priority of the master; 0: ordinary scheduling."""
+    ppm: float = 150.0
+    """Error of the sensors' clocks, with alternating sign, so that samples pass each other."""
+    ros: bool = True
 
     @property
     def period_ns(self) -> float:
@@ -56,167 +71,250 @@ class Setup:
         """The SINC length that gives the rate."""
         return OVERSAMPLING_HZ // self.rate_hz
 
-    @property
-    def sensor_arguments(self) -> str:
-        """The virtual sensors' clocks differ from nominal to opposite sides, so that they pass each other."""
-        errors = ",".join(
-            str(self.ppm if position % 2 == 0 else -self.ppm) for position in range(self.sensors)
-        )
-        return f"--sensors {self.sensors} --signal {self.signal} --sinc {self.sinc} --ppm={errors}"
+    def __str__(self) -> str:
+        """Title of this configuration."""
+        return f"{self.rate_hz} Hz, {self.sensors} sensor{'s' * (self.sensors > 1)}"
+
+
+class Child:
+    """A program that runs beside this process and never outlives it."""
+
+    def __init__(self, name: str, command: list[str], directory: Path, result: Path | None = None) -> None:
+        """`result`: it may end by itself once this file exists."""
+        self.name, self.result = name, result or directory / name
+        self._may_end = result is not None
+        self.log = directory / f"{name}.log"
+        libc = ctypes.CDLL(None)
+
+        def die_with_parent() -> None:
+            libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+            signal.pthread_sigmask(signal.SIG_SETMASK, set())
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+        with self.log.open("wb") as log:
+            # A session of its own: Ctrl-C reaches this process only, which then ends its children in order.
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+                preexec_fn=die_with_parent,  # noqa: PLW1509 - no threads have been started yet
+            )  # fmt: skip
+        self.pid = self._process.pid
+
+    def check(self) -> None:
+        """ScriptError, with its last lines of output, if it has failed."""
+        code = self._process.poll()
+        if code is not None and not (self._may_end and self.result.exists()):
+            lines = self.log.read_text(errors="replace").strip().splitlines()[-8:]
+            text = f"{self.name} ended by itself with exit code {code}; its last output:"
+            raise ScriptError("\n    ".join([text, *lines]))
+
+    def stop(self) -> str | None:
+        """End it; what was wrong about how it ended, or None."""
+        if self._process.poll() is None:
+            self._process.terminate()
+        try:
+            code = self._process.wait(_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+            return f"{self.name} did not end at SIGTERM and was killed"
+        return None if code == 0 else f"{self.name} ended with exit code {code}"
+
+
+class Usage:
+    """What a process uses from now on."""
+
+    def __init__(self, pid: int) -> None:
+        self._folder = Path(f"/proc/{pid}")
+        self._began_s, self._before_s = time.monotonic(), self._used_s()
+
+    def cpu_percent(self) -> float:
+        """Of one CPU."""
+        return round(100 * (self._used_s() - self._before_s) / (time.monotonic() - self._began_s), 1)
+
+    def _used_s(self) -> float:
+        threads = self._folder.glob("task/*/schedstat")  # finer than the ticks of `stat`
+        return sum(int(thread.read_text().split()[0]) for thread in threads) * 1e-9
+
+    def rss(self) -> int:
+        """Resident memory now, bytes."""
+        return int((self._folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+class Chain:
+    """A context in which programs run, and with which all of them end. `title` is printed."""
+
+    def __init__(self, setup: Setup, title: str = "") -> None:
+        self.setup = setup
+        self.children: list[Child] = []
+        self.watched: dict[str, int] = {}  # process ids
+        self._canaries: list[Child] = []
+        self._number = 0
+        if title:
+            print(f"{setup}: {title}", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> Chain:
+        """Make its directory."""
+        self.directory = Path(tempfile.mkdtemp(dir=os.environ.get("DEMO_DIRECTORY")))
+        self._stack = contextlib.ExitStack()
+        self._stack.callback(shutil.rmtree, self.directory, ignore_errors=True)
+        self._stack.callback(self.stop)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """End everything."""
+        self._stack.close()
+
+    def bus(self) -> str:
+        """Start a virtual bus and the canaries; its interface. The sensors have a CPU to themselves."""
+        setup = self.setup
+        errors = ",".join(str(setup.ppm * (-1) ** position) for position in range(setup.sensors))
+        arguments = f"--sensors {setup.sensors} --signal clock --sinc {setup.sinc} --ppm={errors}"
+        bus = VirtualBus(arguments, setup.priority)
+        self._stack.enter_context(bus)
+        self._stack.callback(self.stop)  # before the bus
+        os.sched_setaffinity(bus.pid, own_cpus()[:1])
+        self.watched["sensor"] = bus.pid
+        self.canaries()
+        return bus.ifname
+
+    def start(self, name: str, *command: object, result: Path | None = None, watch: bool = True) -> Child:
+        """Start any program."""
+        child = Child(name, list(map(str, command)), self.directory, result)
+        self.children.append(child)
+        if watch:
+            self.watched[name] = child.pid
+        return child
+
+    def python(self, name: str, module: str, *arguments: object, **how: Any) -> Child:
+        """Start a module of this project."""
+        return self.start(name, sys.executable, "-m", module, *arguments, **how)
+
+    def canaries(self) -> None:
+        """One on each CPU, with a higher priority than everything else; they wake twice a sample period."""
+        priority = min(99, self.setup.priority + 2) if self.setup.priority else 0
+        for cpu in sorted(os.sched_getaffinity(0)):
+            path = self.directory / f"canary-{cpu}"
+            how = ("--cpu", cpu, "--priority", priority, "--tick-us", self.setup.period_ns / 2000)
+            self._canaries.append(
+                self.python(path.name, f"{PROCESSES}.canary", path, *how, result=path, watch=False)
+            )
+
+    def server(self, ifname: str, module: str = "ethercat_server.daemon.cli") -> Client:
+        """Start ethercat-server; a connection to it once its sensors stream."""
+        self.python(
+            "server", module, ifname, PORT, "--set", f"sinc_length={self.setup.sinc}",
+            "--rt-priority", self.setup.priority, "--cpu", own_cpus()[1],
+        )  # fmt: skip
+        return self.connect(self.setup.sensors)
+
+    def connect(self, sensors: int) -> Client:
+        """Connect as soon as the server describes this number of sensors."""
+        found: list[Client] = []
+
+        def ready() -> bool:
+            with contextlib.suppress(ProtocolError):
+                client = Client(PORT, stream=False, raw=True, reconnect=False).connect()
+                found.append(client)
+                if len(client.description["sensors"]) == sensors:
+                    return True
+                client.close()
+            return False
+
+        self.wait(ready, "the server was not ready")
+        return found[-1]
+
+    def node(self, *parameters: str, position: int = 0) -> Child:
+        """Start the ROS 2 node of a sensor, with these parameters."""
+        name = "node" if self.setup.sensors == 1 else f"node {position}"
+        given = [word for each in (f"server_port:={PORT}", f"sensor:={position}", *parameters)
+                 for word in ("-p", each)]  # fmt: skip
+        return self.python(name, "bridge.client", "--ros-args", "-r", f"__node:=bridge_{position}", *given)
+
+    def recorder(
+        self, kind: str, *arguments: object, warm_up_s: float = WARM_UP_S, seconds: float | None = None
+    ) -> Child:
+        """Start a recorder (processes/recorder.py) that ends by itself."""
+        self._number += 1
+        path = self.directory / f"{kind}-{self._number}"
+        times = ("--warm-up", warm_up_s, "--seconds", seconds or self.setup.seconds)
+        module = f"{PROCESSES}.recorder"
+        return self.python(path.name, module, kind, path, *times, *arguments, result=path, watch=False)
+
+    def wait(
+        self,
+        done: Callable[[], bool],
+        what: str = "a program did not get ready",
+        seconds: float = _START_TIMEOUT_S,
+    ) -> None:
+        """Wait; ScriptError if a program fails or it takes too long."""
+        deadline = time.monotonic() + seconds
+        while not done():
+            for child in self.children:
+                child.check()
+            if time.monotonic() > deadline:
+                raise ScriptError(f"{what} within {seconds:g} s")
+            time.sleep(0.02)
+
+    def sleep(self, seconds: float) -> None:
+        """Let it run."""
+        end = time.monotonic() + seconds
+        self.wait(lambda: time.monotonic() > end, seconds=seconds + 5)
+
+    def record(self, recorder: Child) -> Figures:
+        """Wait for a recording to be complete; CPU and memory of each program meanwhile."""
+        path = recorder.result
+        self.wait(lambda: began(path).exists() or path.exists(), "nothing was received")
+        uses = {name: Usage(pid) for name, pid in self.watched.items()}
+        machine = cpu_of_machine()
+        end = time.monotonic() + self.setup.seconds - 0.1
+        self.wait(lambda: time.monotonic() > end or path.exists(), seconds=self.setup.seconds + 5)
+        usage = {
+            "cpu_percent": {name: use.cpu_percent() for name, use in uses.items()},
+            "rss_mb": {name: round(use.rss() / 1e6, 1) for name, use in uses.items()},
+            "stolen_percent": stolen_percent(machine),
+        }
+        self.wait(path.exists, "the recording did not end")
+        return usage
+
+    def stop(self) -> list[str]:
+        """End everything, the last first; what was wrong about how they ended."""
+        troubles = []
+        while self.children:
+            troubles.append(self.children.pop().stop())
+        self.watched.clear()
+        return [trouble for trouble in troubles if trouble]
+
+    def stops(self) -> Ints:
+        """End the canaries; when the machine stopped, (n, 2), CLOCK_MONOTONIC ns."""
+        for canary in self._canaries:
+            if canary in self.children:
+                self.children.remove(canary)
+                canary.stop()
+        pauses = [statistics.read_numbers(each.result, 2) for each in self._canaries if each.result.exists()]
+        return statistics.stops(pauses, self.setup.period_ns)
+
+    def figures(self, recorder: Child, usage: Figures | None = None) -> tuple[Figures, Floats]:
+        """End everything; figures of what was recorded, and all ages in ns."""
+        self.stop()
+        stopped = self.stops()
+        arrivals = statistics.read_arrivals(recorder.result)
+        result, ages = statistics.summary(arrivals, self.setup.period_ns, stopped)
+        longest = float(np.max(stopped[:, 1] - stopped[:, 0])) / 1000 if len(stopped) else 0.0
+        stalls = {"machine_stops": len(stopped), "longest_stop_us": round(longest, 1)}
+        return {**result, **stalls, **(usage or {})}, ages
 
 
 def own_cpus() -> tuple[int, int]:
-    """The CPU of the virtual sensors and that of their master: a real sensor takes no time of any."""
+    """The CPU of the virtual sensors and that of their master: a real sensor takes no CPU time."""
     cpus = sorted(os.sched_getaffinity(0))
     return cpus[0], cpus[-1]
 
 
-class CpuUse:
-    """What a process uses of one core from now on."""
-
-    def __init__(self, process: psutil.Process) -> None:
-        self._process = process
-        self._began_s, self._had_s = time.monotonic(), self._used_s()
-
-    def percent(self) -> float:
-        """Since this was made."""
-        return round(100 * (self._used_s() - self._had_s) / (time.monotonic() - self._began_s), 1)
-
-    def _used_s(self) -> float:
-        threads = Path(f"/proc/{self._process.pid}/task").glob("*/schedstat")
-        if ran_ns := [int(thread.read_text().split()[0]) for thread in threads]:
-            return sum(ran_ns) * 1e-9
-        times = self._process.cpu_times()  # in whole ticks: coarse for a short turn
-        return float(times.user + times.system)
-
-
-@dataclass
-class Chain:
-    """A run of some programs: starts them, measures them, ends them."""
-
-    setup: Setup
-    directory: Path
-    children: list[Child] = field(default_factory=list)
-    canaries: list[Path] = field(default_factory=list)
-    results: dict[Child, Path] = field(default_factory=dict)
-    """Programs that may end by themselves, and the file that is there when they do."""
-    watched: dict[str, psutil.Process] = field(default_factory=dict)
-
-    def start(self, name: str, module: str, *arguments: object) -> Child:
-        """Start a program of ours."""
-        return self.start_command(name, sys.executable, "-m", module, *arguments)
-
-    def start_command(self, name: str, *command: object) -> Child:
-        """Start any program."""
-        self.children.append(Child(name, list(map(str, command)), self.directory))
-        return self.children[-1]
-
-    def start_recorder(self, path: Path, module: str, *arguments: object) -> Child:
-        """Start a program of ours that may end by itself once it has written `path`."""
-        return self.start_command_recorder(path, sys.executable, "-m", module, *arguments)
-
-    def start_command_recorder(self, path: Path, *command: object) -> Child:
-        """Start any program that may end by itself once it has written `path`."""
-        child = self.start_command(path.name, *command)
-        self.results[child] = path
-        return child
-
-    def start_master(self, path: Path, module: str, *arguments: object) -> Child:
-        """As `start_recorder`, for a program in the place of the server, on its CPU."""
-        child = self.start_recorder(path, module, *arguments)
-        os.sched_setaffinity(child.pid, own_cpus()[1:])
-        self.watch("server", child.pid)
-        return child
-
-    def watch(self, name: str, pid: int) -> None:
-        """Measure what this process takes."""
-        self.watched[name] = psutil.Process(pid)
-
-    def start_canaries(self) -> None:
-        """One on each CPU, above everything else: the sensor has the priority above the server's.
-
-        They wake twice a sample period.
-        """
-        priority = min(99, self.setup.priority + 2) if self.setup.priority else 0
-        how = ("--priority", priority, "--tick-us", self.setup.period_ns / 2000)
-        for cpu in sorted(os.sched_getaffinity(0)):
-            path = self.directory / f"canary-{cpu}"
-            self.start(f"canary-{cpu}", "scripts.benchmarks.processes.canary", path, "--cpu", cpu, *how)
-            self.canaries.append(path)
-
-    def check(self) -> None:
-        """DemoError if a program failed."""
-        self.setup.step()
-        for child in self.children:
-            try:
-                child.check()
-            except DemoError:
-                if not (child in self.results and self.results[child].exists()):
-                    raise
-
-    def wait(self, done: Callable[[], bool], what: str, seconds: float = _PATIENCE_S) -> None:
-        """Wait for something; DemoError if it does not come."""
-        deadline = time.monotonic() + seconds
-        while not done():
-            self.check()
-            if time.monotonic() > deadline:
-                raise DemoError(f"{what} within {seconds:g} s")
-            time.sleep(0.02)
-
-    def record(self, path: Path) -> dict[str, Any]:
-        """Wait for a recording, which has been started, to be whole; CPU and memory meanwhile."""
-        self.wait(lambda: began(path).exists() or path.exists(), "nothing was received")
-        uses = {name: CpuUse(process) for name, process in self.watched.items()}
-        others, machine = cpu_of_others(), cpu_of_machine()
-        started = time.monotonic()
-        ending = started + self.setup.seconds - 0.1
-        self.wait(lambda: time.monotonic() > ending or path.exists(), "", self.setup.seconds + 5)
-        usage: dict[str, Any] = {"cpu_percent": {}, "rss_mb": {}}
-        wall = time.monotonic() - started
-        for name, process in self.watched.items():
-            usage["cpu_percent"][name] = uses[name].percent()
-            usage["rss_mb"][name] = round(process.memory_info().rss / _MEGABYTE, 1)
-        since = sum(taken - others.get(pid, 0.0) for pid, taken in cpu_of_others().items())
-        usage["cpu_percent"]["everything else"] = round(100 * since / wall, 1)
-        usage["stolen_percent"] = stolen_percent(machine)
-        self.wait(path.exists, "the recording did not end")
-        return usage
-
-    def stop(self) -> None:
-        """End everything, the last first."""
-        while self.children:
-            self.children.pop().stop()
-
-    def stops(self) -> Ints:
-        """When the machine stopped; after `stop`."""
-        pauses = [statistics.read_numbers(path, 2) for path in self.canaries]
-        return statistics.stops(pauses, self.setup.period_ns)
-
-    def figures(self, path: Path) -> tuple[dict[str, Any], Floats]:
-        """What was recorded; after `stop`."""
-        stopped = self.stops()
-        result, ages = statistics.summary(statistics.read_arrivals(path), self.setup.period_ns, stopped)
-        longest = float(np.max(stopped[:, 1] - stopped[:, 0])) / 1000 if len(stopped) else 0.0
-        return {**result, "machine_stops": len(stopped), "longest_stop_us": round(longest, 1)}, ages
-
-
-def cpu_of_others() -> dict[int, float]:
-    """CPU seconds that each process outside this benchmark has taken so far."""
-    me = psutil.Process()
-    ours = {me.pid, *(child.pid for child in me.children(recursive=True))}
-    taken = {}
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):
-            if process.pid not in ours:
-                times = process.cpu_times()
-                taken[process.pid] = times.user + times.system
-    return taken
-
-
 def cpu_of_machine() -> tuple[float, float]:
-    """CPU seconds that a hypervisor has given to others, and all that have gone by."""
-    times = psutil.cpu_times()
-    return times.steal, sum(times) - times.guest - times.guest_nice
+    """Ticks of all CPUs that a hypervisor has given to others, and all that have passed."""
+    ticks = [int(word) for word in Path("/proc/stat").read_text(encoding="ascii").split()[1:9]]
+    return float(ticks[7]), float(sum(ticks))
 
 
 def stolen_percent(before: tuple[float, float]) -> float:
@@ -225,52 +323,42 @@ def stolen_percent(before: tuple[float, float]) -> float:
     return round(100 * stolen / passed, 1) if passed else 0.0
 
 
-@contextlib.contextmanager
-def chain(setup: Setup) -> Iterator[Chain]:
-    """A chain with its own directory, ended however the block ends."""
-    directory = Path(tempfile.mkdtemp(dir=os.environ.get("DEMO_DIRECTORY")))
-    running = Chain(setup, directory)
+def loopback_up() -> None:
+    """Set the new namespace's loopback interface up, as `ip link set lo up` does."""
+    siocgifflags, siocsifflags, iff_up = 0x8913, 0x8914, 1
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        answer = fcntl.ioctl(any_socket, siocgifflags, struct.pack("16sh14x", b"lo", 0))
+        (flags,) = struct.unpack_from("h", answer, 16)
+        fcntl.ioctl(any_socket, siocsifflags, struct.pack("16sh14x", b"lo", flags | iff_up))
+
+
+def stoppable(run: Callable[[], int], program: str, stopped: Callable[[], int]) -> int:
+    """Run a program, whose directory is removed however it ends; its exit code."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _on_signal)
+    os.environ.setdefault("DEMO_DIRECTORY", tempfile.mkdtemp())
     try:
-        yield running
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+        return run()
+    except Stopped:
+        return stopped()
+    except BrokenPipeError:  # nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (ScriptError, ServerError, OSError) as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return 1
     finally:
-        running.stop()
-        shutil.rmtree(directory, ignore_errors=True)
+        ignore_signals()
+        shutil.rmtree(os.environ.pop("DEMO_DIRECTORY"), ignore_errors=True)
 
 
-@contextlib.contextmanager
-def virtual_bus(setup: Setup) -> Iterator[tuple[str, int]]:
-    """A virtual bus: its interface, and the process of its sensors."""
-    known = set(psutil.Process().children())
-    with VirtualBus(setup.sensor_arguments, setup.priority) as bus:
-        (sensor,) = set(psutil.Process().children()) - known
-        os.sched_setaffinity(sensor.pid, own_cpus()[:1])
-        yield bus.ifname, sensor.pid
+def _on_signal(_number: int, _frame: FrameType | None) -> None:
+    ignore_signals()  # the clean-up is not to be interrupted
+    raise Stopped
 
 
-def start_server(running: Chain, ifname: str, module: str = SERVER) -> Client:
-    """ethercat-server, ready, and a connection to it."""
-    setup = running.setup
-    server = running.start(
-        "server", module, ifname, PORT,
-        "--set", f"sinc_length={setup.sinc}", "--rt-priority", setup.priority, "--cpu", own_cpus()[1],
-    )  # fmt: skip
-    running.watch("server", server.pid)
-    clients: list[Client] = []
-
-    def ready() -> bool:
-        with contextlib.suppress(ProtocolError):
-            clients.append(Client(PORT, stream=False, raw=True, reconnect=False).connect())
-            return len(clients[-1].description["sensors"]) == setup.sensors
-        return False
-
-    running.wait(ready, "the server was not ready")
-    for client in clients[:-1]:
-        client.close()
-    return clients[-1]
-
-
-def recording(running: Chain, name: str) -> tuple[Path, tuple[str, ...]]:
-    """A recording's path, and the arguments that tell a recorder of it."""
-    path = running.directory / name
-    times = ("--warm-up", str(running.setup.warm_up_s), "--seconds", str(running.setup.seconds))
-    return path, (str(path), *times)
+def ignore_signals() -> None:
+    """Only the clean-up follows."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)

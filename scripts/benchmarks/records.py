@@ -6,7 +6,6 @@ as it says itself, the same as the server says (0: it does not), CLOCK_MONOTONIC
 
 from __future__ import annotations
 
-import argparse
 import gc
 import os
 import socket
@@ -58,13 +57,6 @@ def write(path: Path, values: array[int]) -> None:
     unfinished = path.with_suffix(".unfinished")
     unfinished.write_bytes(values.tobytes())
     unfinished.replace(path)
-
-
-def recording_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments that every recording process takes."""
-    parser.add_argument("path", type=Path)
-    parser.add_argument("--warm-up", type=float, default=1.0)
-    parser.add_argument("--seconds", type=float, default=5.0)
 
 
 def steady(priority: int) -> None:

@@ -9,7 +9,6 @@ which the sample was the sensor's newest. Pure functions of arrays; times are CL
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -22,11 +21,9 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 _NUMBER_WRAP: Final = 2**24
-_INSTANT_WRAP_NS: Final = 2**20 * 1_000_000_000
-"""Where the signal `clock` begins anew."""
+_INSTANT_WRAP_NS: Final = 2**20 * 1_000_000_000  # where the signal `clock` begins anew
 _QUANTILES: Final = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-COVERED: Final = 0.5
-"""The part of a sample's period that must be a stop for the sample to be lost to it."""
+COVERED: Final = 0.5  # the part of a sample's period that must be a stop for the sample to be lost to it
 
 
 class Arrivals(NamedTuple):
@@ -39,9 +36,8 @@ class Arrivals(NamedTuple):
     received: Ints
 
 
-@dataclass(frozen=True)
-class Counts:
-    """How much of what the sensor made has arrived."""
+class Counts(NamedTuple):
+    """How many of the samples that the sensor made have arrived."""
 
     made: int
     """Samples from the first to the last that arrived."""
@@ -51,10 +47,6 @@ class Counts:
     """Of the lost: those lost while the machine stopped."""
     repeated: int
     """Arrivals of a sample that had arrived before."""
-
-    def __add__(self, other: Counts) -> Counts:
-        """Both sensors' together."""
-        return Counts(*(a + b for a, b in zip(vars(self).values(), vars(other).values(), strict=True)))
 
 
 def read_numbers(path: Path, columns: int) -> Ints:
@@ -72,21 +64,15 @@ def split(records: Ints) -> list[Arrivals]:
     found = []
     for position in np.unique(records[:, 0]):
         _, number, instant, stamp, received = records[records[:, 0] == position].T
-        found.append(Arrivals(unwrap(number), near(instant, received), stamp, received))
+        half = _NUMBER_WRAP // 2
+        steps = (np.diff(number) + half) % _NUMBER_WRAP - half
+        number = np.concatenate((number[:1], number[:1] + np.cumsum(steps)))
+        # Of the instants that it may be, the latest before the arrival, or just after it.
+        instant = (
+            instant + (received - instant + _INSTANT_WRAP_NS // 2) // _INSTANT_WRAP_NS * _INSTANT_WRAP_NS
+        )
+        found.append(Arrivals(number, instant, stamp, received))
     return found
-
-
-def unwrap(number: Ints) -> Ints:
-    """Sample numbers modulo 2**24 as they were before that."""
-    half = _NUMBER_WRAP // 2
-    steps = (np.diff(number) + half) % _NUMBER_WRAP - half
-    return np.concatenate((number[:1], number[:1] + np.cumsum(steps)))
-
-
-def near(instant: Ints, received: Ints) -> Ints:
-    """Instants modulo 2**20 s as they were before that: the latest before (or just after) the arrival."""
-    turns = (received - instant + _INSTANT_WRAP_NS // 2) // _INSTANT_WRAP_NS
-    return np.asarray(instant + turns * _INSTANT_WRAP_NS, dtype=np.int64)
 
 
 def stops(pauses: Iterable[Ints], period_ns: float) -> Ints:
@@ -150,10 +136,11 @@ def spread_us(values_ns: Floats) -> dict[str, float] | None:
 
 def summary(streams: list[Arrivals], period_ns: float, stopped: Ints) -> tuple[dict[str, Any], Floats]:
     """One chain's figures, all sensors together, and its ages."""
-    counts = sum((count(stream, period_ns, stopped) for stream in streams), Counts(0, 0, 0, 0, 0))
+    counts = [count(stream, period_ns, stopped) for stream in streams]
     all_ages = np.concatenate([ages(stream) for stream in streams] or [np.empty(0)])
     errors = np.concatenate([stamp_errors(stream) for stream in streams] or [np.empty(0)])
-    figures: dict[str, Any] = {**vars(counts), "age_us": spread_us(all_ages), "stamp_error_us": None}
+    figures: dict[str, Any] = dict(zip(Counts._fields, map(sum, zip(*counts, strict=True)), strict=True))
+    figures |= {"age_us": spread_us(all_ages), "stamp_error_us": None}
     if len(errors):
         figures["stamp_error_us"] = {
             "p50": round(float(np.median(errors)) / 1000, 1),

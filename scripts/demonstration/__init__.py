@@ -1,1 +1,0 @@
-"""`scripts/demo`: starts the whole chain, measures it, shows it."""

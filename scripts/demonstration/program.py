@@ -7,194 +7,196 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import fcntl
-import os
-import shutil
-import signal
-import socket
-import struct
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final
 
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from protocol.client import Client
-from protocol.errors import ProtocolError
-from scripts.demonstration.child import Child, DemoError
-from scripts.demonstration.measure import FULL_RATE, Measurement, verdict
-from scripts.demonstration.show import Screen, print_summary, say
-from scripts.demonstration.stops import Canaries
+from scripts.benchmarks.chain import (
+    PORT,
+    Chain,
+    ScriptError,
+    Setup,
+    Stopped,
+    ignore_signals,
+    loopback_up,
+    stoppable,
+)
+from scripts.benchmarks.records import began, may_be_real_time
+from scripts.demonstration.measure import FULL_RATE, Measurement, Summary, explanation, verdict
 
-PORT: Final = 12001
 TOPIC: Final = "/sensone_sensor_data"
-_START_TIMEOUT_S: Final = 30.0
+_RATE_HZ: Final = 800  # the virtual sensor's
+_TABLE_WIDTH: Final = 66  # a narrower terminal gets a line a second: a truncated number is a wrong one
+_ROWS: Final = (
+    ("Force", "force", "N", 2),
+    ("Torque", "torque", "Nm", 3),
+    ("Acceleration", "acceleration", "m/s²", 3),
+    ("Angular rate", "angular_rate", "rad/s", 4),
+)
 
 
-class Stopped(Exception):  # noqa: N818 - not an error
-    """Ctrl-C or SIGTERM."""
+@contextlib.contextmanager
+def listening(client: Client, measurement: Measurement, lock: threading.Lock) -> Iterator[None]:
+    """Two threads take what comes from the server and on the ROS topic."""
+    import rclpy  # noqa: PLC0415 - only now are signals handled
+    from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415
+    from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
+    from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
 
+    from bridge.spinning import Spinner  # noqa: PLC0415
 
-def loopback_up() -> None:
-    """Set the new namespace's loopback interface up, as `ip link set lo up` does."""
-    siocgifflags, siocsifflags, iff_up = 0x8913, 0x8914, 1
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
-        answer = fcntl.ioctl(any_socket, siocgifflags, struct.pack("16sh14x", b"lo", 0))
-        (flags,) = struct.unpack_from("h", answer, 16)
-        fcntl.ioctl(any_socket, siocsifflags, struct.pack("16sh14x", b"lo", flags | iff_up))
-
-
-def wait_for_server(server: Child) -> tuple[Client, dict[str, Any]]:
-    """Connect as soon as the server describes a sensor; its row of the description."""
-    deadline = time.monotonic() + _START_TIMEOUT_S
-    while time.monotonic() < deadline:
-        server.check()
-        with contextlib.suppress(ProtocolError):
-            client = Client(PORT, stream=False, reconnect=False).connect()
-            if sensors := client.description["sensors"]:
-                return client, sensors[0]
-            client.close()
-        time.sleep(0.1)
-    raise DemoError(f"the server did not get ready within {_START_TIMEOUT_S:g} s")
-
-
-class Ears:
-    """The two threads that listen: to the server and to the ROS topic."""
-
-    def __init__(self, client: Client, measurement: Measurement) -> None:
-        import rclpy  # noqa: PLC0415 - only now that the signals are in hand
-        from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415
-        from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
-        from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
-
-        from bridge.spinning import Spinner  # noqa: PLC0415
-
-        self._client = client
-        self.measurement = measurement
-        self.lock = threading.Lock()
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        self._rclpy = rclpy
-        self._node = rclpy.create_node("demo")
-        self._node.create_subscription(Float64MultiArray, TOPIC, self._on_message, 50)
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self._node)
-        self._spinner = Spinner(self._executor)
-        self._threads = [
-            threading.Thread(target=self._hear_server, daemon=True),
-            threading.Thread(target=self._spinner.run, daemon=True),
-        ]
-        client.ask("subscribe")
-        for thread in self._threads:
-            thread.start()
-
-    def _hear_server(self) -> None:
-        for frame in self._client.frames():
+    def receive() -> None:
+        for frame in client.frames():
             now_ns = time.monotonic_ns()
-            with self.lock:
-                self.measurement.take_frame(frame, now_ns)
+            with lock:
+                measurement.take_frame(frame, now_ns)
 
-    def _on_message(self, message: Any) -> None:
+    def on_message(message: Any) -> None:
         now_ns = time.monotonic_ns()
-        with self.lock:
-            self.measurement.take_message(message.data, now_ns)
+        with lock:
+            measurement.take_message(message.data, now_ns)
 
-    def close(self) -> None:
-        """Stop listening."""
-        self._client.close()
-        self._spinner.stop()
-        for thread in self._threads:
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("demo")
+    node.create_subscription(Float64MultiArray, TOPIC, on_message, 50)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    spinner = Spinner(executor)
+    client.ask("subscribe")
+    threads = [threading.Thread(target=each, daemon=True) for each in (receive, spinner.run)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        client.close()
+        spinner.stop()
+        for thread in threads:
             thread.join(3)
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._rclpy.try_shutdown()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
 
 
-def run(seconds: float | None, directory: Path) -> int:
-    """The demo itself; returns the exit code. DemoError or Stopped end it early."""
+class Screen:
+    """Shows the measurement as it grows: a live table on a terminal, else a line a second."""
+
+    def __init__(self, sensor: Mapping[str, Any]) -> None:
+        self._title = f"{sensor['name']}, serial {sensor['serial']}, {sensor['rate_hz']} Hz, virtual"
+        console = Console()
+        fits = console.is_terminal and not console.is_dumb_terminal and console.width >= _TABLE_WIDTH
+        self.live = Live(console=console, auto_refresh=False) if fits else None
+        self.period_s = 0.25 if self.live else 1.0
+        if not fits:
+            print(self._title, flush=True)
+        self._messages, self._at_s, self._rate_hz = 0, time.monotonic(), 0.0
+
+    def show(self, measurement: Measurement) -> None:
+        """Show the state now; hold the measurement's lock."""
+        now_s = time.monotonic()
+        if now_s - self._at_s >= 0.9:
+            self._rate_hz = (measurement.messages - self._messages) / (now_s - self._at_s)
+            self._messages, self._at_s = measurement.messages, now_s
+        sample = measurement.latest
+        assert sample is not None
+        lost, age = measurement.lost + measurement.lost_before, f"{measurement.age_ns / 1e6:.2f} ms"
+        rows = [
+            (f"{name}, {unit}", unit, [f"{v:+.{digits}f}" for v in getattr(sample, vector)])
+            for name, vector, unit, digits in _ROWS
+        ]
+        if self.live is None:
+            values = "  ".join(f"{unit} {' '.join(numbers)}" for _, unit, numbers in rows)
+            repeated = measurement.repeated
+            print(
+                f"{self._rate_hz:7.1f} Hz  age {age}  lost {lost}  repeated {repeated}  {values}", flush=True
+            )
+            return
+        table = Table(title=self._title, title_justify="left", caption="Ctrl-C ends it")
+        table.add_column("", min_width=22)
+        for axis in "xyz":
+            table.add_column(axis, justify="right", min_width=10)
+        for name, _, numbers in rows:
+            table.add_row(name, *numbers)
+        table.add_section()
+        table.add_row("Messages a second", f"{self._rate_hz:.1f}")
+        table.add_row("Age at the subscriber", age)
+        table.add_row("Lost, repeated", str(lost), str(measurement.repeated))
+        self.live.update(table, refresh=True)
+
+
+def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
+    """The figures of the whole run."""
+    table = Table(title="What arrived on the ROS topic", title_justify="left", show_header=False)
+    table.add_column(min_width=34)
+    table.add_column(justify="right", min_width=12)
+    for name, value in (
+        ("Messages", str(summary.messages)),
+        ("Mean rate", f"{summary.rate_hz:.1f} Hz"),
+        ("Sensor's own rate", f"{sensor['rate_hz']} Hz"),
+        ("Lost", str(summary.lost + summary.lost_before)),
+        ("  before or withheld (GAP)", str(summary.lost_before)),
+        ("  between server and subscriber", str(summary.lost)),
+        ("  of both, while the machine stopped", str(summary.lost_in_stops)),
+        ("Repeated", str(summary.repeated)),
+        ("Age at the subscriber, p50", f"{summary.age_ms[0]:.2f} ms"),
+        ("Age at the subscriber, p99", f"{summary.age_ms[1]:.2f} ms"),
+        ("Age at a TCP client, p50", f"{summary.tcp_age_ms[0]:.2f} ms"),
+        ("Age at a TCP client, p99", f"{summary.tcp_age_ms[1]:.2f} ms"),
+        ("All finite", "yes" if summary.all_finite else "NO"),
+        ("All decoded right", "yes" if summary.all_decoded_right else "NO"),
+    ):
+        table.add_row(name, value)
+    console = Console(highlight=False, markup=False)
+    console.print(table)
+    if why := explanation(summary):
+        console.print(why)
+
+
+def run(seconds: float | None) -> int:
+    """The demo itself; returns the exit code. ScriptError or Stopped end it early."""
     loopback_up()
-    measurement = Measurement()
+    lock = threading.Lock()
     binaries = Path(sys.executable).parent
-    with contextlib.ExitStack() as stack:
-        children: list[Child] = []
-
-        def start(name: str, *command: str) -> Child:
-            children.append(Child(name, [str(binaries / name), *command], directory))
-            return children[-1]
-
-        troubles: list[str | None] = []
-
-        def stop_children() -> None:
-            ignore_signals()
-            # The client first: the server's end is not to look like a failure to it.
-            troubles.extend([child.stop() for child in reversed(children)])
-
-        stack.callback(stop_children)
-        server = start("ethercat-server", "virtual", str(PORT))
-        start("bridge-client", "--ros-args", "-p", f"server_port:={PORT}")
-        client, sensor = wait_for_server(server)
-        stack.callback(client.close)
-        measurement.rate_hz = float(sensor["rate_hz"])
+    setup = Setup(_RATE_HZ, 1, 0.0, DEFAULT_PRIORITY if may_be_real_time() else 0)
+    with Chain(setup) as chain:
+        chain.start("ethercat-server", binaries / "ethercat-server", "virtual", PORT)
+        chain.start("bridge-client", binaries / "bridge-client", "--ros-args", "-p", f"server_port:={PORT}")
+        client = chain.connect(1)
+        sensor = client.description["sensors"][0]
+        measurement = Measurement(float(sensor["rate_hz"]))
         # Before the threads that listen: each fork would keep them from reading.
-        canaries = Canaries(directory, 1e9 / measurement.rate_hz)
-        stack.callback(canaries.stop)
-        ears = Ears(client, measurement)
-        stack.callback(ears.close)
-        wait_for_messages(children, measurement)
-        canaries.wait()
-        with ears.lock:
-            measurement.begin()
-        with contextlib.suppress(Stopped), Screen(sensor) as screen:
-            show(screen, ears, children, seconds)
-        ignore_signals()
-        with ears.lock:  # what comes while they end is none of the figures
-            summary = measurement.summary(canaries.stop())
+        chain.canaries()
+        with listening(client, measurement, lock):
+            chain.wait(lambda: measurement.began, f"nothing arrived on {TOPIC}")
+            chain.wait(lambda: all(began(each.result).exists() for each in chain.children[2:]))
+            with lock:
+                measurement.begin()
+            screen = Screen(sensor)
+            with contextlib.suppress(Stopped), screen.live or contextlib.nullcontext():
+                end = time.monotonic() + (seconds or float("inf"))
+                while (left := end - time.monotonic()) > 0:
+                    chain.sleep(min(screen.period_s, left))
+                    with lock:
+                        screen.show(measurement)
+            ignore_signals()
+            with lock:  # what comes while they end is none of the figures
+                summary = measurement.summary(chain.stops())
+        troubles = chain.stop()
     print_summary(summary, sensor)
-    trouble = verdict(summary, float(sensor["rate_hz"])) or next(filter(None, troubles), None)
-    if trouble is not None:
-        raise DemoError(trouble)
+    if trouble := verdict(summary, float(sensor["rate_hz"])) or next(iter(troubles), None):
+        raise ScriptError(trouble)
     if summary.rate_hz < FULL_RATE * float(sensor["rate_hz"]):
-        say(f"Only {summary.rate_hz:.0f} messages/s arrived: this machine was too busy to keep up.")
+        print(f"Only {summary.rate_hz:.0f} messages/s arrived: this machine was too busy to keep up.")
     return 0
-
-
-def wait_for_messages(children: Sequence[Child], measurement: Measurement) -> None:
-    """Wait until the ROS topic delivers the server's samples."""
-    deadline = time.monotonic() + _START_TIMEOUT_S
-    while not measurement.began:
-        for child in children:
-            child.check()
-        if time.monotonic() > deadline:
-            raise DemoError(f"nothing arrived on {TOPIC} within {_START_TIMEOUT_S:g} s")
-        time.sleep(0.05)
-
-
-def show(screen: Screen, ears: Ears, children: Sequence[Child], seconds: float | None) -> None:
-    """Show what arrives until the time is over or Stopped is raised."""
-    began = time.monotonic()
-    due = began
-    while seconds is None or time.monotonic() < began + seconds:
-        due += screen.period_s
-        end = due if seconds is None else min(due, began + seconds)
-        time.sleep(max(end - time.monotonic(), 0))
-        for child in children:
-            child.check()
-        with ears.lock:
-            screen.show(ears.measurement)
-
-
-def on_signal(_number: int, _frame: FrameType | None) -> None:
-    """End what runs with Stopped."""
-    ignore_signals()  # taking things down is not to be stopped half-way
-    raise Stopped
-
-
-def ignore_signals() -> None:
-    """From here on there is only the way out."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
 
 
 def _seconds(text: str) -> float:
@@ -204,30 +206,21 @@ def _seconds(text: str) -> float:
     raise argparse.ArgumentTypeError(f"{text!r}: it must be a number of seconds from 0.5 to 1000000")
 
 
+def _demo() -> int:
+    parser = argparse.ArgumentParser(prog="scripts/demo", description="The whole chain, without hardware.")
+    parser.add_argument("--seconds", type=_seconds, help="end after this number of seconds, not at Ctrl-C")
+    return run(parser.parse_args().seconds)
+
+
+def _stopped() -> int:
+    print("stopped before anything was measured")
+    return 0
+
+
 def main() -> int:
     """Parse the arguments and run."""
     sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
-    directory = Path(os.environ.get("DEMO_DIRECTORY") or tempfile.mkdtemp())
-    try:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
-        parser = argparse.ArgumentParser(
-            prog="scripts/demo", description="The whole chain, without hardware."
-        )
-        parser.add_argument("--seconds", type=_seconds, help="end after so many seconds; else Ctrl-C ends it")
-        return run(parser.parse_args().seconds, directory)
-    except Stopped:
-        print("stopped before anything was measured")
-        return 0
-    except BrokenPipeError:  # nobody reads on
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except DemoError as error:
-        print(f"demo: {error}", file=sys.stderr)
-        return 1
-    finally:
-        shutil.rmtree(directory, ignore_errors=True)
+    return stoppable(_demo, "demo", _stopped)
 
 
 if __name__ == "__main__":

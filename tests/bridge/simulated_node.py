@@ -13,8 +13,6 @@ reader runs in its thread, but only while the test waits for it: the same test g
 
 from __future__ import annotations
 
-import itertools
-import socket
 import threading
 import uuid
 from collections import deque
@@ -29,11 +27,8 @@ from std_srvs.srv import Trigger
 
 from bridge.diagnostics.monitor import TICK_S
 from bridge.node import BridgeNode
-from bridge.stream.connection import Connection
-from protocol.client.connection import SILENCE_S
 from protocol.errors import ConnectionFailedError, UnreachableError
-from protocol.framing import FrameDecoder, encode_json
-from protocol.text.json_text import JsonObject
+from protocol.framing import FrameDecoder
 from tests.bridge.conftest import PATIENCE_S, Log, retire
 from tests.bridge.scripted_server import Script
 from tests.bridge.streaming import status, streaming_description
@@ -85,18 +80,22 @@ class Turns:
             self._changed.notify_all()
 
 
-class Wire(Connection):
-    """A connection in memory; `feed` and `end` are for its other end."""
+class Wire:
+    """A `Channel` in memory; `feed` and `end` are for its other end."""
 
-    same_machine = True
+    is_near = True
+    own = ("memory", 0)
 
     def __init__(self, world: World, turns: Turns, clock: SimulatedClock) -> None:
-        self._replies, self._ids, self._send_lock = {}, itertools.count(1), threading.Lock()
-        self._decoder = FrameDecoder()
-        self.clock, self._turns = clock, turns
-        self._arrived, self._ended = bytearray(), False
-        self._send = world.accept(self)
-        self.sock = socket.socket()  # only to be closed; not left behind by a server that does not listen
+        self.monotonic_ns, self.wait = clock.monotonic_ns, clock.wait
+        self._world, self._turns = world, turns
+        self._arrived, self._ended = bytearray(), True
+        self._send: Callable[[bytes], object] = lambda _: None
+
+    def connect(self, timeout_s: float) -> bool:
+        self._send = self._world.accept(self)
+        self._ended = False
+        return True
 
     def feed(self, data: bytes) -> None:
         self._arrived += data
@@ -106,24 +105,28 @@ class Wire(Connection):
 
     shutdown = end
 
-    def send(self, message: JsonObject) -> None:
+    def close(self) -> None:
+        self.end()
+        self._arrived.clear()
+
+    def fileno(self) -> int:
+        return -1
+
+    def send(self, data: bytes) -> None:
         if self._ended:
             raise ConnectionFailedError("cannot send: Broken pipe")
-        self._send(encode_json(message))
+        self._send(data)
 
-    def receive(self, *, wait: bool = True) -> bool | None:
-        if wait:
-            due_s = self.clock.monotonic() + SILENCE_S
-            self._turns.block(
-                lambda: bool(self._arrived) or self._ended or self.clock.monotonic() >= due_s
-            )  # fmt: skip
-        if self._arrived:
-            self._decoder.feed(self._arrived)
-            self._arrived.clear()
-            return False
-        if self._ended or self._turns.over:
+    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+        if timeout_s > 0:
+            due_ns = self.monotonic_ns() + round(timeout_s * 1e9)
+            self._turns.block(lambda: bool(self._arrived) or self._ended or self.monotonic_ns() >= due_ns)
+        if not self._arrived and (self._ended or self._turns.over):
             raise ConnectionFailedError("the server closed it")
-        return None
+        data = self._arrived[: len(buffer)]
+        buffer[: len(data)] = data
+        del self._arrived[: len(data)]
+        return len(data)
 
 
 class SimulatedServer(Script):
@@ -252,11 +255,7 @@ class SimulatedNode:
 
         class Bridge(BridgeNode):
             clock = self._clock
-
-            def connect(self, _host: str, _port: int) -> Connection:
-                if bench._turns.over:
-                    raise UnreachableError("the test is over")
-                return Wire(server, bench._turns, bench._clock)
+            channel = Wire(server, self._turns, self._clock)
 
             def get_logger(self) -> Any:
                 if not logs:
@@ -317,7 +316,8 @@ class SimulatedNode:
 
     def settle(self) -> None:
         """Let the node do what there is to do now."""
-        self._turns.settle()
+        if self.node.exit_code is None:  # else its client is closed, and its reader ends
+            self._turns.settle()
         while self._triggered and not self._is_busy:
             self._triggered.pop(0)()
 

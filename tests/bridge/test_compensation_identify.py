@@ -9,7 +9,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
-from bridge.diagnostics.health import Level
+from diagnostic_msgs.msg import DiagnosticStatus
+
 from ft_compensation.quantities import NO_PAYLOAD
 from protocol.pdo import STANDARD_GRAVITY
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, sensed
@@ -43,7 +44,7 @@ def started(node: SimulatedNode, server: SimulatedServer) -> SimulatedNode:
     node.run(0.1)
     done, text = node.trigger("identify/start")
     assert done
-    assert "gravity is known by accelerometer" in text
+    assert "gravity is known by imu" in text
     assert "turn the sensor so that its +z axis points up" in text
     return node
 
@@ -100,7 +101,7 @@ def test_from_six_poses_to_a_compensated_wrench(
 def test_the_offset_of_the_accelerometer_is_found_and_subtracted_from_then_on(
     started: SimulatedNode, server: SimulatedServer, folder: Path
 ) -> None:
-    """Gravity, tare and the inertial term go by the corrected acceleration: 0.2 m/s² are 0.16 N here."""
+    """Wrench and tare go by the corrected acceleration: 0.2 m/s² are 0.16 N here."""
     off = {"acceleration_x": 0.02, "acceleration_y": -0.015}  # g
     for up in AXES:
         hold(server, up, bias=BIAS, **off)
@@ -126,10 +127,8 @@ def test_the_offset_of_the_accelerometer_is_found_and_subtracted_from_then_on(
     assert started.trigger("tare")[0]
     hold(server, (-2, 1, 1), bias=BIAS, **off)
     stages.settle(ZERO6, within=1e-2)
-    assert started.set_parameter("compensate_inertia", True)[0]
-    stages.settle(ZERO6, within=1e-2)
     for name, value in (
-        ("compensate_inertia", False), ("tool_mass", 0.0), ("accelerometer.offset", [0.0] * 3),
+        ("tool_mass", 0.0), ("accelerometer.offset", [0.0] * 3),
         ("accelerometer.scale", [1.0] * 3), ("accelerometer.offset_interval", [0.784] * 3),
         ("accelerometer.scale_interval", [0.0098] * 3),
     ):  # fmt: skip
@@ -219,11 +218,11 @@ def test_starting_again_drops_what_was_there(started: SimulatedNode, take: Take)
 
 
 def test_it_does_not_start_without_an_orientation(node: SimulatedNode) -> None:
-    assert node.set_parameter("orientation_source", "none") == (True, "")
+    assert node.set_parameter("gravity_source", "none") == (True, "")
     done, text = node.trigger("identify/start")
     assert not done
-    assert "orientation_source is none" in text
-    assert node.set_parameter("orientation_source", "accelerometer") == (True, "")
+    assert "gravity_source is none" in text
+    assert node.set_parameter("gravity_source", "imu") == (True, "")
 
 
 def test_a_file_that_cannot_be_written(started: SimulatedNode, take: Take) -> None:
@@ -246,8 +245,8 @@ def test_a_tool_that_was_lost_is_a_warning_and_nothing_is_changed(
         hold(server, up, payload=NO_PAYLOAD)
         node.run(2.5)
     words = "a tool of 0.00 kg would explain the measurements in"
-    node.until(f"{words} 6 orientations, but tool_mass is 0.80 kg", compensation=Level.WARN)
+    node.until(f"{words} 6 orientations, but tool_mass is 0.80 kg", compensation=DiagnosticStatus.WARN[0])
     assert node.log.count(words) == 1
     assert node.parameters("tool_mass") == [TOOL.mass]
     assert node.set_parameter("tool_mass", 0.0)[0]
-    node.until("nothing is subtracted", compensation=Level.OK)
+    node.until("nothing is subtracted", compensation=DiagnosticStatus.OK[0])

@@ -23,9 +23,8 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
 
-from bridge.compensating.gravity_sources import ListenerSource, Oriented, SensorSource
-from bridge.compensating.orientation_listener import OrientationListener
-from bridge.compensating.orientation_messages import (
+from bridge.compensating.orientations import (
+    OrientationListener,
     Tf,
     UnusableError,
     check_tf,
@@ -33,6 +32,7 @@ from bridge.compensating.orientation_messages import (
     multiply,
     unit,
 )
+from bridge.compensating.tool_sources import ListenerSource, Oriented
 from bridge.node import StartError
 from bridge.parameters.compensation import CompensationParameters, OrientationParameters
 from bridge.parameters.row import ParameterError
@@ -122,7 +122,7 @@ def node(_robot: Robot) -> Iterator[SimulatedNode]:
     given = {
         "tool_mass": TOOL.mass,
         "tool_center_of_gravity": [*TOOL.center],
-        "orientation_source": "topic_pose",
+        "gravity_source": "topic_pose",
         "orientation.topic": "arm/pose",
         "orientation.stale_after": 0.5,
     }
@@ -139,7 +139,7 @@ def stages(node: SimulatedNode) -> Stages:
 def listen(node: SimulatedNode, source: str, topic: str) -> str:
     """Have the node listen there; the topic's whole name."""
     assert node.set_parameter("orientation.topic", topic) == (True, "")
-    assert node.set_parameter("orientation_source", source) == (True, "")
+    assert node.set_parameter("gravity_source", source) == (True, "")
     return node.name.replace("bridge", topic)
 
 
@@ -280,7 +280,7 @@ def test_the_orientation_is_taken_in_while_a_service_waits(
     node.at(0.8, turn)  # longer than an orientation holds
     node.at(1.6, reply)
     assert node.trigger("sensor_tare") == (False, "no (denied)")
-    assert is_near(stages.gravity[-1], weight(OVER))
+    assert is_near(stages.tool[-1], weight(OVER))
     del robot.answers["tare"]
 
 
@@ -293,7 +293,7 @@ def test_the_orientation_is_taken_in_while_a_service_waits(
             "wrench",
             "'wrench': this node itself has that topic, with WrenchStamped messages and not",
         ),
-        ("orientation_source", "tf", "sudo apt install ros-$ROS_DISTRO-tf2-ros-py"),
+        ("gravity_source", "tf", "sudo apt install ros-$ROS_DISTRO-tf2-ros-py"),
     ],
 )
 def test_a_source_that_cannot_be_had(
@@ -314,20 +314,20 @@ def test_nothing_listens_where_no_source_is_chosen(robot: Robot, stages: Stages,
         return [subscription.topic_name for subscription in node.node.subscriptions]
 
     assert node.name.replace("bridge", "arm/pose") in topics()
-    assert node.set_parameter("orientation_source", "accelerometer") == (True, "")
+    assert node.set_parameter("gravity_source", "imu") == (True, "")
     assert node.name.replace("bridge", "arm/pose") not in topics()
     robot.sending = False
     hold(robot, UP)
     stages.settle(ZERO6)
     status = node.until(compensation=OK)["compensation"]
-    assert values(status)["orientation_source"] == "accelerometer"
+    assert values(status)["gravity_source"] == "imu"
 
 
 @pytest.mark.usefixtures("_ros")
 def test_tf_that_is_missing_is_told_at_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tf2_ros", None)
-    with pytest.raises(StartError, match="parameter orientation_source is 'tf': it needs tf2_ros"):
-        SimulatedNode(SimulatedServer(), orientation_source="tf")
+    with pytest.raises(StartError, match="parameter gravity_source is 'tf': it needs tf2_ros"):
+        SimulatedNode(SimulatedServer(), gravity_source="tf")
 
 
 # TF, by a buffer that is handed in: tf2_ros is not on PyPI.
@@ -390,25 +390,25 @@ def test_the_source_tf(ros_node: Node) -> None:
     with listening(ros_node) as raised:
         source = ListenerSource(CompensationParameters(orientation=chosen), opened)
 
-        def gravity(time_s: float) -> Any:
-            return source.gravity(sample(), time_s, time_s)
+        def felt(time_s: float) -> Any:
+            return source.specific_force(sample(), time_s, time_s)
 
         wait_until(lambda: buffer.asked, "a lookup")
-        assert gravity(1000.0) is None
+        assert felt(1000.0) is None
         words = "no orientation from TF from world to ft: TF has no pose of ft in world: frame does not exist"
         wait_until(lambda: source.why_none(1000.0, 1000.0) == words, words)
         buffer.quaternion, buffer.stamp_ns = TILTED, 1000 * 10**9
         buffer.error = None
-        wait_until(lambda: gravity(1000.0) is not None, "gravity")
+        wait_until(lambda: felt(1000.0) is not None, "a specific force")
         # The frames say all, so `mounting` is not for TF.
-        assert gravity(1000.0) == pytest.approx((-9.80665, 0.0, 0.0))
-        assert gravity(1000.6) is None
+        assert felt(1000.0) == pytest.approx((9.80665, 0.0, 0.0))
+        assert felt(1000.6) is None
         assert "older than the sample (limit 0.5 s)" in source.why_none(1000.6, 1000.6)
         buffer.error = "the tree fell apart"
         wait_until(lambda: "the tree fell apart" in source.why_none(1000.6, 1000.6), "the reason")
         buffer.stamp_ns = 1001 * 10**9
         buffer.error = None
-        wait_until(lambda: gravity(1001.0) is not None, "gravity again")
+        wait_until(lambda: felt(1001.0) is not None, "one again")
         opened.close()
     assert closed.is_set()
     assert not raised
@@ -458,7 +458,7 @@ def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node
     module = types.ModuleType("tf2_ros")
     vars(module).update(names)
     monkeypatch.setitem(sys.modules, "tf2_ros", module)
-    from bridge.compensating.orientation_messages import open_tf
+    from bridge.compensating.orientations import open_tf
 
     check_tf()
     tf = open_tf(ros_node)
@@ -486,13 +486,9 @@ def test_a_clock_that_goes_back_does_not_stop_a_source_for_ever() -> None:
 
     listening = Listening()
     source = ListenerSource(CompensationParameters(), listening)
-    assert source.gravity(sample(), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, -9.80665))
+    assert source.specific_force(sample(), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, 9.80665))
     listening.latest = Oriented(TILTED, 100 * 10**9)
-    assert source.gravity(sample(), 100.0, 100.0) == pytest.approx((-9.80665, 0.0, 0.0))
-    own = SensorSource(CompensationParameters())
-    assert own.gravity(sample(orientation=UPRIGHT), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, -9.80665))
-    assert own.gravity(sample(orientation=TILTED), 100.0, 100.0) == pytest.approx((-9.80665, 0.0, 0.0))
-    assert own.gravity(sample(), 101.0, 101.0) is None
+    assert source.specific_force(sample(), 100.0, 100.0) == pytest.approx((9.80665, 0.0, 0.0))
 
 
 def test_rotations_multiply_in_the_order_that_is_said() -> None:

@@ -51,7 +51,7 @@ def test_a_healthy_stream(node: SimulatedNode) -> None:
     assert array["compensation"].message == (
         "nothing is subtracted: there is no bias and no tool_mass; nobody has subscribed"
     )
-    assert (compensation["tared"], compensation["orientation_source"]) == ("false", "accelerometer")
+    assert (compensation["tared"], compensation["gravity_source"]) == ("false", "imu")
 
 
 def test_it_is_published_every_second_and_at_once_when_a_level_changes(

@@ -9,13 +9,14 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 from bridge.diagnostics.compensation_state import CompensationState
-from bridge.diagnostics.health import Level, Status, judge, text_of
-from bridge.diagnostics.snapshot import ServerCounts, Snapshot
-from bridge.stream.connection import SensorInfo
+from bridge.diagnostics.health import Status, judge, text_of
+from bridge.diagnostics.observer import ServerCounts, Snapshot
 from bridge.stream.frame_selector import FrameCounts
+from bridge.stream.link import SensorInfo
 from bridge.stream.watch import Flags, Watch
 from protocol.framing import DataMessage
 from protocol.health.limits import LIMITS
+from protocol.health.verdict import Level
 from protocol.pdo import encode
 from protocol.sensor.warnings_register import WARNINGS, Severity
 from tests.compensation.making import BIAS, TOOL
@@ -33,7 +34,7 @@ GOOD = Snapshot(
 
 
 STOPPED = CompensationState(has_subscribers=True, why_stopped="why")
-FULL = CompensationState(has_subscribers=True, payload=TOOL, inertia=True, bias=BIAS)
+FULL = CompensationState(has_subscribers=True, payload=TOOL, source="imu", bias=BIAS)
 
 
 def statuses(**changes: Any) -> dict[str, Status]:
@@ -41,7 +42,7 @@ def statuses(**changes: Any) -> dict[str, Status]:
 
 
 def test_good_is_good() -> None:
-    assert [status.level for status in statuses().values()] == [Level.OK] * 5
+    assert [status.level for status in statuses().values()] == [Level.GOOD] * 5
     assert statuses()["stream"].message == "800 samples a second"
 
 
@@ -50,63 +51,65 @@ def test_good_is_good() -> None:
     [
         (
             "link",
-            Level.ERROR,
+            Level.TROUBLE,
             "no server at localhost:1: gone; start ethercat-server",
             {"connected": False, "problem": "gone", "is_reachable": False},
         ),
         (
             "link",
-            Level.ERROR,
+            Level.TROUBLE,
             "not connected to localhost:1: it has no sensor 3 (the node keeps trying)",
             {"connected": False, "problem": "it has no sensor 3"},
         ),
-        ("stream", Level.STALE, "see link", {"connected": False}),
-        ("sensor", Level.STALE, "see link", {"connected": False}),
-        ("clock", Level.STALE, "see stream", {"connected": False}),
-        ("link", Level.WARN, "has not answered for 3 s", {"answer_s": 3.0}),
-        ("compensation", Level.STALE, "see stream", {"connected": False}),
-        ("compensation", Level.ERROR, "has stopped: why", {"compensation": STOPPED}),
-        ("compensation", Level.ERROR, "could not be published if somebody subscribed: why",
+        ("stream", Level.NOT_POSSIBLE, "see link", {"connected": False}),
+        ("sensor", Level.NOT_POSSIBLE, "see link", {"connected": False}),
+        ("clock", Level.NOT_POSSIBLE, "see stream", {"connected": False}),
+        ("link", Level.LOOK, "has not answered for 3 s", {"answer_s": 3.0}),
+        ("compensation", Level.NOT_POSSIBLE, "see stream", {"connected": False}),
+        ("compensation", Level.TROUBLE, "has stopped: why", {"compensation": STOPPED}),
+        ("compensation", Level.TROUBLE, "could not be published if somebody subscribed: why",
          {"compensation": STOPPED._replace(has_subscribers=False)}),
-        ("sensor", Level.ERROR, "are counts", {"settings": {"calibration_matrix": False}}),
-        ("sensor", Level.WARN, "correct the URDF", {"settings": {"coordinate_system": True}}),
-        ("sensor", Level.OK, "as it should be", {"settings": {"coordinate_system": False}}),
-        ("compensation", Level.WARN, "3 samples were not compensated while the sensor", {"new_withheld": 3}),
-        ("compensation", Level.WARN, "3 samples were not compensated, for lack of a current orientation",
+        ("sensor", Level.TROUBLE, "are counts", {"settings": {"calibration_matrix": False}}),
+        ("sensor", Level.LOOK, "correct the URDF", {"settings": {"coordinate_system": True}}),
+        ("sensor", Level.GOOD, "as it should be", {"settings": {"coordinate_system": False}}),
+        ("compensation", Level.LOOK, "3 samples were not compensated while the sensor", {"new_withheld": 3}),
+        ("compensation", Level.LOOK, "3 samples were not compensated, for lack of a current orientation",
          {"new_withheld": 3, "compensation": FULL}),
-        ("compensation", Level.WARN, "not kept", {"compensation": CompensationState(problem="not kept")}),
-        ("compensation", Level.OK, "bias, gravity and inertia are subtracted", {"compensation": FULL}),
-        ("compensation", Level.OK, "bias is subtracted", {"compensation": CompensationState(bias=BIAS)}),
-        ("link", Level.WARN, "again", {"connects": 2, "new_connects": 1}),
-        ("stream", Level.ERROR, "No new sample for 0.6 s", {"silent_s": 0.6}),
-        ("stream", Level.ERROR, "server does not answer: it is stopped", {"silent_s": 2.0, "answer_s": 1.5}),
-        ("stream", Level.ERROR, "in state SAFEOP", {"silent_s": 2.0, "info": SAFEOP}),
-        ("stream", Level.ERROR, "again and again", {"silent_s": 2.0, "new": FrameCounts(repeated=1)}),
-        ("stream", Level.ERROR, "does not answer the bus", {"silent_s": 2.0, "new": FrameCounts(invalid=1)}),
-        ("stream", Level.WARN, "700 samples a second instead of 800: the filters", {"rate_hz": 700.0}),
-        ("stream", Level.OK, "798", {"rate_hz": 798.0}),
-        ("stream", Level.WARN, "12.0 ms old", {"age_us": (1.0, 12_000.0)}),
-        ("stream", Level.ERROR, "120.0 ms old", {"age_us": (1.0, 120_000.0)}),
-        ("stream", Level.ERROR, "600 samples a second", {"rate_hz": 600.0}),
-        ("stream", Level.WARN, "3 of 803 samples (0.37 %) were lost", {"new": FrameCounts(new=800, lost=3)}),
-        ("stream", Level.WARN, "4 of 804", {"new": FrameCounts(new=800),
+        ("compensation", Level.LOOK, "not kept", {"compensation": CompensationState(problem="not kept")}),
+        ("compensation", Level.GOOD, "bias, weight and inertia", {"compensation": FULL}),
+        ("compensation", Level.GOOD, "subtracted: bias;", {"compensation": CompensationState(bias=BIAS)}),
+        ("link", Level.LOOK, "again", {"connects": 2, "new_connects": 1}),
+        ("stream", Level.TROUBLE, "No new sample for 0.6 s", {"silent_s": 0.6}),
+        ("stream", Level.TROUBLE, "server does not answer: it is stopped",
+         {"silent_s": 2.0, "answer_s": 1.5}),
+        ("stream", Level.TROUBLE, "in state SAFEOP", {"silent_s": 2.0, "info": SAFEOP}),
+        ("stream", Level.TROUBLE, "again and again", {"silent_s": 2.0, "new": FrameCounts(repeated=1)}),
+        ("stream", Level.TROUBLE, "does not answer the bus",
+         {"silent_s": 2.0, "new": FrameCounts(invalid=1)}),
+        ("stream", Level.LOOK, "700 samples a second instead of 800: the filters", {"rate_hz": 700.0}),
+        ("stream", Level.GOOD, "798", {"rate_hz": 798.0}),
+        ("stream", Level.LOOK, "12.0 ms old", {"age_us": (1.0, 12_000.0)}),
+        ("stream", Level.TROUBLE, "120.0 ms old", {"age_us": (1.0, 120_000.0)}),
+        ("stream", Level.TROUBLE, "600 samples a second", {"rate_hz": 600.0}),
+        ("stream", Level.LOOK, "3 of 803 samples (0.37 %) were lost", {"new": FrameCounts(new=800, lost=3)}),
+        ("stream", Level.LOOK, "4 of 804", {"new": FrameCounts(new=800),
          "new_server": ServerCounts(lost_samples=4)}),
-        ("stream", Level.ERROR, "50 of 800", {"new": FrameCounts(new=750, lost=50), "rate_hz": 750.0}),
-        ("stream", Level.WARN, "1 frame was invalid", {"new": FrameCounts(new=799, invalid=1)}),
-        ("stream", Level.WARN, "has it back", {"new_server": ServerCounts(recoveries=1)}),
-        ("stream", Level.WARN, "has it back: the server's computer stood still",
+        ("stream", Level.TROUBLE, "50 of 800", {"new": FrameCounts(new=750, lost=50), "rate_hz": 750.0}),
+        ("stream", Level.LOOK, "1 frame was invalid", {"new": FrameCounts(new=799, invalid=1)}),
+        ("stream", Level.LOOK, "has it back", {"new_server": ServerCounts(recoveries=1)}),
+        ("stream", Level.LOOK, "has it back: the server's computer stood still",
          {"new_server": ServerCounts(recoveries=1, missed_deadlines=24)}),
-        ("stream", Level.WARN, "5 old samples skipped", {"new": FrameCounts(stale=5)}),
-        ("stream", Level.ERROR, "not finite: power-cycle", {"new_not_finite": 1}),
-        ("stream", Level.ERROR, "not finite", {"new_server": ServerCounts(not_finite=2)}),
-        ("sensor", Level.ERROR, "no power; check its cable", {"lost": "no power"}),
-        ("sensor", Level.STALE, "see stream", {"silent_s": 2.0}),
-        ("sensor", Level.ERROR, "saturated: Fy: reduce", {"flags": Flags(0, 0, 2)}),
-        ("sensor", Level.WARN, "61.0 °C", {"temperature": 61.0}),
-        ("sensor", Level.ERROR, "81.0 °C", {"temperature": 81.0}),
-        ("clock", Level.STALE, "not said", {"server": {}}),
-        ("clock", Level.WARN, "not follow", {"server": {"sensors": [{"clock": {"mode": "oversampling"}}]}}),
-        ("clock", Level.STALE, "not said", {"server": {"sensors": 5, "last_10s": [], "uptime_s": {}}}),
+        ("stream", Level.LOOK, "5 old samples skipped", {"new": FrameCounts(stale=5)}),
+        ("stream", Level.TROUBLE, "not finite: power-cycle", {"new_not_finite": 1}),
+        ("stream", Level.TROUBLE, "not finite", {"new_server": ServerCounts(not_finite=2)}),
+        ("sensor", Level.TROUBLE, "no power; check its cable", {"lost": "no power"}),
+        ("sensor", Level.NOT_POSSIBLE, "see stream", {"silent_s": 2.0}),
+        ("sensor", Level.TROUBLE, "saturated: Fy: reduce", {"flags": Flags(0, 0, 2)}),
+        ("sensor", Level.LOOK, "61.0 °C", {"temperature": 61.0}),
+        ("sensor", Level.TROUBLE, "81.0 °C", {"temperature": 81.0}),
+        ("clock", Level.NOT_POSSIBLE, "not said", {"server": {}}),
+        ("clock", Level.LOOK, "not follow", {"server": {"sensors": [{"clock": {"mode": "oversampling"}}]}}),
+        ("clock", Level.NOT_POSSIBLE, "not said", {"server": {"sensors": 5, "last_10s": [], "uptime_s": {}}}),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said(name: str, level: Level, words: str, changes: dict[str, Any]) -> None:
@@ -116,34 +119,35 @@ def test_what_is_wrong_is_said(name: str, level: Level, words: str, changes: dic
 
 
 @pytest.mark.parametrize(
-    ("code", "ago_s", "level"), [(0x4210, 3.0, Level.WARN), (0x4210, 90.0, Level.OK), (0x0000, 3.0, Level.OK)]
+    ("code", "ago_s", "level"),
+    [(0x4210, 3.0, Level.LOOK), (0x4210, 90.0, Level.GOOD), (0x0000, 3.0, Level.GOOD)],
 )
 def test_the_last_emergency_is_a_warning_for_a_minute(code: int, ago_s: float, level: Level) -> None:
     last = {"code": code, "text": "temper\x1bature", "register": 9, "data": "00", "ago_s": ago_s}
     clock = {"mode": "locked"}
     status = statuses(server={"sensors": [{"clock": clock, "emergencies": 7, "emergency": last}]})["sensor"]
     assert status.level == level
-    assert ("Emergency 0x4210 (temper?ature): if it" in status.message) == (level is Level.WARN)
+    assert ("Emergency 0x4210 (temper?ature): if it" in status.message) == (level is Level.LOOK)
     assert status.values["last_emergency"] == f"emergency 0x{code:04X} (temper?ature)"
     assert (status.values["emergencies"], status.values["last_emergency_ago_s"]) == (7, ago_s)
 
 
 @pytest.mark.parametrize("last", [5, [], {}, {"code": "x", "ago_s": 1}, {"code": 0x4210, "ago_s": "now"}])
 def test_an_emergency_that_makes_no_sense_is_none(last: object) -> None:
-    assert statuses(server={"sensors": [{"emergency": last}]})["sensor"].level == Level.OK
+    assert statuses(server={"sensors": [{"emergency": last}]})["sensor"].level == Level.GOOD
 
 
 @pytest.mark.parametrize("row", WARNINGS, ids=lambda row: str(row.flag))
 def test_each_bit_has_its_level_and_remedy(row: Any) -> None:
     status = statuses(flags=Flags(warnings=row.flag))["sensor"]
-    assert status.level == (Level.WARN if row.severity is Severity.WARNING else Level.ERROR)
+    assert status.level == (Level.LOOK if row.severity is Severity.WARNING else Level.TROUBLE)
     assert row.meaning in status.message
     assert status.message.lower().endswith(f": {row.remedy.lower()}")
 
 
 def test_the_worst_comes_first() -> None:
     status = statuses(flags=Flags(warnings=0x61))["sensor"]
-    assert status.level == Level.ERROR
+    assert status.level == Level.TROUBLE
     assert status.message.index("saturated") < status.message.index("Overtemperature")
 
 
@@ -152,14 +156,13 @@ def test_values_are_printable_text() -> None:
 
 
 def test_flags_of_one_frame_are_kept_until_taken() -> None:
-    watch = Watch(0)
+    watch = Watch()
 
-    def see(sensor: int = 0, **fields: float) -> None:
-        watch.see([DataMessage(1, 0, 0, sensor, 0, 3, encode(61, fields))])
+    def see(**fields: float) -> None:
+        watch.see([DataMessage(1, 0, 0, 0, 0, 3, encode(61, fields))])
 
     see(warnings=1, status=2)
     see(warnings=4, force_torque_saturated=8)
-    see(sensor=1, warnings=64)
     see()
     assert watch.take_flags() == (2, 5, 8, 0, 0)
     assert watch.take_flags() == (0, 0, 0, 0, 0)

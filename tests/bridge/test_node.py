@@ -73,7 +73,7 @@ def test_the_supervisor_is_heard_during_each_service(
     server: ScriptedServer, listener: Listener, start: Start, service: str, action: str, words: str
 ) -> None:
     """In real time, with rclpy's own executors: which callback waits for which is what is tested."""
-    node = start(server.port, **{"rest.duration": 60.0, "orientation_source": "accelerometer"})
+    node = start(server.port, **{"rest.duration": 60.0})
     node.says("connected to")
     if service == "identify/add_pose":
         assert listener.trigger("identify/start")[0]
@@ -179,7 +179,7 @@ def test_a_wrong_parameter_is_one_sentence(start_process: StartProcess) -> None:
         ({"qos_overrides.NS/wrench.publisher.reliability": "foo"}, "check qos_overrides"),
         ({"qos_overrides.NS/wrench.publisher.depth": -1}, "check qos_overrides"),
         (
-            {"orientation_source": "topic_pose", "orientation.topic": "imu/data_raw"},
+            {"gravity_source": "topic_pose", "orientation.topic": "imu/data_raw"},
             "this node itself has that topic, with Imu messages and not PoseStamped",
         ),
     ],

@@ -79,7 +79,7 @@ def test_nothing_more_unless_it_is_configured() -> None:
         prefix = node.name.removesuffix("bridge")
         assert {name.removeprefix(prefix) for name in node.topics if name.startswith(prefix)} == {
             "sensone_sensor_data", "wrench", "wrench_compensated", "compensation/bias",
-            "compensation/gravity", "compensation/inertia", "imu/data_raw", "imu/data", "temperature",
+            "compensation/tool", "imu/data_raw", "imu/data", "temperature",
         }  # fmt: skip
         node.run(0.2)
         assert "wrench_filtered" not in node.log

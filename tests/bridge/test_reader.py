@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from bridge.parameters.table import Parameters
-from bridge.stream.connection import Connection
-from bridge.stream.events import sentence
+from bridge.stream.link import RequestFailedError, find_sensor, sentence
 from bridge.stream.reader import Reader
 from protocol.errors import ConnectionFailedError, UnreachableError
-from protocol.framing import DataFlag, DataMessage, encode_data, encode_json
+from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
 from protocol.pdo import ImuUnits, Sample, encode
 from protocol.text.json_text import JsonObject
 from tests.bridge.conftest import Log, wait_until
@@ -51,43 +49,58 @@ class Clock:
         return event.is_set()
 
 
-class Memory(Connection):
-    """A connection whose other end is a list of steps; it answers requests as a server does."""
+class Memory:
+    """A `Channel`. The other end of each connection is a list of steps; requests are answered at once."""
 
-    def __init__(self, clock: Clock, steps: Sequence[Step], answer: Callable[[str], JsonObject]) -> None:
-        from protocol.framing import FrameDecoder
+    is_near = True
+    own = ("memory", 0)
 
-        self._replies, self._decoder = {}, FrameDecoder()
-        self._clock, self._steps, self._answer = clock, list(steps), answer
-        self._ids = itertools.count(1)
-        self._send_lock = threading.Lock()
-        self.same_machine = True
-        self.is_closed = False
+    def __init__(self, clock: Clock, attempts: Sequence[Sequence[Step] | Exception]) -> None:
+        self.monotonic_ns, self.wait = clock.monotonic_ns, clock.wait
+        self.description = description()
+        self.on_over: Callable[[], None] = lambda: None
+        self._clock, self._attempts = clock, list(attempts)
+        self._steps: list[Step] = []
+        self._rest = b""
 
-    def send(self, message: JsonObject) -> None:
-        action = str(message["action"])
-        reply = {"reply": action, "id": message["id"], "ok": True, **self._answer(action)}
+    def connect(self, timeout_s: float) -> bool:
+        attempt = self._attempts.pop(0) if self._attempts else UnreachableError("the test is over")
+        if isinstance(attempt, Exception):
+            if not self._attempts:
+                self.on_over()
+            raise attempt
+        self._steps, self._rest = list(attempt), b""
+        return True
+
+    def send(self, data: bytes) -> None:
+        decoder = FrameDecoder()
+        decoder.feed(data)
+        message = cast(JsonObject, decoder.next_message())
+        reply = {"reply": message["action"], "id": message["id"], "ok": True, **self.description}
         self._steps.insert(0, encode_json(reply))
 
-    def receive(self, *, wait: bool = True) -> bool | None:
-        while self._steps:
-            step = self._steps.pop(0)
+    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+        while not self._rest and timeout_s > 0:
+            step = self._steps.pop(0) if self._steps else ConnectionFailedError("the server closed it")
             if isinstance(step, float):
                 self._clock.sleep(step)
             elif isinstance(step, bytes):
-                self._decoder.feed(step)
-                return False
+                self._rest = step
             elif step is None:
-                return None
+                self._clock.sleep(timeout_s)
+                return 0
             else:
                 raise step
-        raise ConnectionFailedError("the server closed it")
+        data, self._rest = self._rest[: len(buffer)], self._rest[len(buffer) :]
+        buffer[: len(data)] = data
+        return len(data)
 
-    def shutdown(self) -> None:
-        self.is_closed = True
+    def shutdown(self) -> None: ...
 
-    def close(self) -> None:
-        self.is_closed = True
+    def close(self) -> None: ...
+
+    def fileno(self) -> int:
+        return -1
 
 
 class Output:
@@ -126,30 +139,16 @@ class Bench:
         self.outputs = Outputs()
         self.log = Log(None)
         self.failures: list[str] = []
-        self.description = description()
-        self.connections: list[Memory] = []
-        self._attempts = list(attempts)
+        self.channel = Memory(self.clock, attempts)
         chosen = Parameters("localhost", 12001, 0, 0.0, "array", ImuUnits.G_DPS)._replace(**parameters)
         self.reader = Reader(
-            chosen, self.outputs, self.log, self.failures.append,
-            connect=self._connect, clock=self.clock,
-        )  # fmt: skip
-
-    def _connect(self, host: str, port: int) -> Connection:
-        assert (host, port) == ("localhost", 12001)
-        if not self._attempts:
-            self.reader._stopping.set()
-            raise UnreachableError("the test is over")
-        attempt = self._attempts.pop(0)
-        if isinstance(attempt, Exception):
-            raise attempt
-        self.connections.append(Memory(self.clock, attempt, lambda _action: self.description))
-        return self.connections[-1]
+            chosen, self.outputs, self.log, self.failures.append, channel=self.channel, clock=self.clock
+        )
+        self.channel.on_over = self.reader.client.close
 
     def run(self) -> list[float]:
         """Run until the attempts are used up; the numbers that were published."""
         self.reader.run()
-        assert all(connection.is_closed for connection in self.connections)
         return [number for number, _ in self.outputs.output.samples]
 
     def frame(self, number: float, after_ns: int = 0, **changes: Any) -> bytes:
@@ -182,15 +181,15 @@ def test_what_is_not_new_is_not_published() -> None:
 
 
 def test_attempts_to_connect_back_off_and_one_line_says_so() -> None:
-    bench = Bench(*[UnreachableError("refused")] * 8)
+    bench = Bench(*[UnreachableError("refused") for _ in range(8)])
     bench.run()
-    assert bench.clock.pauses == pytest.approx([0.1, 0.15, 0.225, 0.3375, 0.50625, 0.759375, 1.0, 1.0])
+    assert bench.clock.pauses == pytest.approx([0.1, 0.15, 0.225, 0.3375, 0.50625, 0.759375, 1.0])
     assert bench.log.lines == ["no server at localhost:12001: refused; trying until there is one"]
-    assert bench.reader.link.problem == "the test is over"
+    assert bench.reader.link.problem == "refused"
 
 
 def test_after_a_connection_that_lasted_the_next_attempt_comes_soon() -> None:
-    down = [UnreachableError("refused")] * 4
+    down = [UnreachableError("refused") for _ in range(4)]
     bench = Bench(*down, [1.5, ConnectionFailedError("reset")], [0.5])
     bench.run()
     assert bench.clock.pauses[4:6] == pytest.approx([0.1, 0.15])
@@ -210,11 +209,11 @@ def test_garbage_ends_the_connection_and_the_next_one_works(garbage: bytes) -> N
     assert "is not this protocol" in lines(bench)
 
 
-def test_an_impossible_time_is_garbage() -> None:
+def test_a_sample_with_an_impossible_time_is_not_published() -> None:
     bench = Bench()
-    bench = Bench([bench.frame(1, stamp_ns=2**64 - 1)], [bench.frame(2, 10**9)])
+    bench = Bench([bench.frame(1, stamp_ns=2**64 - 1), bench.frame(2, 10**9)])
     assert bench.run() == [2.0]
-    assert "a frame has the impossible time 18446744073709551615 ns" in lines(bench)
+    assert "a sample with the impossible time 18446744073709551615 ns was not published" in lines(bench)
 
 
 def test_after_a_stall_nothing_old_is_published() -> None:
@@ -305,14 +304,36 @@ def test_an_event_is_a_sentence(message: JsonObject, said: str) -> None:
     assert sentence(message, {"sinc_length": 64, "chop": False}) == said
 
 
-def test_a_server_without_the_sensor_is_tried_again() -> None:
-    bench = Bench([], [])
-    bench.description = description(sensors=[])
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"protocol": 2}, "speaks protocol 2"),
+        ({"protocol": "\x1b[2J" * 100}, "protocol"),
+        ({"sensors": None}, "no sensor 0 (it has: none)"),
+        ({"sensors": [1, "x", None, {"sensor": False}]}, "no sensor 0 (it has: none)"),
+        ({"sensors": [{"sensor": 3}]}, "no sensor 0 (it has: 3): set the parameter 'sensor' to one it has"),
+    ],
+)
+def test_a_server_that_does_not_fit_is_named_once_and_tried_again(
+    changes: dict[str, Any], words: str
+) -> None:
+    bench = Bench([], [], [], UnreachableError("the test is over"))
+    bench.channel.description = description(**changes)
     bench.run()
-    assert bench.log.lines == [
-        "connection to localhost:12001 ended: the server has no sensor 0 (it has: none): set the parameter "
-        "'sensor' to one it has; connecting again"
-    ]
+    (line,) = bench.log.lines
+    assert line.startswith("connection to localhost:12001 ended: ")
+    assert line.endswith("; connecting again")
+    assert words in line
+    assert line.isprintable()
+    assert len(line) < 400
+
+
+def test_find_sensor_takes_the_row_it_is_asked_for() -> None:
+    rows = [{"sensor": 1, "name": "A"}, {"sensor": 0, "name": "B", "rate_hz": "\n"}]
+    info = find_sensor({"sensors": rows}, 0)
+    assert (info.name, info.serial, info.rate_hz) == ("B", "?", "?")
+    with pytest.raises(RequestFailedError, match="it has: 1, 0"):
+        find_sensor({"sensors": rows}, 2)
 
 
 def test_an_error_of_ours_is_reported() -> None:

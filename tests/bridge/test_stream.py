@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from protocol.framing import DataFlag
-from protocol.pdo import encode
 from tests.bridge.conftest import (
     PATIENCE_S,
     Listener,
@@ -71,51 +69,10 @@ def test_samples_that_come_together_are_all_published(server: ScriptedServer, li
     assert [listener.next_number() for _ in range(8)] == list(range(8))
 
 
-def test_frames_in_pieces(server: ScriptedServer, listener: Listener) -> None:
-    for byte in server.frame(1.0) + server.frame(2.0):
-        server.send_raw(bytes([byte]))
-    assert [listener.next_number() for _ in range(2)] == [1.0, 2.0]
-
-
 def test_both_sizes_of_process_data(server: ScriptedServer, listener: Listener) -> None:
     server.send_sample(0, process_data=process_data(5.0, 77))
     server.send_sample(6.0)
     assert [listener.next_number() for _ in range(2)] == [5.0, 6.0]
-
-
-def test_what_is_no_news_is_not_published(
-    server: ScriptedServer, listener: Listener, node: NodeThread
-) -> None:
-    server.send_sample(1.0, DataFlag.REPEATED)
-    server.send_sample(2.0, DataFlag.INVALID)
-    server.send_sample(3.0, DataFlag.INVALID | DataFlag.REPEATED | DataFlag.GAP)
-    server.send_sample(4.0, sensor=1)
-    server.send_raw(2 * server.frame(5.0))
-    for value in (math.nan, math.inf, -math.inf):
-        server.send_sample(0, process_data=encode(61, {"torque.y": value}))
-    server.send_sample(6.0, DataFlag.GAP)
-    assert [listener.next_number() for _ in range(2)] == [5.0, 6.0]
-    node.says("not finite was not published")
-    assert node.log.count("not finite") == 1
-
-
-def test_events_are_said(server: ScriptedServer, listener: Listener, node: NodeThread) -> None:
-    server.send_json({"event": "sensor_lost", "sensor": 0})
-    server.send_json({"event": "sensor_back", "sensor": 0})
-    server.send_json({"event": "emergency", "sensor": 0, "message": "too hot"})
-    server.send_json({"event": "some\x1b[2Jthing", "detail": "{0}"})
-    server.send_json({"neither": "event nor reply"})
-    server.send_json({"event": ["odd"]})
-    server.send_sample(1.0)
-    assert listener.next_number() == 1.0
-    for words in (
-        "has lost the sensor",
-        "the sensor is back",
-        "emergency",
-        "too hot",
-        "the server sent the event some?[2Jthing, which this version does not know",
-    ):
-        node.says(words)
 
 
 def test_a_sensor_that_goes_and_comes_back(

@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from clients.monitor.model.server import Model
-from clients.monitor.model.state import State
+from clients.monitor.model import Model, State
 from protocol.control import Event
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import encode

@@ -16,9 +16,10 @@ from typing import Any, cast
 
 from clients.recording.columns import Columns, columns
 from clients.report.subjects.subject import Subject, subject
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.stream import SensorStream
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.clock import Clock
+from ethercat_server.ethercat.exchange.process_data import Exchange
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults.table import obey
 from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
@@ -69,12 +70,14 @@ def simulate(
         bus.set_time(sent + _EXCHANGE_NS // 2)
         data, now = life.inputs(), sent + _EXCHANGE_NS
         valid = not (script.lost_frames and chance.random() < script.lost_frames)
-        timing.sends(sent)
-        made = stream.take(data, 3, sent, now) if valid else None
+        timing.sent_ns, timing.in_flight, timing.unanswered = sent, True, timing.unanswered + 1
+        made = None
         if valid:
-            timing.took(sent, now)
-        if stream.learns:
-            stream.learn(now)
+            made = stream.take(data, exchange := Exchange(sent, now, b"", 3, 0))
+            timing.in_flight, timing.unanswered = False, 0
+            if stream.finish(exchange):
+                timing.took(sent, now, now)
+                stream.clock.learn(now)
         if made is None and now >= stream.idle_at_ns:
             made = stream.idle(now)
         if made is not None:

@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 
 from clients.monitor.app import Monitor
-from clients.monitor.model.server import Model
+from clients.monitor.model import Model
 from clients.monitor.recorder import Recorder
-from clients.monitor.view.glyphs import UNICODE
 from protocol.address import Address
 from tests.clients import monitor_states as made
 from tests.server.running import free_port, wait_until
@@ -36,7 +35,7 @@ class Stage:
         self.now_s = made.fed(self.model, 2)
         # Nothing listens there.
         self.address = Address("localhost", free_port())
-        self.app = Monitor(self.model, self.address, UNICODE, clock=lambda: self.now_s)
+        self.app = Monitor(self.model, self.address, clock=lambda: self.now_s)
         self.pilot: Any = None
 
     def shown(self) -> str:
@@ -67,23 +66,15 @@ def test_tare_asks_first_and_only_y_does_it() -> None:
     async def scene(stage: Stage) -> None:
         assert "Tare sensor 0? y: yes, u: undo the last tare, c: clear it, any" in await stage.press("t")
         assert "Not tared" in await stage.press("enter")
-        await stage.press("n", "t")
-        assert "Tare sensor 1?" in stage.shown()
+        assert "Sensor 1  BFT-ROKS" in await stage.press("n")
+        assert "Sensor 0  BFT-SENS" in await stage.press("n")
+        assert "Tare sensor 1?" in await stage.press("n", "t")
         await stage.press("y")
         wait_until(lambda: "Sensor 1 was not tared: no connection to the server" in stage.shown(), "a word")
         await stage.press("t", "u")
         wait_until(lambda: "The tare of sensor 1 was not undone: " in stage.shown(), "another")
         await stage.press("t", "C")
         wait_until(lambda: "The offset of sensor 1 was not cleared: " in stage.shown(), "the last")
-
-    play(scene)
-
-
-def test_next_goes_round() -> None:
-    async def scene(stage: Stage) -> None:
-        assert "Sensor 0  BFT-SENS" in stage.shown()
-        assert "Sensor 1  BFT-ROKS" in await stage.press("n")
-        assert "Sensor 0  BFT-SENS" in await stage.press("n")
 
     play(scene)
 
@@ -146,24 +137,6 @@ def test_record_starts_and_stops_a_recorder(tmp_path: Path) -> None:
     play(scene)
 
 
-def test_a_recorder_that_fails_says_why(tmp_path: Path) -> None:
-    async def scene(stage: Stage) -> None:
-        complaint = "import sys; sys.exit('ethercat-record: the disk is full')"
-        stage.app.recorder = Recorder(stage.address, tmp_path, [sys.executable, "-c", complaint])
-        await stage.press("r")
-        wait_until(lambda: "The recording failed: the disk is full" in stage.shown(), "the reason")
-
-    play(scene)
-
-
-def test_a_recorder_that_is_not_there_says_so(tmp_path: Path) -> None:
-    async def scene(stage: Stage) -> None:
-        stage.app.recorder = Recorder(stage.address, tmp_path, [str(tmp_path / "none")])
-        assert "ethercat-record cannot be started: No such file" in await stage.press("r")
-
-    play(scene)
-
-
 @pytest.mark.parametrize("key", ["q", "ctrl+c", "ctrl+q"])
 def test_keys_that_end_it(key: str) -> None:
     async def scene(stage: Stage) -> None:
@@ -196,5 +169,24 @@ def test_only_rows_that_changed_are_drawn(monkeypatch: pytest.MonkeyPatch) -> No
         stage.model.say("something new")
         stage.app.draw()
         assert [region.y for region in drawn] == [22]
+
+    play(scene)
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (
+            [sys.executable, "-c", "import sys; sys.exit('ethercat-record: the disk is full')"],
+            "The recording failed: the disk is full",
+        ),
+        (["/nowhere/ethercat-record"], "ethercat-record cannot be started: No such file"),
+    ],
+)
+def test_a_recorder_that_fails_says_why(tmp_path: Path, command: list[str], said: str) -> None:
+    async def scene(stage: Stage) -> None:
+        stage.app.recorder = Recorder(stage.address, tmp_path, command)
+        await stage.press("r")
+        wait_until(lambda: said in stage.shown(), "the reason")
 
     play(scene)

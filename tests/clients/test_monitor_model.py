@@ -9,10 +9,9 @@ from unittest import mock
 
 import pytest
 
-from clients.monitor.model.server import Model
-from clients.monitor.model.state import SensorState
+from clients.monitor.model import Model, SensorState
 from clients.monitor.reader import Reader
-from clients.monitor.view.screen import Look, render
+from clients.monitor.screen import Look, render
 from protocol.address import Address
 from protocol.client import Client
 from protocol.control import Event
@@ -80,8 +79,7 @@ def test_repeated_and_invalid_frames_are_counted_and_bring_no_values(model: Mode
         frame(2, high, flags=DataFlag.INVALID),
         frame(3, high, flags=DataFlag.INVALID | DataFlag.REPEATED),
     )
-    stream = sensor.stream
-    assert (stream.samples, stream.repeated, stream.invalid) == (1, 1, 2)
+    assert (sensor.samples, sensor.repeated, sensor.invalid) == (1, 1, 2)
     assert sensor.peaks is not None
     assert sensor.peaks[0].high == 0
     assert texts(sensor) == [
@@ -90,43 +88,36 @@ def test_repeated_and_invalid_frames_are_counted_and_bring_no_values(model: Mode
     ]
 
 
-def test_frames_that_did_not_come_are_counted_and_make_no_jitter(model: Model) -> None:
-    steady = [
-        frame(k, flags=DataFlag.GAP if k == 60 else 0)._replace(monotonic_ns=10**12 + k * made.PERIOD_NS)
-        for k in (*range(50), *range(60, 100))
-    ]  # fmt: skip
+@pytest.mark.parametrize("silent", [False, True])
+def test_samples_that_did_not_come_make_no_jitter(model: Model, silent: bool) -> None:
+    steady = [frame(k)._replace(monotonic_ns=10**12 + k * made.PERIOD_NS) for k in range(100)]
+    if silent:
+        steady[50:60] = [each._replace(flags=DataFlag.REPEATED) for each in steady[50:60]]
+    else:
+        steady[50:61] = [steady[60]._replace(flags=DataFlag.GAP)]
     sensor = take(model, *steady)
-    assert (sensor.stream.missed, sensor.stream.gaps) == (10, 1)
-    assert sensor.stream.jitter_us == 0
-    assert sensor.stream.jitter_worst_us == 0
+    assert (sensor.missed, sensor.gaps, sensor.repeated) == ((0, 0, 10) if silent else (10, 1, 0))
+    assert (sensor.jitter_us, sensor.jitter_worst_us) == (0, 0)
 
 
-def test_the_time_that_a_sensor_was_silent_is_no_jitter(model: Model) -> None:
-    flags = dict.fromkeys(range(50, 60), DataFlag.REPEATED)
-    steady = [
-        frame(k, flags=flags.get(k, 0))._replace(monotonic_ns=10**12 + k * made.PERIOD_NS) for k in range(100)
-    ]
-    assert take(model, *steady).stream.jitter_worst_us == 0
-
-
-def test_jitter_is_the_spread_of_the_intervals(model: Model) -> None:
+def test_jitter_is_that_of_the_intervals(model: Model) -> None:
     shifted = [
         frame(k)._replace(monotonic_ns=10**12 + k * made.PERIOD_NS + (50_000 if k % 2 else 0))
         for k in range(401)
     ]
-    stream = take(model, *shifted).stream
-    assert stream.jitter_us == pytest.approx(50)
-    assert stream.jitter_worst_us == pytest.approx(50)
+    sensor = take(model, *shifted)
+    assert sensor.jitter_us == pytest.approx(50)
+    assert sensor.jitter_worst_us == pytest.approx(50)
 
 
 def test_the_rate_is_that_of_the_samples_and_falls_when_they_stop(model: Model) -> None:
     for first in range(0, 1600, 40):
         take(model, *run(first, 40))
-    assert only(model, now(1600)).stream.rate_hz == pytest.approx(800, abs=0.5)
-    falling = only(model, now(1600) + 2).stream.rate_hz
+    assert only(model, now(1600)).rate_hz == pytest.approx(800, abs=0.5)
+    falling = only(model, now(1600) + 2).rate_hz
     assert falling is not None
     assert 300 < falling < 500
-    assert only(model, now(1600) + 60).stream.rate_hz == 0
+    assert only(model, now(1600) + 60).rate_hz == 0
 
 
 def test_a_new_connection_is_no_loss_and_keeps_the_peaks(model: Model) -> None:
@@ -134,8 +125,8 @@ def test_a_new_connection_is_no_loss_and_keeps_the_peaks(model: Model) -> None:
     model.gone("no server answers", now(1010))
     model.connected(description(), made.OWN_PEER, now(2000))
     sensor = take(model, *run(0, 10))
-    assert sensor.stream.missed == 0
-    assert sensor.stream.samples == 10
+    assert sensor.missed == 0
+    assert sensor.samples == 10
     assert sensor.peaks is not None
     assert tuple(sensor.peaks[0]) == (0, 7)
 
@@ -277,7 +268,7 @@ def test_the_age_is_that_of_a_new_sample_on_arrival(model: Model) -> None:
     for k, age_us in enumerate((300, 200, 900)):
         model.note_age(frame(k), frame(k).monotonic_ns + age_us * 1000)
     model.note_age(frame(3, flags=DataFlag.REPEATED), frame(3).monotonic_ns + 10**9)
-    age = only(model, now(4)).stream.age_us
+    age = only(model, now(4)).age_us
     assert age is not None
     assert tuple(age) == pytest.approx((300, 900), abs=0.01)
 
@@ -296,7 +287,7 @@ def test_an_age_is_noted_only_of_what_was_waited_for(
     with mock.patch.object(model, "note_age", lambda made, _: ages.append(made.sequence)):
         Reader(Address("localhost", 1), model)._take(cast("Client", client))
     assert ages == noted
-    assert only(model, now(4)).stream.samples >= 4
+    assert only(model, now(4)).samples >= 4
 
 
 def test_the_servers_clients_have_rates_and_one_of_them_is_this(model: Model) -> None:
@@ -305,16 +296,9 @@ def test_the_servers_clients_have_rates_and_one_of_them_is_this(model: Model) ->
     model.take_status(status(sent=2600), START_S + 3)
     state = model.state(START_S + 4)
     this, other = state.clients
-    assert (this.is_this, this.rate_hz, this.withheld) == (True, 800, 0)
-    assert (other.is_this, other.rate_hz, other.withheld) == (False, 3200, 12)
+    assert (this.this, this.rate_hz, this.withheld) == (True, 800, 0)
+    assert (other.this, other.rate_hz, other.withheld) == (False, 3200, 12)
     assert state.server.uptime_s == 4568
-
-
-def test_the_clock_is_told_as_the_server_says_it(model: Model) -> None:
-    model.take_status(status(mode="oversampling"), START_S)
-    clock = only(model, START_S).clock
-    assert clock is not None
-    assert clock.mode == "oversampling"
 
 
 def test_without_the_calibration_matrix_the_units_are_counts() -> None:

@@ -8,16 +8,10 @@ import re
 from dataclasses import replace
 
 import pytest
-from rich.text import Text
 
-from clients.monitor.model.server import Model
-from clients.monitor.model.state import Client, Range, State
-from clients.monitor.view.bars import bar, scale_for, trace, traces
-from clients.monitor.view.glyphs import ASCII, UNICODE
-from clients.monitor.view.json_line import json_line
-from clients.monitor.view.screen import KEYS, Look, render
-from clients.monitor.view.table import table
-from clients.numbers import duration, quantity
+from clients.monitor.model import Client, Model, Range, State
+from clients.monitor.screen import KEYS, Look, bar, render, scale_for, table, traces
+from clients.monitor.words import json_line
 from protocol.framing import DataMessage
 from tests.clients import monitor_states as made
 from tests.clients.captures import DOCS, captures
@@ -30,7 +24,7 @@ def plain(state: State, look: Look | None = None, width: int = 80, height: int =
 
 
 @pytest.mark.parametrize("name", STATES)
-@pytest.mark.parametrize("look", [Look(), Look(help=True), Look(glyphs=ASCII), Look(question="x" * 300)])
+@pytest.mark.parametrize("look", [Look(), Look(help=True), Look(ascii=True), Look(question="x" * 300)])
 def test_every_size_is_filled_and_never_exceeded(name: str, look: Look) -> None:
     state = STATES[name]()
     heights = (1, 5, 8, 12, 15, 23, 24, 36, 44, 90)
@@ -73,16 +67,6 @@ def test_80x24_has_the_state_of_a_sensor_that_is_lost_and_of_its_neighbors() -> 
     assert "firmware" not in text, "it goes first"
 
 
-def test_60x15_keeps_force_torque_the_stream_and_the_worst_warning() -> None:
-    text = plain(made.troubled(), width=60, height=15)
-    for fact in ("Fx", "Fy", "Fz!", "Mx", "My", "Mz", "Stream", "saturated: Fz", "Reduce sensor loading"):
-        assert fact in text, fact
-
-
-def test_what_does_not_fit_of_the_warnings_is_counted() -> None:
-    assert re.search(r"and \d more", plain(made.troubled(), width=60, height=15))
-
-
 def test_every_warning_can_be_reached() -> None:
     state = made.troubled()
     alert = state.sensors[0].alerts[0]
@@ -116,10 +100,11 @@ def test_a_tall_screen_is_used(name: str, width: int, height: int) -> None:
     assert sum("█" in row for row in rows) > 12, "the traces have several rows"
 
 
-def test_a_tall_trace_is_the_same_on_more_rows() -> None:
-    past = [Range(0, 0), Range(5, 5), Range(10, 10), None]
-    assert traces(past, 10.0, 4, 2, ASCII) == [" _# ", "_## "]
-    assert traces(past, 10.0, 4, 1, ASCII) == [trace(past, 10.0, 4, ASCII)]
+def test_60x15_keeps_force_torque_the_stream_and_the_worst_warning_and_counts_the_others() -> None:
+    text = plain(made.troubled(), width=60, height=15)
+    for fact in ("Fx", "Fy", "Fz!", "Mx", "My", "Mz", "Stream", "saturated: Fz", "Reduce sensor loading"):
+        assert fact in text, fact
+    assert re.search(r"and \d more", text)
 
 
 def test_a_server_that_is_gone_is_said_with_why_and_since_when() -> None:
@@ -127,16 +112,13 @@ def test_a_server_that_is_gone_is_said_with_why_and_since_when() -> None:
     assert "SERVER GONE 1m05s" in text
     assert "gone at 12:00:00: no server answers (Connection refused)" in text
     assert "values 1m05s old" in text
-
-
-def test_before_anything_is_known() -> None:
-    text = plain(State(replace(made.healthy().server, connected=False, since_s=None)))
+    text = plain(State(replace(made.gone().server, since_s=None)))
     assert "connecting" in text
     assert "no sensor known yet" in text
 
 
 def test_ascii_shows_the_same_in_ascii() -> None:
-    text = plain(made.troubled(), Look(glyphs=ASCII))
+    text = plain(made.troubled(), Look(ascii=True))
     assert text.isascii()
     assert "34.6 degC" in text
     assert "#####" in text
@@ -171,65 +153,10 @@ def _texts(svg: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("value", "drawn"),
-    [
-        (0.0, "-----|-----"),
-        (6.0, "-----|###--"),
-        (10.0, "-----|#####"),
-        (99.0, "-----|#####"),
-        (-10.0, "#####|-----"),
-        (float("nan"), "-----|-----"),
-    ],
-)
-def test_a_bar_grows_from_zero_and_stays_in_its_width(value: float, drawn: str) -> None:
-    assert bar(value, None, 10.0, 11, ASCII).plain == drawn
-
-
-def test_a_bar_marks_its_peaks() -> None:
-    assert bar(2.0, Range(-6.0, 10.0), 10.0, 11, ASCII).plain == "--[--|#---]"
-
-
-def test_a_bar_has_half_cells() -> None:
-    assert bar(5.0, None, 10.0, 11, UNICODE).plain == "─────┼██▌──"
-    assert bar(-5.0, None, 10.0, 11, UNICODE).plain == "──▐██┼─────"
-
-
-@pytest.mark.parametrize(
     ("reach", "scale"), [(0.0, 5.0), (5.0, 5.0), (5.1, 10.0), (10.1, 20.0), (25.0, 30.0), (412.0, 500.0)]
 )
 def test_the_scale_is_a_round_number_that_shows_everything(reach: float, scale: float) -> None:
     assert scale_for([Range(-reach, 0.0)], 5.0) == scale
-
-
-def test_a_trace_shows_a_touch_shorter_than_its_columns() -> None:
-    calm, touch = Range(-8.1, -7.9), Range(-26.0, -8.0)
-    assert trace([calm, calm, touch, calm], 30.0, 4, ASCII) == "##_#"
-
-
-def test_a_trace_shows_where_nothing_came_and_does_not_magnify_noise() -> None:
-    assert trace([Range(1, 2), None, Range(3, 4)], 10.0, 5, ASCII) == "  _ #"
-    quiet = trace([Range(0.0, 0.001), Range(0.001, 0.002)], 10.0, 2, UNICODE)
-    assert len(set(quiet)) == 1
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.9, "0 s"), (59.9, "59 s"), (65, "1m05s"), (3725, "1h02m"), (90061, "1d01h")]
-)
-def test_durations(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
-
-
-@pytest.mark.parametrize("value", [0.0, -0.0, 1.5, -12345678.9, 3.4e38, -3.4e38, float("nan"), float("inf")])
-def test_no_number_leaves_its_column(value: float) -> None:
-    assert len(quantity(value, 2, 9)) == 9
-
-
-def test_text_from_the_server_is_shown_as_it_is() -> None:
-    """Nothing in it is taken for Rich's markup."""
-    state = made.healthy()
-    odd = replace(state, sensors=(replace(state.sensors[0], name="[bold]x[/]"),))
-    assert "[bold]x[/]" in plain(odd)
-    assert isinstance(render(odd, Look(), 80, 24)[1], Text)
 
 
 def test_whatever_a_sensor_sends_is_shown() -> None:
@@ -242,7 +169,7 @@ def test_whatever_a_sensor_sends_is_shown() -> None:
         odd = DataMessage(sequence, stamp_ns, monotonic_ns, 0, noise.getrandbits(3), 0xFFFF, data)
         model.take([odd], made.now(k))
         state = model.state(made.now(k))
-        render(state, Look(glyphs=ASCII if k % 2 else UNICODE), 80, 24)
+        render(state, Look(ascii=bool(k % 2)), 80, 24)
         assert table(state)[-1].startswith(("Trouble: ", "Worth a look: ", "Good: "))
         json.loads(json_line(state, 0.0))
 
@@ -254,3 +181,37 @@ def test_clients_that_do_not_fit_are_counted() -> None:
     shown = row.count("800/s")
     assert shown >= 2
     assert row.endswith(f"and {30 - shown} more")
+
+
+@pytest.mark.parametrize(
+    ("value", "peak", "drawn"),
+    [
+        (0.0, None, "─────┼─────"),
+        (5.0, None, "─────┼██▌──"),
+        (-5.0, None, "──▐██┼─────"),
+        (10.0, None, "─────┼█████"),
+        (99.0, None, "─────┼█████"),
+        (float("nan"), None, "─────┼─────"),
+        (2.0, Range(-6.0, 10.0), "──├──┼█───┤"),
+    ],
+)
+def test_a_bar_grows_from_zero_stays_in_its_width_and_marks_its_peaks(
+    value: float, peak: Range | None, drawn: str
+) -> None:
+    assert bar(value, peak, 10.0, 11).plain == drawn
+
+
+@pytest.mark.parametrize(
+    ("past", "width", "height", "drawn"),
+    [
+        ([Range(0, 0), Range(5, 5), Range(10, 10), None], 4, 1, ["▁▄▇ "]),
+        ([Range(0, 0), Range(5, 5), Range(10, 10), None], 4, 2, ["  ▇ ", "▁▇█ "]),
+        ([Range(-8.1, -7.9), Range(-8.1, -7.9), Range(-26.0, -8.0), Range(-8.1, -7.9)], 4, 1, ["▇▇▁▇"]),
+        ([Range(1, 2), None, Range(3, 4)], 5, 1, ["  ▁ ▇"]),
+        ([Range(0.0, 0.001), Range(0.001, 0.002)], 2, 1, ["▄▄"]),
+        ([], 2, 2, ["  ", "  "]),
+    ],
+    ids=["one row", "two rows", "a touch", "nothing came", "noise is not magnified", "nothing"],
+)
+def test_a_trace(past: list[Range | None], width: int, height: int, drawn: list[str]) -> None:
+    assert traces(past, 10.0, width, height) == drawn

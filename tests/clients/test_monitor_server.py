@@ -21,11 +21,10 @@ from typing import Any
 import pytest
 
 from clients.monitor import cli, program
-from clients.monitor.model.server import Model
-from clients.monitor.model.state import State
+from clients.monitor.model import Model, State
 from clients.monitor.options import parse
 from clients.monitor.reader import Reader
-from clients.monitor.tare import WAYS, tare
+from clients.monitor.tare import clear, tare, undo
 from clients.recording.reader import RecordingError, open_recording
 from ethercat_server.serving.transport.in_memory import ManualClock
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -138,8 +137,8 @@ def test_once_prints_both_sensors_and_says_fine(shared: ServedSimulation, run: R
     assert (code, err) == (0, ""), out
     assert "BFT-SENS-ECAT-M8" in out
     assert "BFT-ROKS-ECAT-M8" in out
-    assert out.count("  force, N  ") == 2
-    assert out.count("    max  ") == 4
+    assert out.count("Force N ") == out.count("Torque Nm ") == 2
+    assert out.count(" min ") == out.count(" max") == 4
     assert "client this one" in out
     assert re.search(r"\n(Good|Worth a look): .*\.\n$", out)
 
@@ -179,9 +178,12 @@ def test_a_line_a_second_until_the_limit(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr(program, "time", SimpleNamespace(sleep=clock.sleep, monotonic=monotonic))
     times = []
-    for _ in program._seconds(4.0):
+
+    def show() -> None:
         times.append(round(monotonic() - 1.0, 3))
         clock.sleep(1.8 if len(times) == 1 else 0.3)  # whoever is late does not hurry afterwards
+
+    program.every_second(4.0, show)
     assert times == [1.0, 2.8, 3.8]
 
 
@@ -292,24 +294,23 @@ def state(model: Model) -> State:
 
 
 def samples(model: Model) -> int:
-    return min((sensor.stream.samples for sensor in state(model).sensors), default=0)
+    return min((sensor.samples for sensor in state(model).sensors), default=0)
 
 
 def test_rate_jitter_age_and_the_own_row_among_the_clients_are_known(shared: ServedSimulation) -> None:
     def is_whole(found: State) -> bool:  # only a sample that was waited for has an age
-        ages = [sensor.stream.age_us for sensor in found.sensors]
+        ages = [sensor.age_us for sensor in found.sensors]
         return bool(found.clients) and None not in ages
 
     with reading(shared.port) as model:
         wait_until(lambda: samples(model) > 50 and is_whole(state(model)), "samples, their ages and a status")
         found = state(model)
-    assert sum(client.is_this for client in found.clients) == 1
+    assert sum(client.this for client in found.clients) == 1
     for sensor in found.sensors:
-        stream = sensor.stream
-        assert stream.rate_hz
-        assert stream.jitter_us is not None
-        assert stream.age_us is not None
-        assert 0 < stream.age_us.p50 <= stream.age_us.worst
+        assert sensor.rate_hz
+        assert sensor.jitter_us is not None
+        assert sensor.age_us is not None
+        assert 0 < sensor.age_us.p50 <= sensor.age_us.worst
         assert sensor.clock is not None
         assert sensor.peaks is not None
 
@@ -337,23 +338,23 @@ def test_a_tare_is_undone_and_cleared() -> None:
             return found
 
     with simulated_bus("--signal", "rest") as bus, simulated_server(bus):
-        assert WAYS["undo"].do(address, 0) == (
+        assert undo(address, 0) == (
             "The tare of sensor 0 was not undone: no tare of it by this user is known; its offset can be "
             "cleared", True,
         )  # fmt: skip
         tare(address, 0)
         tared = offset()
-        assert WAYS["undo"].do(address, 0) == ("The tare of sensor 0 was undone", False)
+        assert undo(address, 0) == ("The tare of sensor 0 was undone", False)
         assert offset() == [0.0] * 6
-        assert not WAYS["undo"].do(address, 0)[1], "of the undoing"
+        assert not undo(address, 0)[1], "of the undoing"
         assert offset() == tared
-        assert WAYS["clear"].do(address, 0) == ("The offset of sensor 0 was cleared", False)
+        assert clear(address, 0) == ("The offset of sensor 0 was cleared", False)
         assert offset() == [0.0] * 6
         with Client(address.port, stream=False).connect() as client:
             client.ask("sdo_write", sensor=0, index=0x8000, subindex=1, type="f32", value=1.0)
-        assert "its offset has changed since" in WAYS["undo"].do(address, 0)[0]
+        assert "its offset has changed since" in undo(address, 0)[0]
         bus.command("on-write 0x8000 2 abort 0x8000 3 0x08000022")
-        text, bad = WAYS["clear"].do(address, 0)
+        text, bad = clear(address, 0)
         assert bad
         assert text.startswith("The offset of sensor 0 was not cleared: ")
         assert offset() == [1.0, *[0.0] * 5]

@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from bridge.stream.connection import Connection
+from bridge.stream.link import find_sensor
 from clients.recording.reader import Description, Event, open_recording
 from clients.replay import cli, program
 from clients.replay.sensors import ReplayedSensors
@@ -199,13 +199,10 @@ def test_what_needs_a_sensor_is_refused_in_a_sentence(
 
 def test_the_node_takes_it_for_a_server(path: Path, frames: list[DataMessage]) -> None:
     del frames
-    with replaying("--loop", path) as served:
-        connection = Connection("localhost", served.port)
-        info = connection.subscribe(1)
+    with replaying("--loop", path) as served, connect(served.port, sensors=[1]) as client:
+        info = find_sensor(client.description, 1)
         assert (info.sensor, info.serial, info.rate, info.settings) == (1, "101", 800, {"sinc_length": 64})
-        while not isinstance(connection.next_message(), DataMessage):
-            connection.receive()
-        connection.close()
+        assert client.receive(PATIENCE_S)
 
 
 def test_shutdown_ends_it(path: Path, frames: list[DataMessage]) -> None:

@@ -15,13 +15,13 @@ import pytest
 
 from clients.recording.columns import Columns
 from clients.report.checks.channels import CHANNELS, FORCE, limit_origin, noise_limit
-from clients.report.checks.check import Level
 from clients.report.checks.spectrum import welch
 from clients.report.checks.stuck import longest_runs
 from clients.report.examine import Examination, examine
 from clients.report.subjects.subject import Subject, subject
 from ethercat_server.virtual_sensor.measurement import scene
 from protocol.framing import DataFlag, DataMessage
+from protocol.health.verdict import Level
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
 from protocol.sensor.meaning import meaning
 from tests.clients.simulated import Script, decoded, described, sensor, simulate, subject_of

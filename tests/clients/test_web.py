@@ -6,22 +6,23 @@ import json
 import math
 import re
 import struct
+import threading
 import tomllib
 from array import array
 from collections.abc import Callable
-from http import HTTPStatus
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple, cast
 
 import pytest
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
 
 from clients.monitor.options import parse
-from clients.monitor.web.access import HEADERS, Token, refused_host, refused_origin
-from clients.monitor.web.files import STREAM, Files
-from clients.monitor.web.hub import MOST_VIEWERS, Hub, WebModel
-from clients.monitor.web.message import state_text
+from clients.monitor.tare import Say
+from clients.monitor.web.hub import MOST_BEHIND, MOST_PAGES, Hub, Page, WebModel, state_text
 from clients.monitor.web.points import CHANNELS, HEADER, STEP_NS, Feed
-from clients.monitor.web.viewer import MOST_BEHIND, Viewer
+from clients.monitor.web.server import HEADERS, STREAM, answer, read_page
 from protocol.framing import DataFlag, DataMessage
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.clients import monitor_states as made
@@ -30,6 +31,7 @@ from tests.clients.monitor_states import START_S, frame, moving
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "clients/monitor/web/page"
+PAGE_FILES = read_page()
 FX, FZ, AZ, WX = (CHANNELS.index(n) for n in ("force.x", "force.z", "acceleration.z", "angular_rate.x"))
 
 
@@ -144,21 +146,48 @@ def test_nothing_waits_endlessly(feed: Feed) -> None:
 
 
 class Harness:
-    """A hub whose pages are names."""
+    """A hub with a model of two sensors, and what its pages were sent."""
 
     def __init__(self) -> None:
         self.model = WebModel(made.ADDRESS)
         self.model.connected(made.description(("one", "two")), made.OWN_PEER, START_S)
-        self.token = Token()
-        self.tares: list[tuple[int, Callable[[str, bool], None], str]] = []
-        self.hub = Hub[str](self.model, self.token, lambda *tare: self.tares.append(tare))
+        self.tares: list[tuple[int, Say, str]] = []
+        self.taring_now = True
+        self.hub = Hub(self.model, self._tare)
+        self.sent: dict[Page, list[str | bytes]] = {}
+        self.page = self.join()
 
-    def states(self) -> dict[str, Any]:
-        return {page: json.loads(text) for pages, text in self.hub.states(START_S) for page in pages}
+    def _tare(self, position: int, say: Say, way: str) -> threading.Thread:
+        self.tares.append((position, say, way))
+        return cast("threading.Thread", SimpleNamespace(is_alive=lambda: self.taring_now))
 
-    def hear(self, page: str, **message: Any) -> dict[str, Any] | None:
-        reply = self.hub.hear(page, json.dumps(message))
-        return None if reply is None else dict(json.loads(reply))
+    def join(self) -> Page:
+        sent: list[str | bytes] = []
+        page = self.hub.join(sent.append, START_S)
+        assert page is not None
+        self.sent[page] = sent
+        return page
+
+    def states(self) -> dict[Page, Any]:
+        """The state that each page was sent just now."""
+        return {page: json.loads(sent[-1]) for page, sent in self.now(self.hub.send_states, START_S).items()}
+
+    def points(self, now_s: float) -> dict[Page, list[Batch]]:
+        """The points likewise."""
+        found = self.now(self.hub.send_points, now_s)
+        return {page: [decode(cast("bytes", each)) for each in sent] for page, sent in found.items()}
+
+    def now(self, send: Callable[..., None], *arguments: Any) -> dict[Page, list[str | bytes]]:
+        for sent in self.sent.values():
+            sent.clear()
+        send(*arguments)
+        return {page: list(sent) for page, sent in self.sent.items() if sent}
+
+    def take(self, page: Page, **message: Any) -> dict[str, Any] | None:
+        """The answer to a message of a page."""
+        found = self.now(self.hub.take, page, json.dumps(message)).get(page, [])
+        replies = [dict(json.loads(each)) for each in found if isinstance(each, str)]
+        return replies[0] if replies else None
 
     def message(self) -> str:
         said = self.model.state(START_S).message
@@ -167,23 +196,21 @@ class Harness:
 
 @pytest.fixture
 def web() -> Harness:
-    harness = Harness()
-    assert harness.hub.join("page") is not None
-    return harness
+    return Harness()
 
 
 def test_each_page_gets_the_sensor_that_it_shows(web: Harness) -> None:
-    web.hub.join("other")
-    web.hear("other", sensor=1)
+    other = web.join()
+    web.take(other, sensor=1)
     states = web.states()
-    assert states["page"]["sensor"]["identity"].startswith("Sensor 0  one")
-    assert states["other"]["sensor"]["identity"].startswith("Sensor 1  two")
+    assert states[web.page]["sensor"]["identity"].startswith("Sensor 0  one")
+    assert states[other]["sensor"]["identity"].startswith("Sensor 1  two")
     web.model.take([frame(k, sensor=s) for k in range(40) for s in (0, 1)], START_S + 0.05)
-    sent = {page: decode(text).sensor for pages, text in web.hub.points(START_S + 1) for page in pages}
-    assert sent == {"page": 0, "other": 1}
-    web.hub.leave("other")
+    sent = {page: [each.sensor for each in batches] for page, batches in web.points(START_S + 1).items()}
+    assert sent == {web.page: [0], other: [1]}
+    web.hub.leave(other)
     web.model.take([frame(k, sensor=s) for k in range(40, 80) for s in (0, 1)], START_S + 0.1)
-    assert [pages for pages, _ in web.hub.points(START_S + 2)] == [["page"]]
+    assert list(web.points(START_S + 2)) == [web.page]
 
 
 def test_a_page_that_comes_later_gets_the_last_minute(web: Harness) -> None:
@@ -192,79 +219,72 @@ def test_a_page_that_comes_later_gets_the_last_minute(web: Harness) -> None:
             moment = 10**12 + second * 10**9
             frames = [frame(second, sensor=s)._replace(monotonic_ns=moment) for s in (0, 1)]
             web.model.take(frames, START_S)
-            list(web.hub.points(START_S + second))
+            web.hub.send_points(START_S + second)
 
-    def kept(page: str) -> list[float]:
-        return [time for message in web.hub.kept(page) for time in decode(message).times]
+    def kept(sensor: int) -> list[Batch]:
+        sent = web.now(web.hub.take, later, json.dumps({"sensor": sensor})).get(later, [])
+        return [decode(cast("bytes", each)) for each in sent]
 
     pass_by(0, 100)
-    web.hub.join("later")
-    assert kept("later") == pytest.approx(range(1039, 1100))
-    web.hear("later", sensor=1)
-    assert {decode(message).sensor for message in web.hub.kept("later")} == {1}
-    web.hear("later", sensor=5)
-    assert kept("later") == []
-    web.hear("later", sensor=1)
+    later = web.join()
+    sent = [decode(each) for each in web.sent[later] if isinstance(each, bytes)]
+    assert [time for each in sent for time in each.times] == pytest.approx(range(1039, 1100))
+    assert {each.sensor for each in kept(1)} == {1}
+    assert kept(5) == []
     web.model.connected(made.description(("one", "two")), made.OWN_PEER, START_S)
     pass_by(-500, -490)  # a restarted machine
-    assert kept("later") == pytest.approx(range(500, 510))
+    assert [time for each in kept(1) for time in each.times] == pytest.approx(range(500, 510))
 
 
 def test_a_page_that_lags_misses_what_came_and_goes_on_with_the_newest(web: Harness) -> None:
-    web.hub.join("quick")
-    slow: list[int] = []
-    for number in range(1, 31):
+    quick, slow = web.join(), web.page
+    first = len(slow.unseen)
+    for _ in range(30):
         states = web.states()
-        web.hear("quick", seen=states["quick"]["state"])
-        assert states["quick"]["state"] == number
-        slow += [states["page"]["state"]] if "page" in states else []
-    assert slow == list(range(1, MOST_BEHIND + 1))
+        web.take(quick, seen=states[quick]["state"])
+        first += slow in states
+    assert first == MOST_BEHIND
     web.model.take([frame(k) for k in range(100)], START_S + 1)
-    assert [pages for pages, _ in web.hub.points(START_S + 1)] == [["quick"]]
-    web.hear("page", seen=MOST_BEHIND)
-    assert web.states()["page"]["state"] == 31, "the newest"
-    for first, expected in ((100, {"quick": False, "page": True}), (200, {"quick": False, "page": False})):
-        web.model.take([frame(k) for k in range(first, first + 100)], START_S + 1)
-        sent = web.hub.points(START_S + 2)
-        skipped = {page: decode(text).skipped for pages, text in sent for page in pages}
+    assert list(web.points(START_S + 1)) == [quick]
+    newest = states[quick]["state"]
+    web.take(slow, seen=newest)
+    assert web.states()[slow]["state"] == newest + 1, "the newest"
+    for start, expected in ((100, {quick: False, slow: True}), (200, {quick: False, slow: False})):
+        web.model.take([frame(k) for k in range(start, start + 100)], START_S + 1)
+        skipped = {page: each.skipped for page, [each] in web.points(START_S + 2).items()}
         assert skipped == expected, "it is told where it was that missed something, not the sensor"
 
 
-def test_an_acknowledgement_of_what_was_not_sent_buys_nothing() -> None:
-    viewer = Viewer(Token())
-    viewer.hear('{"seen":999999999}')
-    for number in range(5, 5 + MOST_BEHIND):
-        assert not viewer.behind
-        viewer.sends(number)
-        viewer.hear('{"seen":-3}')
-        viewer.hear('{"seen":4}')
-    assert viewer.behind
+def test_an_acknowledgement_of_what_was_not_sent_buys_nothing(web: Harness) -> None:
+    web.take(web.page, seen=999_999_999)
+    for _ in range(MOST_BEHIND):
+        assert not web.page.behind
+        web.hub.send_states(START_S)
+        web.take(web.page, seen=-3)
+        web.take(web.page, seen=1)
+    assert web.page.behind
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "{", '{"do":"shutdown"}', '{"do":5}', b"\xff", "\ud800", "[" * 900]
+    "text", ["", "[]", "{", '{"do":"shutdown"}', '{"do":5}', '{"do":[]}', b"\xff", "\ud800", "[" * 900]
 )
-def test_a_message_that_no_page_sends_ends_the_connection(text: str | bytes) -> None:
-    viewer = Viewer(Token())
-    assert viewer.hear(text) is None
-    assert viewer.end == "Not a message of this page"
+def test_a_message_that_no_page_sends_ends_the_connection(web: Harness, text: str | bytes) -> None:
+    assert not web.now(web.hub.take, web.page, text)
+    assert web.page.end == "Not a message of this page"
 
 
-def test_a_flood_of_messages_ends_the_connection() -> None:
-    viewer = Viewer(Token())
-    heard = 0
-    while not viewer.end and heard < 1000:
-        viewer.hear('{"sensor":1}')
-        heard += 1
-    assert heard < 100
-    assert viewer.end == "Too many messages"
+def test_a_flood_of_messages_ends_the_connection(web: Harness) -> None:
+    for _ in range(100):
+        web.take(web.page, sensor=1)
+    assert web.page.end == "Too many messages"
 
 
 def test_pages_are_limited_in_number(web: Harness) -> None:
-    assert all(web.hub.join(f"page {n}") for n in range(1, MOST_VIEWERS))
-    assert web.hub.join("one more") is None
-    web.hub.leave("page")
-    assert web.hub.join("one more") is not None
+    for _ in range(1, MOST_PAGES):
+        web.join()
+    assert web.hub.join(lambda _: None, START_S) is None
+    web.hub.leave(web.page)
+    web.join()
 
 
 # Who may.
@@ -272,12 +292,13 @@ def test_pages_are_limited_in_number(web: Harness) -> None:
 
 @pytest.mark.parametrize("action", ["tare", "clear", "reset"])
 def test_without_the_token_nothing_is_done(web: Harness, action: str) -> None:
-    for token in ("", "wrong", web.token.text[:-1], web.token.text + "A", None, 5, ["x"], "\ud800é"):
-        reply = web.hear("page", token=token, do=action)
+    token = web.hub.token
+    for wrong in ("", "wrong", token[:-1], token + "A", None, 5, ["x"], "\ud800é"):
+        reply = web.take(web.page, token=wrong, do=action)
         assert reply is not None
         assert reply["control"] is False
         assert "token" in reply["refused"]
-    reply = web.hear("page", do=action)
+    reply = web.take(web.page, do=action)
     assert reply == {
         "control": False,
         "refused": "Only a page opened by the link that ethercat-monitor printed may do this",
@@ -287,36 +308,43 @@ def test_without_the_token_nothing_is_done(web: Harness, action: str) -> None:
 
 
 def test_with_the_token_the_sensor_is_tared_once_at_a_time(web: Harness) -> None:
-    assert web.hear("page", token=web.token.text) == {"control": True, "refused": None}
-    web.hub.join("other")
-    refused = web.hear("other", do="tare")
+    assert web.take(web.page, token=web.hub.token) == {"control": True, "refused": None}
+    refused = web.take(web.join(), do="tare")
     assert refused is not None, "the token of one page is no other's"
     assert not refused["control"]
-    web.hear("page", do="tare", sensor=1)
-    [(position, said, way)] = web.tares
+    web.take(web.page, do="tare", sensor=1)
+    [(position, say, way)] = web.tares
     assert (position, way) == (1, "tare")
-    assert "Taring sensor 1" in web.message()
-    web.hear("page", do="tare")
+    web.take(web.page, do="tare")
     assert "A tare is running already" in web.message()
-    said("Sensor 1 was tared", False)
-    assert web.states()["page"]["message"]["text"].endswith("Sensor 1 was tared")
-    web.hear("page", do="undo")
+    say("Sensor 1 was tared", False)
+    assert web.states()[web.page]["message"]["text"].endswith("Sensor 1 was tared")
+    web.taring_now = False
+    web.take(web.page, do="undo")
     assert (web.tares[1][0], web.tares[1][2]) == (1, "undo")
-    assert "Undoing the tare of sensor 1" in web.message()
 
 
 def test_with_the_token_peaks_are_reset(web: Harness) -> None:
     web.model.take([frame(0, {"force.x": 77.0})], START_S)
     web.model.take([frame(1, {"force.x": 1.0})], START_S)
-    assert web.states()["page"]["sensor"]["peaks"]["Fx"] == [1, 77]
-    web.hear("page", token=web.token.text, do="reset")
-    assert web.states()["page"]["sensor"]["peaks"] is None
+    assert web.states()[web.page]["sensor"]["peaks"]["Fx"] == [1, 77]
+    web.take(web.page, token=web.hub.token, do="reset")
+    assert web.states()[web.page]["sensor"]["peaks"] is None
 
 
 def test_every_run_has_another_token_that_no_one_guesses() -> None:
-    tokens = {Token().text for _ in range(100)}
+    model = WebModel(made.ADDRESS)
+    tokens = {Hub(model, lambda *_: threading.Thread()).token for _ in range(100)}
     assert len(tokens) == 100
     assert all(re.fullmatch(r"[\w-]{32,}", token) for token in tokens)
+
+
+def asked(path: str, *origins: str, host: str | None = "localhost:12080") -> Response | None:
+    """The answer to a request of this path, Host and Origin."""
+    headers = Headers([("Host", host)] if host is not None else [])
+    for origin in origins:
+        headers["Origin"] = origin
+    return answer(PAGE_FILES, Request(path, headers))
 
 
 @pytest.mark.parametrize(
@@ -327,71 +355,60 @@ def test_every_run_has_another_token_that_no_one_guesses() -> None:
      ("[::1", False), (None, False)],
 )  # fmt: skip
 def test_only_names_of_this_machine_are_answered(host: str | None, right: bool) -> None:
-    assert (refused_host(host) is None) is right
-    answer = Files().answer("/", host, None)
-    assert answer is not None
-    assert answer.status is (HTTPStatus.OK if right else HTTPStatus.FORBIDDEN)
+    found = asked("/", host=host)
+    assert found is not None
+    assert found.status_code == (200 if right else 403)
 
 
 @pytest.mark.parametrize(
-    ("origin", "right"),
-    [("http://localhost:12080", True), ("http://LOCALHOST:12080", True), ("http://localhost:3000", False),
-     ("https://localhost:12080", False), ("http://127.0.0.1:12080", False), ("http://evil.example", False),
-     ("http://localhost:12080.evil.example", False), ("null", False), ("", False), (None, False)],
+    ("origins", "right"),
+    [(["http://localhost:12080"], True), (["http://LOCALHOST:12080"], True),
+     (["http://localhost:3000"], False),
+     (["https://localhost:12080"], False), (["http://127.0.0.1:12080"], False),
+     (["http://evil.example"], False), (["http://localhost:12080.evil.example"], False), (["null"], False),
+     ([""], False), ([], False), (["http://localhost:12080", "http://evil.example"], False)],
 )  # fmt: skip
-def test_the_stream_is_for_the_page_alone(origin: str | None, right: bool) -> None:
-    assert (refused_origin(origin, "localhost:12080") is None) is right
-    answer = Files().answer(STREAM, "localhost:12080", origin)
-    assert (answer is None) is right
+def test_the_stream_is_for_the_page_alone(origins: list[str], right: bool) -> None:
+    found = asked(STREAM, *origins)
+    assert (found is None) is right
 
 
 def test_a_name_that_leads_here_does_not_open_the_stream() -> None:
     """DNS rebinding: Host and Origin agree, and both are the attacker's."""
-    answer = Files().answer(STREAM, "evil.example:12080", "http://evil.example:12080")
-    assert answer is not None
-    assert answer.status is HTTPStatus.FORBIDDEN
+    found = asked(STREAM, "http://evil.example:12080", host="evil.example:12080")
+    assert found is not None
+    assert found.status_code == 403
 
 
 # The page's files.
 
 
 def test_the_page_is_whole_small_and_keeps_its_own_policy() -> None:
-    files = Files()
-    assert sum(len(body) for body, _ in files.by_path.values()) < 200_000
-    html = files.by_path["/"][0].decode()
+    assert sum(len(body) for body, _ in PAGE_FILES.values()) < 200_000
+    html = PAGE_FILES["/"][0].decode()
     used = set(re.findall(r'(?:src|href)="([^"]+)"', html))
     modules = {
         f"/{name}"
-        for path, (body, _) in files.by_path.items()
+        for path, (body, _) in PAGE_FILES.items()
         if path.endswith(".js")
         for name in re.findall(r'from "\./(\w+\.js)"', body.decode())
     }
-    assert used | modules | {"/"} == set(files.by_path), "each file is used, and each used file is there"
+    assert used | modules | {"/"} == set(PAGE_FILES), "each file is used, and each used file is there"
     assert not re.search(r"<style|\sstyle=|\son\w+=|<script>", html)
     assert "unsafe" not in HEADERS["Content-Security-Policy"]
     assert "//" not in re.sub(r"http://www\.w3\.org/2000/svg|ws://\$|^\s*//.*$| //.*$", "", "".join(
-        body.decode() for path, (body, _) in files.by_path.items() if "/uplot/" not in path
+        body.decode() for path, (body, _) in PAGE_FILES.items() if "/uplot/" not in path
     ), flags=re.MULTILINE), "nothing from elsewhere"  # fmt: skip
 
 
 def test_every_answer_has_the_headers_and_nothing_else_is_served() -> None:
-    files = Files()
-    for path in (
-        "/",
-        "/app.js",
-        "/uplot/uPlot.iife.min.js",
-        "/?x=1",
-        "/nothing",
-        "/../server.py",
-        "/page/app.js",
-        "//",
-    ):
-        answer = files.answer(path, "localhost", None)
-        assert answer is not None
-        assert answer.headers.items() >= HEADERS.items()
-        assert answer.headers["Content-Length"] == str(len(answer.body))
-        known = path.partition("?")[0] in files.by_path
-        assert answer.status is (HTTPStatus.OK if known else HTTPStatus.NOT_FOUND), path
+    known = ("/", "/app.js", "/uplot/uPlot.iife.min.js", "/?x=1")
+    for path in (*known, "/nothing", "/../server.py", "/page/app.js", "//"):
+        found = asked(path)
+        assert found is not None
+        assert {name: found.headers[name] for name in HEADERS} == HEADERS
+        assert found.headers["Content-Length"] == str(len(found.body))
+        assert found.status_code == (200 if path in known else 404), path
 
 
 def test_every_file_is_in_the_package_and_the_library_with_its_license() -> None:

@@ -45,7 +45,7 @@ def page(chromium: Page, web: Web) -> Iterator[Page]:
     """It shows the sensor; nothing was sent yet."""
     chromium.complaints.clear()
     chromium.size(1280, 900)
-    chromium.open(f"{web.origin}/#token={web.token.text}")
+    chromium.open(f"{web.origin}/#token={web.hub.token}")
     wait_for_text(chromium, "#identity", "BFT-SENS-ECAT-M8")
     yield chromium
     chromium.open("about:blank")  # else the page goes on trying to reconnect, and complains in the next test
@@ -134,8 +134,7 @@ def test_what_a_slow_page_missed_is_told_from_what_was_lost(page: Page, web: Web
     feed(web, 160)
     page.wait_for("document.querySelector('#force').plot.data[0].length > 30")
     web.now_s = made.now(400)
-    viewer = next(iter(web.hub._viewers.values()))
-    viewer.missed = True
+    next(iter(web.hub._pages)).missed = True
     web.feed(*(frame(k) for k in range(400, 560)))
     page.wait_for("document.querySelector('#force').plot.skipped?.length > 0")
     web.feed(*(frame(k) for k in range(720, 880)))
@@ -174,7 +173,7 @@ def test_silence_makes_values_old(page: Page, web: Web) -> None:
 def test_a_lost_monitor_is_said_and_comes_back(chromium: Page) -> None:
     web = Web()
     with web.serving():
-        chromium.open(f"{web.origin}/#token={web.token.text}")
+        chromium.open(f"{web.origin}/#token={web.hub.token}")
         wait_for_text(chromium, "#identity", "BFT-SENS-ECAT-M8")
         feed(web, 160)
         chromium.wait_for("!document.querySelector('#tare').disabled")
@@ -243,6 +242,8 @@ def test_a_page_of_another_site_gets_nothing(chromium: Page, web: Web) -> None:
         )
         assert chromium.value(tried.format(f"127.0.0.1:{other.port}")) == "open"
         assert chromium.value(tried.format(f"localhost:{web.port}")) == "refused"
+        chromium.open("about:blank")
+        chromium.wait_for("location.href === 'about:blank'")
 
 
 @pytest.mark.long

@@ -17,8 +17,8 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 from clients.monitor import cli
-from clients.monitor.web.access import HEADERS
-from clients.monitor.web.hub import MOST_VIEWERS, TOO_MANY
+from clients.monitor.web.hub import MOST_PAGES, TOO_MANY
+from clients.monitor.web.server import HEADERS
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.monitor_states import frame
 from tests.clients.web_pages import Web
@@ -64,7 +64,7 @@ def test_the_page_is_served_on_both_loopback_addresses_and_nothing_is_kept(web: 
         assert answer.status == status
         assert dict(answer.getheaders()).items() >= HEADERS.items()
         assert len(answer.read()) == int(answer.headers["Content-Length"])
-        assert web.token.text not in str(answer.headers)
+        assert web.hub.token not in str(answer.headers)
         asking.close()
 
 
@@ -93,7 +93,7 @@ def test_states_and_points_come_and_a_wish_is_answered(web: Web) -> None:
         stream.send('{"do":"tare"}')
         assert "printed" in message(stream, "control")["refused"]
         assert web.tared == []
-        stream.send(json.dumps({"token": web.token.text}))
+        stream.send(json.dumps({"token": web.hub.token}))
         assert message(stream, "control") == {"control": True, "refused": None}
         stream.send('{"do":"tare"}')
         while "was tared" not in str(message(stream, "state")["message"]):
@@ -116,7 +116,7 @@ def test_what_no_page_sends_ends_its_connection_and_no_other(web: Web, text: str
 
 def test_one_page_too_many_is_told_so(web: Web) -> None:
     with contextlib.ExitStack() as stack:
-        for _ in range(MOST_VIEWERS):
+        for _ in range(MOST_PAGES):
             message(stack.enter_context(stream_of(web.port)), "state")
         with stream_of(web.port) as late, pytest.raises(ConnectionClosed) as closed:
             late.recv(PATIENCE_S)

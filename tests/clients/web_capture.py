@@ -15,7 +15,7 @@ from typing import Final
 
 from PIL import Image, PngImagePlugin
 
-from clients.monitor.web.files import Files
+from clients.monitor.web.server import read_page
 from tests.clients import monitor_states as made
 from tests.clients.devtools import browser
 from tests.clients.monitor_states import RATE_HZ, frame, now
@@ -34,7 +34,7 @@ __all__ = ["AGAIN", "PICTURE", "digest", "digest_in"]
 def digest() -> str:
     """Of all files of the page."""
     found = hashlib.sha256()
-    for path, (body, _) in sorted(Files().by_path.items()):
+    for path, (body, _) in sorted(read_page().items()):
         found.update(path.encode() + b"\0" + body)
     return found.hexdigest()
 
@@ -55,7 +55,7 @@ def make(picture: Path) -> None:
     web = Web()
     with tempfile.TemporaryDirectory() as scratch, web.serving(), browser(Path(scratch)) as page:
         page.size(_WIDTH, _HEIGHT, dark=True)
-        page.open(f"{web.origin}/#token={web.token.text}")
+        page.open(f"{web.origin}/#token={web.hub.token}")
         page.wait_for("document.querySelector('#identity')?.innerText.includes('Sensor 0')")
         _feed(web)
         page.wait_for("document.querySelector('[data-axis=Fx]').innerText.includes('.')")

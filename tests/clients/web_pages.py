@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future
 
-from clients.monitor.web.access import Token
-from clients.monitor.web.hub import WebModel
-from clients.monitor.web.server import PageHub, WebServer
+from clients.monitor.tare import Say
+from clients.monitor.web.hub import Hub, WebModel
+from clients.monitor.web.server import serving
 from protocol.framing import DataMessage
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S
@@ -28,16 +28,16 @@ class Web:
     def __init__(self) -> None:
         self.model = WebModel(made.ADDRESS)
         self.model.connected(made.description(), made.OWN_PEER, START_S)
-        self.token = Token()
-        self.hub = PageHub(self.model, self.token, self._tare)
+        self.hub = Hub(self.model, self._tare)
         self.now_s = START_S
         self.port = 0
         self.tared: list[tuple[int, str]] = []
         self.tare_answer = ("Sensor 0 was tared", False)
 
-    def _tare(self, position: int, said: Callable[[str, bool], None], way: str) -> None:
+    def _tare(self, position: int, say: Say, way: str) -> threading.Thread:
         self.tared.append((position, way))
-        said(*self.tare_answer)
+        say(*self.tare_answer)
+        return threading.Thread()
 
     @property
     def origin(self) -> str:
@@ -53,9 +53,7 @@ class Web:
         ready, loop, stop = Future[int](), asyncio.new_event_loop(), asyncio.Event()
 
         async def serve() -> None:
-            async with WebServer(self.hub, self.model, lambda: self.now_s).serving(
-                "localhost", self.port
-            ) as at:
+            async with serving(self.hub, self.model, "localhost", self.port, lambda: self.now_s) as at:
                 ready.set_result(at)
                 await stop.wait()
 

@@ -115,7 +115,7 @@ def panels(data: Samples) -> Iterator[tuple[str, Array]]:
     """Title, and what is left, (n, 6)."""
     yield "as measured", np.hstack([data.force, data.torque])
     yield "bias subtracted (IV.1)", compensated(data, mass=0.0)
-    yield "gravity subtracted too (IV.5)", compensated(data)
+    yield "weight and inertia subtracted too (IV.5)", compensated(data)
     for name, left in mistakes(data):
         yield f"mistake: {name}", left
 

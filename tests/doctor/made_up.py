@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from ethercat_server.doctor.examination import CHECKS
-from ethercat_server.doctor.finding import Finding, Level
+from ethercat_server.doctor.finding import Finding
 from ethercat_server.doctor.machine.facts import InterfaceFacts, Link
 from ethercat_server.doctor.machine.machine import Machine
-from ethercat_server.ethercat.nic.ip import Routes
+from ethercat_server.ethercat.nic.interface import Routes
+from protocol.health.verdict import Level
 
 CPUS = "/sys/devices/system/cpu"
 CARD = Link(index=7, parent="0000:00:1f.6", counters={"rx_packets": 100}, carrier_changes=2)

@@ -9,9 +9,10 @@ from typing import Any
 
 from ethercat_server.doctor.bus.examination import Request, examine_bus
 from ethercat_server.doctor.cli import main
-from ethercat_server.doctor.finding import Finding, Level
+from ethercat_server.doctor.finding import NAMES, Finding
 from ethercat_server.doctor.machine.facts import InterfaceFacts
 from ethercat_server.doctor.report import worst
+from protocol.health.verdict import Level
 from tests.doctor.made_up import FACTS, Files, machine
 from tests.ended import Result, run, run_here
 from tests.server import readable
@@ -68,7 +69,7 @@ class BusFindings(list[Finding]):
 
     def levels(self, subject: str) -> dict[str, str]:
         """The level of each check."""
-        return {check: finding.level.name.lower() for check, finding in self.of(subject).items()}
+        return {check: NAMES[finding.level] for check, finding in self.of(subject).items()}
 
 
 def examined(

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ethercat_server.doctor.cli import build_parser
 from ethercat_server.doctor.examination import CHECKS
+from ethercat_server.doctor.finding import NAMES
 from ethercat_server.doctor.report import EXIT_CODES
 
 DOCS = (Path(__file__).parent.parent.parent / "docs" / "doctor.md").read_text()
@@ -41,7 +42,7 @@ def test_the_example_is_of_these_checks() -> None:
 
 def test_levels_and_exit_codes() -> None:
     for level, code in EXIT_CODES.items():
-        row = next(line for line in DOCS.splitlines() if line.startswith(f"| `{level.name.lower()}` |"))
+        row = next(line for line in DOCS.splitlines() if line.startswith(f"| `{NAMES[level]}` |"))
         assert row.endswith(f"| {code} |")
         if code:
             assert f" {code} " in " ".join(str(build_parser().epilog).replace(",", " ").split())

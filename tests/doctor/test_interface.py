@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from ethercat_server.doctor.examination import examine_machine
-from ethercat_server.doctor.finding import CannotLookError, Level
+from ethercat_server.doctor.finding import CannotLookError
 from ethercat_server.doctor.machine import nic
 from ethercat_server.doctor.machine.facts import InterfaceFacts
-from ethercat_server.ethercat.nic.ip import Routes
+from ethercat_server.ethercat.nic.interface import Routes
+from protocol.health.verdict import Level
 from tests.doctor.made_up import CPUS, but, machine, only
 
 NAMED = "ens5"
@@ -19,7 +20,7 @@ NAMED = "ens5"
 
 def test_nothing_is_wrong_with_a_good_machine(tmp_path: Path) -> None:
     found = list(examine_machine(machine(tmp_path)))
-    assert [finding for finding in found if finding.level is not Level.OK] == []
+    assert [finding for finding in found if finding.level is not Level.GOOD] == []
     assert {finding.subject for finding in found} == {
         "kernel",
         "rights",
@@ -32,9 +33,9 @@ def test_nothing_is_wrong_with_a_good_machine(tmp_path: Path) -> None:
 def test_without_the_interface_the_machine_is_looked_at_all_the_same(tmp_path: Path) -> None:
     gone = machine(tmp_path, facts=InterfaceFacts(names=("lo", "eth1")))
     found = list(examine_machine(gone))
-    assert [(f.check, f.level) for f in found if f.level is not Level.OK] == [
-        ("link", Level.BAD),
-        ("the rest", Level.SKIPPED),
+    assert [(f.check, f.level) for f in found if f.level is not Level.GOOD] == [
+        ("link", Level.TROUBLE),
+        ("the rest", Level.NOT_POSSIBLE),
     ]
     assert "lo, eth1" in only("link", gone).why
 
@@ -49,17 +50,17 @@ def test_without_the_interface_the_machine_is_looked_at_all_the_same(tmp_path: P
 )
 def test_links_that_cannot_be_used(tmp_path: Path, change: dict[str, bool], found: str, command: str) -> None:
     finding = only("link", machine(tmp_path, facts=but(link=change)))
-    assert (finding.level, finding.found, finding.commands) == (Level.BAD, found, (command,))
+    assert (finding.level, finding.found, finding.commands) == (Level.TROUBLE, found, (command,))
 
 
 @pytest.mark.parametrize(
     ("settings", "level"),
     [
-        ((100, "full"), Level.OK),
-        ((100, "half"), Level.BAD),
-        ((10, "full"), Level.BAD),
-        ((1000, "full"), Level.WARNING),
-        ((None, None), Level.OK),
+        ((100, "full"), Level.GOOD),
+        ((100, "half"), Level.TROUBLE),
+        ((10, "full"), Level.TROUBLE),
+        ((1000, "full"), Level.LOOK),
+        ((None, None), Level.GOOD),
     ],
 )
 def test_ethercat_is_100_megabits_full_duplex(
@@ -70,7 +71,7 @@ def test_ethercat_is_100_megabits_full_duplex(
 
 def test_speed_of_what_has_none(tmp_path: Path) -> None:
     virtual = machine(tmp_path, facts=but(settings=(10000, "full"), link={"kind": "veth"}))
-    assert only("speed", virtual).level is Level.OK
+    assert only("speed", virtual).level is Level.GOOD
     with pytest.raises(CannotLookError, match="carrier"):
         only("speed", machine(tmp_path, facts=but(link={"carrier": False})))
     with pytest.raises(CannotLookError, match="went wrong"):
@@ -80,24 +81,24 @@ def test_speed_of_what_has_none(tmp_path: Path) -> None:
 def test_drivers(tmp_path: Path) -> None:
     assert only("driver", machine(tmp_path / "a")).found == "e1000e on 0000:00:1f.6"
     usb = only("driver", machine(tmp_path / "b", facts=but(driver=("r8152", "usb-0000:00:14.0-2"))))
-    assert (usb.level, "PCIe" in usb.why) == (Level.WARNING, True)
+    assert (usb.level, "PCIe" in usb.why) == (Level.LOOK, True)
     guest = only("driver", machine(tmp_path / "c", facts=but(driver=("virtio_net", "0000:00:03.0"))))
-    assert guest.level is Level.WARNING
+    assert guest.level is Level.LOOK
     wireless = machine(tmp_path / "d", {f"/sys/class/net/{NAMED}/wireless/status": ""})
-    assert only("driver", wireless).level is Level.BAD
+    assert only("driver", wireless).level is Level.TROUBLE
 
 
 def test_coalescing(tmp_path: Path) -> None:
-    assert only("coalescing", machine(tmp_path)).level is Level.OK
+    assert only("coalescing", machine(tmp_path)).level is Level.GOOD
     held = {"rx_coalesce_usecs": 3, "tx_coalesce_usecs": 0, "use_adaptive_rx_coalesce": 0}
     found = only("coalescing", machine(tmp_path, facts=but(coalescing=held)))
-    assert (found.level, found.found) == (Level.WARNING, "rx 3 µs")
+    assert (found.level, found.found) == (Level.LOOK, "rx 3 µs")
     assert found.commands == ("sudo ethtool -C ens5 rx-usecs 0 tx-usecs 0",)
     held["use_adaptive_rx_coalesce"] = 1
     found = only("coalescing", machine(tmp_path, facts=but(coalescing=held)))
     assert found.commands == ("sudo ethtool -C ens5 adaptive-rx off adaptive-tx off rx-usecs 0 tx-usecs 0",)
     none = machine(tmp_path, facts=but(coalescing="the driver does not support it"))
-    assert only("coalescing", none).level is Level.OK
+    assert only("coalescing", none).level is Level.GOOD
     with pytest.raises(CannotLookError):
         only("coalescing", machine(tmp_path, facts=but(coalescing="Operation not permitted")))
 
@@ -107,23 +108,23 @@ def test_offloads(tmp_path: Path) -> None:
     found = only("offloads", machine(tmp_path, facts=but(offloads=on)))
     assert (found.level, found.commands) == (Level.NOTE, ("sudo ethtool -K ens5 gro off tso off",))
     assert (
-        only("offloads", machine(tmp_path, facts=but(offloads=on, link={"kind": "veth"}))).level is Level.OK
+        only("offloads", machine(tmp_path, facts=but(offloads=on, link={"kind": "veth"}))).level is Level.GOOD
     )
 
 
 @pytest.mark.parametrize(
     ("eee", "level"),
     [
-        ((True, True), Level.WARNING),
+        ((True, True), Level.LOOK),
         ((True, False), Level.NOTE),
-        ((False, False), Level.OK),
-        ("the driver does not support it", Level.OK),
+        ((False, False), Level.GOOD),
+        ("the driver does not support it", Level.GOOD),
     ],
 )
 def test_energy_efficient_ethernet(tmp_path: Path, eee: tuple[bool, bool] | str, level: Level) -> None:
     found = only("EEE", machine(tmp_path, facts=but(eee=eee)))
     assert found.level is level
-    assert found.commands == (("sudo ethtool --set-eee ens5 eee off",) if level > Level.OK else ())
+    assert found.commands == (("sudo ethtool --set-eee ens5 eee off",) if level > Level.GOOD else ())
 
 
 def test_counters(tmp_path: Path) -> None:
@@ -132,8 +133,8 @@ def test_counters(tmp_path: Path) -> None:
             "counters", machine(tmp_path, facts=but(link={"counters": {"rx_packets": 9, **counters}}))
         ).level
 
-    assert counted() is Level.OK
-    assert counted(rx_crc_errors=1) is Level.WARNING
+    assert counted() is Level.GOOD
+    assert counted(rx_crc_errors=1) is Level.LOOK
     assert counted(rx_dropped=5) is Level.NOTE
     flapping = machine(tmp_path, facts=but(link={"carrier_changes": 90}))
     assert only("counters", flapping).level is Level.NOTE
@@ -144,9 +145,9 @@ def test_counters(tmp_path: Path) -> None:
 def test_counters_that_rise_while_the_doctor_looks() -> None:
     before = {"rx_crc_errors": 7, "rx_dropped": 2, "rx_packets": 1}
     (same,) = nic.rising(before, {**before, "rx_packets": 900})
-    assert same.level is Level.OK
+    assert same.level is Level.GOOD
     (more,) = nic.rising(before, {**before, "rx_crc_errors": 9})
-    assert (more.level, more.found, more.values) == (Level.BAD, "rx_crc_errors 2", {"rx_crc_errors": 2})
+    assert (more.level, more.found, more.values) == (Level.TROUBLE, "rx_crc_errors 2", {"rx_crc_errors": 2})
     (dropped,) = nic.rising(before, {**before, "rx_dropped": 3})
     assert dropped.level is Level.NOTE
     with pytest.raises(CannotLookError):
@@ -162,7 +163,7 @@ def test_interrupts_belong_on_the_isolated_processor(tmp_path: Path) -> None:
     balanced = machine(tmp_path / "c", {"/proc/99/comm": "irqbalance\n"})
     assert "irqbalance runs" in only("interrupts", balanced).found
     shared = machine(tmp_path / "d", {"/proc/irq/130/effective_affinity_list": "0", f"{CPUS}/isolated": ""})
-    assert only("interrupts", shared).level is Level.OK
+    assert only("interrupts", shared).level is Level.GOOD
 
 
 @pytest.mark.parametrize(
@@ -187,8 +188,8 @@ def test_which_interrupts_are_the_cards(tmp_path: Path, line: str, found: bool) 
 
 def test_a_virtual_interface_has_no_interrupts(tmp_path: Path) -> None:
     virtual = machine(tmp_path, {"/proc/interrupts": ""}, facts=but(link={"kind": "veth", "parent": ""}))
-    assert only("interrupts", virtual).level is Level.OK
-    assert only("interrupt threads", virtual).level is Level.OK
+    assert only("interrupts", virtual).level is Level.GOOD
+    assert only("interrupt threads", virtual).level is Level.GOOD
 
 
 def test_interrupt_threads_come_before_the_server(tmp_path: Path) -> None:
@@ -196,7 +197,7 @@ def test_interrupt_threads_come_before_the_server(tmp_path: Path) -> None:
     below = {"/proc/77/stat": "77 (irq/130-ens5) S " + " ".join(["0"] * 36) + " 50 1 0\n"}
     found = only("interrupt threads", machine(tmp_path / "b", below))
     assert (found.level, found.commands) == (Level.NOTE, ("sudo chrt -f -p 85 77",))
-    assert only("interrupt threads", machine(tmp_path / "c", below, rt_priority=40)).level is Level.OK
+    assert only("interrupt threads", machine(tmp_path / "c", below, rt_priority=40)).level is Level.GOOD
     not_threaded = machine(tmp_path / "d", {"/proc/77/comm": None})
     assert "not threaded" in only("interrupt threads", not_threaded).found
 
@@ -224,7 +225,7 @@ def test_interrupt_threads_come_before_the_server(tmp_path: Path) -> None:
 )
 def test_managers(tmp_path: Path, files: dict[str, str], named: str, command: str) -> None:
     found = only("managers", machine(tmp_path, files))
-    assert found.level is Level.WARNING
+    assert found.level is Level.LOOK
     assert named in found.found
     assert command in found.commands[0]
 
@@ -240,18 +241,18 @@ def test_managers(tmp_path: Path, files: dict[str, str], named: str, command: st
     ],
 )
 def test_managers_that_leave_it_alone(tmp_path: Path, files: dict[str, str]) -> None:
-    assert only("managers", machine(tmp_path, files)).level is Level.OK
+    assert only("managers", machine(tmp_path, files)).level is Level.GOOD
 
 
 @pytest.mark.parametrize(
     ("routes", "level"),
     [
-        (Routes(("10.0.0.2/24",), (), True), Level.BAD),
-        (Routes(("10.0.0.2/24",), leased=("10.0.0.2/24",)), Level.BAD),
-        (Routes(("10.0.0.2/24",)), Level.WARNING),
-        (Routes(others=("10.1.0.0/16",)), Level.WARNING),
+        (Routes(("10.0.0.2/24",), (), True), Level.TROUBLE),
+        (Routes(("10.0.0.2/24",), leased=("10.0.0.2/24",)), Level.TROUBLE),
+        (Routes(("10.0.0.2/24",)), Level.LOOK),
+        (Routes(others=("10.1.0.0/16",)), Level.LOOK),
         (Routes(link_local=("fe80::1/64",)), Level.NOTE),
-        (Routes(), Level.OK),
+        (Routes(), Level.GOOD),
     ],
 )
 def test_addresses(tmp_path: Path, routes: Routes, level: Level) -> None:
@@ -260,9 +261,9 @@ def test_addresses(tmp_path: Path, routes: Routes, level: Level) -> None:
 
 def test_membership(tmp_path: Path) -> None:
     bridged = only("membership", machine(tmp_path, facts=but(link={"master": "br0"})))
-    assert (bridged.level, bridged.commands) == (Level.BAD, ("sudo ip link set ens5 nomaster",))
+    assert (bridged.level, bridged.commands) == (Level.TROUBLE, ("sudo ip link set ens5 nomaster",))
     below = only("membership", machine(tmp_path, facts=but(link={"upper": ("ens5.10",)})))
-    assert (below.level, below.commands) == (Level.WARNING, ("sudo ip link delete ens5.10",))
+    assert (below.level, below.commands) == (Level.LOOK, ("sudo ip link delete ens5.10",))
 
 
 TABLE = "sk RefCnt Type Proto Iface R Rmem User Inode\n"
@@ -271,12 +272,12 @@ TABLE = "sk RefCnt Type Proto Iface R Rmem User Inode\n"
 @pytest.mark.parametrize(
     ("row", "level"),
     [
-        ("ffff 3 3 0003 7 1 0 0 4242", Level.WARNING),
-        ("ffff 3 3 0003 0 1 0 0 4242", Level.WARNING),
+        ("ffff 3 3 0003 7 1 0 0 4242", Level.LOOK),
+        ("ffff 3 3 0003 0 1 0 0 4242", Level.LOOK),
         ("ffff 3 3 88cc 7 1 0 0 4242", Level.NOTE),
-        ("ffff 3 3 88cc 0 1 0 0 4242", Level.OK),
-        ("ffff 3 3 0003 8 1 0 0 4242", Level.OK),
-        ("ffff 3 3 88a4 7 1 0 0 4242", Level.OK),
+        ("ffff 3 3 88cc 0 1 0 0 4242", Level.GOOD),
+        ("ffff 3 3 0003 8 1 0 0 4242", Level.GOOD),
+        ("ffff 3 3 88a4 7 1 0 0 4242", Level.GOOD),
     ],
 )
 def test_listeners_hear_its_frames_or_all(tmp_path: Path, row: str, level: Level) -> None:
@@ -286,7 +287,7 @@ def test_listeners_hear_its_frames_or_all(tmp_path: Path, row: str, level: Level
     (descriptors / "3").symlink_to("socket:[4242]")
     found = only("listeners", here)
     assert found.level is level
-    assert found.values["listeners"] == (["tcpdump (66)"] if level is not Level.OK else [])
+    assert found.values["listeners"] == (["tcpdump (66)"] if level is not Level.GOOD else [])
 
 
 def test_listeners_that_may_not_be_seen_are_counted(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ import pytest
 
 from ethercat_server.access.holder import Holder
 from ethercat_server.doctor.bus import examination
-from ethercat_server.doctor.finding import Level
-from ethercat_server.ethercat.nic.ip import Routes
+from ethercat_server.ethercat.nic.interface import Routes
+from protocol.health.verdict import Level
 from tests.doctor.made_up import but
 from tests.doctor.running import examined
 from tests.simulated_links import SimulatedBus, registers, simulated_bus, simulated_server
@@ -73,7 +73,7 @@ def test_a_machine_that_stalls_shows_in_the_measurement(single: SimulatedBus, tm
         single.at(0.7 + 0.05 * n, lambda: single.clock.stall(3e6))
     wake_ups = examined(single, tmp_path, 1.0).of("measurement")["wake-ups"]
     assert wake_ups.values["max"] > 2000
-    assert wake_ups.level > Level.OK
+    assert wake_ups.level > Level.GOOD
 
 
 def test_a_sensor_that_lost_its_master_is_told_and_left_so(single: SimulatedBus, tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_a_sensor_that_lost_its_master_is_told_and_left_so(single: SimulatedBus,
         single.command("safeop 0x1B")
     for _ in range(2):
         found = examined(single, tmp_path, LOOK).of("bus")
-        assert found["slave 0"].level is Level.OK, "its EEPROM belonged to the firmware, and does again"
+        assert found["slave 0"].level is Level.GOOD, "its EEPROM belonged to the firmware, and does again"
         assert found["slave 0 state"].level is Level.NOTE
         assert found["slave 0 state"].found.startswith("SAFEOP with AL status 0x001B")
         now = single.stats()
@@ -95,10 +95,10 @@ def test_damaged_frames_are_told_with_their_cable(bench: SimulatedBus, tmp_path:
     assert lost.level is Level.NOTE
     bench.command("damage 3 @1")
     found = examined(bench, tmp_path, LOOK)
-    assert found.worst is Level.WARNING
+    assert found.worst is Level.LOOK
     on_bus = found.of("bus")
     assert on_bus["slaves"].values == {"slaves": 2}, "it tries again"
-    assert on_bus["slave 1 errors"].level is Level.WARNING
+    assert on_bus["slave 1 errors"].level is Level.LOOK
     assert "3 corrupted between slave 0 and slave 1" in on_bus["slave 1 errors"].found
     assert on_bus["slave 0 errors"].level is Level.NOTE, "damage that others found"
 
@@ -106,21 +106,21 @@ def test_damaged_frames_are_told_with_their_cable(bench: SimulatedBus, tmp_path:
 def test_frames_damaged_while_it_measures_are_bad(bench: SimulatedBus, tmp_path: Path) -> None:
     bench.at(0.7, "damage 5 1")
     found = examined(bench, tmp_path, 1.0).of("measurement")["bus meanwhile"]
-    assert found.level is Level.BAD
+    assert found.level is Level.TROUBLE
     assert "5 corrupted between slave 0 and slave 1" in found.found
 
 
 def test_devices_that_the_server_would_refuse(single: SimulatedBus, tmp_path: Path) -> None:
     single.command("swap EK1100 5")
     found = examined(single, tmp_path, LOOK).of("bus")["slave 0"]
-    assert found.level is Level.BAD
+    assert found.level is Level.TROUBLE
     assert "EK1100, serial 5" in found.found
 
 
 def test_nothing_answers(single: SimulatedBus, tmp_path: Path) -> None:
     single.command("deaf")
     found = examined(single, tmp_path)
-    assert found.worst is Level.BAD
+    assert found.worst is Level.TROUBLE
     assert found.of("bus")["slaves"].found == "no EtherCAT slave answers"
     assert found.levels("measurement") == {"all": "skipped"}
 
@@ -148,7 +148,7 @@ def test_interfaces_where_no_frame_is_sent(
     single: SimulatedBus, tmp_path: Path, changes: dict[str, Any], why: str
 ) -> None:
     found = examined(single, tmp_path, 0.02, facts=but(**changes))
-    assert found.of("bus")["slaves"].level is Level.SKIPPED
+    assert found.of("bus")["slaves"].level is Level.NOT_POSSIBLE
     assert why in found.of("bus")["slaves"].found
     assert found.levels("measurement") == {"all": "skipped"}
     assert single.backend.sensors.frames == 0
@@ -166,8 +166,8 @@ def test_without_rights_it_says_what_it_skipped(single: SimulatedBus, tmp_path: 
 @pytest.mark.parametrize(
     ("holder", "level", "named", "commands"),
     [
-        (Holder(77, "codesys", None), Level.BAD, "process 77 (codesys)", ("sudo kill 77",)),
-        (Holder(None, "", None), Level.SKIPPED, "an EtherCAT master of another user has it", ()),
+        (Holder(77, "codesys", None), Level.TROUBLE, "process 77 (codesys)", ("sudo kill 77",)),
+        (Holder(None, "", None), Level.NOT_POSSIBLE, "an EtherCAT master of another user has it", ()),
     ],
 )
 def test_another_master_is_not_disturbed(
@@ -189,7 +189,7 @@ def test_another_master_is_not_disturbed(
 def test_a_drive_at_work_is_not_touched(tmp_path: Path) -> None:
     with simulated_bus("--chain", "BOTA:OP,DRIVE:OP") as bus:
         found = examined(bus, tmp_path).of("bus")["slave 1"]
-        assert found.level is Level.BAD
+        assert found.level is Level.TROUBLE
         assert "not a Bota sensor, and in OP" in found.found
         assert bus.stats_of_foreign(1)["write_count"] == 0
 
@@ -199,6 +199,6 @@ def test_nothing_is_written_beside_a_drive_at_work(tmp_path: Path) -> None:
     with simulated_bus("--chain", "EK1100,DRIVE:OP,EL3102:PREOP,BOTA") as bus:
         before = registers(bus.backend)
         result = examined(bus, tmp_path)
-        assert result.of("bus")["slave 1"].level is Level.BAD
+        assert result.of("bus")["slave 1"].level is Level.TROUBLE
         assert [bus.stats_of_foreign(place)["write_count"] for place in (0, 1, 2)] == [0, 0, 0]
         assert registers(bus.backend)[3] == before[3]

@@ -7,15 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from ethercat_server.doctor.finding import CannotLookError, Level
+from ethercat_server.doctor.finding import CannotLookError
 from ethercat_server.doctor.machine.machine import as_list, processor_list
+from protocol.health.verdict import Level
 from tests.doctor.made_up import CPUS, Files, looks, machine, only
 
 NO_RIGHTS = {"/proc/self/status": "CapEff:\t0000000000000000\n"}
 
 
 def test_capabilities(tmp_path: Path) -> None:
-    assert only("capabilities", machine(tmp_path / "a")).level is Level.OK
+    assert only("capabilities", machine(tmp_path / "a")).level is Level.GOOD
     none = only("capabilities", machine(tmp_path / "b", NO_RIGHTS))
     assert none.level is Level.NOTE
     assert none.values["missing"] == ["CAP_NET_ADMIN", "CAP_NET_RAW", "CAP_IPC_LOCK", "CAP_SYS_NICE"]
@@ -27,20 +28,21 @@ def test_capabilities(tmp_path: Path) -> None:
 
 
 def test_limits_matter_only_without_the_capabilities(tmp_path: Path) -> None:
-    assert only("limits", machine(tmp_path / "a")).level is Level.OK
+    assert only("limits", machine(tmp_path / "a")).level is Level.GOOD
     found = only("limits", machine(tmp_path / "b", NO_RIGHTS))
     assert (found.level, found.found) == (Level.NOTE, "rtprio 0 and memlock 8192 KiB")
     assert "rtprio 99" in found.commands[0]
     enough = "Max locked memory  unlimited unlimited bytes\nMax realtime priority 99 99\n"
     assert (
-        only("limits", machine(tmp_path / "c", {**NO_RIGHTS, "/proc/self/limits": enough})).level is Level.OK
+        only("limits", machine(tmp_path / "c", {**NO_RIGHTS, "/proc/self/limits": enough})).level
+        is Level.GOOD
     )
 
 
 def test_governors(tmp_path: Path) -> None:
-    assert only("governor", machine(tmp_path / "a")).level is Level.OK
+    assert only("governor", machine(tmp_path / "a")).level is Level.GOOD
     mixed = only("governor", machine(tmp_path / "b", {f"{CPUS}/cpu2/cpufreq/scaling_governor": "powersave"}))
-    assert (mixed.level, mixed.found) == (Level.WARNING, "performance on 3, powersave on 1")
+    assert (mixed.level, mixed.found) == (Level.LOOK, "performance on 3, powersave on 1")
     assert mixed.commands == (f"echo performance | sudo tee {CPUS}/cpu*/cpufreq/scaling_governor",)
     none = {f"{CPUS}/cpu{n}/cpufreq/scaling_governor": None for n in range(4)}
     assert only("governor", machine(tmp_path / "c", none)).values == {"governors": []}
@@ -54,9 +56,9 @@ DEEP: Files = {
 
 def test_idle_states(tmp_path: Path) -> None:
     light = only("idle states", machine(tmp_path / "a"))
-    assert (light.level, light.values["latency_us"]) == (Level.OK, 2)
+    assert (light.level, light.values["latency_us"]) == (Level.GOOD, 2)
     deep = only("idle states", machine(tmp_path / "b", DEEP))
-    assert (deep.level, deep.found) == (Level.WARNING, "C8, 170 µs to wake")
+    assert (deep.level, deep.found) == (Level.LOOK, "C8, 170 µs to wake")
     assert deep.commands == tuple(f"echo 1 | sudo tee {CPUS}/cpu*/cpuidle/state{n}/disable" for n in (2, 3))
     disabled = {**DEEP, f"{CPUS}/cpu1/cpuidle/state3/disable": "1"}
     assert only("idle states", machine(tmp_path / "c", disabled)).level is Level.NOTE
@@ -65,16 +67,16 @@ def test_idle_states(tmp_path: Path) -> None:
 def test_a_program_that_holds_the_latency_keeps_the_processors_awake(tmp_path: Path) -> None:
     held: Files = {**DEEP, "/dev/cpu_dma_latency": struct.pack("=i", 0)}
     found = only("idle states", machine(tmp_path / "a", held))
-    assert (found.level, found.values["limit_us"], found.values["latency_us"]) == (Level.OK, 0, 0)
+    assert (found.level, found.values["limit_us"], found.values["latency_us"]) == (Level.GOOD, 0, 0)
     usual: Files = {**DEEP, "/dev/cpu_dma_latency": struct.pack("=i", 2_000_000_000)}
-    assert only("idle states", machine(tmp_path / "b", usual)).level is Level.WARNING
+    assert only("idle states", machine(tmp_path / "b", usual)).level is Level.LOOK
     cut: Files = {**DEEP, "/dev/cpu_dma_latency": b"\0"}
-    assert only("idle states", machine(tmp_path / "c", cut)).level is Level.WARNING
+    assert only("idle states", machine(tmp_path / "c", cut)).level is Level.LOOK
 
 
 def test_isolation(tmp_path: Path) -> None:
     apart = only("isolation", machine(tmp_path / "a"))
-    assert (apart.level, apart.values["isolated"]) == (Level.OK, [3])
+    assert (apart.level, apart.values["isolated"]) == (Level.GOOD, [3])
     none = only(
         "isolation", machine(tmp_path / "b", {f"{CPUS}/isolated": "\n", f"{CPUS}/nohz_full": "(null)\n"})
     )
@@ -87,7 +89,7 @@ def test_isolation(tmp_path: Path) -> None:
     assert sibling.level is Level.NOTE
     assert "1 shares a core" in sibling.found
     single = only("isolation", machine(tmp_path / "d", {f"{CPUS}/online": "0"}))
-    assert single.level is Level.WARNING
+    assert single.level is Level.LOOK
 
 
 @pytest.mark.parametrize(
@@ -100,7 +102,7 @@ def test_isolation(tmp_path: Path) -> None:
 )
 def test_virtual_machines(tmp_path: Path, files: dict[str, str], named: str) -> None:
     found = only("virtualization", machine(tmp_path, files))
-    assert found.level is Level.WARNING
+    assert found.level is Level.LOOK
     assert named in found.found
 
 
@@ -119,8 +121,8 @@ def test_containers(tmp_path: Path, files: dict[str, str], named: str) -> None:
 
 def test_a_container_in_a_virtual_machine_is_both(tmp_path: Path) -> None:
     both = machine(tmp_path, {"/.dockerenv": "", "/proc/cpuinfo": "flags : hypervisor\n"})
-    assert [finding.level for finding in looks("virtualization", both)] == [Level.NOTE, Level.WARNING]
-    assert only("virtualization", machine(tmp_path / "own")).level is Level.OK
+    assert [finding.level for finding in looks("virtualization", both)] == [Level.NOTE, Level.LOOK]
+    assert only("virtualization", machine(tmp_path / "own")).level is Level.GOOD
 
 
 def test_lists_of_processors() -> None:

@@ -7,8 +7,9 @@ import json
 
 import pytest
 
-from ethercat_server.doctor.finding import Finding, Level, bad, note, ok, skipped, warning
+from ethercat_server.doctor.finding import Finding, bad, note, ok, skipped, warning
 from ethercat_server.doctor.report import EXIT_CODES, Report, as_json, printable, wants_color, worst
+from protocol.health.verdict import Level
 
 
 class Terminal(io.StringIO):
@@ -86,7 +87,7 @@ def test_the_worst_finding_is_the_exit_code() -> None:
     assert EXIT_CODES[worst([ok("a"), note("b", "c"), skipped("d")])] == 0
     assert EXIT_CODES[worst([skipped("d"), warning("b", "c")])] == 0
     assert EXIT_CODES[worst([bad("b", "c"), warning("b", "c")])] == 1
-    assert worst([skipped("d")]) is Level.OK
+    assert worst([skipped("d")]) is Level.GOOD
     assert 2 not in EXIT_CODES.values(), "that is wrong usage"
 
 

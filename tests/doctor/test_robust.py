@@ -11,10 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ethercat_server.doctor.examination import CHECKS, examine, examine_machine
-from ethercat_server.doctor.finding import CannotLookError, Finding, Level, ok
+from ethercat_server.doctor.finding import CannotLookError, Finding, ok
 from ethercat_server.doctor.machine.facts import InterfaceFacts, Link
 from ethercat_server.doctor.machine.machine import Machine
 from ethercat_server.errors import BusError
+from protocol.health.verdict import Level
 from tests.doctor.made_up import CARD, GOOD, but, machine
 
 GARBAGE = ("", "\0\0", "-", "99999999999999999999", "x" * 5000, "1 2 3\n" * 50, b"\xff\xfe\x80", "(", "0-")
@@ -45,8 +46,8 @@ def test_no_files_at_all(tmp_path: Path) -> None:
     bare = Machine("ens5", facts=NOTHING_KNOWN, root=tmp_path)
     found = list(examine_machine(bare))
     assert {finding.check for finding in found} == {check.name for check in CHECKS}
-    assert {finding.level for finding in found} <= {Level.OK, Level.SKIPPED}
-    skipped = [finding for finding in found if finding.level is Level.SKIPPED]
+    assert {finding.level for finding in found} <= {Level.GOOD, Level.NOT_POSSIBLE}
+    skipped = [finding for finding in found if finding.level is Level.NOT_POSSIBLE]
     assert len(skipped) > len(CHECKS) // 2
     assert all(finding.found.startswith("not checked: ") for finding in skipped)
     assert any("/proc/interrupts: No such file" in finding.found for finding in skipped)
@@ -68,10 +69,10 @@ def test_an_endless_file_is_not_read_to_its_end(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("error", "level", "said"),
     [
-        (CannotLookError("why"), Level.SKIPPED, "not checked: why"),
-        (PermissionError(13, "Permission denied"), Level.SKIPPED, "not checked: Permission denied"),
-        (BusError("slave 0 does not answer"), Level.BAD, "slave 0 does not answer"),
-        (ZeroDivisionError("oh"), Level.SKIPPED, "an error in ethercat-doctor"),
+        (CannotLookError("why"), Level.NOT_POSSIBLE, "not checked: why"),
+        (PermissionError(13, "Permission denied"), Level.NOT_POSSIBLE, "not checked: Permission denied"),
+        (BusError("slave 0 does not answer"), Level.TROUBLE, "slave 0 does not answer"),
+        (ZeroDivisionError("oh"), Level.NOT_POSSIBLE, "an error in ethercat-doctor"),
     ],
 )
 def test_a_check_that_fails_is_one_finding_more(error: Exception, level: Level, said: str) -> None:

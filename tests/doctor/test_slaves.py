@@ -9,8 +9,9 @@ import pytest
 
 from ethercat_server.doctor.bus import findings
 from ethercat_server.doctor.bus.slaves import ErrorCounters, Slave
-from ethercat_server.doctor.finding import Finding, Level
+from ethercat_server.doctor.finding import Finding
 from ethercat_server.ethercat.slave.al import AlStatus
+from protocol.health.verdict import Level
 
 INIT = AlStatus.of(1, 0)
 
@@ -29,20 +30,20 @@ def the(findings: Any) -> Finding:
 
 
 def test_whether_anything_answers() -> None:
-    assert the(findings.answers("ens5", 2)).level is Level.OK
+    assert the(findings.answers("ens5", 2)).level is Level.GOOD
     nothing = the(findings.answers("ens5", 0))
-    assert (nothing.level, nothing.values) == (Level.BAD, {"slaves": 0})
+    assert (nothing.level, nothing.values) == (Level.TROUBLE, {"slaves": 0})
 
 
 @pytest.mark.parametrize(
     ("changes", "level", "named"),
     [
-        ({}, Level.OK, "supported"),
-        ({"name": "BFT-ROKS-ECAT-M8"}, Level.OK, "BFT-ROKS"),
-        ({"vendor": 2, "name": "EK1100"}, Level.OK, "vendor 0x00000002, product 0x00000001: not a Bota"),
-        ({"product": 9}, Level.OK, "product 0x00000009: not a Bota"),
-        ({"name": "BFT-GENA"}, Level.BAD, "BFT-GENA"),
-        ({"name": "", "sii_problem": "the SII of slave 0 is busy"}, Level.WARNING, "busy"),
+        ({}, Level.GOOD, "supported"),
+        ({"name": "BFT-ROKS-ECAT-M8"}, Level.GOOD, "BFT-ROKS"),
+        ({"vendor": 2, "name": "EK1100"}, Level.GOOD, "vendor 0x00000002, product 0x00000001: not a Bota"),
+        ({"product": 9}, Level.GOOD, "product 0x00000009: not a Bota"),
+        ({"name": "BFT-GENA"}, Level.TROUBLE, "BFT-GENA"),
+        ({"name": "", "sii_problem": "the SII of slave 0 is busy"}, Level.LOOK, "busy"),
     ],
 )
 def test_who_it_is(changes: dict[str, Any], level: Level, named: str) -> None:
@@ -53,7 +54,7 @@ def test_who_it_is(changes: dict[str, Any], level: Level, named: str) -> None:
 
 def test_a_bus_without_a_sensor() -> None:
     coupler = slave(vendor=2, name="EK1100")
-    assert the(findings.sensors([coupler])).level is Level.BAD
+    assert the(findings.sensors([coupler])).level is Level.TROUBLE
     assert not list(findings.sensors([coupler, slave()]))
     assert not list(findings.sensors([coupler, slave(vendor=0, sii_problem="busy")])), "it may be one"
 
@@ -61,12 +62,12 @@ def test_a_bus_without_a_sensor() -> None:
 @pytest.mark.parametrize(
     ("status", "code", "level"),
     [
-        (1, 0, Level.OK),
-        (8, 0, Level.OK),
+        (1, 0, Level.GOOD),
+        (8, 0, Level.GOOD),
         (0x14, 0x001B, Level.NOTE),
-        (0x12, 0x0016, Level.WARNING),
-        (3, 0, Level.BAD),
-        (0, 0, Level.BAD),
+        (0x12, 0x0016, Level.LOOK),
+        (3, 0, Level.TROUBLE),
+        (0, 0, Level.TROUBLE),
     ],
 )
 def test_the_state_it_is_in(status: int, code: int, level: Level) -> None:
@@ -93,16 +94,16 @@ def counted(**by_name: Any) -> ErrorCounters:
 @pytest.mark.parametrize(
     ("position", "counters", "level", "said"),
     [
-        (0, counted(), Level.OK, "none"),
-        (0, counted(invalid=(3, 0, 0, 0)), Level.WARNING, "3 corrupted between the interface and slave 0"),
-        (1, counted(physical=(4, 0, 0, 0)), Level.WARNING, "4 corrupted between slave 0 and slave 1"),
+        (0, counted(), Level.GOOD, "none"),
+        (0, counted(invalid=(3, 0, 0, 0)), Level.LOOK, "3 corrupted between the interface and slave 0"),
+        (1, counted(physical=(4, 0, 0, 0)), Level.LOOK, "4 corrupted between slave 0 and slave 1"),
         (
             0,
             counted(invalid=(0, 255, 0, 0)),
-            Level.WARNING,
+            Level.LOOK,
             "255 or more corrupted between slave 0 and slave 1",
         ),
-        (1, counted(invalid=(0, 1, 0, 0)), Level.WARNING, "1 corrupted at port 1 of slave 1"),
+        (1, counted(invalid=(0, 1, 0, 0)), Level.LOOK, "1 corrupted at port 1 of slave 1"),
         (1, counted(forwarded=(2, 0, 0, 0)), Level.NOTE, "2 corrupted before reaching slave 1, port 0"),
         (
             0,
@@ -120,13 +121,13 @@ def test_where_errors_arise(position: int, counters: ErrorCounters, level: Level
 
 def test_only_what_is_new_counts_while_measuring() -> None:
     before = {0: counted(invalid=(5, 0, 0, 0)), 1: counted()}
-    assert the(findings.new_errors(before, before, 2)).level is Level.OK
+    assert the(findings.new_errors(before, before, 2)).level is Level.GOOD
     after = {0: counted(invalid=(6, 0, 0, 0)), 1: counted(forwarded=(1, 0, 0, 0))}
     found = the(findings.new_errors(before, after, 2))
-    assert found.level is Level.BAD
+    assert found.level is Level.TROUBLE
     assert found.found.startswith("1 corrupted between the interface and slave 0; ")
     cleared = {0: counted(), 1: counted()}
-    assert the(findings.new_errors(before, cleared, 2)).level is Level.OK, "a server was started meanwhile"
+    assert the(findings.new_errors(before, cleared, 2)).level is Level.GOOD, "a server was started meanwhile"
 
 
 def test_names_from_the_bus_are_told_in_json() -> None:
@@ -137,8 +138,8 @@ def test_names_from_the_bus_are_told_in_json() -> None:
 
 def test_something_connected_that_does_not_answer() -> None:
     alone, linked = (True, False, False, False), (True, True, False, False)
-    assert the(findings.line([slave(links=alone)])).level is Level.OK
-    assert the(findings.line([slave(links=linked), slave(position=1, links=alone)])).level is Level.OK
+    assert the(findings.line([slave(links=alone)])).level is Level.GOOD
+    assert the(findings.line([slave(links=linked), slave(position=1, links=alone)])).level is Level.GOOD
     found = the(findings.line([slave(links=linked), slave(position=1, links=linked)]))
     assert found.level is Level.NOTE
     assert found.found.endswith("port 0 of slave 1, port 1 of slave 1")

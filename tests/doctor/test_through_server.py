@@ -5,13 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from ethercat_server.access.holder import Holder
+from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor.bus import examination
-from ethercat_server.doctor.finding import Level
+from ethercat_server.doctor.bus.server_view import ServerView
 from protocol.address import Address
+from protocol.health.verdict import Level
 from tests.doctor.running import examined
 from tests.simulated_links import SINC_LENGTH, SimulatedBus, SimulatedServer, simulated_bus, simulated_server
 
@@ -63,7 +67,7 @@ def test_losses_show(bench: Bench, tmp_path: Path) -> None:
     bus.command("power cycle 0.2 @1")
     server.run_until(lambda: [event["event"] for event in server.events][-1:] == ["sensor_back"], "the event")
     before, after = (finding for finding in examined(bus, tmp_path, 0.5) if finding.check == "sensors")
-    assert after.level > Level.OK
+    assert after.level > Level.GOOD
     assert (before.values["recoveries"], after.values["recoveries"]) == (0, 1)
 
 
@@ -71,7 +75,7 @@ def test_losses_while_it_looks_are_told(bench: Bench, tmp_path: Path) -> None:
     bus, _ = bench
     bus.at(0.5, "deaf 0.04")
     sensor = examined(bus, tmp_path, 1.0).of("server")["sensors"]
-    assert sensor.level is Level.WARNING, "four samples of a hundred, in one place"
+    assert sensor.level is Level.LOOK, "four samples of a hundred, in one place"
     assert "samples (4 %) were lost" in sensor.found
     assert sensor.values["new_invalid"] > 0
 
@@ -81,9 +85,9 @@ def test_a_lost_sensor_is_bad(bench: Bench, tmp_path: Path) -> None:
     bus.command("power off @1")
     server.run_until(lambda: server.events, "the event")
     found = examined(bus, tmp_path, 0.5)
-    assert found.worst is Level.BAD
+    assert found.worst is Level.TROUBLE
     sensor = found.of("server")["sensors"]
-    assert (sensor.level, sensor.values["verdict"]) == (Level.BAD, "trouble")
+    assert (sensor.level, sensor.values["verdict"]) == (Level.TROUBLE, "trouble")
     assert [finding.check for finding in found].count("server") == 1
 
 
@@ -91,5 +95,24 @@ def test_a_server_that_hangs_is_bad(bench: Bench, tmp_path: Path) -> None:
     bus, server = bench
     server.hangs = True
     found = examined(bus, tmp_path, 0)
-    assert found.worst is Level.BAD
+    assert found.worst is Level.TROUBLE
     assert "no reply to describe within 5 s" in found.of("server")["server"].found
+
+
+def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable() -> None:
+    def status(count: int) -> dict[str, Any]:
+        row = dict.fromkeys(("fresh", "repeated", "invalid", "lost_samples"), 0)
+        row |= {"sensor": 0, "recoveries": count}
+        return {"sensors": [{**row, "clock": {"mode": "locked"}}], "missed_deadlines": 24 * count}
+
+    statuses = iter((status(0), status(1)))
+    sensor = {"sensor": 0, "name": "", "serial": 1, "rate_hz": 800.0, "state": "OP"}
+    link = SimpleNamespace(
+        clock=SimpleNamespace(monotonic_ns=lambda: 0), listen=lambda *_: [], same_machine=True,
+        ask=lambda action: {"sensors": [sensor]} if action == "describe" else next(statuses),
+        close=lambda: None,
+    )  # fmt: skip
+    view = ServerView(cast("Sensors", link), 1.0, own=False)
+    [finding] = view.sensors()
+    assert "The server lost the sensor once and has it back" in finding.found
+    assert "computer stood still" in finding.why

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ethercat_server.doctor import verdict
-from ethercat_server.doctor.finding import Finding, Level
+from ethercat_server.doctor.finding import Finding
+from protocol.health.verdict import Level
 
 
 def summary(p99_us: float, p50_us: float = 20.0, max_us: float | None = None) -> dict[str, float]:
@@ -15,31 +16,36 @@ def exchange(p99_us: float, lost: int = 0, p50_us: float = 80.0) -> Finding:
 
 
 def test_late_wake_ups_matter_by_what_they_cost() -> None:
-    assert verdict.wake_finding(summary(20), 0, 1000).level is Level.OK
+    assert verdict.wake_finding(summary(20), 0, 1000).level is Level.GOOD
     assert verdict.wake_finding(summary(150), 0, 1000).level is Level.NOTE
-    assert verdict.wake_finding(summary(400), 0, 1000).level is Level.WARNING
+    assert verdict.wake_finding(summary(400), 0, 1000).level is Level.LOOK
     one = verdict.wake_finding(summary(20, max_us=3000), 1, 2001)
-    assert (one.level, one.values["later_than_a_period"]) == (Level.WARNING, 1)
-    assert verdict.wake_finding(summary(20, max_us=3000), 10, 1000).level is Level.BAD
+    assert (one.level, one.values["later_than_a_period"]) == (Level.LOOK, 1)
+    assert verdict.wake_finding(summary(20, max_us=3000), 10, 1000).level is Level.TROUBLE
 
 
 def test_exchanges_matter_by_their_losses_and_their_time() -> None:
-    assert exchange(80).level is Level.OK
+    assert exchange(80).level is Level.GOOD
     assert exchange(300).level is Level.NOTE
-    assert exchange(80, lost=1).level is Level.WARNING
-    assert exchange(80, lost=200).level is Level.BAD
+    assert exchange(80, lost=1).level is Level.LOOK
+    assert exchange(80, lost=200).level is Level.TROUBLE
     slow = exchange(860, p50_us=860)
-    assert slow.level is Level.WARNING
+    assert slow.level is Level.LOOK
     assert "samples are 380 µs older than through a PCIe network card" in slow.why
 
 
 def test_old_samples_are_judged_as_those_of_a_stream() -> None:
-    for p99_us, level in ((900, Level.OK), (1300, Level.NOTE), (11_000, Level.WARNING), (110_000, Level.BAD)):
+    for p99_us, level in (
+        (900, Level.GOOD),
+        (1300, Level.NOTE),
+        (11_000, Level.LOOK),
+        (110_000, Level.TROUBLE),
+    ):
         assert verdict.age_finding("when sent", summary(p99_us), "").level is level
 
 
 def test_scheduling_that_was_not_granted_is_said() -> None:
-    assert next(verdict.scheduling(80, real_time=True)).level is Level.OK
+    assert next(verdict.scheduling(80, real_time=True)).level is Level.GOOD
     (refused,) = verdict.scheduling(80, real_time=False)
     assert (refused.level, "not granted" in refused.why) == (Level.NOTE, True)
     (wanted,) = verdict.scheduling(0, real_time=False)

@@ -20,7 +20,7 @@ TOPICS = {
     "/wrench": "geometry_msgs/WrenchStamped",
     "/wrench_compensated": "geometry_msgs/WrenchStamped",
     "/compensation/bias": "geometry_msgs/WrenchStamped",
-    "/compensation/gravity": "geometry_msgs/WrenchStamped",
+    "/compensation/tool": "geometry_msgs/WrenchStamped",
     "/imu/data_raw": "sensor_msgs/Imu",
     "/temperature": "sensor_msgs/Temperature",
     "/diagnostics": "diagnostic_msgs/DiagnosticArray",

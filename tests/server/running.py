@@ -17,10 +17,9 @@ from typing import Any
 
 import pytest
 
-from protocol.client.connection import FramedConnection
 from protocol.control import request
 from protocol.errors import ConnectionFailedError
-from protocol.framing import DataFlag, DataMessage
+from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from protocol.text.json_text import JsonObject
 
 START_TIMEOUT_S = 40.0
@@ -196,7 +195,7 @@ _STARVED = (
     "0x00000000",  # vendor or product
     "cannot be mapped",
     "does not end",
-    "does not reach",  # after a lost frame of SOEM's set-up
+    "does not go to",  # after a lost frame of SOEM's set-up
     "maps process data of",  # as much of it as SOEM could read in its time
 )
 """What it says at start where a busy machine lets the virtual sensor's process wait for too long."""
@@ -272,8 +271,11 @@ class Client:
     """A framed connection that keeps everything, and looks into refused replies too."""
 
     def __init__(self, port: int) -> None:
-        self.connection = FramedConnection("127.0.0.1", port)
-        self.sock = self.connection.sock
+        try:
+            self.sock = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
+        except ConnectionError as error:
+            raise ConnectionFailedError(str(error)) from None
+        self._decoder = FrameDecoder()
         self.events: list[JsonObject] = []
         self.frames: list[DataMessage] = []
         self._id = 0
@@ -282,14 +284,18 @@ class Client:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.connection.close()
+        self.sock.close()
 
     def receive(self) -> JsonObject | None:
         """Wait for one message; a reply is returned, frames and events are put by."""
-        deadline = time.monotonic() + PATIENCE_S
-        while (message := self.connection.next_message()) is None:
-            assert time.monotonic() < deadline, f"nothing came for {PATIENCE_S} s"
-            self.connection.receive()
+        while (message := self._decoder.next_message()) is None:
+            try:
+                data = self.sock.recv(65536)
+            except ConnectionError as error:
+                raise ConnectionFailedError(str(error)) from None
+            if not data:
+                raise ConnectionFailedError("the server closed it")
+            self._decoder.feed(data)
         if isinstance(message, DataMessage):
             self.frames.append(message)
             return None
@@ -316,7 +322,7 @@ class Client:
     def ask_once(self, action: str, **values: object) -> dict[str, Any]:
         """The reply to a request, also where the sensor is lost on purpose."""
         self._id += 1
-        self.connection.send(request(action, self._id, **values))
+        self.sock.sendall(encode_json(request(action, self._id, **values)))
         while True:
             message = self.receive()
             if message is not None:

@@ -10,7 +10,8 @@ import pytest
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.exchange.process_data import FIRST_INDEX
+from ethercat_server.ethercat.exchange.process_data import DUPLICATE, FIRST_INDEX
+from ethercat_server.ethercat.exchange.process_data import Exchange as Taken
 from ethercat_server.ethercat.late_answers import LateAnswers
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build, parse, working_counter
 from ethercat_server.simulation.backend import MemoryBackend
@@ -148,6 +149,13 @@ def operational(
     return bus, backend
 
 
+def inputs(backend: MemoryBackend, position: int) -> bytes:
+    """The process data that a sensor has now."""
+    life = backend.sensors.sensors[position].life
+    assert life is not None
+    return life.inputs()
+
+
 @pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
 def test_an_exchange_brings_every_sensors_process_data(lrw: bool) -> None:
     sensors = [
@@ -158,9 +166,7 @@ def test_an_exchange_brings_every_sensors_process_data(lrw: bool) -> None:
     assert exchange() == 9
     assert bus.process_data.counters == [(3,)] * 3
     for position, options in enumerate(sensors):
-        life = backend.sensors.sensors[position].life
-        assert life is not None
-        assert exchange.inputs[position] == life.inputs()
+        assert exchange.inputs[position] == inputs(backend, position)
         assert len(exchange.inputs[position]) == options.pdo_size
 
 
@@ -181,9 +187,7 @@ def test_process_data_that_does_not_fit_one_frame_goes_in_several(lrw: bool, fra
     assert len(sent) == frames
     assert max(sent) <= 1514
     for position in range(20):
-        life = backend.sensors.sensors[position].life
-        assert life is not None
-        assert exchange.inputs[position] == life.inputs()
+        assert exchange.inputs[position] == inputs(backend, position)
 
 
 def test_a_lost_frame_is_a_miss_and_the_data_stay_those_of_before() -> None:
@@ -222,17 +226,24 @@ def answers(bus: Bus, backend: MemoryBackend) -> bytes:
     return answer
 
 
+def awaited(exchange: Taken | None) -> Taken:
+    """An answer that was awaited, and was not taken before."""
+    assert exchange is not None
+    assert exchange is not DUPLICATE
+    return exchange
+
+
 def test_an_answer_that_comes_again_is_a_duplicate_until_its_index_is_in_use_again() -> None:
     bus, backend = operational()
     process_data, backend.wire = bus.process_data, Wire(Machine(frame_jitter_ns=0))
     answer = answers(bus, backend)
-    assert process_data.take(answer) > 0
-    assert process_data.take(answer) == process_data.take(answer) == -1
+    assert awaited(process_data.take(answer, 1))
+    assert process_data.take(answer, 1) is process_data.take(answer, 1) is DUPLICATE
     for _ in range(INDICES):
         later = answers(bus, backend)
-        assert process_data.take(answer) in (-1, 0)
-        assert process_data.take(later) > 0
-        assert process_data.take(later) == -1
+        assert process_data.take(answer, 1) in (DUPLICATE, None)
+        assert awaited(process_data.take(later, 1))
+        assert process_data.take(later, 1) is DUPLICATE
     assert process_data.in_flight == process_data.lost == 0
 
 
@@ -243,12 +254,11 @@ def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() 
     backend.clock.sleep(0.2)
     assert process_data.lost == 1
     for _ in range(INDICES - 1):
-        assert process_data.take(answers(bus, backend)) > 0
+        assert awaited(process_data.take(answers(bus, backend), 1))
     current = answers(bus, backend)
     assert current[DATAGRAM_INDEX] == late[DATAGRAM_INDEX]
-    assert process_data.take(late) == 0
-    assert process_data.take(current) > 0
-    assert process_data.frame == current
+    assert process_data.take(late, 1) is None
+    assert awaited(process_data.take(current, 1)).frame == current
     assert process_data.duplicates == 0, "it was given up, not taken"
 
 
@@ -261,8 +271,7 @@ def test_a_working_counter_that_cannot_be_is_above_the_highest(lrw: bool) -> Non
         answer = bytearray(answers(bus, backend))
         for datagram, counter in zip(parse(answer, len(answer)), counters, strict=False):
             answer[datagram.end : datagram.end + 2] = counter.to_bytes(2, "little")
-        assert process_data.take(bytes(answer)) > 0
-        assert 6 < process_data.wkc <= 0xFFFF
+        assert 6 < awaited(process_data.take(bytes(answer), 1)).wkc <= 0xFFFF
 
 
 def test_a_late_answer_makes_datagrams_wait_longer_but_never_long() -> None:

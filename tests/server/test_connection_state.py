@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ethercat_server.serving.connection import Connection
-from ethercat_server.serving.state import TRANSITIONS, State
+from ethercat_server.serving.connection import TRANSITIONS, Connection, State
 from ethercat_server.serving.transport.in_memory import InMemoryTransport, ManualClock
 
 

@@ -155,7 +155,7 @@ def test_samples_that_pass_while_the_sensor_itself_is_held_up_are_counted(dc: st
 
 @pytest.mark.parametrize("dc", ["", "none"])
 @pytest.mark.parametrize("jitter_us", [300, 400, 700])
-@pytest.mark.parametrize("seed", [3, 1])
+@pytest.mark.parametrize("seed", [3, 2])
 def test_whatever_is_lost_is_counted_though_frames_take_long_and_unevenly(
     seed: int, jitter_us: int, dc: str
 ) -> None:

@@ -35,7 +35,7 @@ def describe(count: int) -> JsonObject:
         Sensor(position, Identity("B" * 20, 2**32 - 1, "H" * 12, "F" * 13), {}) for position in range(count)
     ]
     for sensor in sensors:
-        sensor.hold(wordiest())
+        sensor.set_in_force(wordiest())
 
     class OnSensors:
         handlers: dict[str, object] = {}  # noqa: RUF012
@@ -63,11 +63,11 @@ def test_a_server_names_the_clock_of_its_stamps(monkeypatch: pytest.MonkeyPatch)
 
 def test_every_setting_is_explained_and_only_when_it_changes() -> None:
     sensor = Sensor(0, Identity("", 0, "", ""), {})
-    sensor.hold(start_up_defaults())
+    sensor.set_in_force(start_up_defaults())
     row = sensor.describe()
     assert row["meaning"].keys() == row["settings"].keys()
     assert row["meaning"]["sinc_length"].startswith("800 Hz; cut-off 209.5 Hz with FIR off")
     assert "delay 1.94 ms" in row["meaning"]["acceleration_filter"]
     assert sensor.describe()["meaning"] is row["meaning"], "nothing is worked out for a request"
-    sensor.hold({**sensor.settings, "sinc_length": 128})
+    sensor.set_in_force({**sensor.settings, "sinc_length": 128})
     assert sensor.describe()["meaning"]["sinc_length"].startswith("400 Hz")

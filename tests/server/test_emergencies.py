@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from ethercat_server.ethercat.mailbox.emergency import ERROR_CLASSES, Emergency
+from ethercat_server.ethercat.slave.emergencies import Emergency
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -122,13 +122,14 @@ def test_emergencies_before_an_answer_are_read_by_the_job() -> None:
     assert len(told(simulation)) == 5
 
 
-def test_each_change_is_told() -> None:
+def test_each_change_is_told_and_the_end_of_an_error_is_no_warning(log: pytest.LogCaptureFixture) -> None:
     simulation = Simulation()
     simulation.run(1.0)
     for code in (0x4210, 0, 0x4210, 0):
         simulation.command(f"emergency {code}")
         simulation.run(0.5)
     assert [event["code"] for event in told(simulation)] == [0x4210, 0, 0x4210, 0]
+    assert {r.levelname for r in log.records if "emergency 0x0000 (error reset" in r.getMessage()} == {"INFO"}
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -161,15 +162,6 @@ def test_a_lost_sensor_is_set_up_again_in_spite_of_emergencies() -> None:
     assert simulation.status()["sensors"][0]["emergencies"] > 0
 
 
-def test_what_says_that_an_error_is_over_is_no_warning(log: pytest.LogCaptureFixture) -> None:
-    simulation = Simulation()
-    simulation.run(1.0)
-    simulation.command("emergency 0")
-    simulation.run(0.2)
-    (record,) = [record for record in log.records if "emergency 0x0000 (error reset" in record.getMessage()]
-    assert record.levelname == "INFO"
-
-
 @pytest.mark.parametrize(
     ("code", "text"),
     [
@@ -185,17 +177,10 @@ def test_every_code_has_words(code: int, text: str) -> None:
     assert Emergency(code, 0, b"").text == text
 
 
-@pytest.mark.parametrize("length", range(12))
-def test_messages_of_every_length_are_parsed_or_not(length: int) -> None:
-    body = (struct.pack("<HHB", 0x1000, 0x1234, 0x81) + b"abcdefg")[:length]
-    parsed = Emergency.parse(body)
-    assert parsed == (Emergency(0x1234, 0x81, b"abcde"[: length - 5]) if length >= 5 else None)
-
-
-@pytest.mark.parametrize("service", [0, 2, 3, 4, 8, 15])
-def test_other_services_are_no_emergencies(service: int) -> None:
-    assert Emergency.parse(struct.pack("<HHB5s", service << 12, 1, 1, b"")) is None
-
-
-def test_no_two_classes_have_the_same_words() -> None:
-    assert len(set(ERROR_CLASSES.values())) == len(ERROR_CLASSES)
+def test_messages_of_every_length_and_service_are_parsed_or_not() -> None:
+    message = struct.pack("<HHB", 0x1000, 0x1234, 0x81) + b"abcdefg"
+    for length in range(12):
+        expected = Emergency(0x1234, 0x81, b"abcde"[: length - 5]) if length >= 5 else None
+        assert Emergency.parse(message[:length]) == expected
+    for service in (0, 2, 3, 4, 8, 15):
+        assert Emergency.parse(struct.pack("<HHB5s", service << 12, 1, 1, b"")) is None

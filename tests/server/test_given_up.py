@@ -9,6 +9,7 @@ import pytest
 
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.errors import SetUpError
+from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.simulation.backend import MemoryBackend
@@ -71,11 +72,11 @@ def test_given_up_in_the_second_attempt(at: int, monkeypatch: pytest.MonkeyPatch
     check = interrupting(at)
     attempts: list[None] = []
 
-    def fail() -> None:
+    def fail(_: CheckInterrupt) -> None:
         attempts.append(None)
         raise SetUpError("a frame was lost")
 
-    monkeypatch.setattr(bus, "_lay_out_exchange", fail)
+    monkeypatch.setattr(bus, "enter_op", fail)
     with pytest.raises(KeyboardInterrupt):
         bring_up(bus, Asked(), lambda: check() if attempts else None)
     bus.close()

@@ -44,7 +44,7 @@ def take_lrw_away(wire: MemoryBackend) -> None:
 
 @pytest.mark.parametrize(("copies", "read_us"), [(2, 20), (2, 400), (4, 20), (4, 100)])
 def test_of_frames_that_arrive_several_times_each_counts_once(copies: int, read_us: int) -> None:
-    wire = HostileWire(SensorOptions(signal="clock", ppm=150.0))
+    wire = HostileWire(SensorOptions(signal="clock", ppm=170.0))
     wire.change = lambda frame: [frame] * copies
     wire.read_ns = read_us * 1000
     running = Simulation(backend=wire)

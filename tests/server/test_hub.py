@@ -11,9 +11,14 @@ from itertools import pairwise
 import pytest
 
 from ethercat_server.serving import permissions
-from ethercat_server.serving.connection import MAX_REQUEST_LENGTH, Connection, Limits, Subscription
-from ethercat_server.serving.outbox import MAX_QUEUED_DATA
-from ethercat_server.serving.state import State
+from ethercat_server.serving.connection import (
+    MAX_QUEUED_DATA,
+    MAX_REQUEST_LENGTH,
+    Connection,
+    Limits,
+    State,
+    Subscription,
+)
 from ethercat_server.serving.transport.in_memory import InMemoryStream
 from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
 from protocol.text.json_text import JsonObject

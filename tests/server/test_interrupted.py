@@ -49,24 +49,22 @@ def check_former(bench: Bench, asking: Client, before: dict[str, Any]) -> None:
     assert asking.ask("sdo_read", index=RATE, type="u16")["value"] == 800
 
 
-def test_an_abort_half_way_in_op(bench: tuple[Bench, Client]) -> None:
+@pytest.mark.parametrize(
+    ("settings", "what", "said"),
+    [
+        (IN_OP, "0x8010 3", "imu_active = 3 did not take"),
+        (BY_PREOP, "0x8006 1", "sinc_length = 128 did not take"),
+    ],
+)
+def test_an_abort_half_way(
+    bench: tuple[Bench, Client], settings: dict[str, Any], what: str, said: str
+) -> None:
     sensor, asking = bench
     before = row(asking)
-    sensor.command(f"abort 0x8010 3 {ABORT}")
-    refused = error(asking.ask("configure", settings=IN_OP))
-    assert refused["code"] == "sensor"
-    assert refused["abort_code"] == int(ABORT, 16)
-    assert "imu_active = 3 did not take" in refused["message"]
-    assert refused["message"].endswith("; the former settings are in force")
-    check_former(sensor, asking, before)
-
-
-def test_an_abort_half_way_by_way_of_preop(bench: tuple[Bench, Client]) -> None:
-    sensor, asking = bench
-    before = row(asking)
-    sensor.command(f"abort 0x8006 1 {ABORT}")
-    refused = error(asking.ask("configure", settings=BY_PREOP))
+    sensor.command(f"abort {what} {ABORT}")
+    refused = error(asking.ask("configure", settings=settings))
     assert (refused["code"], refused["abort_code"]) == ("sensor", int(ABORT, 16))
+    assert said in refused["message"]
     assert refused["message"].endswith("; the former settings are in force")
     check_former(sensor, asking, before)
     assert not [event for event in sensor.client.events if event["event"] != "reconfigured"]
@@ -109,8 +107,13 @@ def test_whoever_asked_is_told_at_once_that_the_sensor_is_lost(bench: tuple[Benc
     check_former(sensor, asking, before)
 
 
-def test_putting_back_what_was_in_force_fails_too_in_op(bench: tuple[Bench, Client]) -> None:
+@pytest.mark.parametrize("comes_back", [False, True])
+def test_putting_back_the_former_settings_fails_too_in_op(
+    bench: tuple[Bench, Client], comes_back: bool
+) -> None:
+    """It is put back when the sensor comes back."""
     sensor, asking = bench
+    before = row(asking)
     sensor.command(f"abort 0x8010 3 {ABORT}")
     sensor.command("on-write 0x8010 3 abort 0x8010 2 0x08000022")
     refused = error(asking.ask("configure", settings=IN_OP))
@@ -121,23 +124,16 @@ def test_putting_back_what_was_in_force_fails_too_in_op(bench: tuple[Bench, Clie
     )
     assert refused["message"].endswith("; configure it again")
     assert held(asking, CONFIGURATION, 2) == 1, "so it is"
+    if comes_back:
+        sensor.command("deaf 0.3")
+        sensor.wait_event("sensor_back")
+        check_former(sensor, asking, before)
     again = asking.ask("configure", settings={"temperature_compensation": True, "imu_active": 2})
     assert again["ok"], again
     assert (held(asking, CONFIGURATION, 2), held(asking, CONFIGURATION, 3)) == (1, 2)
 
 
-def test_what_could_not_be_put_back_is_when_the_sensor_comes_back(bench: tuple[Bench, Client]) -> None:
-    sensor, asking = bench
-    before = row(asking)
-    sensor.command(f"abort 0x8010 3 {ABORT}")
-    sensor.command("on-write 0x8010 3 abort 0x8010 2 0x08000022")
-    assert "failed too" in error(asking.ask("configure", settings=IN_OP))["message"]
-    sensor.command("deaf 0.3")
-    sensor.wait_event("sensor_back")
-    check_former(sensor, asking, before)
-
-
-def test_putting_back_what_was_in_force_fails_too_by_way_of_preop(bench: tuple[Bench, Client]) -> None:
+def test_putting_back_the_former_settings_fails_too_by_way_of_preop(bench: tuple[Bench, Client]) -> None:
     sensor, asking = bench
     before = row(asking)
     sensor.command(f"abort 0x8006 1 {ABORT}")
@@ -178,9 +174,7 @@ def test_a_tare_cut_off_half_way_leaves_the_old_offset(
     assert again["old_offset"] == pytest.approx(first["new_offset"])
 
 
-def test_a_save_that_ends_with_a_status_is_no_success(
-    bench: tuple[Bench, Client],
-) -> None:
+def test_a_save_that_ends_with_a_status_is_no_success(bench: tuple[Bench, Client]) -> None:
     sensor, asking = bench
     sensor.command(f"abort 0x8030 1 {ABORT}")
     refused = error(asking.ask("configure", settings={"imu_active": 3}, save=True))

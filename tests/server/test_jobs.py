@@ -12,13 +12,12 @@ from typing import Any, cast
 
 import pytest
 
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.stream import SensorStream
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.mailbox.mailbox import Mailbox
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, finish
 from ethercat_server.sensor.objects.access import write
 from ethercat_server.sensor.objects.dictionary import BY_SETTING
@@ -125,7 +124,7 @@ def run_tare(
         values[2] = next(force) + struct.unpack("<f", sdo.held.get((0x8000, 1), bytes(4)))[0]
         values[15] = rate_dps
         stream.process_data = layout.struct.pack(*values)
-        stream.fresh += 1
+        stream.sequence += 1
         try:
             next(steps)
         except StopIteration as stop:
@@ -143,7 +142,7 @@ def test_a_tare_whose_sum_is_too_large_is_refused_before_it_writes() -> None:
 
 @pytest.mark.parametrize("size", [0, 113])
 def test_what_does_not_fit_the_mailbox_is_not_sent(size: int) -> None:
-    sdo = MailboxSdo(Mailbox(cast(Bus, NoBus()), 0, ((0x1000, 128), (0x1080, 128))))
+    sdo = MailboxSdo(cast(Bus, NoBus()), 0, ((0x1000, 128), (0x1080, 128)))
     with pytest.raises(BusError, match=f"1 to 112 bytes fit its mailbox, not {size}"):
         finish(sdo.write(0x1008, 0, bytes(size)))
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import re
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
-from unittest import mock
 
 import pytest
 
@@ -19,8 +18,8 @@ from ethercat_server.ethercat.master import soem
 from ethercat_server.ethercat.master.soem import SoemBackend
 from ethercat_server.ethercat.nic.claim import claimed
 from ethercat_server.ethercat.raw_socket import packet_sockets
+from ethercat_server.ethercat.slave.sii_content import decode
 from ethercat_server.sensor.sensor import Sensor
-from protocol.settings import SettingValue
 from tests.server.commands import command, stats
 from tests.server.running import (
     ATTEMPTS,
@@ -55,16 +54,16 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextlib.contextmanager
-def opened(ifname: str, make: type[SoemBackend] = SoemBackend) -> Iterator[SoemBackend]:
-    """A backend, closed when SOEM does not use it any more."""
+def opened(ifname: str) -> Iterator[Bus]:
+    """A bus, closed when SOEM does not use it any more."""
     threads = threading.active_count()
-    backend = make(ifname)
+    backend = SoemBackend(ifname)
+    bus = Bus(backend)
     backend.open()
     try:
-        yield backend
+        yield bus
     finally:
-        backend.release()
-        backend.close()
+        bus.close()
         wait_until(lambda: threading.active_count() == threads, "the end of SOEM's scan")
         backend._abandoned = False
         backend.close()
@@ -75,8 +74,6 @@ def start(
     *commands: str,
     complaint: str = "$^",
     check_interrupt: CheckInterrupt = lambda: None,
-    settings: Mapping[str, SettingValue] = {},
-    make: type[SoemBackend] = SoemBackend,
 ) -> list[Sensor]:
     """Start and end, after these commands.
 
@@ -86,11 +83,9 @@ def start(
     for attempt in range(ATTEMPTS):
         for text in commands:
             command(sensor, text)
-        with opened(veth.near, make) as backend:
-            bus = Bus(backend)
-            backend.on_emergency = bus.emergencies.note
+        with opened(veth.near) as bus:
             try:
-                return bring_up(bus, Asked(settings), check_interrupt).sensors
+                return bring_up(bus, Asked(), check_interrupt).sensors
             except BusError as error:
                 expected = re.search(complaint, str(error)) or not starved(str(error))
                 if expected or attempt == ATTEMPTS - 1:
@@ -125,60 +120,17 @@ def test_an_interface_that_goes_away_while_it_is_opened() -> None:
         assert packet_sockets() == before
 
 
-@pytest.mark.parametrize("how", ["error", pytest.param("busy", marks=pytest.mark.long)])
-def test_an_eeprom_that_cannot_be_read(bench: Bench, how: str) -> None:
-    """SOEM has time-outs of its own: 2 s if each read ends with an error, 11 s if each stays busy."""
-    complaint = rf"the SII \(EEPROM\) of the slave at position 0 of {bench[0].near} cannot be read"
-    with pytest.raises(BusError, match=complaint):
-        start(bench, f"sii {how}", complaint=complaint)
-    command(bench[1], "sii ok")
-
-
-def test_a_name_that_is_no_utf_8_and_a_slave_without_a_mailbox(bench: Bench) -> None:
-    """pysoem raises UnicodeDecodeError for the one, and for the other what it finds in its error ring."""
-    (found,) = start(bench, "eeprom latin")
-    assert found.identity.name == "BFT-SENS-ECAT-M8"
-    complaint = f"sensor 0 on {bench[0].near} has no CoE mailbox, and so no objects to set it up by"
-    with pytest.raises(BusError, match=complaint):
-        start(bench, "eeprom no-mailbox", complaint=complaint)
-    command(bench[1], "eeprom ok")
-
-
-def test_an_object_that_aborts_is_named(bench: Bench) -> None:
-    """An SDO abort as pysoem raises it; INIT as it asks for it."""
-    complaint = "sinc_length = 128 did not take.*: the value is out of range .*0x06090030"
-    with pytest.raises(BusError, match=complaint):
-        start(bench, "abort 0x8006 1 0x06090030", complaint=complaint, settings={"sinc_length": 128})
-    wait_until(lambda: stats(bench[1])["al_state"] == "INIT", "INIT")
-
-
-@pytest.mark.parametrize("count", [1, 6, 15])
-@pytest.mark.parametrize("index", [0x1008, 0x8011, 0x1C12], ids=hex)
-def test_emergencies_in_place_of_an_answer_cost_a_retry_and_are_said_in_words(
-    bench: Bench, caplog: pytest.LogCaptureFixture, index: int, count: int
+@pytest.mark.parametrize("report", ["0x1008 0 6 0", f"{LAST_READ} 0 12", "0x1C12 0 1 0", "0x1C12 0 15 0"])
+def test_emergencies_among_the_answers_are_no_failure_and_are_said_in_words(
+    bench: Bench, caplog: pytest.LogCaptureFixture, report: str
 ) -> None:
-    """0x1C12 is read by SOEM's mapping, and pysoem tells nothing of those."""
-    assert start(bench, f"report {index} 0 {count} 0")[0].pdo_size
-    said = [record.getMessage() for record in caplog.records]
-    assert [
-        text for text in said if ("an emergency, or" if index == 0x1C12 else "emergency 0x4210") in text
-    ], said
-    assert "unexpected" not in " ".join(said)
-
-
-def test_emergencies_that_wait_for_the_mapping_are_no_failure(
-    bench: Bench, caplog: pytest.LogCaptureFixture
-) -> None:
-    assert start(bench, f"report {LAST_READ} 0 12")[0].pdo_size
-    assert [record.getMessage()[:34] for record in caplog.records] == ["sensor 0 reports emergency 0x4210 "]
-
-
-def test_what_pysoem_finds_of_another_slave_is_no_answer() -> None:
-    """It asserts that what it takes from its error ring is of the slave that was asked."""
-    found: list[bytes | Exception] = [AssertionError(), b"\x01"]
-    backend = SoemBackend("never opened")
-    backend._slaves = [mock.Mock(sdo_read=mock.Mock(side_effect=found))]
-    assert backend.sdo_read(0, 0x8011, 0) == b"\x01"
+    """0x1C12 is read by SOEM's mapping, and pysoem tells nothing of those: it costs a retry."""
+    assert start(bench, f"report {report}")[0].pdo_size
+    said = " ".join(record.getMessage() for record in caplog.records)
+    by_soem = report.startswith("0x1C12")
+    assert ("an emergency, or" if by_soem else "emergency 0x4210") in said
+    assert ("trying again" in said) is by_soem, said
+    assert "unexpected" not in said
 
 
 def test_a_slave_that_vanishes_during_the_scan_does_not_hang_the_server(
@@ -187,15 +139,15 @@ def test_a_slave_that_vanishes_during_the_scan_does_not_hang_the_server(
     """SOEM would try on for two minutes, in its thread, until the slave is there again."""
     veth, sensor = bench
     monkeypatch.setattr(soem, "_SCAN_TIMEOUT_S", 1.0)
-    with opened(veth.near) as backend:
+    with opened(veth.near) as bus:
         for _ in range(ATTEMPTS):
             command(sensor, "hear")
             command(sensor, "deaf-after 40")  # in the middle of reading the SII
             with pytest.raises(BusError) as info:
-                backend.scan([0], lambda: None)
+                bus.scan([0], [decode(bytes(256))], lambda: None)
             if "no EtherCAT slave answers" not in str(info.value):
                 break
-        backend.close()  # not from under SOEM
+        bus.close()  # not from under SOEM
         command(sensor, "hear")
     assert f"the scan of {veth.near} does not end: a slave stopped answering" in str(info.value)
 
@@ -215,28 +167,6 @@ def test_a_start_is_given_up_while_a_sensor_does_not_change_its_state(bench: Ben
     command(sensor, "ignore 0")
     assert packet_sockets() == sockets
     wait_until(lambda: stats(sensor)["al_state"] == "INIT", "INIT")
-
-
-@pytest.mark.parametrize("last", ["read", "write"])
-def test_a_start_is_given_up_between_two_transfers(bench: Bench, last: str) -> None:
-    transfers: list[str] = []
-
-    class Noted(SoemBackend):
-        def sdo_read(self, number: int, index: int, subindex: int) -> bytes:
-            transfers.append("read")
-            return super().sdo_read(number, index, subindex)
-
-        def sdo_write(self, number: int, index: int, subindex: int, data: bytes) -> None:
-            transfers.append("write")
-            super().sdo_write(number, index, subindex, data)
-
-    def check_interrupt() -> None:
-        if last in transfers:
-            raise StopRequestedError("asked to stop while starting")
-
-    with pytest.raises(StopRequestedError):
-        start(bench, check_interrupt=check_interrupt, settings={"fir": True}, make=Noted)
-    assert transfers.index(last) == len(transfers) - 1, "nothing after it"
 
 
 def test_whoever_was_first_keeps_all_others_out_before_it_has_opened_the_bus(bench: Bench) -> None:

@@ -53,6 +53,13 @@ def foreign(simulation: Simulation) -> list[ForeignSlave]:
     return [slave for slave in simulation.backend.sensors.slaves if isinstance(slave, ForeignSlave)]
 
 
+def memory_of(backend: MemoryBackend, position: int) -> bytearray:
+    """Registers and process data of a slave."""
+    life = backend.sensors.slaves[position].life
+    assert life is not None
+    return life.esc.memory
+
+
 def check_each(simulation: Simulation) -> None:
     for number in range(len(simulation.sensors)):
         check_frames(frame for frame in simulation.frames if frame.sensor == number)
@@ -88,29 +95,28 @@ def test_sensors_stream_as_if_alone(text: str) -> None:
     assert_left_alone(simulation, states_of(text))
 
 
-def test_describe_tells_the_others() -> None:
-    simulation = mixed("EK1100,BOTA,EL3102,BOTA,DRIVE:PREOP")
-    described = simulation.connect().ask("describe")
-    assert [row["position"] for row in described["sensors"]] == [1, 3]
-    assert [row["sensor"] for row in described["sensors"]] == [0, 1]
-    assert [(row["position"], row["name"], row["state"]) for row in described["others"]] == [
-        (0, "EK1100", "INIT"), (2, "EL3102", "INIT"), (4, "DRIVE", "PREOP"),
-    ]  # fmt: skip
-    assert (described["others"][0]["vendor"], described["others"][0]["product"]) == (2, 0x044C2C52)
-
-
 def test_one_that_goes_away_is_told_and_costs_the_sensor_before_it_nothing(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    simulation = mixed("BOTA,DRIVE")
+    """`describe` has the others, and who is gone."""
+    simulation = mixed("EK1100,BOTA,EL3102,BOTA,DRIVE:PREOP")
+    client = simulation.connect()
+
+    def others() -> list[tuple[int, str, str]]:
+        return [(row["position"], row["name"], row["state"]) for row in client.ask("describe")["others"]]
+
+    described = client.ask("describe")
+    assert [(row["sensor"], row["position"]) for row in described["sensors"]] == [(0, 1), (1, 3)]
+    assert (described["others"][0]["vendor"], described["others"][0]["product"]) == (2, 0x044C2C52)
+    assert others() == [(0, "EK1100", "INIT"), (2, "EL3102", "INIT"), (4, "DRIVE", "PREOP")]
     simulation.run(0.5)
-    simulation.command("power off #1")
-    simulation.run(1.5)
-    assert simulation.others.rows[0]["state"] == "ABSENT"
-    assert "'DRIVE' at position 1" in caplog.text
-    simulation.command("power on #1")
+    simulation.command("power off #4")
+    simulation.run(2.5)
+    assert others()[2] == (4, "DRIVE", "ABSENT")
+    assert "'DRIVE' at position 4" in caplog.text
+    simulation.command("power on #4")
     simulation.run(1.0)
-    assert simulation.others.rows[0]["state"] == "INIT"
+    assert others()[2] == (4, "DRIVE", "INIT")
     check_each(simulation)
     assert simulation.events == []
 
@@ -161,7 +167,7 @@ def test_addresses_that_others_answer_to_are_not_taken() -> None:
     assert Exchange(bus)() == 3, "no FMMU of another answers to it"
     taken = [range(start, start + size) for image in (before[0], before[2]) for start, size in fmmus(image)]
     assert taken
-    (own, _), *_ = fmmus(bytes(reg.FMMU) + bus.fmmus[0])
+    (own, _), *_ = fmmus(registers(backend)[1])
     assert not any(own in area for area in taken)
 
 
@@ -173,7 +179,7 @@ def fmmus(registers: bytes) -> list[tuple[int, int]]:
 
 def test_a_station_that_another_sensor_has_as_its_alias_is_not_taken() -> None:
     backend = chain("BOTA,DRIVE,BOTA")
-    memory = backend.sensors.slaves[2].life.esc.memory  # type: ignore[union-attr]
+    memory = memory_of(backend, 2)
     memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = b"\x01\x10"
     simulation = Simulation(backend=backend)
     assert simulation.bus.stations == [0x1002, 0x1003]
@@ -208,15 +214,13 @@ def test_a_device_in_the_place_of_a_sensor_keeps_its_eeprom(state: str) -> None:
     """The sensor was taken out, and the cable goes to the next device."""
     simulation = mixed(f"BOTA,BOTA,DRIVE:{state}")
     simulation.run(0.3)
-    (drive,) = foreign(simulation)
-    assert drive.life is not None
-    esc = drive.life.esc
-    esc.memory[reg.SII_OWNER] = 1
+    (drive,), memory = foreign(simulation), memory_of(simulation.backend, 2)
+    memory[reg.SII_OWNER] = 1
     del simulation.backend.sensors.slaves[1]
     simulation.backend.sensors.rewire()
     drive.writes.clear()
     simulation.run(2.0)
-    assert esc.memory[reg.SII_OWNER] == 1
+    assert memory[reg.SII_OWNER] == 1
     assert len(drive.writes) < 60
     assert {address for address, _ in drive.writes} <= (set(READING_THE_SII) if state == "INIT" else set())
     assert [sensor.streams for sensor in simulation.sensors] == [True, False]
@@ -240,16 +244,15 @@ def test_one_that_does_not_say_what_it_is(caplog: pytest.LogCaptureFixture) -> N
     assert warnings == ["'nameless' at position 2 (its SII cannot be read) is left alone: it stays in INIT"]
 
 
-def test_sync_signals_that_another_master_left_are_switched_off() -> None:
-    """A sensor would wait for SYNC0."""
+def test_what_another_master_left_is_ended() -> None:
+    """A sensor would wait for SYNC0, and for its EEPROM."""
     backend = chain("BOTA:OP,EK1100")
-    sensor, coupler = (slave.life for slave in backend.sensors.slaves)
-    assert sensor is not None
-    assert coupler is not None
-    for life in (sensor, coupler):
-        life.esc.memory[reg.DC_ACTIVATION + 1] = 3
+    for at in range(2):
+        memory_of(backend, at)[reg.DC_ACTIVATION + 1] = 3
+        memory_of(backend, at)[reg.SII_OWNER] = 0
     assert bring_up(Bus(backend), Asked(), lambda: None).sensors[0].streams
-    assert (sensor.esc.memory[reg.DC_ACTIVATION + 1], coupler.esc.memory[reg.DC_ACTIVATION + 1]) == (0, 3)
+    assert [memory_of(backend, at)[reg.DC_ACTIVATION + 1] for at in range(2)] == [0, 3]
+    assert [memory_of(backend, at)[reg.SII_OWNER] for at in range(2)] == [1, 0]
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.4, 60.0])
@@ -257,8 +260,7 @@ def test_firmware_that_reads_its_eeprom_may_finish(seconds: float) -> None:
     backend = chain("DRIVE,BOTA")
     drive = backend.sensors.slaves[0]
     assert isinstance(drive, ForeignSlave)
-    assert drive.life is not None
-    memory = drive.life.esc.memory
+    memory = memory_of(backend, 0)
     memory[reg.SII_OWNER : reg.SII_OWNER + 2] = b"\1\1"
     began_ns = backend.clock.now_ns
 
@@ -270,15 +272,3 @@ def test_firmware_that_reads_its_eeprom_may_finish(seconds: float) -> None:
         backend.clock.at(began_ns + round(seconds * 1e9), finish)
     assert bring_up(Bus(backend), Asked(), lambda: None).others[0].name == "DRIVE"
     assert memory[reg.SII_OWNER] == 1, "it is the firmware's again"
-
-
-def test_a_device_in_boot_is_not_touched() -> None:
-    """Its firmware may be being written."""
-    backend = chain("BOTA,DRIVE")
-    drive = backend.sensors.slaves[1]
-    assert isinstance(drive, ForeignSlave)
-    assert drive.life is not None
-    drive.life.esc.memory[reg.AL_STATUS] = 3
-    with pytest.raises(BusError, match=r"position 1 in BOOT"):
-        bring_up(Bus(backend), Asked(), lambda: None)
-    assert not drive.writes

@@ -19,8 +19,7 @@ from ethercat_server.daemon.server import serve
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import lock
 from ethercat_server.ethercat.nic.claim import claimed
-from ethercat_server.ethercat.nic.interface import look_up, why_silent
-from ethercat_server.ethercat.nic.ip import Routes, network_trouble
+from ethercat_server.ethercat.nic.interface import Routes, look_up, network_trouble, why_silent
 from ethercat_server.process.signals import Signals
 from tests.doctor.running import doctor_here
 from tests.server import readable

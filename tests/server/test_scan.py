@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from ethercat_server.acquisition.start_up import AsFound, bring_up, find_sensors
+from ethercat_server.acquisition.start_up import AsFound, bring_up
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build
 from ethercat_server.sensor.scan import look_safely
 from ethercat_server.simulation.backend import MemoryBackend
@@ -21,27 +22,31 @@ def no_check() -> None:
     pass
 
 
+@pytest.mark.parametrize("state", [AlState.OP, AlState.BOOT])
 @pytest.mark.parametrize("drive", [0, 1, 2])
-def test_a_drive_at_work_is_not_touched(drive: int) -> None:
+def test_a_drive_at_work_is_not_touched(drive: int, state: AlState) -> None:
+    """In BOOT its firmware may be being written."""
     kinds = ["BOTA:OP"] * 3
     kinds[drive] = "DRIVE:OP"
     backend = chain(",".join(kinds))
+    found = backend.sensors.slaves[drive]
+    assert isinstance(found, ForeignSlave)
+    assert found.life is not None
+    found.life.esc.memory[reg.AL_STATUS] = state
     before = registers(backend)
-    with pytest.raises(BusError, match=rf"no Bota sensors \(position {drive} in OP\).*--force"):
+    with pytest.raises(BusError, match=rf"no Bota sensors \(position {drive} in {state.name}\).*--force"):
         bring_up(bus := Bus(backend), Asked(), no_check)
     bus.close()
     assert registers(backend) == before
-    found = backend.sensors.slaves[drive]
-    assert isinstance(found, ForeignSlave)
     assert not found.writes
     assert found.turning
 
 
 def test_force_takes_it_over() -> None:
     backend = chain("BOTA:OP,DRIVE:OP")
-    found = find_sensors(Bus(backend), AsFound(force=True), no_check)
+    found = bring_up(Bus(backend), AsFound(force=True), no_check)
     assert ([s.position for s in found.sensors], [o.position for o in found.others]) == ([0], [1])
-    assert [image[0x0130] & 0x0F for image in registers(backend)] == [AlState.PREOP] * 2
+    assert [image[0x0130] & 0x0F for image in registers(backend)] == [AlState.OP, AlState.PREOP]
 
 
 @pytest.mark.parametrize("pdo_size", [61, 77])

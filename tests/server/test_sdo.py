@@ -1,7 +1,8 @@
-"""SDO transfers by single datagrams, with a mailbox whose answers are given."""
+"""SDO transfers by single datagrams, with a mailbox whose answers are given; AL status codes in words."""
 
 from __future__ import annotations
 
+import itertools
 import struct
 from typing import cast
 
@@ -10,7 +11,7 @@ import pytest
 from ethercat_server.errors import SdoAbortError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.mailbox.mailbox import Mailbox
+from ethercat_server.ethercat.slave.al import AlStatus
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, T, finish
 from ethercat_server.ethercat.slave.registers import MAILBOX_IN_STATUS
 
@@ -26,6 +27,7 @@ class GivenBus:
     def __init__(self, *answers: tuple[int, int, bytes]) -> None:
         self.answers = list(answers)
         self.asked = 0
+        self.counters: list[int] = []
 
     def read_register(self, slave: int, address: int, size: int) -> bytes:
         if address == MAILBOX_IN_STATUS:
@@ -37,6 +39,7 @@ class GivenBus:
 
     def write_register(self, slave: int, address: int, data: bytes) -> bool:
         self.asked += 1
+        self.counters.append(data[5] >> 4)
         return True
 
 
@@ -48,7 +51,7 @@ def run(bus: GivenBus, steps: Steps[T]) -> T:
 
 
 def mailbox(bus: GivenBus) -> MailboxSdo:
-    return MailboxSdo(Mailbox(cast(Bus, bus), 0, MAILBOXES))
+    return MailboxSdo(cast(Bus, bus), 0, MAILBOXES)
 
 
 def test_a_read_leaves_the_late_answer_to_a_repeated_write_alone() -> None:
@@ -59,6 +62,16 @@ def test_a_read_leaves_the_late_answer_to_a_repeated_write_alone() -> None:
 def test_a_write_leaves_the_late_answer_to_a_repeated_read_alone() -> None:
     bus = GivenBus((READ, 0x8001, b"abcd"), (WRITTEN, 0x8001, bytes(4)))
     run(bus, mailbox(bus).write(0x8001, 1, b"efgh"))
+
+
+def test_no_message_has_the_counter_of_the_one_before_or_that_soems_mapping_begins_with() -> None:
+    bus = GivenBus(*[(READ, 0x8001, b"abcd")] * 20)
+    sdo = mailbox(bus)
+    for _ in range(20):
+        bus.asked = 0
+        finish(sdo.read(0x8001, 1))
+    assert all(one != other for one, other in itertools.pairwise([1, *bus.counters, 1]))
+    assert set(bus.counters) == set(range(2, 8))
 
 
 def test_an_answer_about_another_object_is_left_alone_and_a_refusal_is_not() -> None:
@@ -72,3 +85,16 @@ def test_a_refusal_says_why_in_words_and_as_a_number(code: int, words: str) -> N
     bus = GivenBus((ABORTED, 0x8001, struct.pack("<I", code)))
     with pytest.raises(SdoAbortError, match=rf"sensor 0 refused writing .*{words} \(abort 0x{code:08X}\)"):
         finish(mailbox(bus).write(0x8001, 1, b"efgh"))
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (0x001B, "sync manager watchdog"),
+        (0x0035, "distributed clock: invalid sync cycle time"),
+        (0x8001, "the vendor's own code"),
+        (0x0FFF, "reserved"),
+    ],
+)
+def test_an_al_error_is_said_in_words(code: int, words: str) -> None:
+    assert str(AlStatus.of(0x14, code)).startswith(f"SAFEOP with AL status 0x{code:04X} ({words}")

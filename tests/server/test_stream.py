@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from ethercat_server.acquisition.clock import SampleClock
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.stream import DISCARDED_AT_START, GAP, INVALID, REPEATED, SensorStream
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.timing.sample_clock import SampleClock
+from ethercat_server.ethercat.exchange.process_data import Exchange
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 from protocol.framing import DataMessage, FrameDecoder
 
@@ -28,11 +29,14 @@ class Feeder:
         self.clock.advance(self.now)
         self.sample += new
         data = self.sample.to_bytes(61, "little")
-        self.timing.sends(self.now - took_ns)
-        made = self.stream.take(data, 3, self.now - took_ns, self.now) if valid else None
-        self.timing.took(self.now - took_ns, self.now)
-        if self.stream.learns:
-            self.stream.learn(self.now)
+        self.timing.sent_ns, self.timing.in_flight = self.now - took_ns, True
+        exchange = Exchange(self.now - took_ns, self.now, b"", 3, 0)
+        made = self.stream.take(data, exchange) if valid else None
+        self.timing.in_flight, self.timing.unanswered = False, 0
+        if self.stream.finish(exchange) or not valid:
+            self.timing.took(self.now - took_ns, self.now, self.now)
+            if valid:
+                self.stream.clock.learn(self.now)
         if made is None and self.now >= self.stream.idle_at_ns:
             made = self.stream.idle(self.now)
         if made is None:
@@ -41,7 +45,7 @@ class Feeder:
         decoder.feed(made[0])
         message = decoder.next_message()
         assert isinstance(message, DataMessage)
-        assert message.flags == made[1]
+        assert message.flags == made[2]
         return message
 
     def start(self) -> Feeder:
@@ -170,5 +174,5 @@ def test_frames_that_are_lost_after_a_recovery_count_as_no_lost_samples() -> Non
 
 def test_the_first_sample_at_all_has_none_before_it() -> None:
     clock = SampleClock(PERIOD_NS, ExchangeTiming())
-    clock.predict(10**15, 10**15 + 50_000)
+    clock.take(10**15, 10**15 + 50_000, None, fresh=True)
     assert clock.steps == 1

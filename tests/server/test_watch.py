@@ -8,16 +8,16 @@ from typing import Any, cast
 
 import pytest
 
-from ethercat_server.acquisition.ladder import Ladder
-from ethercat_server.acquisition.recovery import Recovery
+from ethercat_server.acquisition.recovery import Recovery, SensorReturn
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.mailbox.emergencies import Emergencies
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import finish
-from ethercat_server.sensor.others import Others
+from ethercat_server.ethercat.slave.controller import SlaveController
+from ethercat_server.ethercat.slave.emergencies import Emergencies
+from ethercat_server.sensor.scan import OtherSlaves
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 
@@ -32,12 +32,15 @@ class GivenBus:
 
     backend = SimpleNamespace(check_present=lambda: None, why_silent=lambda: "check cable and power")
     stations = (1, 2)
-    fmmus = (b"", b"")
     process_data = SimpleNamespace(counters=[(3,), (3,)], inputs=[[]])
 
     def __init__(self) -> None:
         self.clock = SimulatedClock(Machine())
         self.emergencies = Emergencies(self.clock)
+        mailboxes = [(0x1000, 128)] * 2
+        self.slaves = [SlaveController(cast(Bus, self), n, mailboxes, self.emergencies) for n in range(2)]
+        for slave in self.slaves:
+            slave.attempts = 1
         self.looked_for = False
         self.states: list[AlState | None] = [AlState.OP, AlState.OP]
         self.error = 0
@@ -62,11 +65,6 @@ class GivenBus:
         self.written += 1
         return self.states[position] is not None
 
-    def read_surely(self, position: int, address: int, size: int) -> bytes:
-        if address == reg.SYNC_MANAGER:
-            return struct.pack("<HH4x", 0x1000, 128) * (size // reg.SYNC_MANAGER_SIZE)
-        return b"\2\4" if address == reg.FMMU_AND_SM_COUNT else bytes(size)
-
     def read_at(self, position: int, address: int, size: int) -> bytes | None:
         self.looked_for = True
         return None
@@ -90,7 +88,7 @@ class Watched:
             self.sensors,
             cast(list[SensorStream], [None, None]),
             self.told.append,
-            Others(cast(Bus, self.bus), ()),
+            OtherSlaves(cast(Bus, self.bus), ()),
         )
         self.now = self.bus.clock.now_ns
 
@@ -140,7 +138,7 @@ def test_a_lost_datagram_is_no_lost_sensor() -> None:
 def test_a_refused_sensor_is_not_set_up_again_because_of_a_lost_datagram() -> None:
     bus = GivenBus()
     bus.states[0] = AlState.INIT
-    waiting = Ladder(cast(Bus, bus), a_sensor(0)).wait_for_removal()
+    waiting = SensorReturn(cast(Bus, bus), a_sensor(0)).wait_for_removal()
     for reads in range(10, 100, 10):
         bus.lose = 1
         while bus.read < reads:
@@ -156,7 +154,7 @@ def test_a_refused_sensor_is_not_set_up_again_because_of_a_lost_datagram() -> No
 def test_a_sensor_that_keeps_its_error_is_not_asked_for_op() -> None:
     bus = GivenBus()
     bus.states[0], bus.error = AlState.SAFEOP, 0x001B
-    climbing = Ladder(cast(Bus, bus), a_sensor(0)).states.go(AlState.OP)
+    climbing = bus.slaves[0].go(AlState.OP)
     with pytest.raises(
         BusError, match="sensor 0 keeps its error although it was acknowledged: it is in SAFEOP"
     ):

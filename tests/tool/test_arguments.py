@@ -54,7 +54,7 @@ def test_the_guard_lets_no_write_of_the_factory_calibration_through() -> None:
 
 
 def test_all_that_can_write_is_behind_the_guard() -> None:
-    unguarded = {"BlockingSdo", "MailboxSdo", "_ServerSdo", "sdo"}
+    unguarded = {"MailboxSdo", "_ServerSdo", "sdo"}
     server = ROOT / "ethercat_server"
     for path in [*(server / "tool").rglob("*.py"), *(server / "access").glob("*.py")]:
         tree = ast.parse(path.read_text())
@@ -153,17 +153,6 @@ def test_wrong_arguments_are_one_sentence_and_exit_code_2(arguments: list[str], 
 )
 def test_a_snapshot_that_cannot_be_written_is_said_before_the_sensor_is_read(file: str, said: str) -> None:
     assert said in one_sentence(tool_here("snapshot", "ens5", file, code=1))
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [[], ["colour"], ["objects", "--colour"], ["watch", "a", "b"], ["watch", "a", "--seconds", "-1"]],
-)
-def test_what_argparse_finds_is_exit_code_2(arguments: list[str]) -> None:
-    assert "usage: ethercat-sensor" in tool_here(*arguments, code=2).err
-    assert (
-        tool_here(*arguments, "--json", code=2).json["error"] in tool_here(*arguments, "--json", code=2).err
-    )
 
 
 def test_help_names_every_command_and_the_exit_codes() -> None:

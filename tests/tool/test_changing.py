@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from protocol.sensor.filters import FORCE_TORQUE_FILTERS
 from tests.simulated_links import SimulatedBus, simulated_bus
-from tests.tool.odd_firmware import fewer_objects, refusing, subtracting, wrong_rate
+from tests.tool.odd_firmware import fewer_objects, refusing
 from tests.tool.running import one_sentence, tool_here
 
 TARGET = ("--target", "1", "2", "3", "4", "5", "6")
@@ -92,16 +91,6 @@ def test_a_power_cut_in_the_save_says_what_holds(bench: SimulatedBus) -> None:
     assert said.endswith("; whether it saved all, some or none of its settings is not known: save again")
 
 
-def test_every_sinc_length_of_the_table_gives_its_rate(chain: SimulatedBus) -> None:
-    for length, row in FORCE_TORQUE_FILTERS.items():
-        applied = tool_here(
-            "apply", chain.near, "--sensor", 20, "--set", f"sinc_length={length}", "--json"
-        ).json
-        assert applied["rate_hz"] == row.rate_hz
-        assert applied["meaning"]["cutoff_hz"] == row.cutoff_fir_off_hz
-    assert chain.written(0) == [], "the other sensor of the chain"
-
-
 def test_a_chain_wants_a_choice(chain: SimulatedBus) -> None:
     near = chain.near
     said = one_sentence(tool_here("apply", near, "--set", "fir=on", code=2))
@@ -153,12 +142,6 @@ def test_settings_that_a_sensor_lacks_are_named(
     assert "0x8010:5" in tool_here("objects", near).out
 
 
-def test_a_sinc_length_is_verified_by_the_rate(single: SimulatedBus, monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong_rate(monkeypatch)
-    failed = tool_here("apply", single.near, "--set", "sinc_length=128", code=1)
-    assert "samples at 500 Hz" in one_sentence(failed)
-
-
 def test_chop_that_divides_the_rate_is_taken_and_told(single: SimulatedBus) -> None:
     near, life = single.near, single.backend.sensors.sensors[0].life
     assert life is not None
@@ -191,12 +174,6 @@ def test_tare_makes_the_mean_the_target(bench: SimulatedBus) -> None:
     assert {row[0] for row in bench.written()} == {"0x8000"}, "nothing but the offset"
 
 
-def test_a_sensor_that_moves_is_not_tared() -> None:
-    with simulated_bus("--signal", "sine") as bus:
-        assert "not at rest" in one_sentence(tool_here("tare", bus.near, "--samples", 50, code=1))
-        assert bus.written() == []
-
-
 @pytest.mark.parametrize("motion", ["turn", "scene"])
 def test_a_tare_of_a_moving_sensor_is_refused(motion: str) -> None:
     """Whether it is seen before or after the offset was written: the former one is in force."""
@@ -213,27 +190,6 @@ def test_a_tare_of_a_moving_sensor_is_refused(motion: str) -> None:
             assert [row["value"] for row in read[1:]] == [0.0] * 6
             refused += 1
     assert refused
-
-
-def test_a_tare_that_made_it_worse_is_taken_back(
-    single: SimulatedBus, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    near = single.near
-    tool_here("tare", near, "--samples", 50)
-    single.command("on-write 0x8000 6 limit force.z 9")  # the load is less from here on
-    failed = tool_here("tare", near, "--samples", 50, "--json", code=1)
-    assert failed.json["error"] == (
-        "the tare made sensor 0 worse: Fz is 0.75 N off target after it and was 0 before: keep its load "
-        "still and tare again; the old offset is in force"
-    )
-    read = tool_here("read", near, "Force/Torque Offset", "--json").json["sensors"][0]["objects"]
-    assert [row["value"] for row in read[1:]] == [-1.5, 2.25, 9.75, -0.125, 0.0625, -0.03125]
-    single.power_cycle()
-    subtracting(monkeypatch)
-    failed = tool_here("tare", near, "--samples", 50, code=1)
-    assert "Fz is -19.5 N off target after it and was -9.75 before" in one_sentence(failed)
-    read = tool_here("read", near, "Force/Torque Offset", "--json").json["sensors"][0]["objects"]
-    assert [row["value"] for row in read[1:]] == [0.0] * 6
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -43,11 +43,6 @@ def test_watch_begins_with_settled_data(bus: SimulatedBus) -> None:
         assert (*shown["force"], shown["samples"] >= 20) == (*FORCE, True)
 
 
-def test_tare_without_a_server_takes_settled_data(bus: SimulatedBus) -> None:
-    unsettled_at_first(bus)
-    assert tool_here("tare", bus.near, "--samples", 50, "--json").json["new_offset"][2] == -FORCE[2]
-
-
 @pytest.mark.parametrize("command", ["watch", "tare", "read"])
 def test_through_a_server_that_has_just_started(bus: SimulatedBus, command: str) -> None:
     unsettled_at_first(bus)
@@ -62,20 +57,12 @@ def test_through_a_server_that_has_just_started(bus: SimulatedBus, command: str)
     assert shown == FORCE[2]
 
 
-@pytest.mark.parametrize("through", ["interface", "server"])
-def test_watch_leaves_out_what_has_not_settled_after_a_recovery(bus: SimulatedBus, through: str) -> None:
-    def watched(*way: str) -> list[dict[str, object]]:
-        bus.at(1.5, "power cycle 0.2")
-        ended = tool_here("watch", *way, "--seconds", 3, "--interval", 0.1, "--json")
-        return [json.loads(line) for line in ended.out.splitlines()]
-
+def test_watch_leaves_out_what_has_not_settled_after_a_recovery(bus: SimulatedBus) -> None:
     unsettled_at_first(bus)
-    if through == "interface":
-        rows = watched(bus.near)
-    else:
-        with simulated_server(bus):
-            rows = watched(*SERVER)
+    bus.at(1.5, "power cycle 0.2")
+    ended = tool_here("watch", bus.near, "--seconds", 3, "--interval", 0.1, "--json")
+    rows = [json.loads(line) for line in ended.out.splitlines()]
     full = [row for row in rows if row["samples"]]
-    assert all(tuple(row["force"]) == FORCE for row in full)  # type: ignore[arg-type]
+    assert all(tuple(row["force"]) == FORCE for row in full)
     assert len(full) < len(rows), "it was lost, and told so"
-    assert sum(row["gaps"] for row in full) == 1, full  # type: ignore[misc]
+    assert sum(row["gaps"] for row in full) == 1, full

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.simulated_links import SimulatedBus, SimulatedServer, simulated_bus, simulated_server
+from tests.simulated_links import SimulatedBus, simulated_bus
 from tests.tool.odd_firmware import other_sinc_length
 from tests.tool.running import tool_here
 
@@ -29,23 +29,13 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedBus]:
         yield found
 
 
-@pytest.fixture(params=["interface", "server"])
-def way(request: pytest.FixtureRequest, bus: SimulatedBus) -> Iterator[tuple[str, ...]]:
-    """How the tool is told to reach the sensor."""
-    if request.param == "interface":
-        yield (bus.near,)
-    else:
-        with simulated_server(bus):
-            yield ("--server", SimulatedServer.address)
-
-
 @pytest.mark.parametrize("length", MEANINGS)
-def test_what_is_said_of_it_follows_the_rate(way: tuple[str, ...], length: int) -> None:
-    applied = tool_here("apply", *way, "--set", f"sinc_length={length}", "--json").json
+def test_what_is_said_of_it_follows_the_rate(bus: SimulatedBus, length: int) -> None:
+    applied = tool_here("apply", bus.near, "--set", f"sinc_length={length}", "--json").json
     assert applied["settings"]["sinc_length"] == length
-    (read,) = tool_here("read", *way, "sinc_length", "--json").json["sensors"][0]["objects"]
+    (read,) = tool_here("read", bus.near, "sinc_length", "--json").json["sensors"][0]["objects"]
     assert (read["value"], read["meaning"]) == MEANINGS[length]
-    assert MEANINGS[length][1] in tool_here("objects", *way).out
+    assert MEANINGS[length][1] in tool_here("objects", bus.near).out
 
 
 def test_a_length_that_chop_hides_is_not_overwritten(bus: SimulatedBus) -> None:
@@ -63,19 +53,19 @@ def test_a_length_that_chop_hides_is_not_overwritten(bus: SimulatedBus) -> None:
 
 
 @pytest.mark.parametrize("length", [32, 128, 341, 342, 1000])
-def test_plan_and_restore_end(way: tuple[str, ...], bus: SimulatedBus, length: int, tmp_path: Path) -> None:
+def test_plan_and_restore_end(bus: SimulatedBus, length: int, tmp_path: Path) -> None:
     asked = ("--set", f"sinc_length={length}")
-    tool_here("plan", *way, *asked, code=3)
-    tool_here("apply", *way, *asked)
-    assert "nothing to change" in tool_here("plan", *way, *asked).out
+    tool_here("plan", bus.near, *asked, code=3)
+    tool_here("apply", bus.near, *asked)
+    assert "nothing to change" in tool_here("plan", bus.near, *asked).out
     path = tmp_path / "a.json"
-    tool_here("snapshot", *way, path)
+    tool_here("snapshot", bus.near, path)
     content = json.loads(path.read_text())
     content["settings"]["sinc_length"] = length  # of several with this rate, it cannot know which
     path.write_text(json.dumps(content))
-    assert "nothing to restore" in tool_here("restore", *way, path).out
-    tool_here("apply", *way, "--set", "sinc_length=64", "--set", "fir=on")
-    restored = tool_here("restore", *way, path, "--json").json
+    assert "nothing to restore" in tool_here("restore", bus.near, path).out
+    tool_here("apply", bus.near, "--set", "sinc_length=64", "--set", "fir=on")
+    restored = tool_here("restore", bus.near, path, "--json").json
     assert {row["name"]: row["then"] for row in restored["changes"]} == {"sinc_length": length, "fir": False}
-    assert "nothing to restore" in tool_here("restore", *way, path).out
+    assert "nothing to restore" in tool_here("restore", bus.near, path).out
     assert bus.stats()["sinc_length"] == length

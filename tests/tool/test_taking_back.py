@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.simulated_links import SimulatedBus, simulated_bus, simulated_server
+from tests.simulated_links import SimulatedBus, simulated_bus
 from tests.tool.running import one_sentence, tool_here
 
 
@@ -22,21 +22,13 @@ def offset(*where: object) -> list[float]:
     return [row["value"] for row in rows[1:]]
 
 
-@pytest.mark.parametrize("through_server", [False, True])
-def test_a_tare_is_undone_and_done_again(bench: SimulatedBus, through_server: bool) -> None:
-    def undo_and_redo(*where: object) -> None:
-        tared = tool_here("tare", *where, "--samples", 50, "--json").json["new_offset"]
-        assert offset(*where) == pytest.approx(tared, rel=1e-5)
-        undone = tool_here("tare", *where, "--undo", "--json").json
-        assert (undone["new_offset"], offset(*where)) == ([0.0] * 6, [0.0] * 6)
-        tool_here("tare", *where, "--undo")  # of the undoing: it is the tare again
-        assert offset(*where) == pytest.approx(tared, rel=1e-5)
-
-    if not through_server:
-        undo_and_redo(bench.near)
-        return
-    with simulated_server(bench) as server:
-        undo_and_redo("--server", server.address)
+def test_a_tare_is_undone_and_done_again(bench: SimulatedBus) -> None:
+    tared = tool_here("tare", bench.near, "--samples", 50, "--json").json["new_offset"]
+    assert offset(bench.near) == pytest.approx(tared, rel=1e-5)
+    undone = tool_here("tare", bench.near, "--undo", "--json").json
+    assert (undone["new_offset"], offset(bench.near)) == ([0.0] * 6, [0.0] * 6)
+    tool_here("tare", bench.near, "--undo")  # of the undoing: it is the tare again
+    assert offset(bench.near) == pytest.approx(tared, rel=1e-5)
 
 
 def test_clearing_sets_zero_and_can_be_undone(bench: SimulatedBus) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import re
 import signal
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -18,7 +16,6 @@ from tests.simulated_links import (
     simulated_bus,
     simulated_server,
 )
-from tests.tool.odd_firmware import refusing
 from tests.tool.running import one_sentence, tool_here
 
 Bench = tuple[SimulatedBus, SimulatedServer]
@@ -73,19 +70,6 @@ def test_the_first_name_is_no_interface(monkeypatch: pytest.MonkeyPatch) -> None
     assert len(tool_here("read", "fir", "--json").json["sensors"][0]["objects"]) == 1
 
 
-@pytest.mark.usefixtures("bench")
-def test_objects_and_watch() -> None:
-    sensors = tool_here("objects", *SERVER, "--json").json["sensors"]
-    assert [row["serial"] for row in sensors] == [10, 20]
-    rates = [row["value"] for row in sensors[1]["objects"] if row["index"] == "0x8011"]
-    assert rates == [RATE_HZ]
-    ended = tool_here("watch", *SERVER, "--samples", 20, "--interval", 20, "--json")
-    rows = [json.loads(line) for line in ended.out.splitlines()]
-    assert [(row["sensor"], row["samples"]) for row in rows] == [(0, 20), (1, 20)]
-    assert len(rows[0]["force"]) == 3
-    assert "sensor 1: " in tool_here("watch", *SERVER, "--sensor", 20, "--seconds", 0.2).out
-
-
 def test_plan_apply_save(bench: Bench) -> None:
     bus, server = bench
     asked = ("--sensor", "20", "--set", "sinc_length=128", *SERVER)
@@ -111,37 +95,6 @@ def test_what_is_said_to_last_outlasts_the_sensors_power(bench: Bench) -> None:
     assert (after["settings"]["sinc_length"], after["offset"]) == (128, before["offset"])
     assert any(after["offset"])
     assert "nothing to change" in tool_here("plan", "--sensor", 0, "--set", "sinc_length=128", *SERVER).out
-
-
-def test_apply_that_fails_half_way_takes_everything_back(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    refusing(monkeypatch)
-    bus, _ = bench
-    asked = ("--sensor", 0, "--set", "sinc_length=128", "--set", "fir=on", *SERVER)
-    said = one_sentence(tool_here("apply", *asked, code=1))
-    assert "the former settings are in force" in said
-    assert ("0x8006", 2, "00") in bus.written(), "FIR had been switched on"
-    assert len(tool_here("plan", *asked, "--json", code=3).json["changes"]) == 2
-
-
-def test_what_the_sensor_lacks_or_contradicts_itself_changes_nothing(bench: Bench) -> None:
-    bus, server = bench
-    before = server.client().ask("describe")["sensors"][0]["settings"]
-    asked = ("--sensor", 0, *SERVER, "--set", "temperature_compensation=on")
-    bus.command("abort 0x8010 4 0x06020000")
-    missing = tool_here("apply", *asked, "--set", "coordinate_system=on", code=1)
-    assert "has no setting coordinate_system" in one_sentence(missing)
-    assert server.client().ask("describe")["sensors"][0]["settings"] == before
-    refused = tool_here("apply", *asked, "--set", "fast=on", code=2)
-    assert "fast is true but fir is false" in one_sentence(refused)
-
-
-def test_tare(bench: Bench) -> None:
-    bus, _ = bench
-    tared = tool_here("tare", "--sensor", 0, "--samples", 20, *SERVER, "--json").json
-    assert len(tared["new_offset"]) == 6
-    assert {row[0] for row in bus.written()} == {"0x8000"}
 
 
 def test_a_tare_that_is_stopped_tells_what_came_of_it(bench: Bench) -> None:
@@ -188,20 +141,3 @@ def test_a_server_that_does_not_reply_or_ends_is_one_sentence(bench: Bench) -> N
     bus.at(1.0, server.hub.close)
     said = one_sentence(tool_here("watch", *SERVER, code=1))
     assert f"the server at {server.address} closed the connection" in said
-
-
-def test_snapshot_and_restore(bench: Bench, tmp_path: Path) -> None:
-    bus, _ = bench
-    path = tmp_path / "a.json"
-    tool_here("snapshot", path, "--sensor", 0, *SERVER)
-    tool_here("apply", "--sensor", 0, *SERVER, "--set", "chop=on")
-    content = json.loads(path.read_text())
-    for row in content["objects"]:
-        if row["index"] == "0x8000" and row["subindex"] == 2:
-            row["hex"] = "0000803f"
-    path.write_text(json.dumps(content))
-    assert "serial 20" in one_sentence(tool_here("restore", path, "--sensor", 1, *SERVER, code=1))
-    restored = tool_here("restore", *SERVER, path, "--sensor", 0, "--json").json
-    assert [(row["name"], row["then"]) for row in restored["changes"]] == [("chop", False)]
-    assert [(row["index"], row["subindex"]) for row in restored["objects"]] == [("0x8000", 2)]
-    assert ("0x8000", 2, "0000803f") in bus.written()

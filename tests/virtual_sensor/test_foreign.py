@@ -8,8 +8,9 @@ import struct
 import pytest
 
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.master.datagrams import DatagramMaster
 from ethercat_server.ethercat.slave import sii_content
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.sensor.scan import look_safely
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
@@ -258,11 +259,13 @@ def test_the_backend_in_memory_takes_a_mixed_chain_to_safeop(state: str) -> None
     bus = Bus(backend)
     found = look_safely(bus, no_check, force=True)
     assert [slave.name for slave in found] == ["EK1100", "BFT-SENS-ECAT-M8", "EL3102", "DRIVE"]
-    bus.scan(DatagramMaster(bus, [slave.sii for slave in found]), range(4), no_check)
-    assert bus.master.sdo_read(2, 0x1008, 0) == b"EL3102"
-    assert bus.master.map_process_data(no_check) == [0, 61, 6, 6]
-    states = [slave.life.al.state for slave in backend.sensors.slaves if slave.life]
-    assert states == [SAFEOP] * 4
+    bus.scan(range(1, 4), [slave.sii for slave in found], no_check)  # the coupler has no mailbox
+    assert finish(bus.slaves[1].sdo.read(0x1008, 0), clock=bus.clock) == b"EL3102"
+    assert bus.map_process_data(no_check) == [61, 6, 6]
+    for slave in bus.slaves:
+        finish(slave.go(AlState.SAFEOP), clock=bus.clock)
+    states = [slave.life.al.state for slave in backend.sensors.slaves[1:] if slave.life]
+    assert states == [SAFEOP] * 3
 
 
 @pytest.mark.parametrize("seed", range(3))

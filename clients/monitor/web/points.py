@@ -18,17 +18,16 @@ from typing import Final
 
 from protocol.accounting import NOT_NEW
 from protocol.framing import DataMessage
-from protocol.pdo import LAYOUTS, STANDARD_GRAVITY, ImuUnits, PdoType
+from protocol.health.observer import COMMON
+from protocol.pdo import STANDARD_GRAVITY, ImuUnits, PdoType
 
 STEP_NS: Final = 10_000_000
 KIND: Final = 1
 HEADER: Final = struct.Struct("<BBHId")
-MOST_POINTS: Final = 4096
-"""Points that wait to be taken: 20 s."""
+MOST_POINTS: Final = 4096  # that wait to be taken: 20 s
 
-_COMMON: Final = LAYOUTS[min(LAYOUTS)]
-CHANNELS: Final = tuple(field.name for field in _COMMON.fields if field.type is PdoType.REAL)
-"""Six axes of the wrench, acceleration, angular rate, temperature."""
+# Six axes of the wrench, acceleration, angular rate, temperature.
+CHANNELS: Final = tuple(field.name for field in COMMON.fields if field.type is PdoType.REAL)
 
 Values = tuple[float, ...]
 
@@ -44,15 +43,14 @@ def after_skipped(batch: bytes) -> bytes:
     return HEADER.pack(kind, position, count, 1, start) + batch[HEADER.size :]
 
 
-def scales(imu_units: ImuUnits) -> Values:
+def _scales(imu_units: ImuUnits) -> Values:
     """The factor of each channel from the process data's units to SI."""
-    if imu_units is ImuUnits.SI:
-        return (1.0,) * len(CHANNELS)
-    factors = {"acceleration": STANDARD_GRAVITY, "angular_rate": math.pi / 180.0}
+    of_imu = {"acceleration": STANDARD_GRAVITY, "angular_rate": math.pi / 180.0}
+    factors = {} if imu_units is ImuUnits.SI else of_imu
     return tuple(factors.get(name.split(".")[0], 1.0) for name in CHANNELS)
 
 
-class Points:
+class _Points:
     """One sensor's. A step with one sample is one point, others are two: the extremes of each channel."""
 
     def __init__(self, scale: Values) -> None:
@@ -61,24 +59,20 @@ class Points:
         self._rows: list[Values] = []
         self._points: deque[tuple[int, Values]] = deque(maxlen=MOST_POINTS)
         self._newest: Values = ()
-        self._last = (-1, -1)
+        self.last = (-1, -1)  # number and time of the newest frame
 
     def take(self, frames: Iterable[DataMessage]) -> None:
         """Frames of this sensor as they came; REPEATED, INVALID and old ones bring nothing."""
-        unpack_from = _COMMON.reals.unpack_from
+        unpack_from = COMMON.reals.unpack_from
         for sequence, _, time_ns, _, flags, _, process_data in frames:
-            if flags & NOT_NEW or (sequence <= self._last[0] and time_ns <= self._last[1]):
+            if flags & NOT_NEW or (sequence <= self.last[0] and time_ns <= self.last[1]):
                 continue
             if self._times and time_ns // STEP_NS != self._times[0] // STEP_NS:
                 self._end_step()
-            self._last = sequence, time_ns
+            self.last = sequence, time_ns
             self._times.append(time_ns)
             self._newest = unpack_from(process_data)
             self._rows.append(self._newest)
-
-    def restart(self) -> None:
-        """The server may count from the beginning again."""
-        self._last = (-1, -1)
 
     def batch(self, position: int, *, silent: bool = False) -> bytes | None:
         """The points since the last one, as a message; None without any. `silent`: end the step now."""
@@ -99,11 +93,9 @@ class Points:
         return header + body.tobytes()
 
     def _end_step(self) -> None:
-        if len(self._rows) == 1:
-            self._points.append((self._times[0], _finite(self._rows[0])))
-        else:
-            first, second = zip(*map(_extremes, zip(*self._rows, strict=True)), strict=True)
-            self._points.append((self._times[0], first))
+        first, second = zip(*map(_extremes, zip(*self._rows, strict=True)), strict=True)
+        self._points.append((self._times[0], first))
+        if len(self._rows) > 1:
             self._points.append((self._times[-1], second))
         self._times.clear()
         self._rows.clear()
@@ -112,15 +104,9 @@ class Points:
 def _extremes(column: Values) -> tuple[float, float]:
     """Minimum and maximum in the order in which they came."""
     if not math.isfinite(sum(column)):
-        column = tuple(value for value in column if math.isfinite(value))
-        if not column:
-            return math.nan, math.nan
+        column = tuple(value for value in column if math.isfinite(value)) or (math.nan,)
     low, high = min(column), max(column)
     return (low, high) if column.index(low) < column.index(high) else (high, low)
-
-
-def _finite(values: Values) -> Values:
-    return tuple(value if math.isfinite(value) else math.nan for value in values)
 
 
 class Feed:
@@ -128,20 +114,20 @@ class Feed:
 
     def __init__(self, imu_units: ImuUnits = ImuUnits.G_DPS) -> None:
         self._lock = threading.Lock()
-        self._scale = scales(imu_units)
-        self._points: dict[int, Points] = {}
+        self._scale = _scales(imu_units)
+        self._points: dict[int, _Points] = {}
 
     def restart(self) -> None:
         """A new connection to the server."""
         with self._lock:
             for points in self._points.values():
-                points.restart()
+                points.last = (-1, -1)  # the server may count from the beginning again
 
     def take(self, frames: Sequence[DataMessage]) -> None:
         """Frames of any sensors in order of arrival."""
         with self._lock:
             for position in {frame.sensor for frame in frames}:
-                points = self._points.setdefault(position, Points(self._scale))
+                points = self._points.setdefault(position, _Points(self._scale))
                 points.take(frame for frame in frames if frame.sensor == position)
 
     def batches(self, *, silent: bool = False) -> dict[int, bytes]:

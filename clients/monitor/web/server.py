@@ -1,4 +1,9 @@
-"""The sockets: serves the page's files and its stream. The only file that uses websockets."""
+"""`ethercat-monitor --web`: serves page and stream on this machine. The only file that uses websockets.
+
+A page of another site can make a browser send requests here, even under a host name of its own that resolves
+to this machine (DNS rebinding). Then Host or Origin has that name. Requests are answered only under a name of
+this machine, any port, because `ssh -L` may forward another one; the stream only to the page itself.
+"""
 
 from __future__ import annotations
 
@@ -7,126 +12,192 @@ import contextlib
 import errno
 import logging
 import socket
+import sys
 import time
 from collections.abc import AsyncIterator, Callable
+from functools import partial
+from http import HTTPStatus
+from importlib.resources import files
 from typing import Final
+from urllib.parse import urlsplit
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from clients.monitor.web.files import Files
-from clients.monitor.web.hub import TOO_MANY, Hub, WebModel
-from clients.monitor.web.viewer import MOST_BYTES
+from clients.monitor.options import Options, is_loopback
+from clients.monitor.reader import Reader
+from clients.monitor.tare import start_tare
+from clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, WebModel
+from clients.program import call_on, say
+from protocol.address import Address
 
 STATE_S: Final = 0.2
-_CLOSING_S: Final = 0.5
+POINTS_S: Final = 1 / 30
+STREAM: Final = "/stream"  # where the page opens its WebSocket
+HEADERS: Final = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}  # of every response
+_TYPES: Final = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+_FOREIGN_HOST: Final = (
+    "The page is for this machine only: open http://localhost:PORT/, from elsewhere over ssh -L."
+)
+_FOREIGN_ORIGIN: Final = "The stream is for the page that is served here, and not for others."
 _NO_IPV6: Final = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
 _POLICY_VIOLATION: Final = 1008
 _TRY_AGAIN_LATER: Final = 1013
+_WHY: Final = {
+    errno.EADDRINUSE: "is in use",
+    errno.EACCES: "is reserved for root",
+    errno.EADDRNOTAVAIL: "cannot be had: this machine has no such address",
+}
 
 # What a peer does wrong is no business of the terminal's, and requests are not logged.
 _QUIET: Final = logging.Logger(__name__, logging.CRITICAL)
 
 
-PageHub = Hub[ServerConnection]
+def run_web(options: Options, where: Address) -> int:
+    """Serve the page until a signal or the time limit; returns the exit code."""
+    try:
+        asyncio.run(_run(options, where))
+    except OSError as error:
+        if error.errno not in _WHY:
+            raise
+        say("ethercat-monitor", f"{where} {_WHY[error.errno]}: choose another port with --web PORT")
+        return 1
+    return 0
 
 
-class WebServer:
-    """Serves the pages of a hub while `serving`."""
-
-    def __init__(self, hub: PageHub, model: WebModel, clock: Callable[[], float] = time.monotonic) -> None:
-        self._hub = hub
-        self._model = model
-        self._clock = clock
-        self._files = Files()
-
-    @contextlib.asynccontextmanager
-    async def serving(self, host: str, port: int) -> AsyncIterator[int]:
-        """Serve on a loopback address, `localhost` on both; gives the port. OSError if it cannot be had."""
-        listening = _listen(host, port)
-        loop = asyncio.get_running_loop()
-
-        def points_are_due() -> None:  # in the thread that feeds the model
-            loop.call_soon_threadsafe(self._send_points)
-
-        self._model.on_points = points_are_due
-        async with contextlib.AsyncExitStack() as stack:
-            for sock in listening:
-                await stack.enter_async_context(self._serve(sock))
-            states = asyncio.create_task(self._send_states())
-            try:
-                yield listening[0].getsockname()[1]
-            finally:
-                self._model.on_points = lambda: None
-                states.cancel()
-
-    def _serve(self, sock: socket.socket) -> contextlib.AbstractAsyncContextManager[object]:
-        return serve(
-            self._converse,
-            sock=sock,
-            process_request=self._answer,
-            compression=None,
-            max_size=MOST_BYTES,
-            max_queue=4,
-            open_timeout=5.0,
-            close_timeout=_CLOSING_S,
-            server_header=None,
-            logger=_QUIET,
+async def _run(options: Options, where: Address) -> None:
+    stop = asyncio.Event()
+    call_on(asyncio.get_running_loop(), stop.set, "SIGINT", "SIGTERM", "SIGHUP")
+    model = WebModel(str(options.address), options.imu_units)
+    hub = Hub(model, partial(start_tare, options.address))
+    reader = Reader(options.address, model, POINTS_S)
+    async with serving(hub, model, *where) as port:
+        sys.stdout.write(
+            f"Open http://{Address(where.host, port)}/#token={hub.token}\n"
+            "With this link the page can tare the sensor; without #token=... it only shows. Ctrl-C ends it.\n"
         )
-
-    def _answer(self, _: ServerConnection, request: Request) -> Response | None:
-        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-        answer = self._files.answer(
-            request.path,
-            hosts[0] if len(hosts) == 1 else None,
-            origins[0] if len(origins) == 1 else None,
-        )
-        if answer is None:
-            return None
-        status, headers, body = answer
-        return Response(status.value, status.phrase, Headers(headers), body)
-
-    async def _converse(self, page: ServerConnection) -> None:
-        viewer = self._hub.join(page)
-        if viewer is None:
-            await page.close(_TRY_AGAIN_LATER, TOO_MANY)
-            return
-        self._send_state()
-        self._send_kept(page)
+        sys.stdout.flush()
+        reader.start()
         try:
-            async for text in page:
-                sensor = viewer.sensor
-                reply = self._hub.hear(page, text)
-                if viewer.sensor != sensor:
-                    self._send_kept(page)
-                if viewer.end:
-                    await page.close(_POLICY_VIOLATION, viewer.end)
-                elif reply is not None:
-                    broadcast([page], reply)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), options.seconds)
+        finally:
+            reader.close()
+
+
+@contextlib.asynccontextmanager
+async def serving(
+    hub: Hub, model: WebModel, host: str, port: int, clock: Callable[[], float] = time.monotonic
+) -> AsyncIterator[int]:
+    """Serve on a loopback address, `localhost` on both; gives the port. OSError if it cannot be had."""
+    listening = _listen(host, port)
+    loop, page_files = asyncio.get_running_loop(), read_page()
+
+    def respond(_: ServerConnection, request: Request) -> Response | None:
+        return answer(page_files, request)
+
+    async def converse(connection: ServerConnection) -> None:
+        page = hub.join(partial(broadcast, [connection]), clock())
+        if page is None:
+            await connection.close(_TRY_AGAIN_LATER, TOO_MANY)
+            return
+        try:
+            async for text in connection:
+                hub.take(page, text)
+                if page.end:
+                    await connection.close(_POLICY_VIOLATION, page.end)
         except ConnectionClosed:
             pass
         finally:
-            self._hub.leave(page)
+            hub.leave(page)
 
-    async def _send_states(self) -> None:
+    async def send() -> None:
         while True:
-            self._send_state()
-            self._send_points()
+            hub.send_states(clock())
+            hub.send_points(clock())
             await asyncio.sleep(STATE_S)
 
-    def _send_state(self) -> None:
-        for pages, text in self._hub.states(self._clock()):
-            broadcast(pages, text)
+    def points_are_due() -> None:  # in the reader's thread
+        loop.call_soon_threadsafe(lambda: hub.send_points(clock()))
 
-    def _send_kept(self, page: ServerConnection) -> None:
-        for batch in self._hub.kept(page):
-            broadcast([page], batch)
+    model.on_points = points_are_due
+    async with contextlib.AsyncExitStack() as stack:
+        for sock in listening:
+            await stack.enter_async_context(
+                serve(
+                    converse,
+                    sock=sock,
+                    process_request=respond,
+                    compression=None,
+                    max_size=MOST_BYTES,
+                    max_queue=4,
+                    open_timeout=5.0,
+                    close_timeout=0.5,
+                    server_header=None,
+                    logger=_QUIET,
+                )
+            )
+        sending = asyncio.create_task(send())
+        try:
+            yield listening[0].getsockname()[1]
+        finally:
+            model.on_points = lambda: None
+            sending.cancel()
 
-    def _send_points(self) -> None:
-        for pages, batch in self._hub.points(self._clock()):
-            broadcast(pages, batch)
+
+def read_page() -> dict[str, tuple[bytes, str]]:
+    """Body and type of each file of the page by its path."""
+    page = files("clients.monitor.web") / "page"
+    found = {}
+    for folder, path in ((page, "/"), (page / "uplot", "/uplot/")):
+        for entry in folder.iterdir():
+            if kind := _TYPES.get(entry.name.rpartition(".")[2]):
+                text = "" if kind.startswith("image") else "; charset=utf-8"
+                found[path + entry.name] = entry.read_bytes(), kind + text
+    found["/"] = found.pop("/index.html")
+    return found
+
+
+def answer(page_files: dict[str, tuple[bytes, str]], request: Request) -> Response | None:
+    """The answer to a GET; None for a stream that may be opened."""
+    path = request.path.partition("?")[0]
+    host, origin = (_only(request.headers.get_all(name)) for name in ("Host", "Origin"))
+    status, kind = HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8"
+    if not _is_this_machine(host):
+        body = f"{_FOREIGN_HOST}\n".encode()
+    elif path == STREAM:
+        if origin.lower() == f"http://{host.lower()}":
+            return None
+        body = f"{_FOREIGN_ORIGIN}\n".encode()
+    elif path in page_files:
+        status, (body, kind) = HTTPStatus.OK, page_files[path]
+    else:
+        status, body = HTTPStatus.NOT_FOUND, b"There is no such file.\n"
+    headers = Headers({"Content-Type": kind, "Content-Length": str(len(body)), **HEADERS})
+    return Response(status.value, status.phrase, headers, body)
+
+
+def _only(values: list[str]) -> str:
+    return values[0] if len(values) == 1 else ""
+
+
+def _is_this_machine(host: str) -> bool:
+    try:
+        return is_loopback(urlsplit(f"//{host}").hostname or "")
+    except ValueError:
+        return False
 
 
 def _listen(host: str, port: int) -> list[socket.socket]:

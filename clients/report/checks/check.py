@@ -4,48 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
-from typing import Final
 
-from protocol.health import verdict as health
-
-
-class Level(IntEnum):
-    """Severity, worst last."""
-
-    GOOD = 0
-    NOT_APPLICABLE = 1
-    """There is nothing to check, for example because the IMU is off; a sensor can still be healthy."""
-    NOT_POSSIBLE = 2
-    """It could not be checked."""
-    LOOK = 3
-    """Needs attention; the data can be used."""
-    TROUBLE = 4
-    """The data cannot be trusted, or the sensor needs service."""
-
-    @property
-    def key(self) -> str:
-        """For programs, and for style sheets."""
-        return self.name.lower().replace("_", "-")
-
-    @property
-    def word(self) -> str:
-        """For people."""
-        return _WORDS[self][0]
-
-    @property
-    def symbol(self) -> str:
-        """A symbol beside the word, so that nothing depends on color."""
-        return _WORDS[self][1]
-
-
-_WORDS = {
-    Level.GOOD: (health.Level.GOOD.words, "✓"),
-    Level.NOT_APPLICABLE: ("not applicable", "-"),
-    Level.NOT_POSSIBLE: ("not possible", "?"),
-    Level.LOOK: (health.Level.LOOK.words, "!"),
-    Level.TROUBLE: (health.Level.TROUBLE.words, "✗"),
-}
+from protocol.health.verdict import Finding, Level
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +22,8 @@ class Check:
     """What to do; empty where nothing is wrong."""
 
 
-OF_STREAM: Final = {health.Level.LOOK: Level.LOOK, health.Level.TROUBLE: Level.TROUBLE}
-"""Levels of what the judge of streams found."""
-
-
 def judged(
-    name: str, findings: Sequence[health.Finding], good: str, *, details: str = "", matters: str = "",
+    name: str, findings: Sequence[Finding], good: str, *, details: str = "", matters: str = "",
     remedy: str = "",
 ) -> Check:  # fmt: skip
     """What the judge of streams found, with more `details` and `remedy`; `good` if it found nothing."""
@@ -75,15 +31,7 @@ def judged(
         return Check(name, Level.GOOD, good)
     found = " ".join([*(f"{each.found}." for each in findings), *([details] if details else [])])
     remedies = dict.fromkeys([*(f"{each.remedy}." for each in findings), *([remedy] if remedy else [])])
-    return Check(name, OF_STREAM[findings[0].level], found, matters, " ".join(remedies))
-
-
-HEADLINES = {
-    Level.GOOD: health.Level.GOOD.words.capitalize(),
-    Level.NOT_POSSIBLE: "Not conclusive",
-    Level.LOOK: health.Level.LOOK.words.capitalize(),
-    Level.TROUBLE: health.Level.TROUBLE.words.capitalize(),
-}
+    return Check(name, findings[0].level, found, matters, " ".join(remedies))
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +45,7 @@ class Verdict:
     @property
     def headline(self) -> str:
         """One or two words."""
-        return HEADLINES[self.level]
+        return "Not conclusive" if self.level is Level.NOT_POSSIBLE else self.level.words.capitalize()
 
 
 def verdict(checks: Sequence[Check]) -> Verdict:

@@ -20,8 +20,9 @@ import numpy as np
 
 from clients.numbers import figure, listing
 from clients.report.checks.channels import ACCELERATION, ANGULAR_RATE, CHANNELS, Channel, noise_limit
-from clients.report.checks.check import Check, Level
+from clients.report.checks.check import Check
 from clients.report.subjects.series import Bools, Floats, Ints, Series
+from protocol.health.verdict import Level
 
 WINDOW_S: Final = 0.5
 FEWEST_SAMPLES: Final = 32

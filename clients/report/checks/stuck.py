@@ -13,9 +13,10 @@ import numpy as np
 
 from clients.numbers import count, figure, listing, seconds
 from clients.report.checks.channels import CHANNELS, Channel
-from clients.report.checks.check import Check, Level
+from clients.report.checks.check import Check
 from clients.report.checks.timing import too_few
 from clients.report.subjects.series import Series
+from protocol.health.verdict import Level
 
 _LONGEST_S: Final = 0.1
 _LONGEST_SAMPLES: Final = 16

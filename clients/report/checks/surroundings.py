@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 
 from clients.numbers import figure
-from clients.report.checks.check import Check, Level, judged
+from clients.report.checks.check import Check, judged
 from clients.report.checks.timing import too_few
 from clients.report.subjects.series import Floats, Series
-from protocol.health.verdict import Finding
+from protocol.health.verdict import Finding, Level
 from protocol.pdo import STANDARD_GRAVITY
 
 _GRAVITY_TOLERANCE: Final = 1.0

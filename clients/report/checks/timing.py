@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 
 from clients.numbers import count, figure, seconds
-from clients.report.checks.check import Check, Level, judged
+from clients.report.checks.check import Check, judged
 from clients.report.subjects.series import Bools, Floats, Series
 from protocol.accounting import StreamAccounting, StreamCounts
 from protocol.health.limits import LIMITS
-from protocol.health.verdict import Finding
+from protocol.health.verdict import Finding, Level
 
 Findings = Sequence[Finding]
 """What the judge of streams found that belongs to one check."""

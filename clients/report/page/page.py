@@ -13,10 +13,10 @@ import numpy as np
 from clients import numbers
 from clients.numbers import figure, moment, share
 from clients.report.checks.channels import CHANNELS, GROUPS, limit_origin
-from clients.report.checks.check import Level
 from clients.report.examine import Examination
 from clients.report.page import plots, stream_plots
 from clients.report.page.envelope import BINS
+from protocol.health.verdict import Level
 from protocol.sensor.meaning import meaning, value_meaning
 from protocol.settings import SETTINGS
 from protocol.text.visible import printable, visible

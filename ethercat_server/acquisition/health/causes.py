@@ -8,13 +8,13 @@ from typing import Final
 from ethercat_server.ethercat.datagrams import FIRST_INDEX
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, PROCESSED_BIT, SOURCE, SOURCE_ADDRESS
 
+# Frames of others in a second that are a master's; fewer may be late answers from before the loop.
 _MASTER_FRAMES: Final = 3
-"""Frames of others in a second that are a master's; fewer may be late answers from before the loop."""
+# Seconds without any after which it has gone.
 _GONE_S: Final = 10
-"""Seconds without any after which it has gone."""
 _RECENT_NS: Final = 1_000_000_000
+# Standing still for so long in that time explains a missing answer, or the end of a watchdog.
 _STALL_NS: Final = 20_000_000
-"""Standing still for so long in that time explains a missing answer, or the end of a watchdog."""
 
 log = logging.getLogger(__name__)
 

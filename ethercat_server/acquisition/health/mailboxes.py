@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.mailbox.emergency import Emergency
-from ethercat_server.ethercat.mailbox.mailbox import Mailbox
+from ethercat_server.ethercat.slave.emergencies import Emergency
 from ethercat_server.sensor.sensor import Sensor
 from protocol.control import Event, event
 from protocol.text.json_text import JsonObject
@@ -18,15 +17,9 @@ from protocol.text.json_text import JsonObject
 class Mailboxes:
     """Of all sensors of the bus. `announce` sends an event to the clients."""
 
-    def __init__(
-        self,
-        bus: Bus,
-        sensors: Sequence[Sensor],
-        mailboxes: Sequence[Mailbox],
-        announce: Callable[[JsonObject], None],
-    ) -> None:
+    def __init__(self, bus: Bus, sensors: Sequence[Sensor], announce: Callable[[JsonObject], None]) -> None:
+        self._bus = bus
         self._sensors = sensors
-        self._mailboxes = mailboxes
         self._announce = announce
         self._turn = -1
         bus.emergencies.tell = self._tell
@@ -35,7 +28,7 @@ class Mailboxes:
         """Look at the next sensor's: one datagram, a second one to read one message that is there."""
         self._turn = (self._turn + 1) % len(self._sensors)
         if self._sensors[self._turn].streams:
-            self._mailboxes[self._turn].look()
+            self._bus.slaves[self._turn].sdo.look()
 
     def _tell(self, number: int, emergency: Emergency, count: int) -> None:
         message = f"sensor {number} reports {emergency}"

@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 from typing import Final
 
-from ethercat_server.acquisition.timing.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 
+# A usual round trip above this is a slow network card's, or a slow driver's.
 SLOW_US: Final = 300.0
-"""A usual round trip above this is a slow network card's, or a slow driver's."""
+# A usual round trip through a PCIe card, system calls included.
 _PCIE_US: Final = 100.0
-"""A usual round trip through a PCIe card, system calls included."""
 _SLOW_SECONDS: Final = 5
 
 log = logging.getLogger(__name__)

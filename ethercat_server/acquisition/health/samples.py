@@ -8,13 +8,13 @@ from __future__ import annotations
 import logging
 from typing import Final
 
-from ethercat_server.acquisition.hardware.trust import Verdict
-from ethercat_server.acquisition.timing.sample_clock import PLAUSIBLE_PULL, SampleClock
+from ethercat_server.acquisition.clock import PLAUSIBLE_PULL, SampleClock
+from ethercat_server.acquisition.slave_clock import Verdict
 
+# Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment.
 _DEVIATING_SECONDS: Final = 10
-"""Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment."""
+# Seconds with finite samples only after which it is over.
 _FINITE_SECONDS: Final = 10
-"""Seconds with finite samples only after which it is over."""
 
 log = logging.getLogger(__name__)
 

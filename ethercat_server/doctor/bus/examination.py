@@ -21,7 +21,7 @@ from ethercat_server.doctor.machine import nic
 from ethercat_server.doctor.machine.facts import read_counters
 from ethercat_server.doctor.machine.machine import Machine
 from ethercat_server.errors import ServerError
-from ethercat_server.ethercat.nic.ip import network_trouble
+from ethercat_server.ethercat.nic.interface import network_trouble
 from ethercat_server.ethercat.open_bus import open_bus
 from protocol.address import Address
 

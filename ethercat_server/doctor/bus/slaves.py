@@ -20,8 +20,8 @@ from ethercat_server.ethercat.slave.registers import (
     RX_ERRORS,
     WATCHDOG_COUNTER,
 )
-from ethercat_server.sensor.look import look_at, with_sii
 from ethercat_server.sensor.objects.dictionary import is_sensor
+from ethercat_server.sensor.scan import look_at, with_sii
 
 MOST_PORTS: Final = 4
 _ATTEMPTS: Final = 10

@@ -10,7 +10,7 @@ from ethercat_server.access.holder import Holder, owners
 from ethercat_server.doctor.finding import Finding, bad, cannot_look, note, ok, warning
 from ethercat_server.doctor.machine.facts import known
 from ethercat_server.doctor.machine.machine import Machine
-from ethercat_server.ethercat.nic.ip import ALLOW_IP, network_trouble
+from ethercat_server.ethercat.nic.interface import ALLOW_IP, network_trouble
 from ethercat_server.ethercat.nic.packet_sockets import Listener, packet_sockets
 
 _ETHERCAT: Final = 0x88A4

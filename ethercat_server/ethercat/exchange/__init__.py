@@ -1,1 +1,0 @@
-"""The exchange of process data: its frames, and what they read of the slave controllers' clocks."""

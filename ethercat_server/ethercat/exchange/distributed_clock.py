@@ -17,21 +17,21 @@ from ethercat_server.ethercat.wire import BYTE_NS, COUNTER_SIZE, DATAGRAM_HEADER
 
 _U64_U32: Final = struct.Struct("<QI")
 _PORTS: Final = struct.Struct("<4I")
+# Bit of the DL status that says whether port 0 has a link.
 _LINKS: Final = 4
-"""Bit of the DL status that says whether port 0 has a link."""
 _MOST_BEHIND_NS: Final = 1_000_000
 _WRAP: Final = 1 << 32
 _TIME_SIZE: Final = 4
 _SLACK_NS: Final = 10_000
+# One lost frame is no reason to do without event times; many would hold up the loop.
 _ATTEMPTS: Final = 3
-"""One lost frame is no reason to do without event times; many would hold up the loop."""
 
+# System time when the frame arrived, a working counter; local time of the event PDI buffer change, a working
+# counter. Both times are modulo 2**32 ns.
 Latched = tuple[int, int, int, int]
-"""System time when the frame arrived, a working counter; local time of the event PDI buffer change, a working
-counter. Both times are modulo 2**32 ns."""
 LATCHED: Final = struct.Struct(f"<IH{DATAGRAM_HEADER}xIH")
+# Bytes in a frame, of two datagrams.
 LATCHED_SIZE: Final = DATAGRAM_HEADER + LATCHED.size
-"""Bytes in a frame, of two datagrams."""
 
 
 class DistributedClock(NamedTuple):
@@ -57,14 +57,6 @@ def switch_latched(frame: bytearray, at: int, *, reads: bool) -> None:
     """Have a frame read what is latched, to be found at `at`, or not (NOP)."""
     for data in (at, at + LATCHED.size - COUNTER_SIZE - _TIME_SIZE):
         frame[data - DATAGRAM_HEADER] = Command.FPRD if reads else Command.NOP
-
-
-def latch_events(bus: Datagrams, number: int, sync_manager: int) -> bool:
-    """Have a sensor's controller latch when it writes samples, to this sync manager; False if it does not."""
-    address = reg.SYNC_MANAGER + sync_manager * reg.SYNC_MANAGER_SIZE + reg.SM_ACTIVATE
-    active = bus.read_surely(number, address, 1)[0]
-    latches = bytes([active | reg.SM_LATCH_PDI])
-    return any(bus.write_register(number, address, latches) for _ in range(_ATTEMPTS))
 
 
 def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:

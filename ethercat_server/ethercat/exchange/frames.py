@@ -17,14 +17,14 @@ from ethercat_server.ethercat.wire import (
     build,
 )
 
+# Each frame carries its number in a last datagram (NOP), which comes back as it was sent: by the index
+# alone one that comes back very late would be taken for a later one.
 TAG_SIZE: Final = 4
-"""Each frame carries its number in a last datagram (NOP), which comes back as it was sent: by the index
-alone one that comes back very late would be taken for a later one."""
 _AROUND_DATA: Final = DATAGRAM_HEADER + COUNTER_SIZE
+# Bytes of datagrams that fit one frame.
 _LONGEST: Final = 1498
-"""Bytes of datagrams that fit one frame."""
+# What is sent where the inputs will be; no sensor says it, for its numbers would be NaN throughout.
 _NEVER: Final = b"\xff"
-"""What is sent where the inputs will be; no sensor says it, for its numbers would be NaN throughout."""
 
 
 class Area(NamedTuple):

@@ -4,23 +4,39 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.exchange.distributed_clock import switch_latched
 from ethercat_server.ethercat.exchange.frames import Area, make_frames
 from ethercat_server.ethercat.wire import BYTE_NS, DATAGRAM_INDEX, FRAME_HEADER, Command
 
+# Single datagrams and SOEM use the indices below.
 FIRST_INDEX: Final = 0x90
-"""Single datagrams and SOEM use the indices below."""
-_INDICES: Final = 0x100 - FIRST_INDEX
+_INDICES: Final = 0x100
+# Frames on the wire; a limit for a bus that does not answer.
 MOST_IN_FLIGHT = 100
-"""Frames on the wire; a limit for a bus that does not answer."""
+# A frame that is not back after this time counts as lost: its index is used again.
 _LOST_NS: Final = 100_000_000
-"""A frame that is not back after this time counts as lost: its index is used again."""
 _TAG: Final = struct.Struct("<I")
-_NOTHING: Final = (0, 0, 0)
+_NOTHING: Final = (0, 0, -1)
 _IMPOSSIBLE: Final = 0xFFFF
+
+
+class Exchange(NamedTuple):
+    """One that is back. Times are CLOCK_MONOTONIC ns."""
+
+    sent_ns: int
+    back_ns: int
+    frame: bytes
+    wkc: int
+    """Working counter; 0xFFFF if it cannot be."""
+    which: int
+    """Number of the frame, of those that make up an exchange."""
+
+
+# An answer that was taken before.
+DUPLICATE: Final = Exchange(0, 0, b"", 0, 0)
 
 
 class ProcessData:
@@ -43,7 +59,7 @@ class ProcessData:
         """By frame: what its bytes take on the wire."""
         self._ends = [frame.end for frame in frames]
         self._written = [frame.written for frame in frames]
-        self._tags = [frame.tag for frame in frames]
+        self._tags = [frame.tag for frame in frames] or [0]
         self.inputs = [frame.inputs for frame in frames]
         """By frame: the sensors whose inputs it carries."""
         self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
@@ -55,10 +71,9 @@ class ProcessData:
             for frame in frames
         ]
         """By frame: the highest counters of LRD and LWR."""
-        self._index = self._number = 0
+        self._index, self._number = FIRST_INDEX, 0
+        # By index: when a frame was sent that is not back, else 0; which it was; its tag, -1 once it is lost.
         self._sent = [_NOTHING] * _INDICES
-        """By index less the first: when a frame was sent that is not back, else 0; which it was; its tag, 0
-        once it is lost."""
         self.in_flight = 0
         """Frames in flight: not back, and not known to be lost."""
         self._lost = 0
@@ -66,12 +81,6 @@ class ProcessData:
         """Answers that came once more."""
         self.blocked_until_ns = 0
         """Nothing can be sent before, as long as nothing comes back."""
-        self.frame = b""
-        """The answer that `take` took last."""
-        self.wkc = 0
-        """Its working counter; 0xFFFF if it cannot be."""
-        self.which = 0
-        """Which frame of the exchange it is."""
 
     def read_latched(self, number: int, *, reads: bool) -> int | None:
         """Read what a sensor's controller latches, or no longer; where, or None if it latches nothing."""
@@ -84,7 +93,6 @@ class ProcessData:
 
     def send(self) -> int:
         """Send an exchange, unless too many are on the wire. Returns when."""
-        now_ns = 0
         for which, frame in enumerate(self._frames):
             index = self._index
             if self.in_flight >= MOST_IN_FLIGHT or self._sent[index][0]:
@@ -94,10 +102,10 @@ class ProcessData:
                     self.blocked_until_ns = min(sent[0] for sent in self._sent if sent[0]) + _LOST_NS
                     return now_ns
                 while self._sent[index][0]:
-                    index = (index + 1) % _INDICES
-            self._index = (index + 1) % _INDICES
+                    index = max(FIRST_INDEX, (index + 1) % _INDICES)
+            self._index = max(FIRST_INDEX, (index + 1) % _INDICES)
             self._number = number = (self._number + 1) & 0xFFFFFFFF
-            frame[DATAGRAM_INDEX] = index + FIRST_INDEX
+            frame[DATAGRAM_INDEX] = index
             _TAG.pack_into(frame, self._tags[which], number)
             self.in_flight += 1
             now_ns = self._monotonic_ns()
@@ -105,37 +113,33 @@ class ProcessData:
             self._sent[index] = now_ns, which, number
         return now_ns
 
-    def take(self, frame: bytes) -> int:
-        """Take a frame that has arrived: returns when it was sent.
-
-        0 if it is no answer that is awaited, -1 if it is one that was taken before.
-        """
-        if (
-            len(frame) <= DATAGRAM_INDEX
-            or frame[DATAGRAM_INDEX] < FIRST_INDEX
-            or frame[FRAME_HEADER] != self._command
-        ):
-            return 0
-        index = frame[DATAGRAM_INDEX] - FIRST_INDEX
+    def take(self, frame: bytes, back_ns: int) -> Exchange | None:
+        """Take a frame that has arrived; None if it is no answer that is awaited."""
+        if len(frame) <= DATAGRAM_INDEX or frame[FRAME_HEADER] != self._command:
+            return None
+        index = frame[DATAGRAM_INDEX]
         sent_ns, which, number = self._sent[index]
         at = self._tags[which]
         if len(frame) < at + _TAG.size or _TAG.unpack_from(frame, at)[0] != number:  # an older one
-            return 0
+            return None
         if not sent_ns:
             self.duplicates += 1
-            return -1
-        self._sent[index] = 0, which, number
-        self.blocked_until_ns = 0
+            return DUPLICATE
+        self._sent[index], self.blocked_until_ns = (0, which, number), 0
         self.in_flight -= 1
-        self.frame, self.which = frame, which
         end = self._ends[which]
-        self.wkc = frame[end] | frame[end + 1] << 8
+        wkc = frame[end] | frame[end + 1] << 8
         if not self._lrw:  # an LRW would have counted 2
             end = self._written[which]
             written = frame[end] | frame[end + 1] << 8
             reads, writes = self._most[which]
-            self.wkc = self.wkc + 2 * written if self.wkc <= reads and written <= writes else _IMPOSSIBLE
-        return sent_ns
+            wkc = wkc + 2 * written if wkc <= reads and written <= writes else _IMPOSSIBLE
+        return Exchange(sent_ns, back_ns, frame, wkc, which)
+
+    @property
+    def sent(self) -> int:
+        """Exchanges that were sent."""
+        return self._number // max(1, len(self._frames))
 
     @property
     def lost(self) -> int:

@@ -1,19 +1,16 @@
-"""The backend and the master on pysoem: scan, SDO, mapping, states up to OP. The only file that knows pysoem.
+"""The backend and the master on pysoem: socket, scan, mapping. The only file that knows pysoem.
 
 What pysoem raises is translated here, and its traps end here: the descriptor that a failed open leaks, the
-close that must happen once, the scan that may take minutes, the error ring that hands one call's error to the
-next.
+close that must happen once, the scan that may take minutes, the mapping's error ring.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
-import struct
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import pysoem
@@ -21,20 +18,12 @@ import pysoem
 from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt, Master
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.mailbox.emergency import Emergency
 from ethercat_server.ethercat.nic.interface import check_present, why_silent
 from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
-from ethercat_server.ethercat.slave import times
-from ethercat_server.ethercat.slave.abort_codes import abort_meaning, refused
-from ethercat_server.ethercat.slave.al import AlState, AlStatus
+from ethercat_server.ethercat.slave.abort_codes import abort_meaning
 
-_SDO_ATTEMPTS: Final = 3
-_MOST_WAITING: Final = 16
-"""Emergencies of a sensor that are taken before the mapping, or that an SDO survives."""
 _SCAN_TIMEOUT_S: Final = 15.0
-_STATE_CHECK_S: Final = 0.05
-_IMAGE_BYTES: Final = 4096
-"""Of pysoem's process image, whose end nothing checks."""
+_IMAGE_BYTES: Final = 4096  # of pysoem's process image, whose end nothing checks
 _PYSOEM_ERRORS: Final = (
     pysoem.SdoError,
     pysoem.Emergency,
@@ -43,10 +32,9 @@ _PYSOEM_ERRORS: Final = (
     pysoem.WkcError,
     pysoem.ConfigMapError,
     pysoem.NetworkInterfaceNotOpenError,
-    AssertionError,  # an entry of the error ring about another slave
 )
+# What pysoem makes of entries of its error ring that it does not expect after a mapping.
 _UNEXPECTED: Final = "unexpected error"
-"""What pysoem makes of entries of its error ring that it does not expect after a mapping."""
 
 
 class SoemBackend:
@@ -57,16 +45,9 @@ class SoemBackend:
         self.clock = SYSTEM_CLOCK
         self._ifindex = 0
         self._master: Any = pysoem.Master()
-        self._slaves: list[Any] = []
         self._opened = False
-        self._scanned = False
-        """The slaves' states are this master's business from here on."""
-        self._abandoned = False
-        """A thread that never ended still uses the socket: it must not be closed."""
+        self._abandoned = False  # a thread that never ended still uses the socket: it must not be closed
         self._socket: RawSocket
-        self._emergency_count = 0
-        self.on_emergency: Callable[[int, Emergency], None] = lambda _number, _emergency: None
-        """Told of each emergency of a sensor until OP."""
 
     @property
     def master(self) -> Master:
@@ -116,23 +97,6 @@ class SoemBackend:
 
     def scan(self, positions: Sequence[int], check_interrupt: CheckInterrupt) -> None:
         """See `Master`. SOEM takes every slave on the wire for its own."""
-        count = self._config_init(check_interrupt)
-        if count != len(positions):
-            raise SetUpError(
-                f"{max(count, 0)} of {len(positions)} slaves on {self.ifname} answered the scan: check cable "
-                "and power"
-            )
-        self._slaves = list(self._master.slaves)
-        for slave in self._slaves:
-            slave.add_emergency_callback(self._take_emergency)
-
-    def _take_emergency(self, emergency: Any) -> None:
-        self._emergency_count += 1
-        data = struct.pack("<BHH", emergency.b1, emergency.w1, emergency.w2)
-        found = Emergency(emergency.error_code, emergency.error_reg, data)
-        self.on_emergency(emergency.slave_pos - 1, found)
-
-    def _config_init(self, check_interrupt: CheckInterrupt) -> int:
         # SOEM tries every byte of the SII for long if a slave goes away meanwhile, two minutes in all, and no
         # signal is noticed before it returns. So it runs in a thread, which can be left behind.
         counts: list[int] = []
@@ -141,7 +105,6 @@ class SoemBackend:
         )
         thread.start()
         deadline = time.monotonic() + _SCAN_TIMEOUT_S
-        self._scanned = True
         try:
             while thread.is_alive():
                 thread.join(0.05)
@@ -153,79 +116,33 @@ class SoemBackend:
                     )
         finally:
             self._abandoned = thread.is_alive()
-        return counts[0] if counts else 0
+        count = max(counts, default=0)
+        if count != len(positions):
+            raise SetUpError(
+                f"{max(count, 0)} of {len(positions)} slaves on {self.ifname} answered the scan: check cable "
+                "and power"
+            )
 
-    def enter_preop(self, check_interrupt: CheckInterrupt) -> None:
-        """See `Master`."""
-        self._wait_state(AlState.PREOP, check_interrupt)
-
-    def sdo_read(self, number: int, index: int, subindex: int) -> bytes:
-        """See `Master`."""
-        what = f"reading object 0x{index:04X}:{subindex}"
-        data: bytes = self._sdo(number, index, subindex, what, None)
-        return data
-
-    def sdo_write(self, number: int, index: int, subindex: int, data: bytes) -> None:
-        """See `Master`."""
-        self._sdo(number, index, subindex, f"writing {data.hex()} to object 0x{index:04X}:{subindex}", data)
-
-    def map_process_data(self, check_interrupt: CheckInterrupt) -> list[int]:
-        """See `Master`."""
+    def map_process_data(self, check_interrupt: CheckInterrupt) -> None:
+        """See `Master`. SOEM requests SAFEOP, too."""
         check_interrupt()
-        self._empty_mailboxes()
+        self._socket.set_blocking(True)
         try:
             mapped = self._master.config_map()
         except pysoem.ConfigMapError as error:
             raise self._unmapped(_texts(error.error_list)) from None
         except _PYSOEM_ERRORS as error:
             raise self._unmapped(_texts([error])) from None
+        finally:
+            self._socket.set_blocking(False)
         if mapped > _IMAGE_BYTES:
             raise self._unmapped(f"its slaves say that they have {mapped} bytes")
-        for slave in self._slaves:
-            slave.output = bytes(len(slave.output))
-        return [len(slave.input) for slave in self._slaves]
-
-    def _empty_mailboxes(self) -> None:
-        """Take the emergencies that wait: pysoem takes one that it meets in the mapping for a failure."""
-        for slave in self._slaves:
-            for _ in range(_MOST_WAITING):
-                before = self._emergency_count
-                with contextlib.suppress(*_PYSOEM_ERRORS):
-                    slave.mbx_receive()
-                if self._emergency_count == before:
-                    break
 
     def _unmapped(self, why: str) -> SetUpError:
         return SetUpError(
             f"the process data of {self.ifname} cannot be mapped: {why}; power the sensor off and on, then "
             "start again"
         )
-
-    def go_operational(self, check_interrupt: CheckInterrupt) -> None:
-        """See `Master`."""
-        self._wait_state(AlState.SAFEOP, check_interrupt)
-        self._master.state = pysoem.OP_STATE
-        self._master.write_state()
-        deadline = time.monotonic() + times.STATE_S[AlState.OP]
-        while time.monotonic() < deadline:
-            check_interrupt()
-            for _ in range(5):
-                self._master.send_processdata()
-                self._master.receive_processdata(2000)
-            if self._master.state_check(pysoem.OP_STATE, 2000) == pysoem.OP_STATE:
-                self._socket.set_blocking(False)
-                return
-        raise SetUpError(self._state_complaint(AlState.OP))
-
-    def release(self) -> None:
-        """See `Master`."""
-        if not self._opened or self._abandoned or not self._scanned:
-            return
-        self._scanned = False
-        with contextlib.suppress(*_PYSOEM_ERRORS):
-            self._socket.set_blocking(True)
-            self._master.state = pysoem.INIT_STATE
-            self._master.write_state()
 
     def close(self) -> None:
         """See `Backend`."""
@@ -234,54 +151,6 @@ class SoemBackend:
         self._opened = False
         self._socket.close()
         self._master.close()
-
-    def _sdo(self, number: int, index: int, subindex: int, what: str, data: bytes | None) -> Any:
-        target, last, left = self._slaves[number], "no answer", _SDO_ATTEMPTS
-        most_emergencies = self._emergency_count + _MOST_WAITING
-        while left:
-            emergencies = self._emergency_count
-            try:
-                if data is None:
-                    return target.sdo_read(index, subindex)
-                return target.sdo_write(index, subindex, data)
-            except pysoem.SdoError as error:
-                # Another object's abort is a stale entry of the error ring, not an answer to this call.
-                if (error.index, error.subindex) == (index, subindex):
-                    raise refused(number, what, error.abort_code & 0xFFFFFFFF) from None
-                last = "an answer about another object"
-            except Exception as error:
-                # pysoem raises a plain Exception for an entry of its error ring that it does not know.
-                if not isinstance(error, _PYSOEM_ERRORS) and type(error) is not Exception:
-                    raise
-                last = _texts([error])
-            # An emergency in place of the answer is no failure, but a flood of them is.
-            left -= not emergencies < self._emergency_count <= most_emergencies
-        raise SetUpError(f"sensor {number} did not answer {what}: {last}; check cable and power")
-
-    def _wait_state(self, state: AlState, check_interrupt: CheckInterrupt) -> None:
-        for _ in range(round(times.STATE_S[state] / _STATE_CHECK_S)):
-            check_interrupt()
-            if self._master.state_check(int(state), round(_STATE_CHECK_S * 1e6)) == state:
-                return
-            # state_check wants the state itself; a slave that is above it is fine as well.
-            self._master.read_state()
-            if any(_al_status(s).error or s.state == pysoem.NONE_STATE for s in self._slaves):
-                break
-        raise SetUpError(self._state_complaint(state))
-
-    def _state_complaint(self, state: AlState) -> str:
-        self._master.read_state()
-        for number, slave in enumerate(self._slaves):
-            if slave.state != state:
-                return (
-                    f"sensor {number} does not reach {state.name}: it stays in {_al_status(slave)}; "
-                    "power it off and on, then start again"
-                )
-        return f"the bus on {self.ifname} does not reach {state.name}: start again"
-
-
-def _al_status(slave: Any) -> AlStatus:
-    return AlStatus.of(slave.state, slave.al_status)
 
 
 def _texts(errors: list[Any]) -> str:

@@ -1,1 +1,0 @@
-"""The network interface: what the kernel says of it, and the claim that keeps other masters of ours away."""

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Final
 
 from ethercat_server.errors import InterfaceError
-from ethercat_server.ethercat.nic.interface import look_up, trouble
-from ethercat_server.ethercat.nic.ip import ALLOW_IP, find_routes, network_trouble
+from ethercat_server.ethercat.nic.interface import ALLOW_IP, find_routes, look_up, network_trouble, trouble
 from ethercat_server.ethercat.nic.lock import in_use, locked
 from ethercat_server.ethercat.nic.packet_sockets import master_sockets, users_of
 
-MAX_NAME_LENGTH: Final = 15
-"""Linux's limit; a longer name would overflow SOEM's buffer."""
+MAX_NAME_LENGTH: Final = 15  # Linux's limit; a longer name would overflow SOEM's buffer
 
 _CARRIER_TIMEOUT_S: Final = 5.0
 _CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
@@ -34,7 +32,8 @@ def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
     index = _check_allowed(ifname, allow_ip=allow_ip)
     # Of two that start at once neither has the bus open yet, so looking for that is not enough.
     with locked(ifname, index):
-        _check_free(ifname)
+        if inodes := master_sockets(ifname):
+            raise in_use(ifname, next((process.pid for process in users_of(inodes)), 0))
         _wait_usable(ifname)
         yield
 
@@ -49,33 +48,21 @@ def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
     if found.is_loopback:
         raise InterfaceError(f"{ifname} is the loopback interface: name the one the sensor is connected to")
     if not allow_ip:
-        _check_no_network(ifname)
-    missing = _missing_capabilities()
-    if missing:
+        try:
+            routes = find_routes(ifname)
+        except OSError as error:
+            raise InterfaceError(
+                f"the kernel does not say whether {ifname} has an IP address ({error}): {ALLOW_IP} "
+                "uses it all the same"
+            ) from None
+        if problem := network_trouble(ifname, routes):
+            raise InterfaceError(problem)
+    if missing := _missing_capabilities():
         raise InterfaceError(
             f"not allowed to open {ifname}: {' and '.join(missing)} missing; run with sudo, or "
             "give the service CAP_NET_RAW and CAP_NET_ADMIN"
         )
     return found.ifindex
-
-
-def _check_no_network(ifname: str) -> None:
-    """InterfaceError if `ifname` is part of a network: EtherCAT frames would go there too."""
-    try:
-        routes = find_routes(ifname)
-    except OSError as error:
-        raise InterfaceError(
-            f"the kernel does not say whether {ifname} has an IP address ({error}): {ALLOW_IP} "
-            "uses it all the same"
-        ) from None
-    if problem := network_trouble(ifname, routes):
-        raise InterfaceError(problem)
-
-
-def _check_free(ifname: str) -> None:
-    """Raise InterfaceError if another EtherCAT master has the interface open: two would wreck one another."""
-    if inodes := master_sockets(ifname):
-        raise in_use(ifname, next((process.pid for process in users_of(inodes)), 0))
 
 
 def _wait_usable(ifname: str) -> None:

@@ -19,14 +19,12 @@ from typing import Final
 
 from ethercat_server.errors import InterfaceError
 
-DIRECTORY: Final = Path("/run/ethercat-server")
-"""RuntimeDirectory= of the service, which then owns it."""
+DIRECTORY: Final = Path("/run/ethercat-server")  # RuntimeDirectory= of the service, which then owns it
 _FILE: Final = "lock"
 _NAME: Final = "\0ethercat-server/ifindex/{}"
 _INDEX_BITS: Final = 31
 _NAMESPACE: Final = 0xFFFFFFFF
-_FLOCK: Final = struct.Struct("@hhqqi0q")
-"""Type, whence, start, length, process."""
+_FLOCK: Final = struct.Struct("@hhqqi0q")  # type, whence, start, length, process
 
 
 @contextlib.contextmanager

@@ -18,10 +18,8 @@ _ETHERCAT: Final = 0x88A4
 class Listener(NamedTuple):
     """A packet socket, which receives a copy of frames."""
 
-    protocol: int
-    """Ethernet type; 3 for all."""
-    ifindex: int
-    """Interface; 0 for all."""
+    protocol: int  # Ethernet type; 3 for all
+    ifindex: int  # interface; 0 for all
     inode: int
 
 
@@ -30,8 +28,7 @@ class Process(NamedTuple):
 
     pid: int
     name: str
-    sockets: set[int]
-    """Inodes of all its sockets."""
+    sockets: set[int]  # inodes of all its sockets
 
 
 def master_sockets(ifname: str) -> set[int]:

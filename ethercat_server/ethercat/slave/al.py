@@ -12,8 +12,7 @@ from typing import Final, NamedTuple
 _ERROR: Final = 0x10
 _ACKNOWLEDGE: Final = 0x10
 _STATE_MASK: Final = 0x0F
-_VENDOR_CODES: Final = 0x8000
-"""Codes from here on are the vendor's."""
+_VENDOR_CODES: Final = 0x8000  # from here on
 
 AL_STATUS_CODES: Final[dict[int, str]] = {
     0x0000: "no error",
@@ -94,6 +93,12 @@ class AlState(IntEnum):
     def request(self) -> bytes:
         """What to write to AL control to go there."""
         return struct.pack("<H", self)
+
+
+# Real devices are slow: firmware that starts, filters that are initialized.
+# Timeout for an AL state after it was requested.
+STATE_S: Final = {AlState.INIT: 5.0, AlState.PREOP: 10.0, AlState.SAFEOP: 10.0, AlState.OP: 10.0}
+ACKNOWLEDGE_S: Final = 5.0  # timeout for an error to be gone after it was acknowledged
 
 
 class AlStatus(NamedTuple):

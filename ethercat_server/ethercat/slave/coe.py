@@ -1,29 +1,31 @@
-"""SDO transfers over CoE, in two forms with one interface: generators that end with the result.
+"""SDO transfers over CoE by single datagrams: generators that yield after each and end with the result.
 
-`BlockingSdo` goes through the bus's master and never yields; it is for start-up. `MailboxSdo` sends
-single datagrams and yields after each, so that the acquisition loop goes on in between; it is for OP.
-Code that configures a sensor is written once, with `yield from`, and `finish` runs it to its end at start-up.
+So the acquisition loop goes on in between. At start-up `finish` runs the same steps to their end.
 """
 
 from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from typing import Final, Protocol, TypeVar
 
 from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt
-from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
-from ethercat_server.ethercat.mailbox.mailbox import Mailbox, MessageLostError
-from ethercat_server.ethercat.slave import times
+from ethercat_server.ethercat.datagrams import Registers
 from ethercat_server.ethercat.slave.abort_codes import refused
+from ethercat_server.ethercat.slave.emergencies import Emergencies, Emergency
+from ethercat_server.ethercat.slave.registers import MAILBOX_FULL, MAILBOX_IN_STATUS
 
 T = TypeVar("T")
+# Work in steps: yields when the loop should have its turn, returns the result.
 Steps = Generator[None, None, T]
-"""Work in steps: yields when the loop should have its turn, returns the result."""
 
+_SHORTEST: Final = 16
+_LONGEST: Final = 1486
+_HEADER: Final = struct.Struct("<HHBB")
+_TYPE_COE: Final = 3
 _SDO_HEADER: Final = struct.Struct("<HBHB")
 _COE_SDO_REQUEST: Final = 2
 _COE_SDO_RESPONSE: Final = 3
@@ -36,8 +38,9 @@ _SIZE_GIVEN: Final = 0x01
 _ABORT: Final = 0x80
 _LONGEST_EXPEDITED: Final = 4
 _MOST_DRAINED: Final = 4
-_SIZE_BYTES: Final = 4
-"""The size goes before what is longer."""
+_SIZE_BYTES: Final = 4  # the size goes before what is longer
+_ANSWER_S: Final = 0.7  # until the request is sent again
+_TRANSFER_S: Final = 2.1  # in all: frames lost for a moment are no refusal
 
 
 class Sdo(Protocol):
@@ -77,35 +80,35 @@ def finish(
         steps.close()  # given up between two steps, they undo what is half done while the bus is open
 
 
-class BlockingSdo:
-    """SDO before OP, through the bus's master: each call blocks until the answer is there.
-
-    `check_interrupt` is called before each: with a slow slave many transfers take long.
-    """
-
-    def __init__(self, bus: Bus, number: int, check_interrupt: CheckInterrupt = lambda: None) -> None:
-        self._bus, self._number, self._check_interrupt = bus, number, check_interrupt
-        self.clock = bus.clock
-
-    def read(self, index: int, subindex: int) -> Steps[bytes]:
-        """See `Sdo`."""
-        self._check_interrupt()
-        yield from ()
-        return self._bus.master.sdo_read(self._number, index, subindex)
-
-    def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
-        """See `Sdo`."""
-        self._check_interrupt()
-        yield from ()
-        self._bus.master.sdo_write(self._number, index, subindex, data)
+class MessageLostError(Exception):
+    """A message was taken from the mailbox and lost on its way."""
 
 
 class MailboxSdo:
-    """SDO by single datagrams."""
+    """The mailboxes of slave `number`. A slave has one of these, whoever uses it: it drops a message that
+    reuses the last counter.
 
-    def __init__(self, mailbox: Mailbox) -> None:
-        self._mailbox, self._number = mailbox, mailbox.number
-        self.clock = mailbox.clock
+    Emergencies come in among the answers: each is noted.
+    """
+
+    def __init__(
+        self,
+        bus: Registers,
+        number: int,
+        areas: Sequence[tuple[int, int]],
+        emergencies: Emergencies | None = None,
+    ) -> None:
+        """`areas`: offset and size of the mailbox to the slave, and of the one from it."""
+        self._bus, self._number, self._emergencies = bus, number, emergencies
+        self.clock = bus.clock
+        (self._out, self._out_size), (self._in, self._in_size) = areas
+        if not all(_SHORTEST <= size <= _LONGEST for _, size in areas):
+            raise BusError(
+                f"sensor {number} has mailboxes of {self._out_size} and {self._in_size} bytes, which no "
+                "frame can carry: power it off and on"
+            )
+        self._counter = 0
+        self._in_use = False
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """See `Sdo`."""
@@ -121,7 +124,7 @@ class MailboxSdo:
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """See `Sdo`; at most what fits the mailbox in one piece."""
-        most = self._mailbox.most - _SDO_HEADER.size - _SIZE_BYTES
+        most = self._out_size - _HEADER.size - _SDO_HEADER.size - _SIZE_BYTES
         if not 0 < len(data) <= most:
             raise BusError(
                 f"object 0x{index:04X}:{subindex} of sensor {self._number} cannot be written: 1 to {most} "
@@ -133,21 +136,35 @@ class MailboxSdo:
             command, data = _DOWNLOAD | _SIZE_GIVEN, struct.pack("<I", len(data)) + data
         yield from self._transfer(index, subindex, command, data)
 
+    def look(self) -> None:
+        """Read what the slave says unasked. Who waits for an answer does that too: it is left to them."""
+        if not self._in_use:
+            with contextlib.suppress(MessageLostError):
+                self._take()
+
+    def drain(self, most: int = _MOST_DRAINED) -> Steps[None]:
+        """Read away what is there: `most` messages at most."""
+        for _ in range(most):
+            with contextlib.suppress(MessageLostError):
+                if self._take() is None:
+                    return
+            yield
+
     def _transfer(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
-        self._mailbox.is_in_use = True
+        self._in_use = True
         try:
             return (yield from self._ask(index, subindex, command, data))
         finally:
-            self._mailbox.is_in_use = False
+            self._in_use = False
 
     def _ask(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
         doing, expected = ("reading", _UPLOAD) if command == _UPLOAD else ("writing", _DOWNLOADED)
-        give_up = Deadline(self.clock, times.SDO_S)
+        give_up = Deadline(self.clock, _TRANSFER_S)
         body = _SDO_HEADER.pack(_COE_SDO_REQUEST << 12, command, index, subindex) + data.ljust(4, b"\0")
         while not give_up.passed:
-            yield from self._drain()
-            if self._mailbox.put(body):
-                deadline = Deadline(self.clock, times.SDO_ANSWER_S)
+            yield from self.drain()
+            if self._put(body):
+                deadline = Deadline(self.clock, _ANSWER_S)
                 while not deadline.passed:
                     yield
                     try:
@@ -163,20 +180,12 @@ class MailboxSdo:
             yield
         raise SetUpError(self._unanswered(doing, index, subindex, "no answer"))
 
-    def _drain(self) -> Steps[None]:
-        """Read away what was left in the mailbox from before."""
-        for _ in range(_MOST_DRAINED):
-            with contextlib.suppress(MessageLostError):
-                if self._mailbox.take() is None:
-                    return
-            yield
-
     def _answer(self, index: int, subindex: int, expected: int) -> tuple[int, bytes] | None:
         """Command and data of the answer if it is there; other messages are dropped.
 
         Such as the late answer to a request that was repeated: about the same object, but another command's.
         """
-        body = self._mailbox.take()
+        body = self._take()
         if body is None or len(body) < _SDO_HEADER.size + 4:
             return None
         coe, command, its_index, its_subindex = _SDO_HEADER.unpack_from(body)
@@ -186,6 +195,31 @@ class MailboxSdo:
         if command != _ABORT and command & _COMMAND_MASK != expected:
             return None
         return command, body[_SDO_HEADER.size :]
+
+    def _put(self, body: bytes) -> bool:
+        """Send a CoE message; False if that failed. It has another counter than the one before."""
+        self._counter = max(2, self._counter + 1 & 7)  # 1 is left to SOEM, whose mapping begins with it
+        header = _HEADER.pack(len(body), 0, 0, _TYPE_COE | self._counter << 4)
+        return self._bus.write_register(self._number, self._out, (header + body).ljust(self._out_size, b"\0"))
+
+    def _take(self) -> bytes | None:
+        """The CoE message that is there; None if none is, empty if it is of another protocol.
+
+        MessageLostError if the datagram that took it did not come back in time.
+        """
+        status = self._bus.read_register(self._number, MAILBOX_IN_STATUS, 1)
+        if status is None or not status[0] & MAILBOX_FULL:
+            return None
+        message = self._bus.read_register(self._number, self._in, self._in_size)
+        if message is None:
+            raise MessageLostError
+        length, _, _, kind = _HEADER.unpack_from(message)
+        if kind & 0x0F != _TYPE_COE:
+            return b""
+        body = message[_HEADER.size : _HEADER.size + length]
+        if self._emergencies is not None and (emergency := Emergency.parse(body)) is not None:
+            self._emergencies.note(self._number, emergency)
+        return body
 
     def _unanswered(self, doing: str, index: int, subindex: int, what: str) -> str:
         return f"sensor {self._number} did not answer {doing} object 0x{index:04X}:{subindex}: {what}"

@@ -9,36 +9,29 @@ import struct
 from typing import Final
 
 DL_INFORMATION: Final = 0x0000
-FMMU_AND_SM_COUNT: Final = 0x0004
-"""Two bytes: the number of FMMUs, the number of sync managers."""
+FMMU_AND_SM_COUNT: Final = 0x0004  # two bytes: the number of FMMUs, the number of sync managers
 FEATURES: Final = 0x0008
-DC_AVAILABLE: Final = 1 << 2
-"""In FEATURES: it has a distributed clock."""
-DC_64_BIT: Final = 1 << 3
-"""In FEATURES: of 64 bits, not 32."""
+DC_AVAILABLE: Final = 1 << 2  # in FEATURES: it has a distributed clock
+DC_64_BIT: Final = 1 << 3  # in FEATURES: of 64 bits, not 32
+# In FEATURES: logical memory can be read (LRD) and written (LWR), but not both at once.
 NO_LRW: Final = 1 << 9
-"""In FEATURES: logical memory can be read (LRD) and written (LWR), but not both at once."""
 STATION_ADDRESS: Final = 0x0010
 STATION_ALIAS: Final = 0x0012
 DL_CONTROL: Final = 0x0100
 DL_STATUS: Final = 0x0110
 AL_CONTROL: Final = 0x0120
 AL_STATUS: Final = 0x0130
-AL_STATUS_SIZE: Final = 6
-"""AL status, two reserved bytes, AL status code."""
+AL_STATUS_SIZE: Final = 6  # AL status, two reserved bytes, AL status code
 AL_STATUS_CODE: Final = 0x0134
 PDI_CONTROL: Final = 0x0140
 EVENT_MASK: Final = 0x0200
 EVENT_REQUEST: Final = 0x0210
 AL_EVENT_REQUEST: Final = 0x0220
-RX_ERRORS: Final = 0x0300
-"""Two bytes a port: invalid frames, physical layer errors."""
-FORWARDED_ERRORS: Final = 0x0308
-"""A byte a port: frames that another slave had found invalid."""
+RX_ERRORS: Final = 0x0300  # two bytes a port: invalid frames, physical layer errors
+FORWARDED_ERRORS: Final = 0x0308  # a byte a port: frames that another slave had found invalid
 PROCESSING_UNIT_ERRORS: Final = 0x030C
 PDI_ERRORS: Final = 0x030D
-LOST_LINKS: Final = 0x0310
-"""A byte a port."""
+LOST_LINKS: Final = 0x0310  # a byte a port
 PORT_COUNT: Final = 4
 ERROR_COUNTERS_SIZE: Final = LOST_LINKS + PORT_COUNT - RX_ERRORS
 WATCHDOG_DIVIDER: Final = 0x0400
@@ -46,8 +39,8 @@ WATCHDOG_TIME_PDI: Final = 0x0410
 WATCHDOG_TIME: Final = 0x0420
 WATCHDOG_STATUS: Final = 0x0440
 WATCHDOG_COUNTER: Final = 0x0442
+# Who may access the SII: bit 0 set, the slave's own firmware (PDI); bit 1 takes it from the firmware.
 SII_OWNER: Final = 0x0500
-"""Who may access the SII: bit 0 set, the slave's own firmware (PDI); bit 1 takes it from the firmware."""
 SII_CONTROL: Final = 0x0502
 SII_ADDRESS: Final = 0x0504
 SII_DATA: Final = 0x0508
@@ -55,47 +48,38 @@ FMMU: Final = 0x0600
 FMMU_SIZE: Final = 16
 SYNC_MANAGER: Final = 0x0800
 SYNC_MANAGER_SIZE: Final = 8
+# Offsets within a sync manager.
 SM_CONTROL: Final = 4
-"""Offsets within a sync manager."""
 SM_STATUS: Final = 5
 SM_ACTIVATE: Final = 6
+# In a sync manager's activate register: a frame that exchanges its buffer is a DC event.
 SM_LATCH_ECAT: Final = 0x40
-"""In a sync manager's activate register: a frame that exchanges its buffer is a DC event."""
-SM_LATCH_PDI: Final = 0x80
-"""Likewise the firmware that begins or ends an access to its buffer."""
+SM_LATCH_PDI: Final = 0x80  # likewise the firmware that begins or ends an access to its buffer
 SM_PDI_CONTROL: Final = 7
+# Bits of the control byte: it is a mailbox (else buffered), the master writes.
 SM_MAILBOX, SM_WRITE = 0x02, 0x04
-"""Bits of the control byte: it is a mailbox (else buffered), the master writes."""
-MAILBOX_FULL: Final = 0x08
-"""Bit of a mailbox sync manager's status."""
+MAILBOX_FULL: Final = 0x08  # bit of a mailbox sync manager's status
+# Status of sync manager 1, the mailbox from the slave.
 MAILBOX_IN_STATUS: Final = SYNC_MANAGER + SYNC_MANAGER_SIZE + SM_STATUS
-"""Status of sync manager 1, the mailbox from the slave."""
-DC_RECEIVE_TIMES: Final = 0x0900
-"""Four bytes a port, ns: when the frame that wrote here arrived."""
+DC_RECEIVE_TIMES: Final = 0x0900  # four bytes a port, ns: when the frame that wrote here arrived
 DC_SYSTEM_TIME: Final = 0x0910
-DC_RECEIVE_TIME: Final = 0x0918
-"""Eight bytes: the same, at the processing unit."""
+DC_RECEIVE_TIME: Final = 0x0918  # eight bytes: the same, at the processing unit
 DC_OFFSET: Final = 0x0920
 DC_DELAY: Final = 0x0928
 DC_DIFFERENCE: Final = 0x092C
 DC_SPEED_START: Final = 0x0930
 DC_SPEED_DIFFERENCE: Final = 0x0932
-DC_FILTERS: Final = 0x0934
-"""Two bytes: filter depths of the differences of the system time, and of the speed."""
-DC_ACTIVATION: Final = 0x0980
-"""Two bytes: who controls the SYNC signals, which are active."""
+DC_FILTERS: Final = 0x0934  # two bytes: filter depths of the differences of the system time, and of the speed
+DC_ACTIVATION: Final = 0x0980  # two bytes: who controls the SYNC signals, which are active
+# Four bytes, local time: the frame came that exchanged the buffer of a sync manager.
 DC_ECAT_EVENT: Final = 0x09F0
-"""Four bytes, local time: the frame came that exchanged the buffer of a sync manager."""
-DC_PDI_START_EVENT: Final = 0x09F8
-"""Likewise the firmware began to access a buffer."""
-DC_PDI_CHANGE_EVENT: Final = 0x09FC
-"""Likewise it exchanged one: new inputs."""
+DC_PDI_START_EVENT: Final = 0x09F8  # likewise the firmware began to access a buffer
+DC_PDI_CHANGE_EVENT: Final = 0x09FC  # likewise it exchanged one: new inputs
 DC_END: Final = 0x0A00
 USER_RAM: Final = 0x0F80
-REGISTERS_END: Final = 0x1000
-"""Process data memory begins here."""
+REGISTERS_END: Final = 0x1000  # process data memory begins here
+# Logical start, length, start and end bit, physical start and bit, type, activation.
 FMMU_LAYOUT: Final = struct.Struct("<IHBBHBBB3x")
-"""Logical start, length, start and end bit, physical start and bit, type, activation."""
 FMMU_READ: Final = 1
 FMMU_WRITE: Final = 2
 MOST_FMMUS: Final = 16

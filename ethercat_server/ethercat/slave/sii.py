@@ -7,23 +7,20 @@ cannot be read for one full of zeros, after minutes.
 from __future__ import annotations
 
 import struct
-from typing import Final, Protocol
+from typing import Final
 
 from ethercat_server.errors import BusError
-from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.clock import Clock, Deadline
-from ethercat_server.ethercat.slave import times
+from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.datagrams import Registers
 from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.registers import SII_CONTROL, SII_OWNER
 
 OF_FIRMWARE: Final = b"\x01"
 OF_MASTER: Final = b"\x00"
 _TAKE: Final = b"\x02"
-_IN_USE: Final = 0x01
-"""Of the byte after the owner: the firmware is accessing it."""
+_IN_USE: Final = 0x01  # of the byte after the owner: the firmware is accessing it
 
-_REGISTERS: Final = struct.Struct("<HI8s")
-"""Control and status, the word's address, the data."""
+_REGISTERS: Final = struct.Struct("<HI8s")  # control and status, the word's address, the data
 _COMMAND: Final = struct.Struct("<HI")
 _READ: Final = 0x0100
 _NONE: Final = 0x0000
@@ -31,28 +28,7 @@ _BUSY: Final = 0x8000
 _ERRORS: Final = 0x7800
 _EIGHT_BYTES: Final = 0x0040
 _ATTEMPTS_TO_GIVE_BACK: Final = 3
-
-
-class Registers(Protocol):
-    """How the registers of a slave's controller are reached, as `Bus` does it."""
-
-    @property
-    def clock(self) -> Clock:
-        """The time that passes meanwhile."""
-
-    def read_register(self, slave: int, address: int, size: int, /) -> bytes | None:
-        """None if the slave did not do it."""
-
-    def write_register(self, slave: int, address: int, data: bytes, /) -> bool:
-        """False if the slave did not do it."""
-
-
-class ByPosition:
-    """The registers of slaves that have no station address, in place of those of a `Bus`."""
-
-    def __init__(self, bus: Bus) -> None:
-        self.clock, self.emergencies = bus.clock, bus.emergencies
-        self.read_register, self.write_register = bus.read_at, bus.write_at
+_WORD_S: Final = 1.5  # an EEPROM behind a busy bus is slow
 
 
 def read_sii(bus: Registers, slave: int, word: int, count: int, owner: bytes = OF_FIRMWARE) -> Steps[bytes]:
@@ -75,7 +51,7 @@ def read_sii(bus: Registers, slave: int, word: int, count: int, owner: bytes = O
 
 def _wait_for_firmware(bus: Registers, slave: int) -> Steps[None]:
     """Let the slave's own firmware finish an access; one that never does is interrupted."""
-    deadline = Deadline(bus.clock, times.SII_WORD_S)
+    deadline = Deadline(bus.clock, _WORD_S)
     while not deadline.passed:
         found = bus.read_register(slave, SII_OWNER, 2)
         if found is not None and not (found[0] & 1 and found[1] & _IN_USE):
@@ -85,7 +61,7 @@ def _wait_for_firmware(bus: Registers, slave: int) -> Steps[None]:
 
 def _read_word(bus: Registers, slave: int, word: int) -> Steps[bytes]:
     """What one read command gives: two words, or four."""
-    deadline = Deadline(bus.clock, times.SII_WORD_S)
+    deadline = Deadline(bus.clock, _WORD_S)
     answer, asked = "no answer", False
     while not deadline.passed:
         if not asked:
@@ -108,7 +84,7 @@ def _read_word(bus: Registers, slave: int, word: int) -> Steps[bytes]:
 
 
 def _write(bus: Registers, slave: int, address: int, data: bytes, word: int) -> Steps[None]:
-    deadline = Deadline(bus.clock, times.SII_WORD_S)
+    deadline = Deadline(bus.clock, _WORD_S)
     while not bus.write_register(slave, address, data):
         if deadline.passed:
             raise _unreadable(slave, word, "no answer")

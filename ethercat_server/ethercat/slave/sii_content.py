@@ -7,8 +7,7 @@ from collections.abc import Callable
 from enum import IntEnum, IntFlag
 from typing import Any, Final
 
-Sii = dict[str, Any]
-"""What `decode` returns."""
+Sii = dict[str, Any]  # what `decode` returns
 
 
 class Category(IntEnum):
@@ -35,25 +34,19 @@ class MailboxProtocol(IntFlag):
     VoE = 0x20
 
 
-IDENTITY: Final = struct.Struct("<IIII")
-"""Vendor, product code, revision, serial number."""
+IDENTITY: Final = struct.Struct("<IIII")  # vendor, product code, revision, serial number
 IDENTITY_BYTE: Final = 0x08 * 2
+# Offset and size of the receive mailbox, of the send mailbox, protocols.
 MAILBOXES: Final = struct.Struct("<HHHHH")
-"""Offset and size of the receive mailbox, of the send mailbox, protocols."""
 MAILBOXES_BYTE: Final = 0x18 * 2
-CHECKED_BYTES: Final = 14
-"""The check byte follows them."""
-CATEGORIES_WORD: Final = 0x40
-"""The categories begin here."""
-CATEGORY_HEADER: Final = struct.Struct("<HH")
-"""Category, length in words."""
-SYNC_MANAGER: Final = struct.Struct("<HHBBBB")
-"""Start, length, control, status, enable, type."""
+CHECKED_BYTES: Final = 14  # the check byte follows them
+CATEGORIES_WORD: Final = 0x40  # the categories begin here
+CATEGORY_HEADER: Final = struct.Struct("<HH")  # category, length in words
+SYNC_MANAGER: Final = struct.Struct("<HHBBBB")  # start, length, control, status, enable, type
 
 _RAW_WORDS: Final = 0x80
 _MOST_WORDS: Final = 0x2000
-_WORDS_AT_ONCE: Final = 128
-"""The most that a server reads for one request."""
+_WORDS_AT_ONCE: Final = 128  # the most that a server reads for one request
 _CATEGORY_NAMES: Final[dict[int, str]] = {
     Category.STRINGS: "strings", Category.GENERAL: "general", Category.FMMUS: "FMMUs",
     Category.SYNC_MANAGERS: "sync managers", Category.TXPDOS: "TxPDOs", Category.RXPDOS: "RxPDOs",

@@ -1,1 +1,0 @@
-"""The object dictionary of a Bota sensor: its entries, finding them by name, reading and writing them."""

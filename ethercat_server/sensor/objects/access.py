@@ -78,7 +78,7 @@ def write(sdo: Sdo, sensor: Sensor, index: int, subindex: int, data: bytes) -> S
     try:
         yield from sdo.write(index, subindex, data)
     except CutOffError as error:
-        sensor.unsettled = True
+        sensor.change_interrupted = True
         raise extended(error, "; whether it took the value is not known") from None
     # What was written is to be in force after a power cut too, if it is one of what the server looks after.
     entry = dictionary.BY_ADDRESS.get((index, subindex))
@@ -89,7 +89,7 @@ def write(sdo: Sdo, sensor: Sensor, index: int, subindex: int, data: bytes) -> S
             value = None
         if value is not None:
             sensor.wanted = {**sensor.wanted, entry.setting: value}
-            sensor.hold({**sensor.settings, entry.setting: value})
+            sensor.set_in_force({**sensor.settings, entry.setting: value})
     if index == dictionary.FORCE_TORQUE_OFFSET:
         sensor.offset = yield from read_offset(sdo)
     return {"index": index, "subindex": subindex, "hex": data.hex()}

@@ -17,10 +17,10 @@ from protocol.sensor.meaning import value_meaning
 from protocol.settings import SETTINGS, SettingValue
 
 VENDOR_ID: Final = 0x0000B07A
-PRODUCT_CODE: Final = 1
-"""All Gen-0 EtherCAT models have product code 1; the name identifies the model."""
+PRODUCT_CODE: Final = 1  # all Gen-0 EtherCAT models have product code 1; the name identifies the model
 REVISION: Final = 3
 
+# Names of the Gen-0 models, as in SII and in object 0x1008.
 MODELS: Final = (
     "BFT-SENS-ECAT-M8",
     "BFT-ROKS-ECAT-M8",
@@ -30,7 +30,6 @@ MODELS: Final = (
     "BFT-LAXS-ECAT-M8",
     "BFT-MEGS-ECAT-M8",
 )
-"""Names of the Gen-0 models, as in SII and in object 0x1008."""
 
 
 class ObjectType(Enum):
@@ -45,8 +44,7 @@ class ObjectType(Enum):
     REAL32 = (0x0008, "<f")
     BIT8 = (0x0037, "<B")
     STRING = (0x0009, "")
-    OCTETS = (0x000A, "")
-    """Bytes whose meaning is not known; the value is their hexadecimal digits."""
+    OCTETS = (0x000A, "")  # bytes whose meaning is not known; the value is their hexadecimal digits
 
     def __init__(self, coe_code: int, struct_format: str) -> None:
         self.coe_code = coe_code
@@ -97,15 +95,11 @@ class ObjectEntry:
     name: str
     type: ObjectType
     access: Access
-    default: float | str = 0
-    """Factory default."""
+    default: float | str = 0  # factory default
     unit: str = ""
-    setting: str | None = None
-    """Name of the setting in `protocol.settings`."""
-    codes: Mapping[SettingValue, int] | None = None
-    """Wire value of each setting value, where they differ."""
-    values: Mapping[int, str] | None = None
-    """Wire values that mean something, for what is no setting."""
+    setting: str | None = None  # name of the setting in `protocol.settings`
+    codes: Mapping[SettingValue, int] | None = None  # wire value of each setting value, where they differ
+    values: Mapping[int, str] | None = None  # wire values that mean something, for what is no setting
 
     @property
     def address(self) -> tuple[int, int]:
@@ -156,8 +150,8 @@ _PDO_TYPES = {PdoType.USINT: U8, PdoType.UINT: U16, PdoType.UDINT: U32, PdoType.
 _AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _INVERTED: Mapping[SettingValue, int] = {True: 0, False: 1}
 
+# Writable on the device in every state. Never write it: the calibration is lost.
 FACTORY_CALIBRATION: Final = 0x2000
-"""Writable on the device in every state. Never write it: the calibration is lost."""
 FACTORY_CALIBRATION_ENTRIES: Final = 0x57
 
 DEVICE_NAME: Final = (0x1008, 0)
@@ -180,6 +174,7 @@ def _calibration_type(subindex: int) -> ObjectType:
     return I8 if subindex >= 0x52 else REAL32
 
 
+# Those that the firmware seen has.
 OBJECTS: Final[tuple[ObjectEntry, ...]] = (
     ObjectEntry(0x1000, 0, "Device type", U32, RO, 5001),
     ObjectEntry(0x1008, 0, "Device name", STRING, RO, MODELS[0]),
@@ -234,7 +229,6 @@ OBJECTS: Final[tuple[ObjectEntry, ...]] = (
     ObjectEntry(0x8030, 1, "Command", U8, RW, values={SAVE_PARAMETERS: "save the parameters"}),
     ObjectEntry(0x8030, 2, "Status", U8, RO, values={0: "success"}),
 )  # fmt: skip
-"""Those that the firmware seen has."""
 
 BY_ADDRESS: Final[Mapping[tuple[int, int], ObjectEntry]] = {row.address: row for row in OBJECTS}
 BY_SETTING: Final[Mapping[str, ObjectEntry]] = {row.setting: row for row in OBJECTS if row.setting}

@@ -24,6 +24,7 @@ def _highest_subindices() -> Iterator[ObjectEntry]:
         yield ObjectEntry(index, 0, "Highest sub-index", ObjectType.U8, Access.RO, last)
 
 
+# Every object in Bota's manual, also those that the firmware seen does not have.
 KNOWN_OBJECTS: Final[tuple[ObjectEntry, ...]] = tuple(
     sorted(
         (
@@ -35,10 +36,10 @@ KNOWN_OBJECTS: Final[tuple[ObjectEntry, ...]] = tuple(
         key=lambda row: row.address,
     )
 )
-"""Every object in Bota's manual, also those that the firmware seen does not have."""
 
 BY_ADDRESS: Final[Mapping[tuple[int, int], ObjectEntry]] = {row.address: row for row in KNOWN_OBJECTS}
 
+# Names of the objects that have parts.
 TITLES: Final[Mapping[int, str]] = {
     0x1018: "Identity",
     0x2000: "Factory calibration",
@@ -50,8 +51,8 @@ TITLES: Final[Mapping[int, str]] = {
     0x8010: "Configuration",
     0x8030: "Control",
 }
-"""Names of the objects that have parts."""
 
+# Index, sub-index, name as in Table III.1 and Listing III.6; sub-index 0 of what has parts is all of it.
 NOTE_NAMES: Final[tuple[tuple[int, int, str], ...]] = (
     (0x2000, 0, "Calibration"),
     (0x6000, 0, "Sensor Data"),
@@ -83,7 +84,6 @@ NOTE_NAMES: Final[tuple[tuple[int, int, str], ...]] = (
     (0x8030, 1, "Command"),
     (0x8030, 2, "Status"),
 )
-"""Index, sub-index, name as in Table III.1 and Listing III.6; sub-index 0 of what has parts is all of it."""
 
 _ADDRESS: Final = re.compile(r"(0x[0-9a-f]{1,4})(?::(0x[0-9a-f]{1,2}|[0-9]{1,3}))?", re.IGNORECASE)
 

@@ -15,12 +15,12 @@ from rclpy.node import Node
 
 from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper
 from bridge.compensating.obstacles import Obstacles
+from bridge.compensating.orientations import SourceChoice, is_same_source
 from bridge.compensating.own_offset import OwnOffset
-from bridge.compensating.source_choice import SourceChoice, is_same_source
 from bridge.compensating.tool_sources import NoSource, Source
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.parameters.compensation import CompensationParameters
-from bridge.parameters.live import LiveParameters
+from bridge.parameters.declare import LiveParameters
 from bridge.parameters.row import ParameterError
 from bridge.parameters.table import Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
@@ -197,7 +197,7 @@ class CompensationControl:
     def _check(self, wanted: CompensationParameters) -> None:
         """ParameterError if they cannot be had here."""
         self._choice.check(wanted)
-        if self.link.connection is not None and (rate_hz := self.link.rate_hz):
+        if self.link.is_connected and (rate_hz := self.link.rate_hz):
             known = self.parameters.filter.problems(rate_hz)
             for problem in wanted.filter.problems(rate_hz):
                 if problem not in known:
@@ -255,7 +255,7 @@ class CompensationControl:
 
     def _is_same_sensor(self) -> bool:
         info = self.link.info
-        return self.link.connection is None or info is None or info.serial == self._keeper.serial
+        return not self.link.is_connected or info is None or info.serial == self._keeper.serial
 
     def _follow_sensor(self) -> None:
         """Find the bias of the sensor that is there now."""

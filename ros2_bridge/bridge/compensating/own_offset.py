@@ -48,7 +48,7 @@ class OwnOffset:
 
     def doubt(self) -> str:
         """Why the bias may no longer fit the sensor, a sentence; empty if it does."""
-        if not self.has_bias or self._link.connection is None:
+        if not self.has_bias or not self._link.is_connected:
             return ""
         if self._appeared:
             return "the sensor's own offset was unknown when the bias was taken: the bias may be wrong, tare"

@@ -44,7 +44,7 @@ class CompensationState(NamedTuple):
         if not parts:
             text = "nothing is subtracted: there is no bias and no tool_mass"
         else:
-            text = f"subtracted: {' and '.join(parts)}"
+            text = f"subtracted: {', '.join(parts)}"
         return text if self.has_subscribers else f"{text}; nobody has subscribed"
 
     @property

@@ -6,32 +6,21 @@ Five statuses. A message says what is wrong and what to do; the values are for t
 from __future__ import annotations
 
 from collections.abc import Iterable
-from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
-from bridge.diagnostics.snapshot import SLOW_ANSWER_S, Snapshot, mapping, row_of
-from protocol.health import verdict as health
+from bridge.diagnostics.observer import SLOW_ANSWER_S, Snapshot, mapping, row_of
 from protocol.health.judge import SATURATIONS
 from protocol.health.judge import judge as judge_stream
 from protocol.health.limits import Limits
-from protocol.health.verdict import About
+from protocol.health.verdict import About, Finding, Level, Verdict
 from protocol.text.untrusted import number, whole
 from protocol.text.visible import printable
 
 Values = dict[str, object]
 
 
-class Level(IntEnum):
-    """As `diagnostic_msgs/DiagnosticStatus` numbers them."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
-    STALE = 3
-
-
 class Status(NamedTuple):
-    """One status: its short name, how bad, one sentence, and the values."""
+    """One status: its short name, how bad (NOT_POSSIBLE: STALE in ROS), one sentence, and the values."""
 
     name: str
     level: Level
@@ -39,27 +28,20 @@ class Status(NamedTuple):
     values: Values
 
 
-_LEVELS: Final = {
-    health.Level.GOOD: Level.OK,
-    health.Level.LOOK: Level.WARN,
-    health.Level.TROUBLE: Level.ERROR,
-}
-
-
 class _Verdict:
     """Collects problems: the worst level, and the sentences of all, the worst first."""
 
     def __init__(self) -> None:
-        self.level = Level.OK
+        self.level = Level.GOOD
         self.sentences: list[str] = []
 
     def add(self, level: Level, sentence: str) -> None:
         self.sentences.insert(0 if level > self.level else len(self.sentences), sentence)
         self.level = max(self.level, level)
 
-    def add_all(self, findings: Iterable[health.Finding]) -> None:
+    def add_all(self, findings: Iterable[Finding]) -> None:
         for finding in findings:
-            self.add(_LEVELS[finding.level], finding.sentence)
+            self.add(finding.level, finding.sentence)
 
     def status(self, name: str, good: str, values: Values) -> Status:
         return Status(name, self.level, "; ".join(self.sentences) or good, values)
@@ -78,20 +60,20 @@ def judge(snapshot: Snapshot, limits: Limits) -> list[Status]:
     ]
 
 
-def stream_verdict(snapshot: Snapshot, limits: Limits) -> health.Verdict:
+def stream_verdict(snapshot: Snapshot, limits: Limits) -> Verdict:
     """The verdict of the judge of all streams."""
     return judge_stream(snapshot.observation, limits)
 
 
-def _about(findings: Iterable[health.Finding], subject: About) -> list[health.Finding]:
+def _about(findings: Iterable[Finding], subject: About) -> list[Finding]:
     return [finding for finding in findings if finding.about is subject]
 
 
-def _link(s: Snapshot, findings: list[health.Finding]) -> Status:
+def _link(s: Snapshot, findings: list[Finding]) -> Status:
     verdict = _Verdict()
     if not s.connected:
         verdict.add(
-            Level.ERROR,
+            Level.TROUBLE,
             f"no server at {s.address}: {s.problem}; start ethercat-server there, or set server_host and "
             "server_port to where it is (the node keeps trying)"
             if not s.is_reachable
@@ -99,7 +81,7 @@ def _link(s: Snapshot, findings: list[health.Finding]) -> Status:
         )
     elif s.answer_s > SLOW_ANSWER_S:
         verdict.add(
-            Level.WARN,
+            Level.LOOK,
             f"the server at {s.address} has not answered for {s.answer_s:.0f} s: it is stopped or overloaded",
         )
     else:
@@ -115,14 +97,14 @@ def _link(s: Snapshot, findings: list[health.Finding]) -> Status:
     return verdict.status("link", f"connected to {s.address}", values)
 
 
-def _stream(s: Snapshot, findings: list[health.Finding], limits: Limits) -> Status:
+def _stream(s: Snapshot, findings: list[Finding], limits: Limits) -> Status:
     verdict = _Verdict()
     if not s.connected:
-        verdict.add(Level.STALE, "no samples: there is no connection to the server, see link")
+        verdict.add(Level.NOT_POSSIBLE, "no samples: there is no connection to the server, see link")
     else:
         verdict.add_all(findings)
         if s.new.stale >= limits.lost_warn:
-            verdict.add(Level.WARN, f"{s.new.stale} old samples skipped: the node or the server was stopped")
+            verdict.add(Level.LOOK, f"{s.new.stale} old samples skipped: the node or the server was stopped")
     mine, recent = s.server_row, mapping(s.server.get("last_10s"))
     age = row_of(recent.get("age_us"), s.sensor)
     wake, exchange = mapping(recent.get("wake_us")), mapping(recent.get("exchange_us"))
@@ -157,14 +139,14 @@ def _lost_text(lost: str) -> str:
     return lost if "check " in lost else f"{lost}; check its cable and power"
 
 
-def _sensor(s: Snapshot, findings: list[health.Finding], *, is_silent: bool) -> Status:
+def _sensor(s: Snapshot, findings: list[Finding], *, is_silent: bool) -> Status:
     verdict = _Verdict()
     if not s.connected:
-        verdict.add(Level.STALE, "unknown: there is no connection to the server, see link")
+        verdict.add(Level.NOT_POSSIBLE, "unknown: there is no connection to the server, see link")
     elif s.lost is not None:
-        verdict.add(Level.ERROR, _lost_text(s.lost))
+        verdict.add(Level.TROUBLE, _lost_text(s.lost))
     elif is_silent:
-        verdict.add(Level.STALE, "unknown: there are no new samples, see stream")
+        verdict.add(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")
     else:
         verdict.add_all(findings)
     last = mapping(s.server_row.get("emergency"))
@@ -189,13 +171,13 @@ def _sensor(s: Snapshot, findings: list[health.Finding], *, is_silent: bool) -> 
     return verdict.status("sensor", "as it should be", values)
 
 
-def _clock(s: Snapshot, findings: list[health.Finding], *, is_silent: bool) -> Status:
+def _clock(s: Snapshot, findings: list[Finding], *, is_silent: bool) -> Status:
     clock = mapping(s.server_row.get("clock"))
     verdict = _Verdict()
     if not s.connected or s.lost is not None or is_silent:
-        verdict.add(Level.STALE, "unknown: there are no new samples, see stream")
+        verdict.add(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")
     elif clock.get("mode") is None:
-        verdict.add(Level.STALE, "the server has not said yet")
+        verdict.add(Level.NOT_POSSIBLE, "the server has not said yet")
     else:
         verdict.add_all(findings)
     values: Values = {
@@ -207,16 +189,16 @@ def _clock(s: Snapshot, findings: list[health.Finding], *, is_silent: bool) -> S
 def _compensation(s: Snapshot, *, is_silent: bool) -> Status:
     verdict, c = _Verdict(), s.compensation
     if not s.connected or s.lost is not None or is_silent:
-        verdict.add(Level.STALE, "there are no new samples, see stream")
+        verdict.add(Level.NOT_POSSIBLE, "there are no new samples, see stream")
     elif c.why_stopped is not None:
         state = "has stopped" if c.has_subscribers else "could not be published if somebody subscribed"
-        verdict.add(Level.ERROR, f"wrench_compensated {state}: {c.why_stopped}")
+        verdict.add(Level.TROUBLE, f"wrench_compensated {state}: {c.why_stopped}")
     elif c.why_partly:
-        verdict.add(Level.ERROR, c.why_partly)
+        verdict.add(Level.TROUBLE, c.why_partly)
     elif s.new_withheld:
-        verdict.add(Level.WARN, f"{s.new_withheld} samples were not compensated{_why_withheld(s)}")
+        verdict.add(Level.LOOK, f"{s.new_withheld} samples were not compensated{_why_withheld(s)}")
     if c.problem:
-        verdict.add(Level.WARN, c.problem)
+        verdict.add(Level.NOT_POSSIBLE if verdict.level is Level.NOT_POSSIBLE else Level.LOOK, c.problem)
     return verdict.status("compensation", c.good, c.values)
 
 

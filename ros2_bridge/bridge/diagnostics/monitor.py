@@ -16,14 +16,20 @@ from rclpy.node import Node
 
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.health import Status, judge, text_of
-from bridge.diagnostics.observer import Observer
-from bridge.diagnostics.snapshot import Snapshot
+from bridge.diagnostics.observer import Observer, Snapshot
 from bridge.publishing.messages import Outputs, create_publisher
 from bridge.stream.reader import Reader
 from protocol.health.limits import Limits
+from protocol.health.verdict import Level
 
 TICK_S: Final = 0.1
 REPORT_S: Final = 1.0
+_LEVELS: Final = {
+    Level.GOOD: DiagnosticStatus.OK,
+    Level.LOOK: DiagnosticStatus.WARN,
+    Level.TROUBLE: DiagnosticStatus.ERROR,
+    Level.NOT_POSSIBLE: DiagnosticStatus.STALE,
+}
 
 
 class Monitor:
@@ -45,7 +51,7 @@ class Monitor:
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
         self._published_s = self._clock.monotonic()
-        self._levels: list[int] = []
+        self._levels: list[Level] = []
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
 
@@ -76,7 +82,7 @@ class Monitor:
             self._observer.measure(now_s)
         snapshot = self._observer.look(now_s)
         statuses = judge(snapshot, self.limits)
-        levels = [int(status.level) for status in statuses]
+        levels = [status.level for status in statuses]
         if regular or levels != self._levels:
             self._levels, self._published_s = levels, now_s
             self._publish(statuses, snapshot)
@@ -90,7 +96,7 @@ class Monitor:
         message.status = [
             DiagnosticStatus(
                 name=self._prefix + status.name,
-                level=bytes((status.level,)),
+                level=_LEVELS[status.level],
                 message=status.message,
                 hardware_id=f"{info.name} {info.serial}" if info else "",
                 values=[KeyValue(key=key, value=text_of(value)) for key, value in status.values.items()],

@@ -4,20 +4,176 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from concurrent.futures import Future
+from typing import Any, Final, NamedTuple
 
 from bridge.diagnostics.compensation_state import CompensationState
-from bridge.diagnostics.server_status import ServerStatus
-from bridge.diagnostics.snapshot import ServerCounts, Snapshot
-from bridge.stream.connection import find_sensor
 from bridge.stream.frame_selector import FrameCounts
+from bridge.stream.link import Link, SensorInfo
 from bridge.stream.reader import Reader
 from bridge.stream.watch import Flags
 from protocol.errors import ConnectionFailedError
+from protocol.health.judge import Observation, emergency
 from protocol.health.observer import p99
+from protocol.text.json_text import JsonObject
 
 _SHORTEST_RATE_S: Final = 0.8
 """A rate measured over less time than this says little."""
+SLOW_ANSWER_S: Final = 2.0
+"""A server that owes an answer for this time is stopped or overloaded."""
+
+
+class Snapshot(NamedTuple):
+    """What is known at one moment. "New" is since the last regular report."""
+
+    sensor: int
+    address: str
+    connected: bool
+    problem: str
+    is_reachable: bool
+    """Whether there is a server there, connected or not."""
+    connection_s: float
+    """How long there has been, or has not been, a connection."""
+    connects: int
+    new_connects: int
+    info: SensorInfo | None
+    lost: str | None
+    silent_s: float
+    """Since the last new sample, or since the connection was made."""
+    rate_hz: float | None
+    """Measured; None while that is not possible yet."""
+    expected_hz: float
+    age_us: tuple[float, float] | None
+    """p50 and p99; None without samples or where the server's clock is another machine's."""
+    counts: FrameCounts
+    new: FrameCounts
+    not_finite: int
+    new_not_finite: int
+    flags: Flags
+    temperature: float | None
+    server: Mapping[str, Any]
+    """The latest `status` reply of this connection; empty if there is none yet."""
+    new_server: ServerCounts
+    answer_s: float
+    """How long the server has owed an answer; 0 if it owes none."""
+    settings: Mapping[str, object] = {}
+    """The sensor's settings, as far as they are known."""
+    saturated: int = 0
+    new_saturated: int = 0
+    """Samples whose force or torque was saturated."""
+    compensation: CompensationState = CompensationState()
+    new_withheld: int = 0
+    """Samples that could not be compensated."""
+
+    @property
+    def observation(self) -> Observation:
+        """The same as every judge of a stream wants it."""
+        mode = mapping(self.server_row.get("clock")).get("mode")
+        return Observation(
+            seconds=1.0,
+            samples=self.new.new,
+            lost=max(self.new.missing, self.new_server.lost_samples),
+            repeated=self.new.repeated,
+            invalid=self.new.invalid,
+            silent_s=self.silent_s,
+            rate_hz=self.rate_hz,
+            nominal_hz=self.expected_hz,
+            age_p99_us=None if self.age_us is None else self.age_us[1],
+            # The node checks those that it publishes, the server all.
+            not_finite=max(self.new_not_finite, self.new_server.not_finite),
+            warnings=self.flags.warnings,
+            force_torque_saturated=self.flags.force_torque_saturated,
+            acceleration_saturated=self.flags.acceleration_saturated,
+            angular_rate_saturated=self.flags.angular_rate_saturated,
+            temperature=self.temperature,
+            locked=None if mode is None else mode == "locked",
+            recoveries=self.new_server.recoveries,
+            missed_deadlines=self.new_server.missed_deadlines,
+            reconnects=self.new_connects if self.connects > 1 else 0,
+            is_lost=self.lost is not None,
+            state="?" if self.info is None else self.info.state,
+            server_silent=self.answer_s > SLOW_ANSWER_S / 2,
+            emergency=emergency(self.server_row.get("emergency")),
+            settings=self.settings,
+        )
+
+    @property
+    def server_row(self) -> Mapping[str, Any]:
+        """Our sensor's row of `server`; empty if it has none."""
+        return row_of(self.server.get("sensors"), self.sensor)
+
+
+def mapping(value: object) -> Mapping[str, Any]:
+    """`value` if it is a JSON object, else an empty one: the server's word is not trusted to have a form."""
+    return value if isinstance(value, dict) else {}
+
+
+def row_of(rows: object, position: int) -> Mapping[str, Any]:
+    """The object at `position` of a JSON list; empty if there is none."""
+    return mapping(rows[position] if isinstance(rows, list) and position < len(rows) else None)
+
+
+class ServerCounts(NamedTuple):
+    """What the server itself has counted, of our sensor or at all, by the names in `status`."""
+
+    lost_samples: int = 0
+    not_finite: int = 0
+    recoveries: int = 0
+    missed_deadlines: int = 0
+
+    @classmethod
+    def of(cls, status: Mapping[str, Any], position: int) -> ServerCounts:
+        """Those in a `status` reply; 0 for what it does not say."""
+        row = {**status, **row_of(status.get("sensors"), position)}
+        return cls(*(value if type(value := row.get(name)) is int else 0 for name in cls._fields))
+
+    def since(self, then: ServerCounts | None) -> ServerCounts:
+        """What was added since `then`, if that is known."""
+        if then is None:
+            return ServerCounts()
+        return ServerCounts(*(max(now - before, 0) for now, before in zip(self, then, strict=True)))
+
+
+class ServerStatus:
+    """Polls the server's `status` and `describe`: `ask` once a second, `collect` often. It never waits."""
+
+    def __init__(self) -> None:
+        self.status: Mapping[str, Any] = {}
+        self._link: Link | None = None
+        self._connects = 0
+        self._waiting: dict[str, Future[JsonObject]] = {}
+        self._asked_s = 0.0
+
+    def collect(self, link: Link) -> JsonObject | None:
+        """Take what was answered; returns a `describe` reply, once."""
+        if not link.is_connected or link.connects != self._connects:
+            self._connects, self.status, self._waiting = link.connects, {}, {}
+        self._link = link
+        described = None
+        for action in [action for action, reply in self._waiting.items() if reply.done()]:
+            reply = self._waiting.pop(action)
+            if reply.exception() is not None or reply.result().get("ok") is not True:
+                continue
+            if action == "status":
+                self.status = reply.result()
+            else:
+                described = reply.result()
+        return described
+
+    def ask(self, now_s: float) -> None:
+        """Ask again, unless an answer is still owed."""
+        if self._link is None or not self._link.is_connected or self._waiting:
+            return
+        self._asked_s = now_s
+        try:
+            for action in ("status", "describe"):
+                self._waiting[action] = self._link.client.request(action)
+        except ConnectionFailedError:
+            self._waiting = {}  # the reader will notice
+
+    def owed_s(self, now_s: float) -> float:
+        """How long an answer has been owed."""
+        return now_s - self._asked_s if self._waiting else 0.0
 
 
 class Observer:
@@ -41,10 +197,9 @@ class Observer:
     def look(self, now_s: float) -> Snapshot:
         """How things are now."""
         link, reader = self._link, self._reader
-        connection = link.connection
-        described = self._poll.collect(connection)
+        described = self._poll.collect(link)
         if described is not None:
-            self._take_description(described)
+            link.described(described)
         counts = dataclasses.replace(reader.counts)
         if link.epoch != self._epoch:
             self._epoch, self._rate_hz = link.epoch, None
@@ -59,7 +214,7 @@ class Observer:
         return Snapshot(
             sensor=link.sensor,
             address=link.address,
-            connected=connection is not None,
+            connected=link.is_connected,
             problem=link.problem,
             is_reachable=link.is_reachable,
             connection_s=now_s - link.since_s,
@@ -89,10 +244,9 @@ class Observer:
 
     def measure(self, now_s: float) -> None:
         """Work out rate and ages of the interval that ends; before `look`."""
-        connection = self._link.connection
         ages = self._reader.watch.take_ages()
         self._age_us = None
-        if ages and connection is not None and connection.same_machine:
+        if ages and self._link.is_connected and self._link.client.session.same_machine:
             self._age_us = ages[len(ages) // 2] / 1e3, (p99(ages) or 0) / 1e3
         if self._link.epoch != self._epoch:
             return
@@ -114,12 +268,6 @@ class Observer:
         elif not reported.connected:
             self._then_server = None  # the next server counts from 0
         self._poll.ask(now_s)
-
-    def _take_description(self, description: Mapping[str, Any]) -> None:
-        try:
-            self._link.described(find_sensor(description, self._link.sensor))
-        except ConnectionFailedError:
-            return  # not there any more: its frames will say so
 
 
 def _difference(now: FrameCounts, then: FrameCounts) -> FrameCounts:

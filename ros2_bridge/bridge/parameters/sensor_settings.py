@@ -17,8 +17,8 @@ from rclpy.parameter import Parameter
 
 from bridge.parameters.declare import SETTINGS_PREFIX as PREFIX
 from bridge.parameters.row import ParameterError
-from bridge.stream.link import Link
-from bridge.stream.requests import CONFIGURE_TIMEOUT_S, RequestFailedError, Requests
+from bridge.stream.link import Link, RequestFailedError
+from bridge.stream.requests import CONFIGURE_TIMEOUT_S, Requests
 from protocol.errors import SettingError
 from protocol.settings import SETTINGS, Setting, SettingValue, check_settings
 

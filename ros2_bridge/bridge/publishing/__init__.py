@@ -1,1 +1,0 @@
-"""From samples to messages: topics and their serialized messages, and the compensated wrench."""

@@ -1,12 +1,13 @@
-"""The ROS messages: each made and serialised once, then refilled and published.
+"""The ROS messages, which are published in serialized form.
 
 An output's `publish` runs in the reader's thread, for every selected sample and only while somebody has
-subscribed, so it must not block and should not allocate. `topics` has the list of them.
+subscribed, so it must not block and should not allocate. `topics` lists them.
 """
 
 from __future__ import annotations
 
 import math
+import struct
 from array import array
 from collections.abc import Callable, Sequence
 from typing import Any, Final, Protocol
@@ -15,13 +16,14 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.table import Parameters
-from bridge.publishing.serialized import SerializedMessage, axes
 from ft_compensation.compensator import Stages
+from protocol.cdr import StampedNumbers
 from protocol.framing import DataMessage
 from protocol.pdo import Sample, Vector3
 
@@ -108,15 +110,13 @@ class ArrayOutput(Topic):
         message.layout.dim = [
             MultiArrayDimension(label=ARRAY_LABEL, size=ARRAY_SIZE, stride=ARRAY_SIZE)
         ]  # fmt: skip
-        message.data = array("d", bytes(8 * ARRAY_SIZE))
-        self._serialized = SerializedMessage(
-            message, [[(message.data, position) for position in range(ARRAY_SIZE)]]
-        )
+        values = struct.Struct(f"<{ARRAY_SIZE}d")
+        message.data = array("d", bytes(values.size))
+        self._layout, self._pack = serialize_message(message)[: -values.size], values.pack
 
     def publish(self, sample: Sample, frame: DataMessage) -> None:  # noqa: ARG002 - the message has no header
         """Publish the twelve values."""
-        self._serialized.fill(0, sample.array)
-        self._publish(self._serialized.message())
+        self._publish(self._layout + self._pack(*sample.array))
 
 
 class WrenchTopic(Topic):
@@ -124,15 +124,11 @@ class WrenchTopic(Topic):
 
     def __init__(self, node: Node, topic: str, frame_id: str) -> None:
         super().__init__(node, WrenchStamped, topic)
-        message = WrenchStamped()
-        message.header.frame_id = frame_id
-        wrench = message.wrench
-        positions = [[*axes(wrench.force), *axes(wrench.torque)]]
-        self._serialized = SerializedMessage(message, positions, message.header.stamp)
+        self._pack = StampedNumbers(frame_id, 6).pack
 
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Publish a force and a torque."""
-        self._publish(self._serialized.filled(frame.stamp_ns, force + torque))
+        self._publish(self._pack(frame.stamp_ns, *force, *torque))
 
 
 class WrenchOutput(WrenchTopic):
@@ -179,17 +175,16 @@ class TemperatureOutput(Topic):
 
     def __init__(self, node: Node, topic: str, parameters: Parameters) -> None:
         super().__init__(node, Temperature, topic)
+        self._pack = StampedNumbers(parameters.frame_id, 2).pack
         self.configure(parameters)
 
     def configure(self, parameters: Parameters) -> None:
         """Take this variance, from any thread."""
-        message = Temperature(variance=parameters.temperature_variance)
-        message.header.frame_id = parameters.frame_id
-        self._serialized = SerializedMessage(message, [[(message, "temperature")]], message.header.stamp)
+        self._variance = parameters.temperature_variance
 
     def publish(self, sample: Sample, frame: DataMessage) -> None:
         """Publish the temperature."""
-        self._publish(self._serialized.filled(frame.stamp_ns, (sample.temperature,)))
+        self._publish(self._pack(frame.stamp_ns, sample.temperature, self._variance))
 
 
 def _is_finite(value: float | Sequence[float] | None) -> bool:

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
-from bridge.compensating.orientation_messages import Tf, check_tf, open_tf
+from bridge.compensating.orientations import TF_PERIOD_S, Tf, check_tf, open_tf
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.table import Parameters
 from bridge.publishing.messages import StageTopic
@@ -20,8 +20,6 @@ from ft_compensation.outputs.frames import WrenchTransform
 from protocol.framing import DataMessage
 from protocol.pdo import Vector3
 
-TF_PERIOD_S: Final = 0.005
-"""Period of the TF lookups."""
 _PATIENCE: Final = 200
 """Failed lookups after the first subscription before it is a problem: TF has to arrive first."""
 _NS_PER_S: Final = 1_000_000_000

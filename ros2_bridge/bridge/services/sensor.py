@@ -10,11 +10,9 @@ from rclpy.node import Node
 
 from bridge.parameters.sensor_settings import SettingsParameters
 from bridge.services.triggers import create_triggers
-from bridge.stream.connection import find_sensor
-from bridge.stream.link import Link
-from bridge.stream.requests import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, RequestFailedError, Requests
+from bridge.stream.link import Link, RequestFailedError, find_sensor
+from bridge.stream.requests import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, Requests
 from ft_compensation.quantities import AXES
-from protocol.errors import ConnectionFailedError
 
 _TARE_S: Final = 0.5
 """How long a tare averages."""
@@ -62,10 +60,7 @@ class Services:
 
     def _get_settings(self) -> str:
         reply = self._requests.ask("describe", DESCRIBE_TIMEOUT_S)
-        try:
-            info = find_sensor(reply, self._link.sensor)
-        except ConnectionFailedError as error:
-            raise RequestFailedError(str(error)) from None
+        info = find_sensor(reply, self._link.sensor)
         return json.dumps({**info.settings, "rate_hz": info.rate})
 
     def _apply_settings(self) -> str:

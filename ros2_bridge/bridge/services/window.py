@@ -7,10 +7,9 @@ from typing import Final
 
 from bridge.compensating.control import CompensationControl
 from bridge.publishing.compensated_wrench import RestWindow
-from bridge.stream.connection import find_sensor
-from bridge.stream.requests import DESCRIBE_TIMEOUT_S, RequestFailedError, Requests
+from bridge.stream.link import RequestFailedError, find_sensor
+from bridge.stream.requests import DESCRIBE_TIMEOUT_S, Requests
 from ft_compensation.quantities import CompensationError
-from protocol.errors import ConnectionFailedError
 
 _PATIENCE_S: Final = 2.0
 """A window may take this much longer than half as long again as it lasts."""
@@ -27,7 +26,7 @@ def take_window(control: CompensationControl, requests: Requests, *, needs_tool:
     if (conflict := control.obstacles.conflict(control.parameters, needs_tool=needs_tool)) is not None:
         raise CompensationError(conflict)
     link = control.link
-    if link.connection is None:
+    if not link.is_connected:
         raise CompensationError(f"{link.absence}, so there are no samples")
     _wait_settled(control, requests)
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
@@ -69,5 +68,5 @@ def _wait_settled(control: CompensationControl, requests: Requests) -> None:
             if link.clock.monotonic() > deadline_s:
                 raise CompensationError(f"sensor {link.sensor} does not settle: see the server's log")
             link.clock.wait(threading.Event(), _LOOK_S)
-    except (RequestFailedError, ConnectionFailedError) as error:
+    except RequestFailedError as error:
         raise CompensationError(str(error)) from None

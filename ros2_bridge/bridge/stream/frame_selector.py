@@ -2,7 +2,7 @@
 
 The rules it keeps:
 
-- `protocol.accounting` says which frames are new. No other frame is ever selected.
+- Only new frames come here, each once: `protocol.accounting` has left out the others.
 - Age is CLOCK_MONOTONIC now minus the frame's, compared with what is usual on this connection: where the
   server's clock is another machine's, only differences mean anything.
 - When a queued frame is older than usual by BACKLOG_NS (this process was stopped, or is slower than the
@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.accounting import StreamAccounting, StreamCounts
+from protocol.accounting import StreamCounts
 from protocol.framing import DataMessage
 
 BACKLOG_NS: Final = 50_000_000
@@ -42,33 +42,30 @@ class FrameCounts(StreamCounts):
 class FrameSelector:
     """Selects the frames of one connection that are to be published. A new connection needs a new one."""
 
-    def __init__(self, sensor: int, counts: FrameCounts, *, same_clock: bool, limit_hz: float = 0.0) -> None:
+    def __init__(self, counts: FrameCounts, *, same_clock: bool, limit_hz: float = 0.0) -> None:
         """`same_clock`: the server's CLOCK_MONOTONIC is ours. `limit_hz` 0 is no limit."""
-        self._sensor = sensor
         self._counts = counts
         self._limit: RateLimit | None
         self.limit(limit_hz)
-        self.accounting = StreamAccounting(counts)
         self._may_be_negative = not same_clock
         self._usual_ns: int | None = None
         """The usual age; None before the first frame."""
         self._skipping: tuple[int, int] | None = None
         """While everything is stale: the time of the last check of the age, and the age."""
-        self.passed_over: list[DataMessage] = []
+        self.passed_over: Sequence[DataMessage] = ()
         """New frames that the rate limit left out of the last `select`, older than the one selected."""
 
     def limit(self, hz: float) -> None:
         """Select at most this many a second, 0 = all; from any thread."""
         self._limit = RateLimit(hz) if hz > 0 else None
 
-    def select(self, frames: Sequence[DataMessage], now_ns: int) -> list[DataMessage]:
-        """The frames of `frames`, all that were queued, that are to be published, oldest first.
+    def select(self, fresh: Sequence[DataMessage], now_ns: int) -> Sequence[DataMessage]:
+        """Those of the new frames, one or more, all that were queued, that are to be published, in order.
 
         `now_ns` is CLOCK_MONOTONIC after the last was received.
         """
-        fresh = self.accounting.select_new(frames, self._sensor)
         if self.passed_over:
-            self.passed_over = []
+            self.passed_over = ()
         if not fresh:
             return fresh
         newest = fresh[-1]
@@ -99,7 +96,7 @@ class FrameSelector:
             return selected
         return fresh
 
-    def _after_stall(self, fresh: list[DataMessage], age_ns: int, now_ns: int) -> list[DataMessage]:
+    def _after_stall(self, fresh: Sequence[DataMessage], age_ns: int, now_ns: int) -> list[DataMessage]:
         """The newest of `fresh`, or nothing while more is on the way; `age_ns` is its age."""
         if self._skipping is None:
             self._skipping = now_ns, age_ns

@@ -1,34 +1,68 @@
 """What is known of the server and the sensor. The reader writes it, every thread may read it.
 
-Attributes are replaced, never changed in place, so that reading one needs no lock.
+Attributes are replaced, never changed in place, so that reading one needs no lock. What the server says is
+not trusted.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 from bridge.clock import Clock
-from bridge.stream.connection import Connection, SensorInfo, known_offset, known_rate, known_settings
-from protocol.control import Event
-from protocol.settings import SettingValue, sampling_rate_hz
+from ft_compensation.quantities import Wrench, wrench_text
+from protocol.client.client import Client
+from protocol.client.session import Disconnected
+from protocol.control import Event, six_numbers
+from protocol.errors import SettingError
+from protocol.settings import SETTINGS, SettingValue
 from protocol.text.json_text import JsonObject
+from protocol.text.untrusted import number, rows
 from protocol.text.visible import printable
 
-NEVER_CONNECTED: Final = "no connection yet"
+_MOST_HZ: Final = 1e6
+
+
+class RequestFailedError(Exception):
+    """The server did not do it; the text is its sentence, or says why there is none."""
+
+
+class SensorInfo(NamedTuple):
+    """What the server says about the sensor, made safe to print."""
+
+    sensor: int
+    name: str
+    serial: str
+    rate_hz: str
+    state: str
+    hardware: str = "?"
+    firmware: str = "?"
+    rate: float = 0.0
+    """`rate_hz` as a number; 0 if it is none."""
+    settings: Mapping[str, SettingValue] = {}
+    settling: bool = False
+    """Whether its data has not settled."""
+    offset: tuple[float, ...] | None = None
+    """Its own force/torque offset, N and Nm; None if the server does not say."""
+
+    def __str__(self) -> str:
+        """One phrase for the log."""
+        return f"sensor {self.sensor} ({self.name}, serial {self.serial}, {self.rate_hz} Hz, {self.state})"
 
 
 class Link:
     """`on_change` is called, in the writer's thread, after each change of what is known."""
 
-    def __init__(self, address: str, sensor: int, clock: Clock) -> None:
+    def __init__(self, client: Client, sensor: int, clock: Clock) -> None:
+        self.client = client
+        """Of the node's only connection."""
         self.clock = clock
         """What everything is timed by."""
-        self.address = address
+        self.address = printable(client.address)
         self.sensor = sensor
         self.on_change: Callable[[], object] = lambda: None
-        self.connection: Connection | None = None
-        """The connection, while its stream runs."""
+        self.is_connected = False
         self.info: SensorInfo | None = None
         """The sensor as the server described it last; kept when the connection ends."""
         self.settings: Mapping[str, SettingValue] = {}
@@ -37,7 +71,7 @@ class Link:
         """The sensor's own force/torque offset, part of every sample, N and Nm; None: not known."""
         self.rate_hz = 0.0
         """Samples a second that are to be expected; 0 if the server does not say."""
-        self.problem = NEVER_CONNECTED
+        self.problem = client.session.problem
         """Why there is no connection."""
         self.is_reachable = False
         """Whether there is a server there for all that; it may be too old, or have no such sensor."""
@@ -49,16 +83,17 @@ class Link:
         self.epoch = 0
         """Raised by everything that interrupts the stream or changes its rate."""
 
-    def connected(self, connection: Connection, info: SensorInfo) -> None:
+    def connected(self, description: JsonObject) -> SensorInfo:
         """The stream begins."""
-        self.info, self.settings, self.rate_hz = info, info.settings, info.rate
-        self.offset = info.offset
+        self.info = info = find_sensor(description, self.sensor)
+        self.settings, self.rate_hz, self.offset = info.settings, info.rate, info.offset
         self.connects += 1
         self.since_s = self.clock.monotonic()
         self.lost = None
         self.epoch += 1
-        self.connection = connection
+        self.is_connected = True
         self.on_change()
+        return info
 
     @property
     def absence(self) -> str:
@@ -66,19 +101,18 @@ class Link:
         what = "the node is not connected to the server" if self.is_reachable else "there is no server"
         return f"{what} at {self.address} ({self.problem})"
 
-    def disconnected(self, problem: str, *, is_reachable: bool = False) -> None:
+    def disconnected(self, event: Disconnected) -> None:
         """There is no connection (any more)."""
-        if self.connection is not None:
-            self.since_s = self.clock.monotonic()
-        had, self.connection = self.connection, None
-        self.settings, self.problem, self.lost = {}, problem, None
+        had, self.is_connected = self.is_connected, False
+        self.settings, self.problem, self.lost = {}, event.reason, None
         # One that has just gone away is not there, whatever it said last.
-        self.is_reachable = is_reachable and had is None
-        if had is not None:
+        self.is_reachable = event.reachable and not had
+        if had:
+            self.since_s = self.clock.monotonic()
             self.on_change()
 
     def take_event(self, message: JsonObject) -> bool:
-        """Learn from an event; False if it is of another sensor, and so nothing to us."""
+        """Learn from an event; False if it is of another sensor."""
         if message.get("sensor", self.sensor) != self.sensor:
             return False
         event = message.get("event")
@@ -99,22 +133,91 @@ class Link:
     def take_settings(self, message: JsonObject) -> None:
         """Note the settings, and the rate, that a message says are in force."""
         found = known_settings(message.get("settings"))
-        if not found or self.connection is None:
+        if not found or not self.is_connected:
             return
         rate_hz = known_rate(message.get("rate_hz"))
-        if (
-            not rate_hz
-            and (length := found.get("sinc_length")) != self.settings.get("sinc_length")
-            and length
-        ):
-            rate_hz = float(sampling_rate_hz(int(length)))  # the server is an older one
         if rate_hz not in (0.0, self.rate_hz):
             self.rate_hz = rate_hz
             self.epoch += 1
         self.settings = found
 
-    def described(self, info: SensorInfo) -> None:
+    def described(self, description: JsonObject) -> None:
         """Take a later reply to `describe`. Settings and offset come with events, which are never stale."""
-        if info.rate != self.rate_hz:
-            self.epoch += 1
-        self.info, self.rate_hz = info, info.rate
+        self.client.session.describe(description)
+        with contextlib.suppress(RequestFailedError):  # not there any more: its frames will say so
+            self.info = info = find_sensor(description, self.sensor)
+            if info.rate != self.rate_hz:
+                self.epoch += 1
+            self.rate_hz = info.rate
+
+
+def known_settings(settings: object) -> dict[str, SettingValue]:
+    """Those of `settings`, a message's, that are in the table and have a value that they can have."""
+    found: dict[str, SettingValue] = {}
+    for name, value in settings.items() if isinstance(settings, dict) else ():
+        if name in SETTINGS:
+            with contextlib.suppress(SettingError):
+                found[name] = SETTINGS[name].check(value)
+    return found
+
+
+def known_rate(rate_hz: object) -> float:
+    """The sampling rate that a message gives, Hz; 0 if it is none."""
+    return float(rate_hz) if isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ else 0.0
+
+
+def known_offset(offset: object) -> tuple[float, ...] | None:
+    """The sensor's own offset from a message; None if missing or invalid."""
+    try:
+        return six_numbers(offset)
+    except ValueError:
+        return None
+
+
+def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
+    """The row of `sensor` in a `describe` reply; RequestFailedError if there is none."""
+    found = rows(description.get("sensors"))
+    for row in found:
+        if row.get("sensor") == sensor and not isinstance(row.get("sensor"), bool):
+            name, serial, rate, state, hardware, firmware = (
+                printable(row.get(key, "?"), 40)
+                for key in ("name", "serial", "rate_hz", "state", "hardware", "firmware")
+            )
+            number = known_rate(row.get("rate_hz"))
+            settings, settling = known_settings(row.get("settings")), row.get("settling") is True
+            offset = known_offset(row.get("offset"))
+            return SensorInfo(
+                sensor, name, serial, rate, state, hardware, firmware, number, settings, settling, offset
+            )
+    there = ", ".join(printable(row.get("sensor"), 10) for row in found[:16]) or "none"
+    raise RequestFailedError(
+        f"the server has no sensor {sensor} (it has: {there}): set the parameter 'sensor' to one it has"
+    )
+
+
+def sentence(message: JsonObject, before: Mapping[str, SettingValue]) -> str:
+    """What an event says; `before` are the settings that were in force."""
+    event = message["event"]
+    told = message.get("message")
+    if event == Event.SENSOR_LOST:
+        return printable(told) if isinstance(told, str) and told else "the server has lost the sensor"
+    if event == Event.SENSOR_BACK:
+        lost_s = number(message.get("lost_s"))
+        return "the sensor is back" + ("" if lost_s is None else f" after {lost_s:g} s")
+    if event == Event.RECONFIGURED:
+        return f"the sensor was reconfigured{_changes(message, before)}"
+    if event == Event.OFFSET_CHANGED:
+        offset = known_offset(message.get("offset"))
+        now = "no longer known" if offset is None else f"{wrench_text(Wrench.of(offset))} now"
+        return f"the sensor's own offset is {now}"
+    if event == Event.EMERGENCY:
+        return "the sensor reports an emergency" + (f": {printable(told)}" if isinstance(told, str) else "")
+    if event == Event.SHUTTING_DOWN:
+        return "the server is shutting down"
+    return f"the server sent the event {printable(event, 40)}, which this version does not know"
+
+
+def _changes(message: Mapping[str, Any], before: Mapping[str, SettingValue]) -> str:
+    now = known_settings(message.get("settings"))
+    changed = [f"{name} {str(value).lower()}" for name, value in now.items() if before.get(name) != value]
+    return f": {', '.join(changed)}" if changed else ""

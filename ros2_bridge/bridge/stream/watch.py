@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from protocol.accounting import NOT_NEW
 from protocol.framing import DataMessage
 from protocol.pdo import LAYOUTS, Sample
 
@@ -45,8 +44,7 @@ _FORCE_TORQUE: Final = Flags._fields.index("force_torque_saturated")
 class Watch:
     """`see` is for the reader, `take_flags` and `take_ages` are for the monitor."""
 
-    def __init__(self, sensor: int) -> None:
-        self._sensor = sensor
+    def __init__(self) -> None:
         self._seen: tuple[int, ...] = tuple(Flags())
         self._current: tuple[int, ...] = self._seen
         self._changes: deque[tuple[int, ...]] = deque(maxlen=_MOST_CHANGES)
@@ -60,13 +58,13 @@ class Watch:
         """Samples whose force or torque was saturated."""
 
     def see(self, frames: Sequence[DataMessage]) -> None:
-        """Note the flags of every frame, whether it is to be published or not."""
+        """Note the flags of new frames, whether they are to be published or not."""
         for frame in frames:
             flags = _FLAGS.unpack_from(frame.process_data)
-            if flags != self._seen and frame.sensor == self._sensor:
+            if flags != self._seen:
                 self._seen = flags
                 self._changes.append(flags)
-            if flags[_FORCE_TORQUE] and not frame.flags & NOT_NEW and frame.sensor == self._sensor:
+            if flags[_FORCE_TORQUE]:
                 self.saturated += 1
 
     def take_flags(self) -> Flags:

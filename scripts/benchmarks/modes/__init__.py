@@ -1,1 +1,0 @@
-"""A module for each option of `scripts/benchmark` that measures one part by itself."""

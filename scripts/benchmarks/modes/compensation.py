@@ -8,15 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 import numpy as np
-import rclpy
-from rclpy.context import Context
-from rich.console import Console
-from rich.table import Table
 
-from bridge.compensating.tool_sources import ImuSource
-from bridge.parameters.compensation import CompensationParameters
-from bridge.publishing.compensated_wrench import CompensatedOutput, Plan, RestWindow
-from bridge.publishing.messages import make_stages
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
 from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
@@ -25,16 +17,14 @@ from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.stationary_limits import StationaryLimits
 from protocol.framing import DataMessage
 from protocol.pdo import Sample, SampleDecoder, encode
-from scripts.benchmarks.chain import Setup
-from scripts.demonstration.child import DemoError
+from scripts.benchmarks.chain import Figures, ScriptError, Setup
+from scripts.benchmarks.modes.mode import Mode, points
 
 SAMPLES: Final = 20_000
 SIZE: Final = 61
-DEFAULT: Final = "bias, weight and inertia"
-"""The case of what is on by default, once there is a tool_mass."""
-MOST_US: Final = 20.0
+DEFAULT: Final = "bias, weight and inertia"  # what is on by default, once there is a tool_mass
+MOST_US: Final = 20.0  # more than this is an error
 MOST_BY_DEFAULT_US: Final = 12.0
-"""What it may cost."""
 _TOOL: Final = Payload(0.8, (0.004, -0.006, 0.055))
 _BIAS: Final = Wrench((3.0, -1.5, 7.25), (0.2, -0.05, 0.125))
 _START_NS: Final = 1_700_000_000_000_000_000
@@ -68,6 +58,14 @@ def took(each: Callable[[int], object]) -> dict[str, float]:
 
 def costs(setup: Setup) -> Costs:
     """Each case's."""
+    import rclpy  # noqa: PLC0415 - the other modes do without
+    from rclpy.context import Context  # noqa: PLC0415
+
+    from bridge.compensating.tool_sources import ImuSource  # noqa: PLC0415
+    from bridge.parameters.compensation import CompensationParameters  # noqa: PLC0415
+    from bridge.publishing.compensated_wrench import CompensatedOutput, Plan, RestWindow  # noqa: PLC0415
+    from bridge.publishing.messages import make_stages  # noqa: PLC0415
+
     data, decoder = list(frames()), SampleDecoder(SIZE)
     samples: list[Sample] = [decoder.decode(one) for one in data]
     step_ns = 1_000_000_000 // setup.rate_hz
@@ -91,7 +89,7 @@ def costs(setup: Setup) -> Costs:
             before = output.published
             found[name] = took(lambda number: output.publish(samples[number], messages[number]))
             if output.published - before != SAMPLES:
-                raise DemoError(f"{name}: not all samples were compensated")
+                raise ScriptError(f"{name}: not all samples were compensated")
 
         measure(DEFAULT, window=False)
         measure("while a tare is taken", window=True)
@@ -117,16 +115,25 @@ def outputs(samples: list[Sample], rate_hz: float) -> Costs:
     return found
 
 
-def measure_compensation(setup: Setup, console: Console) -> dict[str, Any]:
-    """Measure and print. DemoError if it costs too much."""
+def measure(setup: Setup, _: Any) -> list[Figures]:
+    """A row for each case. ScriptError if it costs too much."""
     found = costs(setup)
-    table = Table("", "median, µs", "mean, µs", "p99, µs", "of decoding", title="Compensation of a sample")
-    for name, cost in found.items():
-        ratio = cost["50"] / found["decoding"]["50"]
-        table.add_row(name, *(f"{cost[which]:.1f}" for which in ("50", "mean", "99")), f"{ratio:.1f}")
-    console.print(table)
     worst = max(found, key=lambda name: found[name]["50"])
     for name, most_us in ((worst, MOST_US), (DEFAULT, MOST_BY_DEFAULT_US)):
         if found[name]["50"] > most_us:
-            raise DemoError(f"{name} takes {found[name]['50']:.1f} µs a sample, more than {most_us:g} µs")
-    return found
+            raise ScriptError(f"{name} takes {found[name]['50']:.1f} µs a sample, more than {most_us:g} µs")
+    return [
+        {"case": name, "us": cost, "of_decoding": round(cost["50"] / found["decoding"]["50"], 1)}
+        for name, cost in found.items()
+    ]
+
+
+MODE: Final = Mode(
+    "only what compensation costs the node for each sample",
+    measure,
+    {
+        "compensation of a sample": lambda row: row["case"],
+        "median / mean / p99, µs": lambda row: points(row["us"], "50", "mean", "99", digits=1),
+        "of decoding": lambda row: f"{row['of_decoding']}",
+    },
+)

@@ -14,19 +14,15 @@ from typing import Final
 import numpy as np
 
 from scripts.benchmarks import statistics
-from scripts.benchmarks.chain import Setup, chain, recording
-from scripts.benchmarks.chains import Figures
+from scripts.benchmarks.chain import PROCESSES, WARM_UP_S, Chain, Figures, ScriptError, Setup
 from scripts.benchmarks.statistics import Arrivals, Floats
-from scripts.demonstration.child import DemoError
 
 VERSION: Final = "1.1.16"
 REQUIREMENT: Final = f"bota-driver=={VERSION}"
-_ROOT: Final = Path(__file__).parents[3]
-_ENVIRONMENT: Final = _ROOT / ".venv-vendor"
+_ENVIRONMENT: Final = Path(__file__).parents[3] / ".venv-vendor"
 _PYTHON: Final = _ENVIRONMENT / "bin" / "python"
+# What the ROS packages in .venv set is not for another environment's Python.
 _WITHOUT_ROS: Final = ("env", "-u", "LD_LIBRARY_PATH", "-u", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
-"""What the ROS packages in .venv set is not for another environment's Python."""
-_DRIVER: Final = "scripts.benchmarks.processes.vendor_driver"
 
 
 def installed() -> bool:
@@ -41,7 +37,7 @@ def installed() -> bool:
 
 
 def install() -> None:
-    """Make .venv-vendor. DemoError if that fails."""
+    """Make .venv-vendor. ScriptError if that fails."""
     print(f"installing {REQUIREMENT} into {_ENVIRONMENT} (once)", flush=True)
     pip = [sys.executable, "-m", "pip", "--python", str(_PYTHON), "install", "--quiet"]
     for command in (
@@ -51,27 +47,22 @@ def install() -> None:
         done = subprocess.run(command, check=False, capture_output=True, text=True)
         if done.returncode:
             why = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[-1]
-            raise DemoError(f"{REQUIREMENT} cannot be installed into {_ENVIRONMENT}: {why}")
+            raise ScriptError(f"{REQUIREMENT} cannot be installed into {_ENVIRONMENT}: {why}")
 
 
-def measure_driver(setup: Setup, ifname: str, sensor: int) -> tuple[Figures, Floats]:
+def measure_driver(setup: Setup) -> tuple[Figures, Floats]:
     """The driver, with the server's priority, for which it does not ask; the ages of first returns."""
-    with chain(setup) as running:
-        running.start_canaries()
-        running.watch("sensor", sensor)
-        path, arguments = recording(running, "driver")
-        driver = running.start_command_recorder(
-            path, *_WITHOUT_ROS, _PYTHON, "-m", _DRIVER, *arguments, "--ifname", ifname,
-            "--sinc", setup.sinc, "--calls", setup.rate_hz, "--priority", setup.priority,
+    with Chain(setup, "Bota's driver") as chain:
+        path = chain.directory / "driver"
+        driver = chain.start(
+            "server", *_WITHOUT_ROS, _PYTHON, "-m", f"{PROCESSES}.vendor_driver", path,
+            "--warm-up", WARM_UP_S, "--seconds", setup.seconds, "--ifname", chain.bus(),
+            "--sinc", setup.sinc, "--calls", setup.rate_hz, "--priority", setup.priority, result=path,
         )  # fmt: skip
-        running.watch("server", driver.pid)
-        usage = running.record(path)
-        running.stop()
-        figures, _ = running.figures(path)
-        (arrivals,) = statistics.read_arrivals(path)
-    ages = first_ages(arrivals)
+        figures, _ = chain.figures(driver, chain.record(driver))
+        ages = first_ages(statistics.read_arrivals(path)[0])
     every = {"age_us": statistics.spread_us(ages), "every_age_us": figures["age_us"]}
-    return {**figures, **every, **usage, "version": VERSION}, ages
+    return {**figures, **every, "version": VERSION}, ages
 
 
 def first_ages(arrivals: Arrivals) -> Floats:
@@ -85,7 +76,7 @@ def main() -> int:
     try:
         if not installed():
             install()
-    except DemoError as error:
+    except ScriptError as error:
         print(f"benchmark: {error}", file=sys.stderr)
     except KeyboardInterrupt:  # the script says that it was stopped
         return 130

@@ -1,1 +1,0 @@
-"""Programs that the benchmark starts, each as a process of its own."""

@@ -1,4 +1,4 @@
-"""The polling design, to compare with: exchange, send the raw bytes, sleep for a period; a client on a timer.
+"""The polling design, to compare with: exchange, send the raw bytes, sleep for a period; a node on a timer.
 
 One sensor, one client; nothing is added but the figures that are written at the end.
 """
@@ -9,19 +9,16 @@ import argparse
 import select
 import signal
 import socket
-import struct
 import time
 from array import array
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from ethercat_server.virtual_sensor.measurement.signals import decode_clock
-from scripts.benchmarks.records import Recording, connect, recording_arguments, write
+from protocol.pdo import SampleDecoder
+from scripts.benchmarks.processes.recorder import SIZE, poll
+from scripts.benchmarks.records import connect, write
 
 TOPIC: Final = "/polling_sensor_data"
-_SIZE: Final = 61
-_VALUES: Final = struct.Struct("<5x6f2x3fx3f5x")
 
 
 def server(arguments: argparse.Namespace) -> None:
@@ -32,7 +29,6 @@ def server(arguments: argparse.Namespace) -> None:
     signal.signal(signal.SIGTERM, lambda number, _frame: stopping.append(number))
     master = operational_master(arguments.ifname)
     period_s = 1 / arguments.rate
-    timeout_us = int(period_s * 1e6)
     figures = array("q")
     with socket.create_server(("127.0.0.1", arguments.port)) as listener:
         client, _ = listener.accept()
@@ -42,7 +38,7 @@ def server(arguments: argparse.Namespace) -> None:
         select.select([client], [], [], 0)  # for a shutdown request
         sent = time.monotonic_ns()
         master.send_processdata()
-        master.receive_processdata(timeout_us)
+        master.receive_processdata(int(period_s * 1e6))
         figures.extend((woke - asleep - int(period_s * 1e9), time.monotonic_ns() - sent))
         try:
             client.sendall(master.slaves[0].input)
@@ -54,37 +50,8 @@ def server(arguments: argparse.Namespace) -> None:
     write(arguments.path, figures)
 
 
-def poll(connection: socket.socket) -> bytes:
-    """One message if there is one: what the client does at each tick of its timer."""
-    if select.select([connection], [], [], 0)[0]:
-        return connection.recv(_SIZE)
-    return b""
-
-
-def client(arguments: argparse.Namespace) -> None:
-    """The client without ROS: a timer, and a poll at each tick."""
-    recording = Recording(arguments.path, arguments.warm_up, arguments.seconds)
-    period_ns = int(1e9 / arguments.rate)
-    with connect(arguments.port) as connection:
-        due = time.monotonic_ns()
-        while True:
-            due += period_ns
-            now = time.monotonic_ns()
-            if due > now:
-                time.sleep((due - now) * 1e-9)
-            else:
-                due += (now - due) // period_ns * period_ns
-            data = poll(connection)
-            if len(data) == _SIZE:
-                now = time.monotonic_ns()
-                clock = decode_clock(_VALUES.unpack(data))
-                if not recording.take(0, *clock, 0, now):
-                    break
-        recording.write()
-
-
 def node(arguments: argparse.Namespace) -> None:
-    """The client as a ROS 2 node: polls and publishes at each tick of a timer, until SIGTERM."""
+    """A ROS 2 node: polls and publishes at each tick of a timer, until SIGTERM."""
     import rclpy  # noqa: PLC0415 - only the node needs it
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
     from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
@@ -96,16 +63,14 @@ def node(arguments: argparse.Namespace) -> None:
     signal.signal(signal.SIGTERM, stop)
     ros_node = rclpy.create_node("polling")
     publisher = ros_node.create_publisher(Float64MultiArray, TOPIC, 1)
-    values: list[float] = []
+    message: Any = Float64MultiArray()
+    decode = SampleDecoder(SIZE).decode
 
     def tick() -> None:
-        nonlocal values
         data = poll(connection)
-        if len(data) == _SIZE:
-            values = list(_VALUES.unpack(data))
-        if values:
-            message: Any = Float64MultiArray()
-            message.data = values
+        if len(data) == SIZE:
+            message.data = decode(data).array
+        if message.data:
             publisher.publish(message)
 
     with connect(arguments.port) as connection:
@@ -113,24 +78,12 @@ def node(arguments: argparse.Namespace) -> None:
         rclpy.spin(ros_node)
 
 
-def main() -> None:
-    """Run one of the three programs."""
-    parser = argparse.ArgumentParser()
-    programs = parser.add_subparsers(required=True)
-    parts: tuple[Callable[[argparse.Namespace], None], ...] = (server, client, node)
-    for part in parts:
-        program = programs.add_parser(part.__name__)
-        program.set_defaults(run=part)
-        program.add_argument("--port", type=int, required=True)
-        program.add_argument("--rate", type=float, required=True)
-        if part is client:
-            recording_arguments(program)
-        elif part is server:
-            program.add_argument("path", type=Path)
-            program.add_argument("--ifname", required=True)
-    arguments = parser.parse_args()
-    arguments.run(arguments)
-
-
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser()
+    parser.add_argument("part", choices=("server", "node"))
+    parser.add_argument("path", type=Path)
+    parser.add_argument("--ifname")
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--rate", type=float, required=True)
+    given = parser.parse_args()
+    {"server": server, "node": node}[given.part](given)

@@ -11,12 +11,13 @@ import argparse
 import contextlib
 import os
 import time
+from pathlib import Path
 from typing import Final
 
 import bota_driver  # type: ignore[import-not-found]
 
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
-from scripts.benchmarks.records import Recording, recording_arguments, sleep_until, steady
+from scripts.benchmarks.records import Recording, sleep_until, steady
 
 _ATTEMPTS: Final = 5
 
@@ -24,7 +25,9 @@ _ATTEMPTS: Final = 5
 def main() -> None:
     """Record, then end."""
     parser = argparse.ArgumentParser()
-    recording_arguments(parser)
+    parser.add_argument("path", type=Path)
+    parser.add_argument("--warm-up", type=float, required=True)
+    parser.add_argument("--seconds", type=float, required=True)
     parser.add_argument("--ifname", required=True)
     parser.add_argument("--sinc", type=int, required=True)
     parser.add_argument("--calls", type=float, required=True, help="per second")

@@ -11,21 +11,21 @@ from pathlib import Path
 from typing import Any, Final
 
 from ethercat_server.ethercat.raw_socket import packet_sockets
-from scripts.demonstration.child import DemoError
+from scripts.benchmarks.chain import ScriptError
 
 _SOURCE: Final = Path(__file__).with_suffix(".c")
 _OP_ATTEMPTS: Final = 500
 
 
 def build(folder: Path) -> Path:
-    """The C program, optimized. DemoError if it cannot be built."""
+    """The C program, optimized. ScriptError if it cannot be built."""
     if shutil.which("gcc") is None:
-        raise DemoError("there is no C compiler (sudo apt install gcc)")
+        raise ScriptError("there is no C compiler (sudo apt install gcc)")
     program = folder / "yardstick"
     command = ["gcc", "-std=gnu11", "-O2", "-Wall", "-Wextra", str(_SOURCE), "-o", str(program)]
     made = subprocess.run(command, check=False, capture_output=True, text=True)
     if made.returncode:
-        raise DemoError(f"gcc could not build {_SOURCE.name}:\n{made.stderr}")
+        raise ScriptError(f"gcc could not build {_SOURCE.name}:\n{made.stderr}")
     return program
 
 
@@ -36,7 +36,7 @@ def operational_master(ifname: str) -> Any:
     master = pysoem.Master()
     master.open(ifname)
     if master.config_init() <= 0:
-        raise DemoError(f"no sensor answers on {ifname}")
+        raise ScriptError(f"no sensor answers on {ifname}")
     master.config_map()
     master.state_check(pysoem.SAFEOP_STATE, 50_000)
     master.state = pysoem.OP_STATE
@@ -46,7 +46,7 @@ def operational_master(ifname: str) -> Any:
         master.receive_processdata(2000)
         if master.state_check(pysoem.OP_STATE, 2000) == pysoem.OP_STATE:
             return master
-    raise DemoError(f"the sensor on {ifname} does not reach OP")
+    raise ScriptError(f"the sensor on {ifname} does not reach OP")
 
 
 def main() -> None:

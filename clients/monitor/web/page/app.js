@@ -146,9 +146,8 @@ function choose(position) {
 }
 
 function showControl() {
-  const able = control && Boolean(sensor) && !troubles.link && !troubles.server;
   for (const button of [byId("tare"), byId("reset")]) {
-    button.disabled = !able;
+    button.disabled = !(control && sensor && !troubles.link && !troubles.server);
     button.title = control ? "" : "Only in a page opened by the link that ethercat-monitor printed";
   }
 }

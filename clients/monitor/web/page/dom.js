@@ -1,4 +1,4 @@
-// Small helpers for the page's elements. Texts are set as text: nothing that a sensor says becomes markup.
+// Small helpers for the page's elements and colors. Texts are set as text: nothing that a sensor says becomes markup.
 
 export const byId = (id) => document.getElementById(id);
 
@@ -23,3 +23,15 @@ export function fill(node, value, make) {
   shown.set(node, text);
   node.replaceChildren(...make(value));
 }
+
+/** The colors of the style sheet as a canvas needs them; renewed when the theme changes. */
+export const colors = {};
+
+function renew() {
+  const style = getComputedStyle(document.documentElement);
+  for (const name of ["raised", "ink", "muted", "grid", "missed", "x", "y", "z", "torque"])
+    colors[name] = style.getPropertyValue(`--${name}`).trim();
+}
+
+document.addEventListener("theme", renew);
+renew();

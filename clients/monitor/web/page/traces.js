@@ -2,8 +2,7 @@
 /* global uPlot */
 
 import { CHANNELS } from "./link.js";
-import { colors } from "./colors.js";
-import { element } from "./dom.js";
+import { colors, element } from "./dom.js";
 
 const KEPT_S = 62;
 const STEP_S = 0.01;

@@ -1,6 +1,6 @@
 // The wrench as two arrows on a drawing of the sensor: a parallel projection on a plain canvas.
 
-import { colors } from "./colors.js";
+import { colors } from "./dom.js";
 
 const LEAST = { N: 5, Nm: 0.2, counts: 1000 };
 const SHRINK_MS = 3000;

@@ -1,1 +1,0 @@
-"""Time stamps by slave controllers: their event times, on CLOCK_MONOTONIC, once they prove right."""

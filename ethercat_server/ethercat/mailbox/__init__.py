@@ -1,1 +1,0 @@
-"""The CoE mailbox of a slave, and what it says there unasked."""

@@ -1,0 +1,174 @@
+"""One sensor's slave controller: AL states, mailbox, and the registers that it needs in OP.
+
+At the start and when a sensor comes back the same steps take it to OP, one or two datagrams each.
+Source: ETG.1000.4 and ETG.1000.6.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Final
+
+from ethercat_server.errors import BusError, SetUpError
+from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.datagrams import Datagrams
+from ethercat_server.ethercat.exchange.frames import Area
+from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.slave.al import ACKNOWLEDGE_S, STATE_S, AlState, AlStatus
+from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
+from ethercat_server.ethercat.slave.emergencies import Emergencies
+from ethercat_server.ethercat.slave.sii import OF_FIRMWARE
+
+_START_ATTEMPTS: Final = 20
+_MAILBOXES_END: Final = 2 * reg.SYNC_MANAGER_SIZE
+_SYNC_MANAGER: Final = struct.Struct("<2xHBxBx")  # length, control, activation
+_HARDWARE: Final = struct.Struct("<BBxxH")  # numbers of FMMUs and of sync managers, features
+
+
+class GoneError(SetUpError):
+    """The slave stopped answering in the middle."""
+
+
+class SlaveController:
+    """The slave controller of sensor `number`.
+
+    Attributes:
+        number: of the sensor.
+        attempts: how often a datagram is sent until it is answered; more than one only while nothing streams.
+        sdo: its mailbox, whoever uses it.
+        areas: its process data in the logical address space, as `read_mapping` has found it.
+        features: what the controller can do, from then on.
+    """
+
+    def __init__(
+        self, bus: Datagrams, number: int, mailboxes: Sequence[tuple[int, int]], emergencies: Emergencies
+    ) -> None:
+        """`mailboxes`: offset and size of the one to the sensor and of the one from it."""
+        self._bus = bus
+        self.number = number
+        self.attempts = _START_ATTEMPTS
+        out, back = mailboxes
+        self.sdo = MailboxSdo(bus, number, (out, back), emergencies)
+        self._mailboxes = reg.pack_sync_manager(*out, reg.SM_CONTROL_MAILBOX_OUT)
+        self._mailboxes += reg.pack_sync_manager(*back, reg.SM_CONTROL_MAILBOX_IN)
+        self.areas: list[Area] = []
+        self.features = 0
+        self._units = self._count = 0
+        self._managers = self._fmmus = b""
+        self._latch: tuple[int, bytes] | None = None
+
+    def status(self) -> AlStatus | None:
+        """Its AL status; None if it does not answer."""
+        for _ in range(self.attempts):
+            data = self._bus.read_register(self.number, reg.AL_STATUS, reg.AL_STATUS_SIZE)
+            if data is not None:
+                return AlStatus.parse(data)
+        return None
+
+    def write(self, address: int, data: bytes) -> None:
+        """Write registers; GoneError if it does not answer."""
+        if not any(self._bus.write_register(self.number, address, data) for _ in range(self.attempts)):
+            raise self._gone()
+
+    def go(self, state: AlState) -> Steps[None]:
+        """Request an AL state and wait for it; an error is acknowledged first. SetUpError if it fails."""
+        status = self.status()
+        if status is not None and status.error:
+            yield from self._acknowledge(status)
+        self.write(reg.AL_CONTROL, state.request())
+        deadline = Deadline(self._bus.clock, STATE_S[state])
+        while True:
+            status = yield from self._next_status()
+            if status.state is state and not status.error:
+                return
+            if status.error or deadline.passed:
+                raise SetUpError(
+                    f"sensor {self.number} does not go to {state.name}: it is in {status}; power it off and "
+                    "on"
+                )
+
+    def enter_preop(self) -> Steps[None]:
+        """By way of INIT: what another master has set up (FMMUs, sync managers, SYNC0) is cleared."""
+        yield from self.go(AlState.INIT)
+        self._read_hardware()
+        self.write(reg.FMMU, bytes(self._units * reg.FMMU_SIZE))
+        self._bus.write_register(self.number, reg.DC_ACTIVATION, b"\0\0")  # a controller without DC refuses
+        yield
+        self.write(reg.SYNC_MANAGER, self._mailboxes.ljust(self._count * reg.SYNC_MANAGER_SIZE, b"\0"))
+        self.write(reg.SII_OWNER, OF_FIRMWARE)  # a slave reads its SII on the way to PREOP
+        yield from self.go(AlState.PREOP)
+
+    def map(self, managers: bytes = b"", fmmus: bytes = b"") -> None:
+        """Write sync managers from the third on, and FMMUs: by default those that `read_mapping` has read."""
+        self.write(reg.SYNC_MANAGER + _MAILBOXES_END, managers or self._managers)
+        self.write(reg.FMMU, fmmus or self._fmmus)
+
+    def read_mapping(self) -> int:
+        """Read back how a master has mapped the process data; returns the bytes of the inputs.
+
+        SetUpError if something was not written: SOEM writes it once, and does not look whether that worked.
+        """
+        self._read_hardware()
+        self._fmmus = self._bus.read_surely(self.number, reg.FMMU, self._units * reg.FMMU_SIZE)
+        rows = reg.FMMU_LAYOUT.iter_unpack(self._fmmus)
+        self.areas = [Area(row[0], row[0] + row[1], row[6]) for row in rows if row[7] & 1]
+        data = self._bus.read_surely(self.number, reg.SYNC_MANAGER, self._count * reg.SYNC_MANAGER_SIZE)
+        used = {
+            reg.FMMU_WRITE if control & reg.SM_WRITE else reg.FMMU_READ: at * reg.SYNC_MANAGER_SIZE
+            for at, (length, control, active) in enumerate(_SYNC_MANAGER.iter_unpack(data))
+            if length and active & 1 and not control & reg.SM_MAILBOX
+        }
+        if {area.kind for area in self.areas} != used.keys():
+            raise self.unmapped()
+        if self.features & reg.DC_AVAILABLE and reg.FMMU_READ in used:
+            at = used[reg.FMMU_READ] + reg.SM_ACTIVATE
+            self._latch = reg.SYNC_MANAGER + at, bytes([data[at] | reg.SM_LATCH_PDI])
+            data = data[:at] + self._latch[1] + data[at + 1 :]
+        self._managers = data[_MAILBOXES_END:]
+        return sum(area.end - area.start for area in self.areas if area.kind == reg.FMMU_READ)
+
+    def latch_events(self) -> bool:
+        """Have the controller latch when samples come to be; False if it has no distributed clock.
+
+        Another master may end that at any time.
+        """
+        if self._latch is None:
+            return False
+        self.write(*self._latch)
+        return True
+
+    def enter_op(self) -> Steps[None]:
+        """From PREOP with the process data mapped, which has to be exchanged meanwhile."""
+        yield from self.go(AlState.SAFEOP)
+        yield from self.go(AlState.OP)
+
+    def unmapped(self) -> SetUpError:
+        """The error to be raised if its mapping cannot be."""
+        return SetUpError(f"sensor {self.number} did not answer when it was mapped: check cable and power")
+
+    def _acknowledge(self, status: AlStatus) -> Steps[None]:
+        # The request waits until the error is gone: the slave sees only what was written to AL control last.
+        self.write(reg.AL_CONTROL, status.acknowledge())
+        deadline = Deadline(self._bus.clock, ACKNOWLEDGE_S)
+        while (now := (yield from self._next_status())).error:
+            if deadline.passed:
+                raise BusError(
+                    f"sensor {self.number} keeps its error although it was acknowledged: it is in {now}"
+                )
+
+    def _next_status(self) -> Steps[AlStatus]:
+        yield
+        status = self.status()
+        if status is None:
+            raise self._gone()
+        return status
+
+    def _gone(self) -> GoneError:
+        return GoneError(f"sensor {self.number} does not answer: check cable and power")
+
+    def _read_hardware(self) -> None:
+        if not self._count:
+            data = self._bus.read_surely(self.number, reg.FMMU_AND_SM_COUNT, _HARDWARE.size)
+            units, count, self.features = _HARDWARE.unpack(data)
+            self._units, self._count = min(units, reg.MOST_FMMUS), min(count, reg.MOST_SYNC_MANAGERS)
