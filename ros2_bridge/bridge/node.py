@@ -28,7 +28,18 @@ from bridge.parameters.declare import LiveParameters, declare, warn_of_others
 from bridge.parameters.row import ParameterError
 from bridge.parameters.sensor_settings import SettingsParameters
 from bridge.parameters.table import Parameters
-from bridge.publishing.topics import make, make_compensated
+from bridge.publishing.compensated_wrench import CompensatedOutput
+from bridge.publishing.filtered_wrench import FilteredTopic
+from bridge.publishing.messages import (
+    ArrayOutput,
+    ImuOutput,
+    Outputs,
+    RawImuOutput,
+    TemperatureOutput,
+    WrenchOutput,
+    make_stages,
+)
+from bridge.publishing.wrench_frames import make_frames
 from bridge.services.bias import BiasServices
 from bridge.services.identify import IdentifyServices
 from bridge.services.sensor import Services
@@ -66,8 +77,23 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
         self.parameters = parameters = declare(self)
-        compensated = make_compensated(self, parameters, lambda: self.reader.link.rate_hz)
-        outputs = make(self, parameters, compensated)
+        compensated = CompensatedOutput(
+            [
+                *make_stages(self, parameters.frame_id),
+                *make_frames(self, parameters),
+                FilteredTopic(self, parameters, lambda: self.reader.link.rate_hz),
+            ]
+        )
+        outputs = Outputs(
+            [
+                ArrayOutput(self, parameters.array_topic),
+                WrenchOutput(self, "wrench", parameters.frame_id),
+                RawImuOutput(self, parameters),
+                ImuOutput(self, parameters),
+                TemperatureOutput(self, "temperature", parameters),
+                compensated,
+            ]
+        )
         self.reader = Reader(
             parameters, outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )

@@ -14,10 +14,9 @@ from typing import Final
 from rclpy.node import Node
 
 from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper
-from bridge.compensating.obstacles import Obstacles
-from bridge.compensating.orientations import SourceChoice, is_same_source
+from bridge.compensating.orientations import SourceChoice, source_of
 from bridge.compensating.own_offset import OwnOffset
-from bridge.compensating.tool_sources import NoSource, Source
+from bridge.compensating.tool_sources import IMU_IS_OFF, NoSource, Source
 from bridge.diagnostics.compensation_state import CompensationState
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.declare import LiveParameters
@@ -72,9 +71,9 @@ class CompensationControl:
         self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
         self._shifting = threading.Lock()
         """For whoever shifts the ramp, or replaces it and the plan."""
-        self._watch: PayloadWatch | None = None
+        self._payload_watch: PayloadWatch | None = None
         self._watched: object = None
-        self.obstacles, self._live = Obstacles(link, watch), live
+        self._watch, self._live = watch, live
         live.checks.append(lambda wanted: self._check(wanted.compensation))
         live.listeners.append(lambda wanted: self._apply(wanted.compensation))
         self._guard = node.create_guard_condition(self._follow_sensor)
@@ -105,7 +104,7 @@ class CompensationControl:
         else:
             self._follow_offset()
             if self.output.hold is not _LOOKING_UP:
-                self.obstacles.hold(self.parameters, self.output)
+                self._hold()
 
     @property
     def keeping(self) -> str:
@@ -128,13 +127,13 @@ class CompensationControl:
 
     def state(self) -> CompensationState:
         """How things are, for the diagnostics' thread."""
-        output, source, watch = self.output, self._choice.source, self._watch
+        output, source, watch = self.output, self._choice.source, self._payload_watch
         payload = self.parameters.payload
         return CompensationState(
             has_subscribers=output.has_subscribers,
             published=output.published,
             withheld=output.withheld,
-            why_stopped=self.obstacles.stopping(self.parameters, output, source, self._choice.listener),
+            why_stopped=self._why_stopped(),
             why_partly=output.problem,
             source=source.describe,
             age_s=source.age_s(output.time_s),
@@ -145,7 +144,7 @@ class CompensationControl:
             is_ramping=self.is_ramping,
             keep=self.parameters.bias_keep,
             stops_on_saturation=output.stops_on_saturation,
-            problem=self.obstacles.conflict(self.parameters)
+            problem=self.conflict()
             or self._own_offset.doubt()
             or self._ramp.taken.doubt(payload)
             or self.keeping
@@ -156,6 +155,52 @@ class CompensationControl:
     def is_ramping(self) -> bool:
         """Whether it is on the way to `bias`, as of the latest sample."""
         return not self._ramp.arrived(self.output.time_s)
+
+    def conflict(self, *, needs_tool: bool = False) -> str | None:
+        """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
+        specific force in the frame of the wrench, a sentence that says what to do."""
+        settings = self.link.settings
+        if settings.get("calibration_matrix") is False:
+            return (
+                "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
+                "switch it on"
+            )
+        if settings.get("inertia_compensation") is True and self.parameters.payload.mass:
+            return (
+                "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
+                "or set tool_mass to 0"
+            )
+        return self._blind() if needs_tool else None
+
+    def _blind(self) -> str | None:
+        if self.parameters.orientation.source != "imu":
+            return None
+        if self.link.settings.get("coordinate_system") is True:
+            return (
+                "settings.coordinate_system is on, so the wrench is in a frame configured in the sensor, and "
+                "the rotation from the IMU to it is unknown: switch it off, or take the orientation of that "
+                "frame from the robot (gravity_source)"
+            )
+        return IMU_IS_OFF if self.link.settings.get("imu_active") == 0 else None
+
+    def _hold(self) -> None:
+        """Publish nothing while the specific force is needed and cannot be known."""
+        self.output.hold = self._blind() if self.parameters.payload.mass else None
+
+    def _why_stopped(self) -> str | None:
+        """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
+        output, source, watch = self.output, self._choice.source, self._watch
+        sample, stamp_s = output.sample, output.stamp_s
+        if not output.has_subscribers:
+            if not self.parameters.payload.mass:
+                return output.hold
+            sample, stamp_s = watch.sample, watch.stamp_ns * 1e-9
+        elif not output.is_stopped:
+            return None
+        elif output.is_saturated:
+            return output.hold or "force or torque is saturated, and on_saturation is stop"
+        why = source.why_none(sample, stamp_s) if sample is not None else ""
+        return output.hold or why or ("what is known of the tool is too old" if output.is_stopped else None)
 
     def set_bias(self, bias: Wrench, origin: str, taken: Taken | None = None) -> None:
         """Put a bias in force, `taken` by a tare, and keep it if that is asked for."""
@@ -205,7 +250,7 @@ class CompensationControl:
 
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted
-        if not is_same_source(wanted, was):
+        if source_of(wanted) != source_of(was):
             self._open_source()
         self.output.tune(wanted)
         self._ramp.seconds = wanted.bias_ramp_time
@@ -224,7 +269,7 @@ class CompensationControl:
             self._say_weighed(self.bias.plus(before, -1.0))
         self.output.stops_on_saturation = wanted.on_saturation == "stop"
         if self.output.hold is not _LOOKING_UP:
-            self.obstacles.hold(self.parameters, self.output)
+            self._hold()
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
             self._keeper.forget()
         self._keeper.keep(self._ramp, wanted, self._own_offset.to_keep)
@@ -243,15 +288,13 @@ class CompensationControl:
         self._guard.trigger()  # the parameter follows
 
     def _make_plan(self) -> None:
-        wanted = self.parameters
-        has_weight = wanted.payload.mass > 0.0
-        watched = wanted.payload, self.bias, self.sensors
+        payload, rest = self.parameters.payload, self.parameters.rest
+        watched = payload, self.bias, self.sensors
         if watched != self._watched:
             self._watched = watched
-            self._watch = PayloadWatch(wanted.payload, self._log.warning, wanted.rest) if has_weight else None
-        self.output.plan = Plan(
-            self._choice.source, Compensator(wanted.payload), self._ramp, has_weight, self._watch
-        )
+            self._payload_watch = PayloadWatch(payload, self._log.warning, rest) if payload.mass else None
+        source, has_tool = self._choice.source, payload.mass > 0.0
+        self.output.plan = Plan(source, Compensator(payload), self._ramp, has_tool, self._payload_watch)
 
     def _is_same_sensor(self) -> bool:
         info = self.link.info
@@ -283,7 +326,7 @@ class CompensationControl:
         self._follow_offset()
         if self.bias != self.parameters.bias:
             self._live.put(bias=[*self.bias.values])  # shifted
-        self.obstacles.hold(self.parameters, self.output)
+        self._hold()
         if not self._is_same_sensor():
             self.link_changed()
 

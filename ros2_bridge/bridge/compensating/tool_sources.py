@@ -1,6 +1,6 @@
 """The specific force at the tool, sample by sample: what the reader asks. No ROS.
 
-The reader alone calls `specific_force`. `why_none` and `age_s` are for the diagnostics' thread.
+The reader alone calls `specific_force`; the others are for the diagnostics' thread too.
 """
 
 from __future__ import annotations
@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, Protocol
 
-from bridge.parameters.compensation import CompensationParameters, Quaternion
+from bridge.parameters.compensation import CompensationParameters
 from ft_compensation.orientation import QuaternionGravity
+from ft_compensation.quantities import Quaternion
 from ft_compensation.specific_force import ImuSpecificForce
 from protocol.pdo import Sample, Vector3
 
 IMU_IS_OFF = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
-_NOT_FINITE = "the IMU sends NaN or infinity: see the status stream"
 
 
 class Oriented(NamedTuple):
@@ -41,8 +41,8 @@ class Source(Protocol):
             stamp_s: its time by the wall clock, which others stamp their orientations by.
         """
 
-    def why_none(self, time_s: float, stamp_s: float) -> str:
-        """The reason for None, a sentence."""
+    def why_none(self, sample: Sample, stamp_s: float) -> str:
+        """Why there is none for this sample, a sentence; empty if nothing is known to be wrong."""
 
     def age_s(self, time_s: float) -> float:
         """How old the orientation in use is; 0 where there is none."""
@@ -61,7 +61,7 @@ class NoSource:
         """None."""
         return None
 
-    def why_none(self, time_s: float, stamp_s: float) -> str:  # noqa: ARG002
+    def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """What to do."""
         return (
             f"{self._why}, so the weight of the tool is not known: set gravity_source to a source, or set "
@@ -81,24 +81,19 @@ class ImuSource:
 
     def __init__(self, parameters: CompensationParameters, imu_position: Vector3) -> None:
         """`imu_position` is the IMU's, m from the wrench origin."""
-        center = parameters.payload.center
-        (cx, cy, cz), (x, y, z) = center, imu_position
+        (cx, cy, cz), (x, y, z) = parameters.payload.center, imu_position
         self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), parameters.accelerometer)
-        self._broken = ""
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """Of this sample."""
         found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
-        if found is None:
-            self._broken = _NOT_FINITE
-        elif not any(sample.acceleration):
-            self._broken = IMU_IS_OFF
-            return None
-        return found
+        return found if any(sample.acceleration) else None
 
-    def why_none(self, time_s: float, stamp_s: float) -> str:  # noqa: ARG002
+    def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """The IMU is off or broken."""
-        return self._broken
+        if not any(sample.acceleration):
+            return IMU_IS_OFF
+        return "" if sample.is_finite else "the IMU sends NaN or infinity: see the status stream"
 
     def age_s(self, time_s: float) -> float:  # noqa: ARG002
         """Every sample brings its own."""
@@ -139,22 +134,23 @@ class ListenerSource:
         found = self._turn.gravity(time_s)
         return None if found is None else (-found[0], -found[1], -found[2])
 
-    def why_none(self, time_s: float, stamp_s: float) -> str:  # noqa: ARG002
+    def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """Nothing has come, it stopped, it is of no use, or its stamps are of another time."""
-        latest, name = self._listener.latest, self.describe
+        latest, problem, name = self._listener.latest, self._listener.problem, self.describe
         if latest is None:
-            return f"no orientation from {name}: {self._listener.problem}"
+            return f"no orientation from {name}: {problem}"
         behind_s = stamp_s - latest.stamp_ns * 1e-9
+        if abs(behind_s) <= self._limit_s:
+            return ""
+        limit = f"(limit {self._limit_s:g} s)"
         if behind_s < 0:
             return (
-                f"the orientation from {name} is stamped {_seconds(-behind_s)} after the sample (limit "
-                f"{self._limit_s:g} s): the clocks of the two computers differ"
+                f"the orientation from {name} is stamped {_seconds(-behind_s)} after the sample {limit}: the "
+                "clocks of the two computers differ"
             )
-        problem = self._listener.problem
+        why = problem or "it has stopped, is slow, or has another clock"
         return (
-            f"the latest orientation from {name} is {_seconds(behind_s)} older than the sample (limit "
-            f"{self._limit_s:g} s)"
-            + (f": {problem}" if problem else ": it has stopped, is slow, or has another clock")
+            f"the latest orientation from {name} is {_seconds(behind_s)} older than the sample {limit}: {why}"
         )
 
     def age_s(self, time_s: float) -> float:

@@ -5,7 +5,6 @@ All can be set while the node runs. A wrong value is refused with a sentence and
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
@@ -17,13 +16,14 @@ from ft_compensation.quantities import (
     ZERO,
     Accelerometer,
     Payload,
+    Quaternion,
     Wrench,
     length,
+    unit_quaternion,
 )
 from ft_compensation.stationary_limits import StationaryLimits
 from protocol.pdo import Vector3
 
-Quaternion = tuple[float, float, float, float]
 AUTO: Final = "auto"
 """The value of a path that is for the node to choose."""
 TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
@@ -126,13 +126,10 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
             f"parameter gravity is {list(gravity)}: it must be at least {_LEAST_GRAVITY} m/s² long; for no "
             "compensation of gravity set tool_mass to 0"
         )
-    norm = math.sqrt(sum(part * part for part in mounting))
-    if abs(norm - 1.0) > 0.01:
-        raise ParameterError(
-            f"parameter orientation.mounting is {list(mounting)}: a rotation is a quaternion of length 1, "
-            f"this one's is {norm:g}"
-        )
-
+    try:
+        mounting = unit_quaternion(mounting)
+    except ValueError as error:
+        raise ParameterError(f"parameter orientation.mounting is {list(mounting)}: {error}") from None
     if min(values["accelerometer.scale"]) < _LEAST_SCALE:
         raise ParameterError(
             f"parameter accelerometer.scale is {list(values['accelerometer.scale'])}: each must be at least "
@@ -149,7 +146,7 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
             raise ParameterError(
                 f"parameter {name} is {values[name]:g}: it must be 0, for none, or at least {least:g} Hz"
             )
-    orientation = group("orientation.") | {"mounting": tuple(part / norm for part in mounting)}
+    orientation = group("orientation.") | {"mounting": mounting}
     return CompensationParameters(
         payload=Payload(values["tool_mass"], values["tool_center_of_gravity"]),
         gravity=gravity,

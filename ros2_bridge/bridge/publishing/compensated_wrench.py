@@ -1,4 +1,4 @@
-"""`wrench_compensated` and what was subtracted, a topic each: the compensation as the reader runs it. No ROS.
+"""`wrench_compensated` and what was subtracted, a topic each: the compensation as the reader runs it.
 
 The reader calls `publish` for every selected sample, but only while somebody has subscribed or a window is
 open. What it goes by is a `Plan`, which the executor's thread replaces as a whole: there are no locks.
@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 from bridge.compensating.tool_sources import NoSource, Source
 from bridge.parameters.compensation import CompensationParameters
+from bridge.publishing.filtered_wrench import FilteredTopic
+from bridge.publishing.messages import StageTopic
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.payload_watch import PayloadWatch
@@ -57,7 +59,7 @@ class RestWindow:
             self._felt = (x + fx, y + fy, z + fz)
             self._count += 1
         elif self._blind is None:
-            self._blind = self.source.why_none(time_s, stamp_s)
+            self._blind = self.source.why_none(sample, stamp_s)
         window = self._window
         # Too few samples, as of a slow sensor or a busy machine, make it longer.
         if not window.add(sample, time_s) or not (window.count >= self._fewest or window.spoiled):
@@ -82,40 +84,15 @@ class RestWindow:
         return x / self._count, y / self._count, z / self._count
 
 
-class StageTopic(Protocol):
-    """One stage of the compensation as a topic, as it is or worked on: `publishing.messages.StageTopic`."""
-
-    index: int
-    """Of the stage in `Stages`."""
-    takes_all: bool
-    """Whether it also needs samples that are not published: `note`."""
-
-    @property
-    def problem(self) -> str:
-        """Why it publishes nothing, a sentence; "" if it does."""
-
-    def is_wanted(self) -> bool:
-        """Whether anybody has subscribed."""
-
-    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
-        """Publish a force and a torque."""
-
-    def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
-        """Take a sample that `publishing_frequency` leaves out."""
-
-    def tune(self, parameters: CompensationParameters) -> None:
-        """Take other parameters; for the executor's thread."""
-
-
 class CompensatedOutput:
     """An output of the reader's."""
 
     fields = ("force", "torque")
 
-    def __init__(self, topics: Sequence[StageTopic]) -> None:
+    def __init__(self, topics: Sequence[StageTopic | FilteredTopic]) -> None:
         self._all = topics
-        self._wanted: tuple[StageTopic, ...] = ()
-        self._noting: tuple[StageTopic, ...] = ()
+        self._wanted: tuple[StageTopic | FilteredTopic, ...] = ()
+        self._noting: tuple[StageTopic | FilteredTopic, ...] = ()
         self.plan = Plan(NoSource(), Compensator(), BiasRamp(), has_tool=False)
         self.window: RestWindow | None = None
         """The one that is open."""
@@ -129,8 +106,10 @@ class CompensatedOutput:
         """Whether the latest could not be compensated; at the start, whether for long."""
         self._begins_s = math.inf
         """Time of a subscription after which nothing was published yet, s; infinite: unknown."""
+        self.sample: Sample | None = None
+        """The latest that came here."""
         self.time_s = self.stamp_s = 0.0
-        """The latest sample's, seconds: by the server's monotonic clock, and since the Unix epoch."""
+        """Its time, s: by the server's monotonic clock, and since the Unix epoch."""
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed to any of the topics, or a window is open."""
@@ -166,7 +145,8 @@ class CompensatedOutput:
 
     def _felt(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
         """The specific force as far as it is needed, None if it is not known; the window takes the sample."""
-        self.time_s, self.stamp_s = time_s, stamp_s = frame.monotonic_ns * 1e-9, frame.stamp_ns * 1e-9
+        self.sample, time_s, stamp_s = sample, frame.monotonic_ns * 1e-9, frame.stamp_ns * 1e-9
+        self.time_s, self.stamp_s = time_s, stamp_s
         window = self.window
         if not plan.has_tool and window is None:
             return ZERO

@@ -45,7 +45,7 @@ class BiasServices:
 
     def _specific_force(self, window: RestWindow) -> Vector3:
         parameters = self._control.parameters
-        if conflict := self._control.obstacles.conflict(parameters, needs_tool=True):
+        if conflict := self._control.conflict(needs_tool=True):
             raise CompensationError(conflict)
         felt = window.specific_force()
         check_at_rest(felt, length(parameters.gravity))

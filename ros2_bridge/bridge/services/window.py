@@ -23,7 +23,7 @@ def take_window(control: CompensationControl, requests: Requests, *, needs_tool:
 
     CompensationError if they do not come or mean nothing.
     """
-    if (conflict := control.obstacles.conflict(control.parameters, needs_tool=needs_tool)) is not None:
+    if (conflict := control.conflict(needs_tool=needs_tool)) is not None:
         raise CompensationError(conflict)
     link = control.link
     if not link.is_connected:
