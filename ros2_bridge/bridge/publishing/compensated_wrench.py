@@ -19,7 +19,7 @@ from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
-from ft_compensation.stationary import StationaryMeans, StationaryWindow
+from ft_compensation.stationary import StationaryWindow
 from ft_compensation.stationary_limits import StationaryLimits
 from protocol.framing import DataMessage
 from protocol.pdo import Sample, Vector3
@@ -40,48 +40,34 @@ class Plan(NamedTuple):
     """Checks now and then whether the payload is still the one that is compensated."""
 
 
-class RestWindow:
+class RestWindow(StationaryWindow):
     """Samples of some time at rest, and the specific force meanwhile."""
 
     def __init__(self, seconds: float, limits: StationaryLimits, source: Source) -> None:
+        super().__init__(seconds, limits)
         self.source = source
         self.done = threading.Event()
-        self._window = StationaryWindow(seconds, limits)
-        self._fewest = limits.least_samples
-        self._felt = ZERO
-        self._count = 0
-        self._blind: str | None = None
+        self._sum, self._felt = ZERO, 0
+        self._blind = ""
 
-    def add(self, sample: Sample, time_s: float, stamp_s: float, felt: Vector3 | None) -> bool:
+    def take(self, sample: Sample, time_s: float, stamp_s: float, felt: Vector3 | None) -> bool:
         """Take a sample and its specific force, for the reader. True: the window is complete."""
-        if felt is not None:
-            (x, y, z), (fx, fy, fz) = self._felt, felt
-            self._felt = (x + fx, y + fy, z + fz)
-            self._count += 1
-        elif self._blind is None:
-            self._blind = self.source.why_none(sample, stamp_s)
-        window = self._window
-        # Too few samples, as of a slow sensor or a busy machine, make it longer.
-        if not window.add(sample, time_s) or not (window.count >= self._fewest or window.spoiled):
-            return False
-        self.done.set()
-        return True
-
-    @property
-    def count(self) -> int:
-        """Samples so far."""
-        return self._window.count
-
-    def means(self) -> StationaryMeans:
-        """What was read; CompensationError if the sensor did not rest."""
-        return self._window.means()
+        if felt is None:
+            self._blind = self._blind or self.source.why_none(sample, stamp_s) or "not in every sample"
+        else:
+            (x, y, z), (fx, fy, fz) = self._sum, felt
+            self._sum = (x + fx, y + fy, z + fz)
+            self._felt += 1
+        if self.add(sample, time_s):
+            self.done.set()
+        return self.done.is_set()
 
     def specific_force(self) -> Vector3:
         """Its mean in the sensor's frame, m/s²; CompensationError if it was not known all the time."""
-        if self._blind is not None or not self._count:
+        if self._blind or not self._felt:
             raise CompensationError(f"the weight of the tool is not known: {self._blind or 'no sample came'}")
-        x, y, z = self._felt
-        return x / self._count, y / self._count, z / self._count
+        x, y, z = self._sum
+        return x / self._felt, y / self._felt, z / self._felt
 
 
 class CompensatedOutput:
@@ -151,7 +137,7 @@ class CompensatedOutput:
         if not plan.has_tool and window is None:
             return ZERO
         felt = plan.source.specific_force(sample, time_s, stamp_s)
-        if window is not None and window.add(sample, time_s, stamp_s, felt):
+        if window is not None and window.take(sample, time_s, stamp_s, felt):
             self.window = None
         return felt if plan.has_tool else ZERO
 
