@@ -17,7 +17,7 @@ from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeepe
 from bridge.compensating.orientations import SourceChoice, source_of
 from bridge.compensating.own_offset import OwnOffset
 from bridge.compensating.tool_sources import IMU_IS_OFF, NoSource, Source
-from bridge.diagnostics.compensation_state import CompensationState
+from bridge.diagnostics.observer import CompensationState
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.declare import LiveParameters
 from bridge.parameters.row import ParameterError

@@ -1,17 +1,25 @@
-"""The services that take, clear and undo the bias: `~/tare`, `~/clear_tare`, `~/undo_tare`."""
+"""The services that take, clear and undo the bias, and the window at rest that identification takes, too."""
 
 from __future__ import annotations
+
+import threading
+from typing import Final
 
 from rclpy.node import Node
 
 from bridge.compensating.control import CompensationControl
 from bridge.publishing.compensated_wrench import RestWindow
-from bridge.services.triggers import create_triggers
-from bridge.services.window import take_window
-from bridge.stream.requests import Requests
+from bridge.services.sensor import create_triggers
+from bridge.stream.link import RequestFailedError, find_sensor
+from bridge.stream.requests import DESCRIBE_TIMEOUT_S, Requests
 from ft_compensation.bias import Taken, check_at_rest, estimate_bias
 from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, length, wrench_text
 from protocol.pdo import Vector3
+
+_PATIENCE_S: Final = 2.0
+"""A window may take this much longer than half as long again as it lasts."""
+_LOOK_S: Final = 0.05
+_SETTLED_WITHIN_S: Final = 10.0
 
 
 class BiasServices:
@@ -64,3 +72,58 @@ class BiasServices:
             text += f"; not kept: {control.keeping}" if control.keeping else "; kept for the next start"
         self._log.info(text)
         return text
+
+
+def take_window(control: CompensationControl, requests: Requests, *, needs_tool: bool) -> RestWindow:
+    """The samples of the next `rest.duration`, whole, once the sensor's data has settled; blocks the caller
+    and never the stream.
+
+    CompensationError if they do not come or mean nothing.
+    """
+    if (conflict := control.conflict(needs_tool=needs_tool)) is not None:
+        raise CompensationError(conflict)
+    link = control.link
+    if not link.is_connected:
+        raise CompensationError(f"{link.absence}, so there are no samples")
+    _wait_settled(control, requests)
+    seconds, limits = control.parameters.rest_duration, control.parameters.rest
+    window = RestWindow(seconds, limits, control.source)
+    patience_s = 1.5 * seconds + _PATIENCE_S
+    clock = link.clock
+    deadline_s = clock.monotonic() + patience_s
+    info, offset, bad = link.info, link.offset, control.count_not_finite()
+    control.output.window = window
+    try:
+        while not clock.wait(window.done, _LOOK_S):
+            if control.ending:
+                raise CompensationError("the node ends")
+            if clock.monotonic() > deadline_s:
+                raise CompensationError(
+                    f"only {window.count} samples came in {patience_s:.1f} s: see /diagnostics, stream"
+                )
+    finally:
+        control.output.window = None
+    # By what the reader knows: the executor, which would count another sensor, is the one that waits here.
+    if info is not None and link.info is not None and info.serial != link.info.serial:
+        raise CompensationError("the sensor was replaced by another meanwhile: call again")
+    if offset != link.offset:
+        raise CompensationError("the sensor's own offset was changed meanwhile: call again")
+    if bad := control.count_not_finite() - bad:
+        raise CompensationError(
+            f"the window is spoiled: {bad} of its samples were not finite; see /diagnostics, stream, and "
+            "call again"
+        )
+    return window
+
+
+def _wait_settled(control: CompensationControl, requests: Requests) -> None:
+    """After a sensor has entered OP its data settles, which the server knows."""
+    link = control.link
+    deadline_s = link.clock.monotonic() + _SETTLED_WITHIN_S
+    try:
+        while find_sensor(requests.ask("describe", DESCRIBE_TIMEOUT_S), link.sensor).settling:
+            if link.clock.monotonic() > deadline_s:
+                raise CompensationError(f"sensor {link.sensor} does not settle: see the server's log")
+            link.clock.wait(threading.Event(), _LOOK_S)
+    except RequestFailedError as error:
+        raise CompensationError(str(error)) from None

@@ -9,8 +9,8 @@ from rclpy.node import Node
 from bridge.compensating.bias_keeper import directory_of, expand
 from bridge.compensating.control import CompensationControl
 from bridge.parameters.compensation import AUTO
-from bridge.services.triggers import create_triggers
-from bridge.services.window import take_window
+from bridge.services.bias import take_window
+from bridge.services.sensor import create_triggers
 from bridge.stream.requests import Requests
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified

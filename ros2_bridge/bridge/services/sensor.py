@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 from rclpy.node import Node
+from std_srvs.srv import Trigger
 
 from bridge.parameters.sensor_settings import SettingsParameters
-from bridge.services.triggers import create_triggers
 from bridge.stream.link import Link, RequestFailedError, find_sensor
 from bridge.stream.requests import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, Requests
 from ft_compensation.quantities import AXES
@@ -20,6 +20,23 @@ _FEWEST_SAMPLES, _MOST_SAMPLES = 20, 2000
 _TARE_PATIENCE: Final = 6.0
 """The server may take so many times as long as the samples should: it takes them twice."""
 _TARE_EXTRA_S: Final = 4.0
+
+
+def create_triggers(node: Node, acts: Mapping[str, Callable[[], str]], failure: type[Exception]) -> None:
+    """A service `~/NAME` for each act, which returns what it did; a `failure` says why it was not done."""
+    for name, act in acts.items():
+
+        def answer(_request: Any, response: Any, name: str = name, act: Callable[[], str] = act) -> Any:
+            try:
+                response.message = act()
+                response.success = True
+            except failure as error:
+                response.message = str(error)
+                response.success = False
+                node.get_logger().warning(f"{name} failed: {error}")
+            return response
+
+        node.create_service(Trigger, f"~/{name}", answer)
 
 
 class Services:
