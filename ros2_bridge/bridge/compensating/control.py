@@ -6,17 +6,16 @@ change goes through it, so that it always shows what is in force, or ramped in.
 
 from __future__ import annotations
 
-import contextlib
 import threading
-from collections.abc import Callable, Iterator
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final
 
 from rclpy.node import Node
 
 from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper
-from bridge.compensating.orientations import SourceChoice, source_of
+from bridge.compensating.orientations import SourceChoice
 from bridge.compensating.own_offset import OwnOffset
-from bridge.compensating.tool_sources import IMU_IS_OFF, NoSource, Source
+from bridge.compensating.tool_sources import IMU_IS_OFF, Source
 from bridge.diagnostics.observer import CompensationState
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.declare import LiveParameters
@@ -64,9 +63,8 @@ class CompensationControl:
         self._own_offset = OwnOffset(link)
         self.count_not_finite = count_not_finite
         """Samples so far that were not finite somewhere."""
-        self._next_origin = FROM_PARAMETER
-        self._next_taken: Taken | None = None
-        """Of the bias that is being put in force, where that is a tare."""
+        self._next: tuple[str, Taken | None] = (FROM_PARAMETER, None)
+        """Origin of the bias that is being put in force, and what it was taken with if by a tare."""
         self._choice.check(self.parameters)
         self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
         self._shifting = threading.Lock()
@@ -84,7 +82,7 @@ class CompensationControl:
         ParameterError if it cannot be had.
         """
         self._choice.open(self.parameters, self._model)
-        self.output.stops_on_saturation = self.parameters.on_saturation == "stop"
+        self.output.tune(self.parameters)
         self._make_plan()
 
     def close(self) -> None:
@@ -205,12 +203,7 @@ class CompensationControl:
     def set_bias(self, bias: Wrench, origin: str, taken: Taken | None = None) -> None:
         """Put a bias in force, `taken` by a tare, and keep it if that is asked for."""
         self._own_offset.begin(bias, is_measured=origin in _MEASURED)
-        self._next_taken = taken
-        try:
-            with self._origin(origin):
-                self._live.put(bias=[*bias.values])
-        finally:
-            self._next_taken = None
+        self._put(origin, taken, bias=[*bias.values])
 
     def undo_bias(self) -> Wrench:
         """Go back to the bias before, and return it; CompensationError if there is none."""
@@ -221,23 +214,22 @@ class CompensationControl:
 
     def set_payload(self, payload: Payload, bias: Wrench, accelerometer: Accelerometer | None = None) -> None:
         """Put an identified payload, its bias and the accelerometer's correction in force, all at once."""
-        values: dict[str, object] = {
+        values: dict[str, Any] = {
             "tool_mass": payload.mass,
             "tool_center_of_gravity": [*payload.center],
             "bias": [*bias.values],
         }
         if accelerometer is not None:
             values |= {f"accelerometer.{name}": [*part] for name, part in accelerometer._asdict().items()}
-        with self._origin("identified"):
-            self._live.put(**values)
+        self._put("identified", **values)
 
-    @contextlib.contextmanager
-    def _origin(self, origin: str) -> Iterator[None]:
-        self._next_origin = origin
+    def _put(self, origin: str, taken: Taken | None = None, **values: Any) -> None:
+        """Set parameters, the bias among them."""
+        self._next = origin, taken
         try:
-            yield
+            self._live.put(**values)
         finally:
-            self._next_origin = FROM_PARAMETER
+            self._next = FROM_PARAMETER, None
 
     def _check(self, wanted: CompensationParameters) -> None:
         """ParameterError if they cannot be had here."""
@@ -250,24 +242,25 @@ class CompensationControl:
 
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted
-        if source_of(wanted) != source_of(was):
-            self._open_source()
+        self._open_source()
         self.output.tune(wanted)
         self._ramp.seconds = wanted.bias_ramp_time
-        before = self.bias
+        before, (origin, taken) = self.bias, self._next
         # A parameter that the shift of the bias has not reached yet is no wish.
-        is_wish = self._next_taken is not None or wanted.bias not in (was.bias, before)
+        is_wish = taken is not None or wanted.bias not in (was.bias, before)
         with self._shifting:
             if wanted.payload != was.payload:
                 self._ramp = self._ramp.weighed(wanted.payload)
             if is_wish:
-                self._ramp.go(wanted.bias, self.output.time_s, self._next_taken or Taken())
-                self._own_offset.begin(wanted.bias, is_measured=self._next_origin in _MEASURED)
-                self.origin = self._next_origin
+                self._ramp.go(wanted.bias, self.output.time_s, taken or Taken())
+                self._own_offset.begin(wanted.bias, is_measured=origin in _MEASURED)
+                self.origin = origin
             self._make_plan()
         if wanted.payload != was.payload and not is_wish:
-            self._say_weighed(self.bias.plus(before, -1.0))
-        self.output.stops_on_saturation = wanted.on_saturation == "stop"
+            # The bias of a tare is another one with it.
+            if warning := self._ramp.taken.warning(self.bias.plus(before, -1.0), wanted.payload):
+                self._log.warning(warning)
+            self._guard.trigger()  # the parameter follows
         if self.output.hold is not _LOOKING_UP:
             self._hold()
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
@@ -279,13 +272,6 @@ class CompensationControl:
             self._choice.open(self.parameters, self._model)
         except ParameterError as error:  # too late to refuse the parameter
             self._log.error(str(error))
-            self._choice.source = NoSource(str(error))
-
-    def _say_weighed(self, change: Wrench) -> None:
-        """The payload is another one, and so the bias of a tare, by `change`."""
-        if warning := self._ramp.taken.warning(change, self.parameters.payload):
-            self._log.warning(warning)
-        self._guard.trigger()  # the parameter follows
 
     def _make_plan(self) -> None:
         payload, rest = self.parameters.payload, self.parameters.rest
@@ -315,12 +301,10 @@ class CompensationControl:
             elif is_another:
                 # What was before in its history was the other's too.
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
-                self._make_plan()
-            if self._model != info.name:
-                self._model = info.name
-                self._open_source()
-                self._make_plan()
+            self._model = info.name
+            self._open_source()
             self.sensors += is_another
+            self._make_plan()
             if not self.keeping and self.bias != NO_WRENCH:
                 self._keeper.keep(self._ramp, self.parameters, self._own_offset.to_keep)
         self._follow_offset()
@@ -344,8 +328,6 @@ class CompensationControl:
     def _begin_with(self, begin: Beginning) -> None:
         """Put a bias in force at once, with nothing before it."""
         problem = self.keeping
-        with self._origin(begin.origin):
-            self._ramp = BiasRamp(begin.bias, self.parameters.bias_ramp_time, begin.taken)
-            self._live.put(bias=[*begin.bias.values])
+        self._ramp = BiasRamp(begin.bias, self.parameters.bias_ramp_time, begin.taken)
+        self._put(begin.origin, bias=[*begin.bias.values])
         self.origin, self._keeper.problem = begin.origin, problem
-        self._make_plan()

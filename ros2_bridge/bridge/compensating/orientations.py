@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from bridge.compensating.tool_sources import ImuSource, ListenerSource, NoSource, Oriented, Source
+from bridge.compensating.tool_sources import ImuSource, ListenerSource, Oriented, Source
 from bridge.parameters.compensation import TOPIC_SOURCES, CompensationParameters, OrientationParameters
 from bridge.parameters.row import ParameterError
 from bridge.transforms import Tf, UnusableError, check_tf, follow_tf, look_up, open_tf, stamp_ns
@@ -136,8 +136,10 @@ class SourceChoice:
 
     def __init__(self, node: Node, frame: str) -> None:
         """`frame` is the sensor's, for TF."""
-        self.source: Source = NoSource()
+        self.source: Source = Source()
         self._listener: OrientationListener | None = None
+        self._opened: object = None
+        """What the open source depends on."""
         self._node, self._frame = node, frame
         self._group = MutuallyExclusiveCallbackGroup()
 
@@ -164,19 +166,32 @@ class SourceChoice:
                 )
 
     def open(self, wanted: CompensationParameters, model: str) -> None:
-        """Open the source that is wanted, for a sensor of this model; ParameterError if that cannot be."""
+        """Open the source that is wanted, for a sensor of this model, unless it is open.
+
+        ParameterError if that cannot be; then there is none.
+        """
+        name, listened = wanted.orientation.source, (wanted.orientation, wanted.gravity)
+        position = imu_position(wanted, model)
+        opened = (wanted.accelerometer, position, wanted.payload.center) if name == "imu" else listened
+        if opened == self._opened:
+            return
         self.close()
-        name = wanted.orientation.source
         if name == "none":
-            self.source = NoSource()
+            self.source = Source()
         elif name == "imu":
-            self.source = ImuSource(wanted, imu_position(wanted, model))
+            self.source = ImuSource(wanted, position)
         else:
-            self._listener = OrientationListener(self._node, wanted.orientation, self._frame, self._group)
+            try:
+                self._listener = OrientationListener(self._node, wanted.orientation, self._frame, self._group)
+            except ParameterError as error:
+                self.source = Source(str(error))
+                raise
             self.source = ListenerSource(wanted, self._listener)
+        self._opened = opened
 
     def close(self) -> None:
         """Stop listening for orientations."""
+        self._opened = None
         if self._listener is not None:
             self._listener.close()
             self._listener = None
@@ -187,10 +202,3 @@ def imu_position(wanted: CompensationParameters, model: str) -> Vector3:
     if any(wanted.imu_position):
         return wanted.imu_position
     return 0.0, 0.0, IMU_HEIGHTS.get(model[4:8], 0.0)
-
-
-def source_of(wanted: CompensationParameters) -> tuple[object, ...]:
-    """What a source depends on: with another one it has to be opened anew."""
-    if wanted.orientation.source == "imu":
-        return "imu", wanted.accelerometer, wanted.imu_position, wanted.payload.center
-    return wanted.orientation, wanted.gravity

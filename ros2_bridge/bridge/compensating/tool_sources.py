@@ -24,15 +24,19 @@ class Oriented(NamedTuple):
     stamp_ns: int
 
 
-class Source(Protocol):
-    """The specific force at the tool's center of gravity, m/s² in the sensor's frame."""
+class Source:
+    """The specific force at the tool's center of gravity, m/s² in the sensor's frame. Of this class: none."""
 
-    describe: str
+    describe = "none"
     """Its name for people."""
-    is_imu: bool
+    is_imu = False
     """Whether it is measured, with what the tool accelerates; else it is minus gravity."""
 
-    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:
+    def __init__(self, why: str = "gravity_source is none") -> None:
+        """`why` there is none."""
+        self._why = why
+
+    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """m/s², for this sample; None if what is known is too old, or nothing is.
 
         Args:
@@ -40,40 +44,21 @@ class Source(Protocol):
             time_s: its time by a clock that nobody sets.
             stamp_s: its time by the wall clock, which others stamp their orientations by.
         """
-
-    def why_none(self, sample: Sample, stamp_s: float) -> str:
-        """Why there is none for this sample, a sentence; empty if nothing is known to be wrong."""
-
-    def age_s(self, time_s: float) -> float:
-        """How old the orientation in use is; 0 where there is none."""
-
-
-class NoSource:
-    """There is none: `gravity_source` is `none`, or what it is set to cannot be had."""
-
-    describe = "none"
-    is_imu = False
-
-    def __init__(self, why: str = "gravity_source is none") -> None:
-        self._why = why
-
-    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
-        """None."""
         return None
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
-        """What to do."""
+        """Why there is none for this sample, a sentence; empty if nothing is known to be wrong."""
         return (
             f"{self._why}, so the weight of the tool is not known: set gravity_source to a source, or set "
             "tool_mass to 0"
         )
 
     def age_s(self, time_s: float) -> float:  # noqa: ARG002
-        """Infinite."""
+        """How old the orientation in use is; 0 where every sample brings its own, infinite where none is."""
         return math.inf
 
 
-class ImuSource:
+class ImuSource(Source):
     """The sensor's own accelerometer and gyroscope."""
 
     describe = "imu"
@@ -108,10 +93,8 @@ class Listening(Protocol):
     describe: str
 
 
-class ListenerSource:
+class ListenerSource(Source):
     """A topic or TF: the latest orientation, carried on to the sample's time by the gyroscope."""
-
-    is_imu = False
 
     def __init__(self, parameters: CompensationParameters, listener: Listening) -> None:
         self._listener = listener
@@ -121,7 +104,7 @@ class ListenerSource:
         self.describe = listener.describe
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:
-        """From the latest orientation, if its time is close to the sample's."""
+        """From the latest orientation, if its time is close to the sample\'s."""
         self._turn.follow(sample.angular_rate, time_s)
         latest = self._listener.latest
         if latest is not self._taken and latest is not None:

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from bridge.compensating.tool_sources import NoSource, Source
+from bridge.compensating.tool_sources import Source
 from bridge.parameters.compensation import CompensationParameters
 from bridge.publishing.filtered_wrench import FilteredTopic
 from bridge.publishing.messages import StageTopic
@@ -79,7 +79,7 @@ class CompensatedOutput:
         self._all = topics
         self._wanted: tuple[StageTopic | FilteredTopic, ...] = ()
         self._noting: tuple[StageTopic | FilteredTopic, ...] = ()
-        self.plan = Plan(NoSource(), Compensator(), BiasRamp(), has_tool=False)
+        self.plan = Plan(Source(), Compensator(), BiasRamp(), has_tool=False)
         self.window: RestWindow | None = None
         """The one that is open."""
         self.hold: str | None = None
@@ -116,7 +116,8 @@ class CompensatedOutput:
         return "; ".join(topic.problem for topic in self._wanted if topic.problem)
 
     def tune(self, parameters: CompensationParameters) -> None:
-        """Take what parameters say of single topics; for the executor's thread."""
+        """Take what parameters say of the topics; for the executor's thread."""
+        self.stops_on_saturation = parameters.on_saturation == "stop"
         for topic in self._all:
             topic.tune(parameters)
 
