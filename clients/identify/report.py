@@ -9,8 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from clients.identify.stationary_periods import StationaryPeriod, StationaryPeriods
-from ft_compensation.identification.judgement import Fit
-from ft_compensation.identification.payload import Identified, OffsetFit
+from ft_compensation.identification.payload import Fit, Identified, OffsetFit
 from ft_compensation.identification.poses import Pose
 from ft_compensation.quantities import Wrench
 
