@@ -6,16 +6,16 @@ one.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import tempfile
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from ft_compensation.quantities import CompensationError, Payload, Wrench, vector
+from protocol.errors import FileError
 from protocol.pdo import Vector3
+from protocol.program.new_file import NewFile
 
 _FORMAT: Final = "bota-ethercat-bridge compensation"
 _VERSION: Final = 1
@@ -89,7 +89,11 @@ class CompensationStore:
             content["specific_force"] = list(specific_force)
         try:
             self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-            _replace(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+            with NewFile(path, force=True, mode=0o600) as file:
+                file.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
+                file.finish()
+        except FileError as error:
+            raise StoreError(str(error)) from None
         except OSError as error:
             raise StoreError(f"{path} cannot be written: {error.strerror or error}") from None
         return path
@@ -139,23 +143,3 @@ def _parse(data: bytes, serial: int) -> Stored:
     except ValueError as error:
         raise _ContentError(str(error)) from None
     return Stored(bias, payload, str(content.get("saved", ""))[:40], offset, felt)
-
-
-def _replace(path: Path, text: str) -> None:
-    descriptor, beside = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(beside).replace(path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            Path(beside).unlink()
-        raise
-    # The new name is on disk only when the directory is.
-    directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
