@@ -29,8 +29,6 @@ class Tf(NamedTuple):
     """What a lookup raises."""
     latest: Any
     """The time that stands for the latest there is."""
-    close: Callable[[], object] = lambda: None
-    """Ends listening."""
 
 
 class Pose(NamedTuple):
@@ -69,28 +67,19 @@ def check_tf(wanted: str = "parameter gravity_source is 'tf'", instead: str = "t
         ) from None
 
 
-def open_tf(node: Any) -> Tf:
-    """A buffer that `node` fills from /tf and /tf_static as it spins, in a callback group of tf2_ros's."""
+def follow_tf(node: Node, group: CallbackGroup, look: Callable[[Tf], object]) -> Callable[[], None]:
+    """Listen to TF, in a callback group of tf2_ros's, and call `look` every TF_PERIOD_S, until what is
+    returned is called."""
     from rclpy.time import Time  # noqa: PLC0415
     from tf2_ros import Buffer, TransformException, TransformListener  # noqa: PLC0415 - see check_tf
 
     buffer = Buffer()
     listener = TransformListener(buffer, node, spin_thread=False)
-    return Tf(buffer, TransformException, Time(), listener.unregister)
-
-
-def follow_tf(
-    node: Node,
-    group: CallbackGroup,
-    look: Callable[[Tf], object],
-    open_buffer: Callable[[Node], Tf] = open_tf,
-) -> Callable[[], None]:
-    """Listen to TF, and call `look` every TF_PERIOD_S, until what is returned is called."""
-    tf = open_buffer(node)
+    tf = Tf(buffer, TransformException, Time())
     timer = node.create_timer(TF_PERIOD_S, lambda: look(tf), group)
 
     def close() -> None:
         node.destroy_timer(timer)
-        tf.close()
+        listener.unregister()
 
     return close

@@ -9,7 +9,6 @@ import math
 import sys
 import threading
 import time
-import types
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -18,7 +17,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 import rclpy
-from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
@@ -28,11 +27,12 @@ from bridge.compensating.tool_sources import ListenerSource, Oriented
 from bridge.node import StartError
 from bridge.parameters.compensation import CompensationParameters, OrientationParameters
 from bridge.parameters.row import ParameterError
-from bridge.transforms import Pose, Tf, UnusableError, check_tf, look_up, open_tf
+from bridge.transforms import check_tf
 from ft_compensation.quantities import length, unit_quaternion
 from protocol.text.json_text import JsonObject
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, is_near, weight
 from tests.bridge.conftest import listening, retire, wait_until
+from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.bridge.streaming import values
 from tests.compensation.making import BIAS, TOOL, sample
@@ -323,42 +323,7 @@ def test_tf_that_is_missing_is_told_at_start(monkeypatch: pytest.MonkeyPatch) ->
         SimulatedNode(SimulatedServer(), gravity_source="tf")
 
 
-# TF, by a buffer that is handed in: tf2_ros is not on PyPI.
-
-
-class FakeTfError(Exception):
-    """What a lookup raises."""
-
-
-class FakeBuffer:
-    """A `tf2_ros.Buffer` that knows one transform."""
-
-    def __init__(self) -> None:
-        self.quaternion = UPRIGHT
-        self.stamp_ns = 0
-        self.error: str | None = "frame does not exist"
-        self.asked: list[tuple[str, str, Any]] = []
-
-    def lookup_transform(self, target_frame: str, source_frame: str, time_: Any) -> Any:
-        self.asked.append((target_frame, source_frame, time_))
-        if self.error:
-            raise FakeTfError(self.error)
-        found = TransformStamped()
-        found.header.stamp.sec, found.header.stamp.nanosec = divmod(self.stamp_ns, 10**9)
-        r = found.transform.rotation
-        r.x, r.y, r.z, r.w = self.quaternion
-        return found
-
-
-def test_tf_is_asked_for_the_sensor_in_the_base() -> None:
-    buffer = FakeBuffer()
-    tf = Tf(buffer, FakeTfError, "latest", lambda: None)
-    with pytest.raises(UnusableError, match="TF has no pose of ft_sensor in base_link: frame does not exist"):
-        look_up(tf, "base_link", "ft_sensor")
-    buffer.error, buffer.quaternion, buffer.stamp_ns = None, TILTED, 12_000_000_345
-    found = look_up(tf, "base_link", "ft_sensor")
-    assert found == Pose((0.0, 0.0, 0.0), pytest.approx(TILTED), 12_000_000_345)  # type: ignore[arg-type]
-    assert buffer.asked[-1] == ("base_link", "ft_sensor", "latest")
+# TF.
 
 
 @pytest.fixture
@@ -368,45 +333,54 @@ def ros_node(_ros: None) -> Iterator[Node]:
     made.destroy_node()
 
 
-def tf_of(buffer: Any, closed: Callable[[], object] = lambda: None) -> Callable[[Node], Tf]:
-    """What opens a buffer that is there already."""
-    return lambda _node: Tf(buffer, FakeTfError, "latest", closed)
-
-
-def test_the_source_tf(ros_node: Node) -> None:
-    buffer = FakeBuffer()
-    closed = threading.Event()
+def test_the_source_tf(ros_node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    tf = FakeTf(monkeypatch)
+    check_tf()
     chosen = OrientationParameters("tf", base_frame="world", mounting=ROLLED, stale_after=0.5)
-    group = MutuallyExclusiveCallbackGroup()
-    opened = OrientationListener(ros_node, chosen, "ft", group, tf_of(buffer, closed.set))
+    opened = OrientationListener(ros_node, chosen, "ft", MutuallyExclusiveCallbackGroup())
     with listening(ros_node) as raised:
         source = ListenerSource(CompensationParameters(orientation=chosen), opened)
 
         def felt(time_s: float) -> Any:
             return source.specific_force(sample(), time_s, time_s)
 
-        wait_until(lambda: buffer.asked, "a lookup")
+        wait_until(lambda: tf.asked, "a lookup")
+        assert set(tf.asked) == {("world", "ft")}
         assert felt(1000.0) is None
         words = "no orientation from TF from world to ft: TF has no pose of ft in world: frame does not exist"
         wait_until(lambda: source.why_none(sample(), 1000.0) == words, words)
-        buffer.quaternion, buffer.stamp_ns = TILTED, 1000 * 10**9
-        buffer.error = None
+        tf.quaternion, tf.stamp_ns, tf.error = TILTED, lambda: 1000 * 10**9, None
         wait_until(lambda: felt(1000.0) is not None, "a specific force")
         # The frames say all, so `mounting` is not for TF.
         assert felt(1000.0) == pytest.approx((9.80665, 0.0, 0.0))
         assert felt(1000.6) is None
         assert "older than the sample (limit 0.5 s)" in source.why_none(sample(), 1000.6)
-        buffer.error = "the tree fell apart"
+        tf.error = "the tree fell apart"
         wait_until(lambda: "the tree fell apart" in source.why_none(sample(), 1000.6), "the reason")
-        buffer.stamp_ns = 1001 * 10**9
-        buffer.error = None
+        tf.stamp_ns, tf.error = lambda: 1001 * 10**9, None
         wait_until(lambda: felt(1001.0) is not None, "one again")
-        buffer.stamp_ns = 0  # static transforms only: they hold at any time
+        tf.stamp_ns = lambda: 0  # static transforms only: they hold at any time
         wait_until(lambda: felt(time.time()) is not None, "what is always so")
+        assert tf.listening == 1
         opened.close()
-    assert closed.is_set()
+    assert tf.listening == 0
     assert not raised
     assert not list(ros_node.timers)
+
+
+def test_a_source_that_fails_ends_the_executor(ros_node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> int:
+        raise LookupError("unforeseen")
+
+    tf = FakeTf(monkeypatch)
+    tf.error, tf.stamp_ns = None, fail
+    opened = OrientationListener(
+        ros_node, OrientationParameters("tf"), "ft", MutuallyExclusiveCallbackGroup()
+    )
+    with listening(ros_node) as raised:
+        wait_until(lambda: raised, "the failure")
+    assert str(raised[0]) == "unforeseen"
+    opened.close()
 
 
 @pytest.mark.usefixtures("_ros")
@@ -418,47 +392,6 @@ def test_topics_are_remapped_as_those_of_the_node_are() -> None:
     assert by_topic.describe == "topic /left/pose"
     by_topic.close()
     node.destroy_node()
-
-
-def test_a_source_that_fails_ends_the_executor(ros_node: Node) -> None:
-    class Broken:
-        def lookup_transform(self, target_frame: str, source_frame: str, time: Any) -> Any:
-            raise LookupError("unforeseen")
-
-    group = MutuallyExclusiveCallbackGroup()
-    opened = OrientationListener(ros_node, OrientationParameters("tf"), "ft", group, tf_of(Broken()))
-    with listening(ros_node) as raised:
-        wait_until(lambda: raised, "the failure")
-    assert str(raised[0]) == "unforeseen"
-    opened.close()
-
-
-def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node: Node) -> None:
-    """What of tf2_ros is used, by its public names: a stand-in with the same signatures."""
-    made: list[Any] = []
-
-    class Buffer:
-        def __init__(self, cache_time: Any = None, node: Any = None) -> None:
-            made.append(self)
-
-    class TransformListener:
-        def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
-            made.append((buffer, node, spin_thread))
-
-        def unregister(self) -> None:
-            made.append("unregistered")
-
-    names = {"Buffer": Buffer, "TransformListener": TransformListener, "TransformException": FakeTfError}
-    module = types.ModuleType("tf2_ros")
-    vars(module).update(names)
-    monkeypatch.setitem(sys.modules, "tf2_ros", module)
-    check_tf()
-    tf = open_tf(ros_node)
-    assert isinstance(tf.buffer, Buffer)
-    assert tf.errors is FakeTfError
-    assert tf.latest.nanoseconds == 0
-    tf.close()
-    assert made == [tf.buffer, (tf.buffer, ros_node, False), "unregistered"]
 
 
 def test_without_tf2_ros(monkeypatch: pytest.MonkeyPatch) -> None:

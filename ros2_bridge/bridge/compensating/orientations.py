@@ -21,7 +21,7 @@ from sensor_msgs.msg import Imu
 from bridge.compensating.tool_sources import ImuSource, ListenerSource, Oriented, Source
 from bridge.parameters.compensation import TOPIC_SOURCES, CompensationParameters, OrientationParameters
 from bridge.parameters.row import ParameterError
-from bridge.transforms import Tf, UnusableError, check_tf, follow_tf, look_up, open_tf, stamp_ns
+from bridge.transforms import Tf, UnusableError, check_tf, follow_tf, look_up, stamp_ns
 from ft_compensation.quantities import Quaternion, unit_quaternion
 from protocol.pdo import Vector3
 from protocol.sensor.frames import IMU_HEIGHTS
@@ -63,14 +63,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 class OrientationListener:
     """From construction to `close`. Read `latest` and `problem` from any thread: they are replaced."""
 
-    def __init__(
-        self,
-        node: Node,
-        chosen: OrientationParameters,
-        frame: str,
-        group: CallbackGroup,
-        open_buffer: Callable[[Node], Tf] = open_tf,
-    ) -> None:
+    def __init__(self, node: Node, chosen: OrientationParameters, frame: str, group: CallbackGroup) -> None:
         """`chosen.source` is a key of TOPIC_KINDS, or `tf`: then `frame` is the sensor's.
 
         ParameterError if ROS refuses to listen there.
@@ -91,7 +84,7 @@ class OrientationListener:
             return Oriented(rotation, stamp or time.time_ns())  # static transforms hold at any time, so now
 
         self.describe = f"TF from {chosen.base_frame} to {frame}"
-        self.close = follow_tf(node, group, lambda tf: self._take(lambda: read(tf)), open_buffer)
+        self.close = follow_tf(node, group, lambda tf: self._take(lambda: read(tf)))
 
     def _subscribe(self, node: Node, chosen: OrientationParameters, group: CallbackGroup) -> None:
         kind, find = TOPIC_KINDS[chosen.source]
