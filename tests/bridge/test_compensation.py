@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 from ft_compensation.quantities import Payload
 from protocol.control import Event, event
 from protocol.framing import DataFlag
-from protocol.pdo import STANDARD_GRAVITY, encode
+from protocol.pdo import STANDARD_GRAVITY
 from tests.bridge.compensating import (
     OVER,
     QUICK,
@@ -271,36 +271,12 @@ def test_a_tare_is_refused(
     assert list(node.parameters("bias")[0]) == ZERO6
 
 
-def test_a_tare_while_the_force_moves_is_refused(
-    stages: Stages, server: SimulatedServer, node: SimulatedNode
-) -> None:
-    still, pushed = sensed(UP), sensed(UP, force_y=9.0)
-    for position in range(100):
-        server.once(process_data=pushed if position // 3 % 2 else still)
-    done, text = node.trigger("tare")
-    assert not done
-    assert "the sensor is not stationary: force y moved by" in text
-    assert list(node.parameters("bias")[0]) == ZERO6
-
-
 def every_other(server: SimulatedServer, **bad: Any) -> None:
     """Every other sample of the next second is so."""
     good = server.changes
     for _ in range(50):
         server.once(**good)
         server.once(**{**good, **bad})
-
-
-def test_a_saturated_sample_spoils_a_tare(
-    stages: Stages, server: SimulatedServer, node: SimulatedNode
-) -> None:
-    mask = encode(61, {"force_torque_saturated": 4})
-    saturated = bytes(a | b for a, b in zip(sensed(UP), mask, strict=True))
-    for position in range(30):
-        server.once(process_data=saturated if position == 15 else sensed(UP))
-    done, text = node.trigger("tare")
-    assert not done
-    assert "force or torque was saturated" in text
 
 
 def test_a_sample_that_is_not_finite_spoils_a_tare(

@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import KeyValue
 from std_srvs.srv import Trigger
 
 from bridge.node import SERVER_GOES_ON, SUPERVISOR_TOPIC, run
-from tests.bridge.conftest import Listener, NodeProcess, Start, StartProcess, establish, wait_until
+from tests.bridge.conftest import Listener, Start, StartProcess, establish, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 
@@ -42,21 +42,6 @@ def test_waits_for_the_server_and_finds_it_again(listener: Listener, start: Star
     assert node.log.count("connected again") == 1
     node.finish()
     assert node.ends() == 0
-
-
-def test_the_supervisor_shuts_the_server_down_and_ends_the_node(
-    server: ScriptedServer, listener: Listener, start: Start
-) -> None:
-    node = start(server.port)
-    node.says("connected to")
-    for key, value in (("ft_sensors", "0"), ("camera", "1"), ("ft_sensors", "11")):
-        listener.supervise(key, value)
-    listener.supervise("ft_sensors", "1")
-    assert node.ends() == 0
-    actions = [request["action"] for request in server.requests]
-    assert actions[:2] == ["describe", "subscribe"]
-    assert actions.count("shutdown") == 1
-    assert "is shutting down" in node.log
 
 
 @pytest.mark.parametrize(
@@ -194,14 +179,6 @@ def test_topics_that_cannot_be_made_are_one_sentence(
     assert "Traceback" not in node.log
 
 
-def test_a_wrong_setting_at_start_is_one_sentence(start: Start) -> None:
-    node = start(12001, **{"settings.acceleration_range_g": 3})
-    assert node.ends() == 2
-    (line,) = node.log.splitlines()
-    assert line.startswith("bridge-client: parameter settings.acceleration_range_g: ")
-    assert "2, 4, 8, 16" in line
-
-
 def test_arguments_that_are_not_understood(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (["dance"], ["--ros-args", "-p"]):
         assert run(arguments) == 2
@@ -219,14 +196,6 @@ def test_without_a_home_it_says_what_to_set(
     node = start_process(12001)
     assert node.ends() == 1
     assert "set HOME, or ROS_LOG_DIR to a directory for its log" in node.log.splitlines()[-1]
-
-
-def test_help() -> None:
-    """In a process: the program blocks signals before anything else."""
-    node = NodeProcess("--help")
-    assert node.ends() == 0
-    assert node.log.startswith("usage: ros2 run bridge client")
-    node.close()
 
 
 def test_a_signal_while_it_starts_is_no_traceback(
