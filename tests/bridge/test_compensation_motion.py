@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 from bridge.compensating.tool_sources import ListenerSource, Oriented
-from bridge.parameters.compensation import CompensationParameters
+from bridge.parameters.compensation import DEFAULTS
 from ft_compensation.bias import force_bound_95
 from ft_compensation.quantities import Accelerometer, Payload
 from protocol.pdo import STANDARD_GRAVITY, encode
@@ -138,7 +138,7 @@ def test_an_orientation_of_a_topic_is_carried_on_to_the_sample(set_by_s: float) 
     """The robot turns by 2 rad/s about x and tells its pose 20 ms late, twenty times a second; meanwhile the
     wall clock, by which poses are stamped, is set."""
     listening: Any = Pose()
-    source, speed, begin_s, wall_s = ListenerSource(CompensationParameters(), listening), 2.0, 1000.0, 1e9
+    source, speed, begin_s, wall_s = ListenerSource(DEFAULTS, listening), 2.0, 1000.0, 1e9
     for step in range(100):
         t = step * 0.01
         if step == 50:

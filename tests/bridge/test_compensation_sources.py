@@ -25,7 +25,7 @@ from sensor_msgs.msg import Imu
 from bridge.compensating.orientations import OrientationListener, multiply
 from bridge.compensating.tool_sources import ListenerSource, Oriented
 from bridge.node import StartError
-from bridge.parameters.compensation import CompensationParameters, OrientationParameters
+from bridge.parameters.compensation import DEFAULTS
 from bridge.parameters.row import ParameterError
 from bridge.transforms import check_tf
 from ft_compensation.quantities import length, unit_quaternion
@@ -336,10 +336,10 @@ def ros_node(_ros: None) -> Iterator[Node]:
 def test_the_source_tf(ros_node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
     tf = FakeTf(monkeypatch)
     check_tf()
-    chosen = OrientationParameters("tf", base_frame="world", mounting=ROLLED, stale_after=0.5)
+    chosen = DEFAULTS.orientation._replace(source="tf", base_frame="world", mounting=ROLLED, stale_after=0.5)
     opened = OrientationListener(ros_node, chosen, "ft", MutuallyExclusiveCallbackGroup())
     with listening(ros_node) as raised:
-        source = ListenerSource(CompensationParameters(orientation=chosen), opened)
+        source = ListenerSource(DEFAULTS._replace(orientation=chosen), opened)
 
         def felt(time_s: float) -> Any:
             return source.specific_force(sample(), time_s, time_s)
@@ -375,7 +375,7 @@ def test_a_source_that_fails_ends_the_executor(ros_node: Node, monkeypatch: pyte
     tf = FakeTf(monkeypatch)
     tf.error, tf.stamp_ns = None, fail
     opened = OrientationListener(
-        ros_node, OrientationParameters("tf"), "ft", MutuallyExclusiveCallbackGroup()
+        ros_node, DEFAULTS.orientation._replace(source="tf"), "ft", MutuallyExclusiveCallbackGroup()
     )
     with listening(ros_node) as raised:
         wait_until(lambda: raised, "the failure")
@@ -388,7 +388,9 @@ def test_topics_are_remapped_as_those_of_the_node_are() -> None:
     remaps = ["--ros-args", "-r", "pose:=/left/pose"]
     node = rclpy.create_node("bridge", namespace="/test_remap", cli_args=remaps)
     group = MutuallyExclusiveCallbackGroup()
-    by_topic = OrientationListener(node, OrientationParameters("topic_pose", "pose"), "ft", group)
+    by_topic = OrientationListener(
+        node, DEFAULTS.orientation._replace(source="topic_pose", topic="pose"), "ft", group
+    )
     assert by_topic.describe == "topic /left/pose"
     by_topic.close()
     node.destroy_node()
@@ -410,7 +412,7 @@ def test_a_clock_that_goes_back_does_not_stop_a_source_for_ever() -> None:
         describe = "topic /x"
 
     listening = Listening()
-    source = ListenerSource(CompensationParameters(), listening)
+    source = ListenerSource(DEFAULTS, listening)
     assert source.specific_force(sample(), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, 9.80665))
     listening.latest = Oriented(TILTED, 100 * 10**9)
     assert source.specific_force(sample(), 100.0, 100.0) == pytest.approx((9.80665, 0.0, 0.0))

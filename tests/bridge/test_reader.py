@@ -9,12 +9,12 @@ from typing import Any, cast
 
 import pytest
 
-from bridge.parameters.table import Parameters
+from bridge.parameters.table import DEFAULTS
 from bridge.stream.link import sentence
 from bridge.stream.reader import Reader
 from protocol.errors import ConnectionFailedError, UnreachableError
 from protocol.framing import DataMessage, FrameDecoder, encode_data, encode_json
-from protocol.pdo import ImuUnits, Sample, encode
+from protocol.pdo import Sample, encode
 from protocol.text.json_text import JsonObject
 from tests.bridge.conftest import Log, wait_until
 from tests.bridge.scripted_server import description, process_data
@@ -140,7 +140,7 @@ class Bench:
         self.log = Log(None)
         self.failures: list[str] = []
         self.channel = Memory(self.clock, attempts)
-        chosen = Parameters("localhost", 12001, 0, 0.0, "array", ImuUnits.G_DPS)._replace(**parameters)
+        chosen = DEFAULTS._replace(**parameters)
         self.reader = Reader(
             chosen, self.outputs, self.log, self.failures.append, channel=self.channel, clock=self.clock
         )

@@ -92,30 +92,30 @@ ROWS: Final = tuple(row._replace(live=True) for row in _TABLE)
 class OrientationParameters(NamedTuple):
     """Where the orientation comes from."""
 
-    source: str = "imu"
-    topic: str = "orientation"
-    base_frame: str = "base_link"
-    mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
-    stale_after: float = 0.1
+    source: str
+    topic: str
+    base_frame: str
+    mounting: Quaternion
+    stale_after: float
 
 
 class CompensationParameters(NamedTuple):
     """The values, checked."""
 
-    payload: Payload = Payload()
-    gravity: Vector3 = DEFAULT_GRAVITY
-    bias: Wrench = Wrench(ZERO, ZERO)
-    bias_ramp_time: float = 0.5
-    bias_keep: bool = False
-    bias_directory: str = AUTO
-    imu_position: Vector3 = ZERO
-    on_saturation: str = "publish"
-    orientation: OrientationParameters = OrientationParameters()
-    accelerometer: Accelerometer = EXACT
-    rest_duration: float = 1.0
-    rest: StationaryLimits = _REST
-    identify_file: str = AUTO
-    filter: FilterSettings = FilterSettings()
+    payload: Payload
+    gravity: Vector3
+    bias: Wrench
+    bias_ramp_time: float
+    bias_keep: bool
+    bias_directory: str
+    imu_position: Vector3
+    on_saturation: str
+    orientation: OrientationParameters
+    accelerometer: Accelerometer
+    rest_duration: float
+    rest: StationaryLimits
+    identify_file: str
+    filter: FilterSettings
 
 
 def gather(values: Mapping[str, Any]) -> CompensationParameters:
@@ -147,15 +147,11 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
                 f"parameter {name} is {values[name]:g}: it must be 0, for none, or at least {least:g} Hz"
             )
     orientation = group("orientation.") | {"mounting": mounting}
+    names = set(CompensationParameters._fields) & values.keys() - {"bias"}
     return CompensationParameters(
+        **{name: values[name] for name in names},
         payload=Payload(values["tool_mass"], values["tool_center_of_gravity"]),
-        gravity=gravity,
         bias=Wrench.of(values["bias"]),
-        bias_ramp_time=values["bias_ramp_time"],
-        bias_keep=values["bias_keep"],
-        bias_directory=values["bias_directory"],
-        imu_position=values["imu_position"],
-        on_saturation=values["on_saturation"],
         orientation=OrientationParameters(values["gravity_source"], **orientation),
         accelerometer=Accelerometer(**group("accelerometer.")),
         rest_duration=duration,
@@ -163,3 +159,6 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
         identify_file=values["identify.file"],
         filter=FilterSettings(**group("filter.")),
     )
+
+
+DEFAULTS: Final = gather({row.name: row.default for row in ROWS})

@@ -62,7 +62,7 @@ def costs(setup: Setup) -> Costs:
     from rclpy.context import Context  # noqa: PLC0415
 
     from bridge.compensating.tool_sources import ImuSource  # noqa: PLC0415
-    from bridge.parameters.compensation import CompensationParameters  # noqa: PLC0415
+    from bridge.parameters.compensation import DEFAULTS  # noqa: PLC0415
     from bridge.publishing.compensated_wrench import CompensatedOutput, Plan, RestWindow  # noqa: PLC0415
     from bridge.publishing.messages import make_stages  # noqa: PLC0415
 
@@ -83,7 +83,7 @@ def costs(setup: Setup) -> Costs:
         output = CompensatedOutput(make_stages(node, "ft"))
 
         def measure(name: str, *, window: bool) -> None:
-            source = ImuSource(CompensationParameters(payload=_TOOL), (0.0, 0.0, -0.0257))
+            source = ImuSource(DEFAULTS._replace(payload=_TOOL), (0.0, 0.0, -0.0257))
             output.plan = Plan(source, Compensator(_TOOL), BiasRamp(_BIAS), has_tool=True)
             output.window = RestWindow(1e9, StationaryLimits(), source) if window else None
             before = output.published
