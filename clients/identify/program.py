@@ -18,9 +18,8 @@ from clients.program import discard_output, say
 from clients.recording.columns import columns
 from clients.recording.reader import RecordedSensor, Recording, open_recording
 from ft_compensation.identification.parameter_file import write_yaml
-from ft_compensation.identification.payload import Identified, identify
+from ft_compensation.identification.payload import Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
-from ft_compensation.identification.session import summary
 from ft_compensation.quantities import CompensationError
 from protocol.errors import FileError
 from protocol.pdo import STANDARD_GRAVITY

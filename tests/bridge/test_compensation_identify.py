@@ -185,7 +185,7 @@ def test_a_pose_that_is_no_good_is_not_taken(
     assert "pose 2 taken" in take(SIDE)
     done, text = started.trigger("identify/drop_pose")
     assert done
-    assert "1 are left" in text
+    assert "1 are left; not enough yet" in text
     assert "pose 2 taken" in take(OVER)
 
 

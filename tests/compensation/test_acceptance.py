@@ -17,7 +17,7 @@ from ethercat_server.virtual_sensor.measurement.motion import TURN_LENGTH
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ft_compensation.bias import estimate_bias
 from ft_compensation.compensator import Compensator
-from ft_compensation.identification.payload import Identified
+from ft_compensation.identification.payload import Identified, identify
 from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.specific_force import ImuSpecificForce
 from ft_compensation.stationary import NotStationaryError, StationaryMeans, StationaryWindow
@@ -76,7 +76,7 @@ def smooth(left: Rows, count: int = 40) -> Rows:
 
 @pytest.fixture(scope="module")
 def identified() -> Identified:
-    return take_poses(samples("poses", POSES_TAKE, part=STILL)).solve()
+    return identify(take_poses(samples("poses", POSES_TAKE, part=STILL)))
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def check_identified(found: Identified) -> None:
 def test_six_poses_give_mass_within_one_percent_and_centre_within_two_millimetres(
     seed: int, sinc: int
 ) -> None:
-    found = take_poses(samples("poses", POSES_TAKE, seed, sinc, STILL)).solve()
+    found = identify(take_poses(samples("poses", POSES_TAKE, seed, sinc, STILL)))
     check_identified(found)
     assert found.bias.force == pytest.approx(OFFSET[:3], abs=0.1)
     assert found.bias.torque == pytest.approx(OFFSET[3:], abs=0.002)
@@ -195,7 +195,7 @@ def test_through_the_server_bias_contact_and_the_beginning_of_a_turn() -> None:
 @pytest.mark.long
 def test_through_the_server_identification_contact_and_a_full_turn() -> None:
     bench = Bench()
-    found = take_poses(bench.stream("poses", POSES_TAKE)).solve()
+    found = identify(take_poses(bench.stream("poses", POSES_TAKE)))
     check_identified(found)
     check_turn(bench, found.payload, found.bias, TURN_LENGTH)
     check_contact(bench, found.payload, found.bias)

@@ -289,3 +289,26 @@ def offset_notes(undetermined: str) -> Iterator[str]:
             f"the poses do not determine the accelerometer's offset along {' and '.join(undetermined)}, so "
             "nearly none is assumed there: take poses with that axis once up and once down"
         )
+
+
+def summary(result: Identified) -> str:
+    """The answer in one sentence with its confidence interval, and the notes as further ones."""
+    x, y, z = (1000.0 * part for part in result.payload.center)
+    ix, iy, iz = (1000.0 * part for part in result.centre_interval)
+    text = (
+        f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, center of gravity ({x:.2f} ± "
+        f"{ix:.2f}, {y:.2f} ± {iy:.2f}, {z:.2f} ± {iz:.2f}) mm ({100 * result.confidence:g} % confidence) "
+        f"from {result.coverage.poses} poses; residual {result.force_rms:.2g} N "
+        f"({result.force_fit.verdict}), {result.torque_rms:.2g} Nm ({result.torque_fit.verdict})"
+    )
+    return ". ".join([text, *result.notes])
+
+
+def accelerometer_text(fit: OffsetFit) -> str:
+    """Offset and sensitivities of the accelerometer with their confidence intervals, a sentence."""
+    found = fit.calibration
+    axes = zip("xyz", found.offset, found.offset_interval, strict=True)
+    offset = ", ".join(f"{axis} {value:.3f} ± {half:.3f}" for axis, value, half in axes)
+    axes = zip("xyz", found.scale, found.scale_interval, strict=True)
+    scale = ", ".join(f"{axis} {value:.4f} ± {half:.4f}" for axis, value, half in axes)
+    return f"Accelerometer: offset {offset} m/s², scale {scale}"

@@ -88,6 +88,13 @@ class Coverage(NamedTuple):
     next_pose: str
     """What to do next, a sentence."""
 
+    @property
+    def advice(self) -> str:
+        """What is missing and what to do next, a sentence."""
+        if self.missing is None:
+            return f"the poses suffice; one more would help most: {self.next_pose}"
+        return f"not enough yet: {self.missing}; {self.next_pose}"
+
 
 def directions(poses: Sequence[Pose]) -> NDArray[np.float64]:
     """Where gravity points in the sensor's frame: (n, 3), length 1."""
