@@ -1,6 +1,6 @@
 """What the compensation is to do: parameters made into a `Plan`, the bias with its history, the source.
 
-Lives in the executor's thread, but for `link_changed` and `cancel`. The parameter `bias` is the bias: every
+Lives in the executor's thread, but for `link_changed`. The parameter `bias` is the bias: every
 change goes through it, so that it always shows what is in force, or ramped in.
 """
 
@@ -54,7 +54,6 @@ class CompensationControl:
         """Where the bias in force comes from."""
         self.sensors = 1
         """How many have been there: what was measured on one is of no use with another."""
-        self.ending = False
         self._model = ""
         """Of the sensor that is or was there."""
         self._log = node.get_logger()
@@ -88,10 +87,6 @@ class CompensationControl:
     def close(self) -> None:
         """Stop listening for orientations."""
         self._choice.close()
-
-    def cancel(self) -> None:
-        """Make whoever waits for samples give up; from any thread: the node ends."""
-        self.ending = True
 
     def link_changed(self) -> None:
         """There is another connection, or none; for the reader's thread."""

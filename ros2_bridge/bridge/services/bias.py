@@ -10,8 +10,7 @@ from rclpy.node import Node
 from bridge.compensating.control import CompensationControl
 from bridge.publishing.compensated_wrench import RestWindow
 from bridge.services.sensor import create_triggers
-from bridge.stream.link import RequestFailedError, find_sensor
-from bridge.stream.requests import DESCRIBE_TIMEOUT_S, Requests
+from bridge.stream.link import DESCRIBE_TIMEOUT_S, Link, RequestFailedError, find_sensor
 from ft_compensation.bias import Taken, check_at_rest, estimate_bias
 from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, length, wrench_text
 from protocol.pdo import Vector3
@@ -25,15 +24,15 @@ _SETTLED_WITHIN_S: Final = 10.0
 class BiasServices:
     """A tare blocks the executor for `rest.duration`, and never the stream."""
 
-    def __init__(self, node: Node, control: CompensationControl, requests: Requests) -> None:
-        self._control, self._requests, self._log = control, requests, node.get_logger()
+    def __init__(self, node: Node, control: CompensationControl) -> None:
+        self._control, self._log = control, node.get_logger()
         acts = {"tare": self._tare, "clear_tare": self._clear, "undo_tare": self._undo}
         create_triggers(node, acts, CompensationError)
 
     def _tare(self) -> str:
         control = self._control
         payload = control.parameters.payload
-        window = take_window(control, self._requests, needs_tool=payload.mass > 0)
+        window = take_window(control, needs_tool=payload.mass > 0)
         means = window.means()
         try:
             felt: Vector3 | None = self._specific_force(window)
@@ -74,7 +73,7 @@ class BiasServices:
         return text
 
 
-def take_window(control: CompensationControl, requests: Requests, *, needs_tool: bool) -> RestWindow:
+def take_window(control: CompensationControl, *, needs_tool: bool) -> RestWindow:
     """The samples of the next `rest.duration`, whole, once the sensor's data has settled; blocks the caller
     and never the stream.
 
@@ -85,7 +84,7 @@ def take_window(control: CompensationControl, requests: Requests, *, needs_tool:
     link = control.link
     if not link.is_connected:
         raise CompensationError(f"{link.absence}, so there are no samples")
-    _wait_settled(control, requests)
+    _wait_settled(link)
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
     window = RestWindow(seconds, limits, control.source)
     patience_s = 1.5 * seconds + _PATIENCE_S
@@ -95,7 +94,7 @@ def take_window(control: CompensationControl, requests: Requests, *, needs_tool:
     control.output.window = window
     try:
         while not clock.wait(window.done, _LOOK_S):
-            if control.ending:
+            if link.ending:
                 raise CompensationError("the node ends")
             if clock.monotonic() > deadline_s:
                 raise CompensationError(
@@ -116,12 +115,11 @@ def take_window(control: CompensationControl, requests: Requests, *, needs_tool:
     return window
 
 
-def _wait_settled(control: CompensationControl, requests: Requests) -> None:
+def _wait_settled(link: Link) -> None:
     """After a sensor has entered OP its data settles, which the server knows."""
-    link = control.link
     deadline_s = link.clock.monotonic() + _SETTLED_WITHIN_S
     try:
-        while find_sensor(requests.ask("describe", DESCRIBE_TIMEOUT_S), link.sensor).settling:
+        while find_sensor(link.ask("describe", DESCRIBE_TIMEOUT_S), link.sensor).settling:
             if link.clock.monotonic() > deadline_s:
                 raise CompensationError(f"sensor {link.sensor} does not settle: see the server's log")
             link.clock.wait(threading.Event(), _LOOK_S)

@@ -11,7 +11,6 @@ from bridge.compensating.control import CompensationControl
 from bridge.parameters.compensation import AUTO
 from bridge.services.bias import take_window
 from bridge.services.sensor import create_triggers
-from bridge.stream.requests import Requests
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
 from ft_compensation.identification.poses import Pose, coverage, pose_of
@@ -22,8 +21,8 @@ from protocol.errors import FileError
 class IdentifyServices:
     """One identification at a time. A pose blocks the executor for `rest.duration`, and never the stream."""
 
-    def __init__(self, node: Node, control: CompensationControl, requests: Requests) -> None:
-        self._control, self._requests, self._log = control, requests, node.get_logger()
+    def __init__(self, node: Node, control: CompensationControl) -> None:
+        self._control, self._log = control, node.get_logger()
         self._poses: list[Pose] | None = None
         """Those taken so far; None: no identification was started."""
         self._sensor = self._sensor_now()
@@ -54,7 +53,7 @@ class IdentifyServices:
 
     def _add_pose(self) -> str:
         poses = self._started()
-        window = take_window(self._control, self._requests, needs_tool=True)
+        window = take_window(self._control, needs_tool=True)
         means = window.means()
         x, y, z = window.specific_force()
         magnitude = length(self._control.parameters.gravity)

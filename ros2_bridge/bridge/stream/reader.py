@@ -32,16 +32,6 @@ _LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
 _WARN_EVERY_S: Final = 10.0
 
 
-class Log(Protocol):
-    """The part of a ROS logger that is used here."""
-
-    def info(self, message: str) -> Any:
-        """Log what happened."""
-
-    def warning(self, message: str) -> Any:
-        """Log what is not as it should be."""
-
-
 class Outputs(Protocol):
     """What the samples go to: `bridge.publishing.messages.Outputs`."""
 
@@ -63,7 +53,7 @@ class Reader:
         self,
         parameters: Parameters,
         outputs: Outputs,
-        log: Log,
+        log: Any,
         on_failure: Callable[[str], object],
         *,
         channel: Channel | None = None,
