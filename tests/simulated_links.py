@@ -21,7 +21,7 @@ import pytest
 from ethercat_server.access import private_server, raw, sensors
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.acquisition.start_up import AsFound, Wanted
-from ethercat_server.doctor.bus import examination
+from ethercat_server.doctor import bus_checks
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import ByPosition
@@ -120,7 +120,7 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     bus = SimulatedBus(MemoryBackend(*options.slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scan, "read_image", _read_image)
-        for module in (raw, examination):
+        for module in (raw, bus_checks):
             patch.setattr(module, "open_bus", lambda _ifname, **_: contextlib.closing(Bus(bus.backend)))
 
         def private(_ifname: str, *, force: bool = False, **_: object) -> PrivateServer:

@@ -255,7 +255,7 @@ def test_the_documentations_page_can_be_renewed() -> None:
         (["--load", "0"], "--load"),
         (["--load", "65"], "--load"),
         (["--cards", "0.5"], "0.05, 0.44, 0.86, 2, 3"),
-        (["--node", "--cpp"], "not allowed with"),
+        (["--node", "--cards"], "not allowed with"),
     ],
 )
 def test_wrong_arguments_are_refused(wrong: list[str], why: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -274,7 +274,7 @@ def test_wrong_arguments_are_refused(wrong: list[str], why: str, capsys: pytest.
         (["--cards", "0.05,3"], "cards", [0.05, 3.0]),
         (["--load", "4"], "load", 4),
         (["--soak", "2"], "soak", 2.0),
-        *[([f"--{name}"], name, True) for name in ("node", "cpp", "compensation")],
+        *[([f"--{name}"], name, True) for name in ("node", "compensation")],
     ],
 )
 def test_an_option_measures_only_what_it_names(given: list[str], mode: str, argument: object) -> None:

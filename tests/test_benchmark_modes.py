@@ -18,13 +18,11 @@ from protocol.framing import DataMessage, FrameDecoder
 from protocol.pdo import SampleDecoder
 from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import ScriptError, Setup
-from scripts.benchmarks.modes import cards, compensation, cpp, node, vendor
+from scripts.benchmarks.modes import cards, compensation, node, vendor
 from scripts.benchmarks.processes import yardstick
 from scripts.benchmarks.processes.relay import Delay
 from scripts.benchmarks.records import began
 from scripts.benchmarks.statistics import Arrivals
-from tests.clients import cpp_programs
-from tests.clients.cpp_programs import needs_gxx, patient
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S
 from tests.test_benchmark import NO_STOPS, clock_data
@@ -133,56 +131,6 @@ def test_too_much_is_said(monkeypatch: pytest.MonkeyPatch, limit: str) -> None:
     monkeypatch.setattr(compensation, limit, 1e-6)
     with pytest.raises(ScriptError, match=r"takes \d+\.\d µs a sample, more than"):
         compensation.measure(SETUP, None)
-
-
-# -- the C++ client
-
-
-def lines(way: str, who: str, *ages_us: float) -> list[str]:
-    return [f"{way} {who} {int(age * 1000)}" for age in ages_us]
-
-
-def test_the_ratio_is_of_medians_and_of_99th_percentiles() -> None:
-    made_up = [
-        *lines("waiting", "bare", 20, 20, 30),
-        *lines("waiting", "client", 25, 25, 15),
-        *lines("polling", "bare", 10),
-        *lines("polling", "client", 11),
-    ]
-    waiting, polling = cpp.figures(made_up)
-    assert waiting["ratio"]["p50"] == 1.25
-    assert polling["ratio"] == {"p50": 1.1, "p99": 1.1}
-    assert waiting["samples"] == 3
-    with pytest.raises(ScriptError, match="too few samples while polling"):
-        cpp.figures(made_up[:7])
-
-
-@needs_gxx
-@patient
-def test_a_short_run_of_the_pair() -> None:
-    program = str(cpp_programs.build(Path(cpp.__file__).with_suffix(".cpp"), ("-O0",)))
-    rows = cpp.run([program, "pair", "1600", "0.05"], 0.05)
-    assert [row["way"] for row in rows] == ["waiting", "polling"]
-    for row in rows:
-        assert row["samples"] > 0
-        assert row["bare_us"]["min"] > 0
-        assert row["client_us"]["min"] > 0
-    with pytest.raises(ScriptError, match="usage"):
-        cpp.run([program, "nonsense"], 1)
-
-
-def test_it_is_built_with_the_compiler_that_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    compiler = tmp_path / "g++"
-    compiler.write_text('#!/bin/sh\necho "$@" >"$6"\n')
-    compiler.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    assert "-O2 " in cpp.build(tmp_path).read_text()
-    compiler.write_text("#!/bin/sh\necho an error >&2\nexit 1\n")
-    with pytest.raises(ScriptError, match=r"could not build the C\+\+ benchmark:\nan error"):
-        cpp.build(tmp_path)
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(ScriptError, match=r"apt install g\+\+"):
-        cpp.build(tmp_path)
 
 
 # -- Bota's driver

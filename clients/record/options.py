@@ -10,7 +10,6 @@ from typing import Final
 
 from clients.arguments import (
     add_force,
-    add_imu_units,
     add_server,
     file_and_server,
     number,
@@ -20,7 +19,6 @@ from clients.arguments import (
     server_of,
 )
 from protocol.address import Address
-from protocol.pdo import ImuUnits
 
 _UNITS: Final = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}
 _SIZE: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)([kMG]?)B?", re.ASCII)
@@ -38,9 +36,6 @@ class RecordOptions(argparse.Namespace):
     sensors: list[int] | None
     """Positions on the bus, ascending; None for all."""
     seconds: float | None
-    ros: bool
-    namespaces: list[str] | None
-    imu_units: ImuUnits
     rotate_size: int | None
     rotate_seconds: float | None
     force: bool
@@ -64,12 +59,6 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
         help="record only the sensor at this position on the bus; repeatable")  # fmt: skip
     add("--for", type=_duration, dest="seconds", metavar="TIME", help="stop after this time: 30s, 5min, 2h")
     add("--seconds", type=seconds, metavar="S", help="the same in seconds")
-    add("--ros", action="store_true",
-        help="also write what the ROS 2 node would publish: WrenchStamped, Imu, Temperature")  # fmt: skip
-    add("--ros-namespace", type=_namespace, action="append", dest="namespaces", metavar="NAME",
-        help="namespace of these topics, one for each sensor in order (default: none for one sensor, "
-        "sensor_0, sensor_1, ... for several)")  # fmt: skip
-    add_imu_units(made, "--ros")
     add("--rotate-size", type=_size, metavar="SIZE", help="start a new file when one reaches this size")
     add("--rotate-seconds", type=number(1, 1e9, "at least 1 s"), metavar="S",
         help="start a new file every S seconds")  # fmt: skip
@@ -82,8 +71,6 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     options = made.parse_intermixed_args(argv, RecordOptions())
     options.path, old = file_and_server(made, options.names)
     options.address = server_of(made, options.server, old)
-    if options.namespaces is not None and not options.ros:
-        made.error("--ros-namespace requires --ros")
     if options.sensors is not None:
         options.sensors = sorted(set(options.sensors))
     return options
@@ -104,10 +91,3 @@ def _size(text: str) -> int:
     if size >= _LEAST_SIZE:
         return size
     raise argparse.ArgumentTypeError(f"{text!r}: it must be a size such as 100M, at least 100k")
-
-
-def _namespace(text: str) -> str:
-    name = text.strip("/")
-    if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", name, re.ASCII):
-        return name
-    raise argparse.ArgumentTypeError(f"{text!r}: it must be a ROS namespace, such as left_arm")

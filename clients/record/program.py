@@ -21,10 +21,8 @@ from clients.record.recorder import Recorder
 from clients.record.source import Batch, Source
 from clients.recording.file_format import FORMAT_VERSION
 from clients.recording.reader import Event
-from clients.recording.ros_messages import RosTopics
 from protocol.errors import ConnectionFailedError, ProtocolError, RefusedError, UnreachableError
 from protocol.program.version import VERSION
-from protocol.text.untrusted import rows
 from protocol.text.visible import printable
 
 _WAIT_S = 0.2
@@ -58,7 +56,7 @@ def _run(source: Source, parts: Parts, options: RecordOptions, signals: Signals)
     if first is None:
         _say("stopped before the server started; nothing was recorded")
         return 0
-    recorder = Recorder(parts, f"ethercat-record {VERSION}", _notes(options, source), _ros(options, source))
+    recorder = Recorder(parts, f"ethercat-record {VERSION}", _notes(options, source))
     return _record(source, recorder, first, options, parts, signals)
 
 
@@ -146,22 +144,4 @@ def _notes(options: RecordOptions, source: Source) -> dict[str, str]:
         "host": socket.gethostname(),
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
         **({"sensors": " ".join(map(str, options.sensors))} if options.sensors else {}),
-    }
-
-
-def _ros(options: RecordOptions, source: Source) -> dict[int, RosTopics]:
-    if not options.ros:
-        return {}
-    assert source.description is not None
-    described = [row.get("sensor") for row in rows(source.description.get("sensors"))]
-    positions = options.sensors or sorted({position for position in described if isinstance(position, int)})
-    names = options.namespaces or (
-        [""] if len(positions) == 1 else [f"sensor_{position}" for position in positions]
-    )
-    if len(names) != len(positions):
-        raise RecordingError(
-            f"--ros-namespace is given {len(names)} times for {len(positions)} sensors: give one each"
-        )
-    return {
-        position: RosTopics(name, options.imu_units) for position, name in zip(positions, names, strict=True)
     }

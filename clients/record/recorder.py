@@ -19,7 +19,6 @@ from clients.record.source import Batch, lost
 from clients.record.tally import Tally
 from clients.recording.disk import DiskFile
 from clients.recording.reader import Description, Event
-from clients.recording.ros_messages import RosTopics
 from clients.recording.writer import RecordingWriter
 from protocol.framing import DataMessage
 
@@ -41,17 +40,14 @@ class Recorder:
         bytes_written: size of all files.
     """
 
-    def __init__(
-        self, parts: Parts, library: str, notes: Mapping[str, str], ros: Mapping[int, RosTopics]
-    ) -> None:
-        """Create the first file; DiskError. `notes` become its metadata, `ros` are ROS topics by sensor."""
+    def __init__(self, parts: Parts, library: str, notes: Mapping[str, str]) -> None:
+        """Create the first file; DiskError. `notes` become its metadata."""
         self.tally = Tally()
         self.error: DiskError | None = None
         self.saved = 0
         self._parts = parts
         self._library = library
         self._notes = notes
-        self._ros = ros
         self._queue: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
         self._backlog = 0
         self._overflow = 0
@@ -163,7 +159,7 @@ class Recorder:
     def _open_part(self) -> None:
         self._disk = self._parts.open()
         notes = {**self._notes, "part": str(len(self._parts.made) - 1)}
-        self._writer = RecordingWriter(self._disk, self._library, notes, self._ros)
+        self._writer = RecordingWriter(self._disk, self._library, notes)
         if self._description is not None:
             self._writer.describe(time.time_ns(), self._description.reply)
 

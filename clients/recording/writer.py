@@ -27,7 +27,6 @@ from clients.recording.file_format import (
     pack_frame,
     pack_json,
 )
-from clients.recording.ros_messages import DEFINITIONS, RosTopics
 from protocol.framing import DataMessage
 from protocol.text.json_text import JsonObject
 
@@ -42,13 +41,10 @@ class RecordingWriter:
         frames: number of frames written.
     """
 
-    def __init__(
-        self, disk: DiskFile, library: str, notes: Mapping[str, str], ros: Mapping[int, RosTopics]
-    ) -> None:
-        """Start the file: `notes` become its metadata, `ros` has the ROS topics by sensor."""
+    def __init__(self, disk: DiskFile, library: str, notes: Mapping[str, str]) -> None:
+        """Start the file: `notes` become its metadata."""
         self.frames = 0
         self._disk = disk
-        self._ros = ros
         self._mcap = Writer(
             cast("IO[Any]", disk),
             chunk_size=_CHUNK_SIZE,
@@ -62,7 +58,6 @@ class RecordingWriter:
         self._events = self._channel(EVENTS_TOPIC, TEXT_SCHEMA, TEXT_DEFINITION)
         self._notes = 0
         self._frame_channels: dict[int, int] = {}
-        self._ros_channels: dict[int, list[int]] = {}
 
     @property
     def size(self) -> int:
@@ -78,19 +73,14 @@ class RecordingWriter:
         self._note(self._events, stamp_ns, event)
 
     def frame(self, frame: DataMessage) -> None:
-        """Write a frame, and its ROS messages."""
-        sensor, stamp_ns, sequence = frame.sensor, frame.stamp_ns, frame.sequence & _U32
-        add = self._mcap.add_message
-        channel = self._frame_channels.get(sensor)
+        """Write a frame."""
+        channel = self._frame_channels.get(frame.sensor)
         if channel is None:
-            channel = self._open_sensor(sensor)
-        add(channel, stamp_ns, pack_frame(frame), stamp_ns, sequence)
+            channel = self._channel(frame_topic(frame.sensor), FRAME_SCHEMA, FRAME_DEFINITION)
+            self._frame_channels[frame.sensor] = channel
+        stamp_ns = frame.stamp_ns
+        self._mcap.add_message(channel, stamp_ns, pack_frame(frame), stamp_ns, frame.sequence & _U32)
         self.frames += 1
-        ros = self._ros.get(sensor)
-        if ros is not None:
-            channels = self._ros_channels[sensor]
-            for position, body in ros.messages(frame):
-                add(channels[position], stamp_ns, body, stamp_ns, sequence)
 
     def flush(self) -> None:
         """End the chunk and write it to disk; DiskError if it cannot be written."""
@@ -107,16 +97,6 @@ class RecordingWriter:
     def _note(self, channel: int, stamp_ns: int, message: JsonObject) -> None:
         self._mcap.add_message(channel, stamp_ns, pack_json(message), stamp_ns, self._notes)
         self._notes += 1
-
-    def _open_sensor(self, sensor: int) -> int:
-        if sensor not in self._frame_channels:
-            self._frame_channels[sensor] = self._channel(frame_topic(sensor), FRAME_SCHEMA, FRAME_DEFINITION)
-            if sensor in self._ros:
-                self._ros_channels[sensor] = [
-                    self._channel(topic.name, topic.schema, DEFINITIONS[topic.schema])
-                    for topic in self._ros[sensor].topics
-                ]
-        return self._frame_channels[sensor]
 
     def _channel(self, topic: str, schema: str, definition: str) -> int:
         number = self._schemas.get(schema)

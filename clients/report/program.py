@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from clients.errors import RecordingError, ReportError
-from clients.report.examine import Examination, examine
+from clients.report import subjects
+from clients.report.checks import Examination, examine
 from clients.report.options import ReportOptions
-from clients.report.page.page import as_json, render
-from clients.report.subjects import live, recorded
-from clients.report.subjects.subject import Subject
+from clients.report.page import as_json, render
+from clients.report.series import Subject
 from protocol.errors import ConnectionFailedError, ProtocolError, UnreachableError
 from protocol.health.verdict import Level
 from protocol.program.new_file import NewFile
@@ -54,9 +54,9 @@ def _make(options: ReportOptions, progress: Callable[[float], None], file: NewFi
 
 def _subjects(options: ReportOptions, progress: Callable[[float], None]) -> list[Subject]:
     if options.recording is not None:
-        return recorded.subjects(options.recording, options.sensor, options.imu_units)
+        return subjects.of_recording(options.recording, options.sensor, options.imu_units)
     assert options.server is not None
-    return live.subjects(options.server, options.seconds, options.sensor, options.imu_units, progress)
+    return subjects.of_server(options.server, options.seconds, options.sensor, options.imu_units, progress)
 
 
 def _summary(examinations: Sequence[Examination]) -> str:

@@ -22,7 +22,7 @@ from protocol.program.completion import add_completion
 
 if TYPE_CHECKING:
     from ethercat_server.doctor.finding import Finding
-    from ethercat_server.doctor.machine.machine import Machine
+    from ethercat_server.doctor.machine import Machine
 
 _PROGRAM: Final = "ethercat-doctor"
 _EXIT_CODES: Final = "exit codes: 0 good or worth a look, 1 trouble, failed or stopped, 2 wrong arguments"
@@ -85,8 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.getLogger("ethercat_server.process.realtime").setLevel(logging.ERROR)
     args = build_parser().parse_args(argv)
     # KeyboardInterrupt in an import may be lost in Python's own code: load all before there can be one.
-    from ethercat_server.doctor import examination, report  # noqa: F401, PLC0415
-    from ethercat_server.doctor.bus import examination as bus  # noqa: F401, PLC0415
+    from ethercat_server.doctor import bus_checks, report  # noqa: F401, PLC0415
 
     return command_line.run(_PROGRAM, lambda: _run(args), as_json=args.json)
 
@@ -114,8 +113,8 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iterator[Finding]:
-    from ethercat_server.doctor.bus.examination import Request, examine_bus  # noqa: PLC0415
-    from ethercat_server.doctor.examination import examine_machine  # noqa: PLC0415
+    from ethercat_server.doctor.bus_checks import Request, examine_bus  # noqa: PLC0415
+    from ethercat_server.doctor.machine_checks import examine_machine  # noqa: PLC0415
 
     with contextlib.ExitStack() as cleanup:
         machine = _machine(args, cleanup)
@@ -125,10 +124,13 @@ def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iter
 
 def _machine(args: argparse.Namespace, cleanup: contextlib.ExitStack) -> Machine:
     """This machine and the interface; a virtual bus for `virtual`, closed by `cleanup`."""
-    from ethercat_server.doctor.bus.examination import check_rights  # noqa: PLC0415
+    from ethercat_server.doctor.bus_checks import check_rights  # noqa: PLC0415
     from ethercat_server.doctor.finding import CannotLookError  # noqa: PLC0415
-    from ethercat_server.doctor.machine.facts import InterfaceFacts, collect  # noqa: PLC0415
-    from ethercat_server.doctor.machine.machine import Machine  # noqa: PLC0415
+    from ethercat_server.doctor.machine import (  # noqa: PLC0415
+        InterfaceFacts,
+        Machine,
+        collect,
+    )
     from ethercat_server.virtual_sensor.virtual_bus import VirtualBus  # noqa: PLC0415
 
     resolution = time.clock_getres(time.CLOCK_MONOTONIC)

@@ -31,7 +31,7 @@ from scripts.benchmarks.chain import (
     stolen_percent,
     stoppable,
 )
-from scripts.benchmarks.modes import cards, comparison, compensation, cpp, load, node, path, soak
+from scripts.benchmarks.modes import cards, comparison, compensation, load, node, path, soak
 from scripts.benchmarks.modes.mode import Mode
 from scripts.benchmarks.plot import draw
 from scripts.benchmarks.records import may_be_real_time
@@ -42,7 +42,6 @@ MODES: Final[Mapping[str, Mode]] = {
     "load": load.MODE,
     "node": node.MODE,
     "cards": cards.MODE,
-    "cpp": cpp.MODE,
     "compensation": compensation.MODE,
     "path": path.MODE,
     "soak": soak.MODE,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 from clients.recording.disk import DiskFile
 from clients.recording.file_format import FORMAT_VERSION
-from clients.recording.ros_messages import RosTopics
 from clients.recording.writer import RecordingWriter
 from protocol import pdo
 from protocol.framing import DataMessage
@@ -37,10 +36,10 @@ def frame(number: int, sensor: int = 0, flags: int = 0, size: int = 61, **values
     return DataMessage(number, START_NS + moment, moment, sensor, flags, 3, data)
 
 
-def writer(path: Path, ros: Mapping[int, RosTopics] | None = None, **notes: str) -> RecordingWriter:
+def writer(path: Path, **notes: str) -> RecordingWriter:
     """A new recording at `path`."""
     disk = DiskFile(path, overwrite=True)
-    return RecordingWriter(disk, "test", {"format": FORMAT_VERSION, **notes}, ros or {})
+    return RecordingWriter(disk, "test", {"format": FORMAT_VERSION, **notes})
 
 
 def record(

@@ -21,9 +21,9 @@ from unittest import mock
 
 from PIL import Image, PngImagePlugin
 
-from clients.report.examine import examine
-from clients.report.page import plots, stream_plots
-from clients.report.page.page import render
+from clients.report import plots
+from clients.report.checks import examine
+from clients.report.page import render
 from tests.clients import chromium
 from tests.clients.simulated import sensor
 
@@ -47,7 +47,7 @@ def undrawn() -> Iterator[None]:
     def draw(_name: str, title: str, description: str, *_: object) -> str:
         return f"<svg><title>{html.escape(title)}</title><desc>{html.escape(description)}</desc></svg>"
 
-    with mock.patch.object(plots, "draw", draw), mock.patch.object(stream_plots, "draw", draw):
+    with mock.patch.object(plots, "draw", draw), mock.patch.object(plots, "draw", draw):
         yield
 
 

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from clients.recording.columns import Columns, columns
-from clients.report.subjects.subject import Subject, subject
+from clients.report.series import Subject, subject
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.ethercat.clock import Clock

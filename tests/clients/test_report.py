@@ -14,11 +14,9 @@ import numpy as np
 import pytest
 
 from clients.recording.columns import Columns
-from clients.report.checks.channels import CHANNELS, FORCE, limit_origin, noise_limit
-from clients.report.checks.spectrum import welch
-from clients.report.checks.stuck import longest_runs
-from clients.report.examine import Examination, examine
-from clients.report.subjects.subject import Subject, subject
+from clients.report.checks import Examination, examine, longest_runs
+from clients.report.series import CHANNELS, FORCE, Subject, limit_origin, noise_limit, subject
+from clients.report.spectrum import welch
 from ethercat_server.virtual_sensor.measurement import scene
 from protocol.framing import DataFlag, DataMessage
 from protocol.health.verdict import Level

@@ -14,9 +14,8 @@ from types import SimpleNamespace
 import pytest
 
 from clients.program import missing
-from clients.report import cli, program
-from clients.report.subjects import live
-from clients.report.subjects.live import Received
+from clients.report import cli, program, subjects
+from clients.report.subjects import Received
 from protocol.framing import DataFlag, DataMessage
 from tests.clients.recordings import writer
 from tests.clients.report_capture import undrawn
@@ -325,7 +324,7 @@ def test_a_live_sensor_is_reported_on(
 ) -> None:
     out = tmp_path / "live.html"
     with simulated_bus("--sinc", "512") as bus, simulated_server(bus) as server:
-        monkeypatch.setattr(live, "time", SimpleNamespace(monotonic=lambda: bus.clock.now_ns * 1e-9))
+        monkeypatch.setattr(subjects, "time", SimpleNamespace(monotonic=lambda: bus.clock.now_ns * 1e-9))
         code, said, err = ended(capsys, "--server", server.address, "--seconds", "5", "-o", out, "--json")
         assert code == 0, err
         [sensor] = json.loads(said)

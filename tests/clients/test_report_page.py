@@ -17,14 +17,12 @@ from PIL import Image
 
 from clients.numbers import figure, seconds
 from clients.recording.columns import Columns
-from clients.report.checks.channels import FORCE, GROUPS
-from clients.report.examine import Examination, examine
-from clients.report.page import page as page_module
-from clients.report.page import plots, stream_plots
-from clients.report.page.envelope import envelope, stretches
-from clients.report.page.page import as_json, render
-from clients.report.subjects.series import Floats
-from clients.report.subjects.subject import subject
+from clients.report import page as page_module
+from clients.report import plots
+from clients.report.checks import Examination, examine
+from clients.report.page import as_json, render
+from clients.report.plots import envelope, stretches
+from clients.report.series import FORCE, GROUPS, Floats, subject
 from tests.clients import report_capture
 from tests.clients.chromium import DARK, needs_chromium, run, screenshot
 from tests.clients.report_capture import undrawn
@@ -206,7 +204,7 @@ def plots_of(examination: Examination) -> dict[str, str]:
         "s0-force": plots.over_time(series, FORCE, "s0-force"),
         "s0-spectrum": plots.spectra(series, examination.spectrum, "s0-spectrum"),
         "s0-drift": plots.drifts(examination.drift, series.duration, "s0-drift"),
-        "s0-stamps": stream_plots.intervals(examination.timing, "s0-stamps"),
+        "s0-stamps": plots.intervals(examination.timing, "s0-stamps"),
     }
     return {name: plot or "" for name, plot in made.items()}
 

@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ethercat_server.doctor.examination import CHECKS
 from ethercat_server.doctor.finding import Finding
-from ethercat_server.doctor.machine.facts import InterfaceFacts, Link
-from ethercat_server.doctor.machine.machine import Machine
+from ethercat_server.doctor.machine import InterfaceFacts, Link, Machine
+from ethercat_server.doctor.machine_checks import CHECKS
 from ethercat_server.ethercat.nic.interface import Routes
 from protocol.health.verdict import Level
 

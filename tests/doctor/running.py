@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ethercat_server.doctor.bus.examination import Request, examine_bus
+from ethercat_server.doctor.bus_checks import Request, examine_bus
 from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.finding import NAMES, Finding
-from ethercat_server.doctor.machine.facts import InterfaceFacts
+from ethercat_server.doctor.machine import InterfaceFacts
 from ethercat_server.doctor.report import worst
 from protocol.health.verdict import Level
 from tests.doctor.made_up import FACTS, Files, machine

@@ -9,8 +9,8 @@ import sys
 import pytest
 
 from ethercat_server.doctor.cli import main
-from ethercat_server.doctor.examination import CHECKS
-from ethercat_server.doctor.machine.machine import Machine
+from ethercat_server.doctor.machine import Machine
+from ethercat_server.doctor.machine_checks import CHECKS
 from tests.doctor.running import MODULE, doctor_here
 from tests.ended import run_here
 from tests.server.running import PATIENCE_S

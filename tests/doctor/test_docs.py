@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ethercat_server.doctor.cli import build_parser
-from ethercat_server.doctor.examination import CHECKS
 from ethercat_server.doctor.finding import NAMES
+from ethercat_server.doctor.machine_checks import CHECKS
 from ethercat_server.doctor.report import EXIT_CODES
 
 DOCS = (Path(__file__).parent.parent.parent / "docs" / "doctor.md").read_text()

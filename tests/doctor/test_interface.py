@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from ethercat_server.doctor.examination import examine_machine
+from ethercat_server.doctor import machine_checks
 from ethercat_server.doctor.finding import CannotLookError
-from ethercat_server.doctor.machine import nic
-from ethercat_server.doctor.machine.facts import InterfaceFacts
+from ethercat_server.doctor.machine import InterfaceFacts
+from ethercat_server.doctor.machine_checks import examine_machine
 from ethercat_server.ethercat.nic.interface import Routes
 from protocol.health.verdict import Level
 from tests.doctor.made_up import CPUS, but, machine, only
@@ -144,14 +144,14 @@ def test_counters(tmp_path: Path) -> None:
 
 def test_counters_that_rise_while_the_doctor_looks() -> None:
     before = {"rx_crc_errors": 7, "rx_dropped": 2, "rx_packets": 1}
-    (same,) = nic.rising(before, {**before, "rx_packets": 900})
+    (same,) = machine_checks.rising(before, {**before, "rx_packets": 900})
     assert same.level is Level.GOOD
-    (more,) = nic.rising(before, {**before, "rx_crc_errors": 9})
+    (more,) = machine_checks.rising(before, {**before, "rx_crc_errors": 9})
     assert (more.level, more.found, more.values) == (Level.TROUBLE, "rx_crc_errors 2", {"rx_crc_errors": 2})
-    (dropped,) = nic.rising(before, {**before, "rx_dropped": 3})
+    (dropped,) = machine_checks.rising(before, {**before, "rx_dropped": 3})
     assert dropped.level is Level.NOTE
     with pytest.raises(CannotLookError):
-        list(nic.rising(before, {}))
+        list(machine_checks.rising(before, {}))
 
 
 def test_interrupts_belong_on_the_isolated_processor(tmp_path: Path) -> None:
@@ -304,7 +304,7 @@ def test_names_of_interfaces_are_quoted_in_commands(tmp_path: Path) -> None:
 
 
 def test_the_facts_of_a_real_interface() -> None:
-    from ethercat_server.doctor.machine.facts import Link, collect
+    from ethercat_server.doctor.machine import Link, collect
 
     found = collect("lo")
     assert isinstance(found.link, Link)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from ethercat_server.access.holder import Holder
-from ethercat_server.doctor.bus import examination
+from ethercat_server.doctor import bus_checks
 from ethercat_server.ethercat.nic.interface import Routes
 from protocol.health.verdict import Level
 from tests.doctor.made_up import but
@@ -70,7 +70,7 @@ def test_what_is_measured(bench: SimulatedBus, tmp_path: Path) -> None:
 
 def test_a_machine_that_stalls_shows_in_the_measurement(single: SimulatedBus, tmp_path: Path) -> None:
     for n in range(5):
-        single.at(0.7 + 0.05 * n, lambda: single.clock.stall(3e6))
+        single.at(0.704 + 0.05 * n, lambda: single.clock.stall(3e6))  # between two exchanges
     wake_ups = examined(single, tmp_path, 1.0).of("measurement")["wake-ups"]
     assert wake_ups.values["max"] > 2000
     assert wake_ups.level > Level.GOOD
@@ -179,7 +179,7 @@ def test_another_master_is_not_disturbed(
     named: str,
     commands: tuple[str, ...],
 ) -> None:
-    monkeypatch.setattr(examination, "find_holder", lambda _: holder)
+    monkeypatch.setattr(bus_checks, "find_holder", lambda _: holder)
     found = examined(single, tmp_path, LOOK).of("bus")["slaves"]
     assert (found.level, found.commands) == (level, commands)
     assert named in found.found

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ethercat_server.doctor.finding import CannotLookError
-from ethercat_server.doctor.machine.machine import as_list, processor_list
+from ethercat_server.doctor.machine import as_list, processor_list
 from protocol.health.verdict import Level
 from tests.doctor.made_up import CPUS, Files, looks, machine, only
 

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ethercat_server.doctor.examination import CHECKS, examine, examine_machine
 from ethercat_server.doctor.finding import CannotLookError, Finding, ok
-from ethercat_server.doctor.machine.facts import InterfaceFacts, Link
-from ethercat_server.doctor.machine.machine import Machine
+from ethercat_server.doctor.machine import InterfaceFacts, Link, Machine
+from ethercat_server.doctor.machine_checks import CHECKS, examine, examine_machine
 from ethercat_server.errors import BusError
 from protocol.health.verdict import Level
 from tests.doctor.made_up import CARD, GOOD, but, machine

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.doctor.bus import findings
-from ethercat_server.doctor.bus.slaves import ErrorCounters, Slave
+from ethercat_server.doctor import bus_checks
+from ethercat_server.doctor.bus_checks import ErrorCounters, Slave
 from ethercat_server.doctor.finding import Finding
 from ethercat_server.ethercat.slave.al import AlStatus
 from protocol.health.verdict import Level
@@ -30,8 +30,8 @@ def the(findings: Any) -> Finding:
 
 
 def test_whether_anything_answers() -> None:
-    assert the(findings.answers("ens5", 2)).level is Level.GOOD
-    nothing = the(findings.answers("ens5", 0))
+    assert the(bus_checks.answers("ens5", 2)).level is Level.GOOD
+    nothing = the(bus_checks.answers("ens5", 0))
     assert (nothing.level, nothing.values) == (Level.TROUBLE, {"slaves": 0})
 
 
@@ -47,16 +47,16 @@ def test_whether_anything_answers() -> None:
     ],
 )
 def test_who_it_is(changes: dict[str, Any], level: Level, named: str) -> None:
-    found = the(findings.identity(slave(**changes)))
+    found = the(bus_checks.identity(slave(**changes)))
     assert found.level is level
     assert named in found.found
 
 
 def test_a_bus_without_a_sensor() -> None:
     coupler = slave(vendor=2, name="EK1100")
-    assert the(findings.sensors([coupler])).level is Level.TROUBLE
-    assert not list(findings.sensors([coupler, slave()]))
-    assert not list(findings.sensors([coupler, slave(vendor=0, sii_problem="busy")])), "it may be one"
+    assert the(bus_checks.any_sensor([coupler])).level is Level.TROUBLE
+    assert not list(bus_checks.any_sensor([coupler, slave()]))
+    assert not list(bus_checks.any_sensor([coupler, slave(vendor=0, sii_problem="busy")])), "it may be one"
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_a_bus_without_a_sensor() -> None:
     ],
 )
 def test_the_state_it_is_in(status: int, code: int, level: Level) -> None:
-    found = the(findings.state(slave(al=AlStatus.of(status, code))))
+    found = the(bus_checks.al_state(slave(al=AlStatus.of(status, code))))
     assert found.level is level
     if code:
         assert f"0x{code:04X}" in found.found
@@ -115,32 +115,34 @@ def counted(**by_name: Any) -> ErrorCounters:
     ],
 )
 def test_where_errors_arise(position: int, counters: ErrorCounters, level: Level, said: str) -> None:
-    found = the(findings.errors(slave(position=position, counters=counters), 2))
+    found = the(bus_checks.error_counters(slave(position=position, counters=counters), 2))
     assert (found.level, found.found) == (level, said)
 
 
 def test_only_what_is_new_counts_while_measuring() -> None:
     before = {0: counted(invalid=(5, 0, 0, 0)), 1: counted()}
-    assert the(findings.new_errors(before, before, 2)).level is Level.GOOD
+    assert the(bus_checks.new_errors(before, before, 2)).level is Level.GOOD
     after = {0: counted(invalid=(6, 0, 0, 0)), 1: counted(forwarded=(1, 0, 0, 0))}
-    found = the(findings.new_errors(before, after, 2))
+    found = the(bus_checks.new_errors(before, after, 2))
     assert found.level is Level.TROUBLE
     assert found.found.startswith("1 corrupted between the interface and slave 0; ")
     cleared = {0: counted(), 1: counted()}
-    assert the(findings.new_errors(before, cleared, 2)).level is Level.GOOD, "a server was started meanwhile"
+    assert the(bus_checks.new_errors(before, cleared, 2)).level is Level.GOOD, (
+        "a server was started meanwhile"
+    )
 
 
 def test_names_from_the_bus_are_told_in_json() -> None:
-    found = the(findings.identity(slave(al=AlStatus.parse(struct.pack("<HHH", 0x14, 0, 0x1B)))))
+    found = the(bus_checks.identity(slave(al=AlStatus.parse(struct.pack("<HHH", 0x14, 0, 0x1B)))))
     assert found.values["al_state"] == "SAFEOP"
     assert found.values["al_error"] is True
 
 
 def test_something_connected_that_does_not_answer() -> None:
     alone, linked = (True, False, False, False), (True, True, False, False)
-    assert the(findings.line([slave(links=alone)])).level is Level.GOOD
-    assert the(findings.line([slave(links=linked), slave(position=1, links=alone)])).level is Level.GOOD
-    found = the(findings.line([slave(links=linked), slave(position=1, links=linked)]))
+    assert the(bus_checks.cabling([slave(links=alone)])).level is Level.GOOD
+    assert the(bus_checks.cabling([slave(links=linked), slave(position=1, links=alone)])).level is Level.GOOD
+    found = the(bus_checks.cabling([slave(links=linked), slave(position=1, links=linked)]))
     assert found.level is Level.NOTE
     assert found.found.endswith("port 0 of slave 1, port 1 of slave 1")
-    assert list(findings.line([])) == []
+    assert list(bus_checks.cabling([])) == []

@@ -12,8 +12,8 @@ import pytest
 
 from ethercat_server.access.holder import Holder
 from ethercat_server.access.sensors import Sensors
-from ethercat_server.doctor.bus import examination
-from ethercat_server.doctor.bus.server_view import ServerView
+from ethercat_server.doctor import bus_checks
+from ethercat_server.doctor.bus_checks import ServerView
 from protocol.address import Address
 from protocol.health.verdict import Level
 from tests.doctor.running import examined
@@ -26,7 +26,7 @@ ADDRESS = Address("127.0.0.1", 12001)
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     holder = Holder(os.getpid(), "ethercat-server", ADDRESS)
-    monkeypatch.setattr(examination, "find_holder", lambda _: holder)
+    monkeypatch.setattr(bus_checks, "find_holder", lambda _: holder)
     with (
         simulated_bus("--sensors", "2", "--serial", "10,20", "--sinc", SINC_LENGTH) as bus,
         simulated_server(bus) as server,

@@ -27,15 +27,15 @@ def numbers(running: Simulation) -> list[int]:
     return [reading(frame)[0] for frame in running.frames if not frame.flags & OLD]
 
 
-def check_lost(running: Simulation, least: int = 1) -> None:
-    """What was lost is flagged, and `lost_samples` has it exactly, once the samples after it have come."""
+def check_lost(running: Simulation, least: int = 1, off_by: int = 0) -> None:
+    """What was lost is flagged, and `lost_samples` has it, once the samples after it have come."""
     running.backend.become(Machine())
     running.run(0.1)
     check_frames(running.frames)
     got = numbers(running)
     lost = got[-1] + 1 - got[0] - len(got)
     assert lost >= least
-    assert running.status()["sensors"][0]["lost_samples"] == lost
+    assert running.status()["sensors"][0]["lost_samples"] == pytest.approx(lost, abs=off_by)
 
 
 def test_every_sample_is_handed_out_once_and_its_stamp_is_its_instant() -> None:
@@ -155,14 +155,14 @@ def test_samples_that_pass_while_the_sensor_itself_is_held_up_are_counted(dc: st
 
 @pytest.mark.parametrize("dc", ["", "none"])
 @pytest.mark.parametrize("jitter_us", [300, 400, 700])
-@pytest.mark.parametrize("seed", [3, 2])
+@pytest.mark.parametrize("seed", range(6))
 def test_whatever_is_lost_is_counted_though_frames_take_long_and_unevenly(
     seed: int, jitter_us: int, dc: str
 ) -> None:
-    """A starved slave looks at its data anywhere within an exchange."""
+    """A starved slave looks at its data anywhere within an exchange: of the first it is not sure."""
     running = simulation(Machine(seed=seed, frame_jitter_ns=jitter_us * 1e3, wake_ns=50e3), dc=dc)
     running.run(2.0)
-    check_lost(running)
+    check_lost(running, off_by=1)
 
 
 def test_polls_of_several_sensors_are_merged_where_exchanges_cost_time(

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from clients.report.subjects.series import Floats, Series
+from clients.report.series import Floats, Series
 
 RESOLUTION_S: Final = 2.0
 """Length of a segment: a resolution of half a hertz."""

@@ -12,10 +12,10 @@ import numpy as np
 
 from clients import numbers
 from clients.numbers import figure, moment, share
-from clients.report.checks.channels import CHANNELS, GROUPS, limit_origin
-from clients.report.examine import Examination
-from clients.report.page import plots, stream_plots
-from clients.report.page.envelope import BINS
+from clients.report import plots
+from clients.report.checks import Examination
+from clients.report.plots import BINS
+from clients.report.series import CHANNELS, GROUPS, limit_origin
 from protocol.health.verdict import Level
 from protocol.sensor.meaning import meaning, value_meaning
 from protocol.settings import SETTINGS
@@ -87,8 +87,8 @@ def _view(examination: Examination, name: str) -> dict[str, Any]:
             "noise": plots.noise_bars(examination.noise, f"{name}-noise"),
             "spectrum": plots.spectra(series, spectrum, f"{name}-spectrum") if spectrum else None,
             "drift": plots.drifts(drift, series.duration, f"{name}-drift"),
-            "stamps": stream_plots.intervals(examination.timing, f"{name}-stamps"),
-            "events": stream_plots.events(examination.timing, f"{name}-events"),
+            "stamps": plots.intervals(examination.timing, f"{name}-stamps"),
+            "events": plots.events(examination.timing, f"{name}-events"),
         },
     }
 

@@ -1,1 +1,0 @@
-"""Checks of the bus and its slaves, and the measurement."""

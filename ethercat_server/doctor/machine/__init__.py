@@ -1,1 +1,0 @@
-"""Checks of the machine: kernel, processors, network interface, other software on it."""
