@@ -74,6 +74,8 @@ def test_good_is_good() -> None:
          {"new": Counts(uncompensated=3)}),
         ("compensation", Level.LOOK, "3 samples were not compensated, for lack of a current orientation",
          {"new": Counts(uncompensated=3), "compensation": FULL}),
+        ("compensation", Level.LOOK, "the IMU's range was exceeded",
+         {"flags": Flags(acceleration_saturated=4), "compensation": FULL}),
         ("compensation", Level.LOOK, "not kept", {"compensation": CompensationState(problem="not kept")}),
         ("compensation", Level.GOOD, "bias, weight and inertia", {"compensation": FULL}),
         ("compensation", Level.GOOD, "subtracted: bias;", {"compensation": CompensationState(bias=BIAS)}),

@@ -195,6 +195,16 @@ def _compensation(s: Snapshot, *, is_silent: bool) -> Status:
         verdict.add(Level.TROUBLE, f"wrench_compensated {state}: {c.why_stopped}")
     elif c.why_partly:
         verdict.add(Level.TROUBLE, c.why_partly)
+    elif (
+        c.source == "imu"
+        and c.payload.mass
+        and (s.flags.acceleration_saturated or s.flags.angular_rate_saturated)
+    ):
+        verdict.add(
+            Level.LOOK,
+            "the IMU's range was exceeded, so wrench_compensated was wrong meanwhile: set "
+            "settings.acceleration_range_g and settings.angular_rate_range_dps higher",
+        )
     elif s.new.uncompensated:
         verdict.add(Level.LOOK, f"{s.new.uncompensated} samples were not compensated{_why_withheld(s)}")
     if c.problem:
