@@ -17,11 +17,9 @@ from clients.identify.stationary_periods import StationaryPeriod, StationaryPeri
 from clients.program import discard_output, say
 from clients.recording.columns import columns
 from clients.recording.reader import RecordedSensor, Recording, open_recording
-from ft_compensation.identification.judgement import Fit
 from ft_compensation.identification.parameter_file import write_yaml
-from ft_compensation.identification.payload import Identified, OffsetFit, identify
+from ft_compensation.identification.payload import Fit, Identified, OffsetFit, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
-from ft_compensation.identification.session import summary
 from ft_compensation.quantities import CompensationError, Wrench
 from protocol.errors import FileError
 from protocol.pdo import STANDARD_GRAVITY

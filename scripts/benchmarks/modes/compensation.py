@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from ft_compensation.attitude.tilt import GyroscopeOffset
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator
 from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
@@ -23,7 +22,7 @@ from scripts.benchmarks.modes.mode import Mode, points
 
 SAMPLES: Final = 20_000
 SIZE: Final = 61
-DEFAULT: Final = "bias and gravity"  # what is on by default, once there is a tool_mass
+DEFAULT: Final = "bias, weight and inertia"  # what is on by default, once there is a tool_mass
 MOST_US: Final = 20.0  # more than this is an error
 MOST_BY_DEFAULT_US: Final = 12.0
 _TOOL: Final = Payload(0.8, (0.004, -0.006, 0.055))
@@ -62,8 +61,8 @@ def costs(setup: Setup) -> Costs:
     import rclpy  # noqa: PLC0415 - the other modes do without
     from rclpy.context import Context  # noqa: PLC0415
 
-    from bridge.compensating.gravity_sources import AccelerometerSource  # noqa: PLC0415
-    from bridge.parameters.compensation import CompensationParameters  # noqa: PLC0415
+    from bridge.compensating.tool_sources import ImuSource  # noqa: PLC0415
+    from bridge.parameters.compensation import DEFAULTS  # noqa: PLC0415
     from bridge.publishing.compensated_wrench import CompensatedOutput, Plan, RestWindow  # noqa: PLC0415
     from bridge.publishing.messages import make_stages  # noqa: PLC0415
 
@@ -83,22 +82,17 @@ def costs(setup: Setup) -> Costs:
         node = rclpy.create_node("compensation_cost", context=context)
         output = CompensatedOutput(make_stages(node, "ft"))
 
-        def measure(name: str, *, inertia: bool, window: bool) -> None:
-            source = AccelerometerSource(CompensationParameters(payload=_TOOL), GyroscopeOffset())
-            output.plan = Plan(
-                source, Compensator(_TOOL, inertia=inertia), BiasRamp(_BIAS), needs_gravity=True
-            )
+        def measure(name: str, *, window: bool) -> None:
+            source = ImuSource(DEFAULTS._replace(payload=_TOOL), (0.0, 0.0, -0.0257))
+            output.plan = Plan(source, Compensator(_TOOL), BiasRamp(_BIAS), has_tool=True)
             output.window = RestWindow(1e9, StationaryLimits(), source) if window else None
-            for number in range(-setup.rate_hz, 0):  # a second, until gravity is known
-                output.follow(samples[number % SAMPLES], frame(number))
             before = output.published
             found[name] = took(lambda number: output.publish(samples[number], messages[number]))
             if output.published - before != SAMPLES:
                 raise ScriptError(f"{name}: not all samples were compensated")
 
-        measure(DEFAULT, inertia=False, window=False)
-        measure("with inertia", inertia=True, window=False)
-        measure("with inertia, while a tare is taken", inertia=True, window=True)
+        measure(DEFAULT, window=False)
+        measure("while a tare is taken", window=True)
     finally:
         rclpy.try_shutdown(context=context)
     found |= outputs(samples, setup.rate_hz)
