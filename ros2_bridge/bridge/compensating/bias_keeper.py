@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from bridge.parameters.compensation import AUTO, CompensationParameters
 from ft_compensation.bias import BiasRamp, Taken
-from ft_compensation.quantities import NO_WRENCH, Wrench, length, wrench_text
+from ft_compensation.quantities import NO_WRENCH, Wrench, wrench_text
 from ft_compensation.store import CompensationStore, Stored, StoreError, default_directory
 
 FROM_PARAMETER: Final = "parameter"
@@ -58,7 +58,9 @@ class BiasKeeper:
         if self.serial is None or (bias, taken, offset) == self._kept:
             return
         try:
-            path = _store(parameters).save(_number(self.serial), bias, taken.payload, offset, taken.gravity)
+            path = _store(parameters).save(
+                _number(self.serial), bias, taken.payload, offset, taken.specific_force
+            )
         except StoreError as error:
             self._say_not_kept(str(error))
             return
@@ -92,12 +94,12 @@ class BiasKeeper:
                 "parameter bias is given, and is overwritten"
             )
             return None
-        before = Taken(stored.payload or parameters.payload, stored.gravity)
+        before = Taken(stored.payload or parameters.payload, stored.specific_force)
         if stored.offset == offset:
             self._kept = stored.bias, before, offset
         self._log.info(f"the sensor with serial number {serial} has the bias that was kept at {stored.saved}")
         change, taken = before.weighed(parameters.payload)
-        if warning := taken.warning(change, parameters.payload, length(parameters.gravity)):
+        if warning := taken.warning(change, parameters.payload):
             self._log.warning(warning)
         is_one = stored.bias != NO_WRENCH or stored.offset is not None
         return Beginning(stored.bias.plus(change), f"kept since {stored.saved}", is_one, taken)

@@ -11,10 +11,8 @@ from typing import NamedTuple
 from bridge.diagnostics.observer import SLOW_ANSWER_S, Snapshot, mapping, row_of
 from protocol.health.judge import SATURATIONS
 from protocol.health.judge import judge as judge_stream
-from protocol.health.limits import Limits
-from protocol.health.verdict import About, Finding, Level, Verdict
-from protocol.text.untrusted import number, whole
-from protocol.text.visible import printable
+from protocol.health.verdict import About, Finding, Level, Limits, Verdict
+from protocol.text.untrusted import number, printable, whole
 
 Values = dict[str, object]
 
@@ -90,7 +88,7 @@ def _link(s: Snapshot, findings: list[Finding]) -> Status:
         "address": s.address,
         "connected": s.connected,
         "connected_s" if s.connected else "disconnected_s": round(s.connection_s, 1),
-        "reconnects": max(s.connects - 1, 0),
+        "reconnects": max(s.counts.connects - 1, 0),
         "server_uptime_s": s.server.get("uptime_s", ""),
         "last_problem": s.problem,
     }
@@ -113,13 +111,13 @@ def _stream(s: Snapshot, findings: list[Finding], limits: Limits) -> Status:
         "expected_hz": s.expected_hz or "",
         "age_p50_us": "" if s.age_us is None else round(s.age_us[0]),
         "age_p99_us": "" if s.age_us is None else round(s.age_us[1]),
-        "samples": s.counts.new,
-        "lost": s.counts.missing,
+        "samples": s.counts.samples,
+        "lost": s.counts.lost,
         "skipped": s.counts.stale,
         "limited": s.counts.limited,
         "repeated": s.counts.repeated,
         "invalid": s.counts.invalid,
-        "not_finite": s.not_finite,
+        "not_finite": s.counts.not_finite,
         "server_not_finite": mine.get("not_finite", ""),
         "server_lost": mine.get("lost_samples", ""),
         "server_recoveries": mine.get("recoveries", ""),
@@ -163,7 +161,7 @@ def _sensor(s: Snapshot, findings: list[Finding], *, is_silent: bool) -> Status:
         "status_byte": f"{s.flags.status:#04x}",
         "warnings_register": f"{s.flags.warnings:#010x}",
         **{row.field: f"{getattr(s.flags, row.field):#x}" for row in SATURATIONS},
-        "saturated_samples": s.saturated,
+        "saturated_samples": s.counts.saturated,
         "emergencies": s.server_row.get("emergencies", ""),
         "last_emergency": emergency,
         "last_emergency_ago_s": "" if ago_s is None else ago_s,
@@ -195,8 +193,18 @@ def _compensation(s: Snapshot, *, is_silent: bool) -> Status:
         verdict.add(Level.TROUBLE, f"wrench_compensated {state}: {c.why_stopped}")
     elif c.why_partly:
         verdict.add(Level.TROUBLE, c.why_partly)
-    elif s.new_withheld:
-        verdict.add(Level.LOOK, f"{s.new_withheld} samples were not compensated{_why_withheld(s)}")
+    elif (
+        c.source == "imu"
+        and c.payload.mass
+        and (s.flags.acceleration_saturated or s.flags.angular_rate_saturated)
+    ):
+        verdict.add(
+            Level.LOOK,
+            "the IMU's range was exceeded, so wrench_compensated was wrong meanwhile: set "
+            "settings.acceleration_range_g and settings.angular_rate_range_dps higher",
+        )
+    elif s.new.uncompensated:
+        verdict.add(Level.LOOK, f"{s.new.uncompensated} samples were not compensated{_why_withheld(s)}")
     if c.problem:
         verdict.add(Level.NOT_POSSIBLE if verdict.level is Level.NOT_POSSIBLE else Level.LOOK, c.problem)
     return verdict.status("compensation", c.good, c.values)
@@ -205,7 +213,7 @@ def _compensation(s: Snapshot, *, is_silent: bool) -> Status:
 def _why_withheld(s: Snapshot) -> str:
     """What may have been the reason."""
     c, reasons = s.compensation, []
-    if c.stops_on_saturation and s.new_saturated:
+    if c.stops_on_saturation and s.new.saturated:
         reasons.append("because force or torque was saturated (on_saturation)")
     if c.payload.mass:
         reasons.append(f"for lack of a current orientation ({c.source})")
