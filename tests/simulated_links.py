@@ -12,9 +12,7 @@ whatever connects to a server gets one that streams them. Time passes only while
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 
@@ -35,60 +33,10 @@ from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
 from protocol.client import Client, client
-from tests.memory_channel import MemoryChannel
-from tests.simulation import Simulation
+from tests.simulation import MemoryChannel, SimulatedBus, Simulation
 
-PATIENCE_S = 60.0
-"""Simulated time that anything may take."""
 SINC_LENGTH, RATE_HZ = 512, 100
 """What a server sets the sensors to: the fewer samples, the faster it is simulated."""
-
-
-class SimulatedBus:
-    """Virtual sensors on the interface `near`."""
-
-    near = "lo"
-    """The doctor asks the kernel about it, so there must be such an interface; nothing is sent there."""
-
-    def __init__(self, backend: MemoryBackend) -> None:
-        self.backend = backend
-        self.clock = backend.clock
-
-    def command(self, line: str) -> str:
-        """Have a fault command of the virtual sensor obeyed now; returns its answer."""
-        answer = self.backend.command(line)
-        assert answer.startswith("ok"), answer
-        return answer[3:]
-
-    def at(self, seconds: float, action: str | Callable[[], object]) -> None:
-        """Have a fault command obeyed, or `action` called, so many seconds from now."""
-
-        def act() -> None:
-            if isinstance(action, str):
-                self.command(action)
-            else:
-                action()
-
-        self.clock.at(self.clock.now_ns + round(seconds * 1e9), act)
-
-    def power_cycle(self) -> None:
-        """Off, on again, and nobody looks meanwhile."""
-        self.command("power cycle 0.1")
-        self.clock.sleep(0.2)
-
-    def stats(self, position: int = 0) -> dict[str, Any]:
-        """What a virtual sensor says of itself."""
-        found: dict[str, Any] = json.loads(self.command("stats"))["sensors"][position]
-        return found
-
-    def stats_of_foreign(self, place: int) -> dict[str, Any]:
-        """What the foreign slave at this position says of itself."""
-        found: dict[str, Any] = json.loads(self.command("stats"))["foreign"][str(place)]
-        return found
-
-    def written(self, position: int = 0) -> list[tuple[str, int, str]]:
-        """The SDO writes so far: index, sub-index, data."""
-        return [(row["index"], row["subindex"], row["hex"]) for row in self.stats(position)["sdo_writes"]]
 
 
 _READ_IMAGE = scan.read_image
@@ -149,7 +97,7 @@ class SimulatedServer(Simulation):
         """Whether it is stopped by somebody."""
 
     def go_on(self, until: Callable[[], object], seconds: float) -> None:
-        """See `memory_channel.Server`."""
+        """See `Simulation`."""
         if self.hangs:
             self.clock.sleep(seconds)
         else:

@@ -14,7 +14,9 @@ failure is repeated by the same arguments, step by step in a debugger.
 
 from __future__ import annotations
 
+import functools
 import json
+import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -27,12 +29,13 @@ from ethercat_server.sensor.sensor import Identity
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.transport.base import Transport
-from ethercat_server.serving.transport.in_memory import InMemoryTransport
+from ethercat_server.serving.transport.in_memory import InMemoryStream, InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.measurement.signals import ClockReading, decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.control import request
+from protocol.errors import ConnectionFailedError, UnreachableError
 from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from protocol.pdo import LAYOUTS
 from protocol.settings import SettingValue, start_up_defaults
@@ -83,7 +86,47 @@ class RecordingHub(Hub):
         super().broadcast(message)
 
 
-class Simulation:
+class SimulatedBus:
+    """Virtual sensors in memory."""
+
+    near = "lo"
+    """The doctor asks the kernel about it, so there must be such an interface; nothing is sent there."""
+
+    def __init__(self, backend: MemoryBackend) -> None:
+        self.backend, self.clock = backend, backend.clock
+
+    def command(self, line: str) -> str:
+        """Have a fault command of the virtual sensor obeyed now; returns its answer."""
+        answer = self.backend.command(line)
+        assert answer.startswith("ok"), answer
+        return answer[3:]
+
+    def at(self, seconds: float, action: str | Callable[[], object]) -> None:
+        """Have a fault command obeyed, or `action` called, so many seconds from now."""
+        act = functools.partial(self.command, action) if isinstance(action, str) else action
+        self.clock.at(self.clock.now_ns + round(seconds * 1e9), act)
+
+    def power_cycle(self) -> None:
+        """Off, on again, and nobody looks meanwhile."""
+        self.command("power cycle 0.1")
+        self.clock.sleep(0.2)
+
+    def stats(self, position: int = 0) -> dict[str, Any]:
+        """What a virtual sensor says of itself."""
+        found: dict[str, Any] = json.loads(self.command("stats"))["sensors"][position]
+        return found
+
+    def stats_of_foreign(self, place: int) -> dict[str, Any]:
+        """What the foreign slave at this position says of itself."""
+        found: dict[str, Any] = json.loads(self.command("stats"))["foreign"][str(place)]
+        return found
+
+    def written(self, position: int = 0) -> list[tuple[str, int, str]]:
+        """The SDO writes so far: index, sub-index, data."""
+        return [(row["index"], row["subindex"], row["hex"]) for row in self.stats(position)["sdo_writes"]]
+
+
+class Simulation(SimulatedBus):
     """A server that streams. `frames` has all that it handed to its clients, `events` what it announced."""
 
     def __init__(
@@ -96,8 +139,7 @@ class Simulation:
         **extra: object,
     ) -> None:
         """`backend` is that of a simulation before, for a server that is started again."""
-        self.backend = backend or MemoryBackend(*sensors, machine=machine)
-        self.clock = self.backend.clock
+        super().__init__(backend or MemoryBackend(*sensors, machine=machine))
         self.started_ns = self.clock.now_ns
         self.transport = InMemoryTransport(self.clock)
         self.frames: list[DataMessage] = []
@@ -141,28 +183,6 @@ class Simulation:
     def connect(self, uid: int | None = 0, *, buffer_size: int = 65536) -> Client:
         """A client of user `uid`, on a framed connection."""
         return Client(self, uid, buffer_size)
-
-    def command(self, line: str) -> str:
-        """Have a fault command of the virtual sensor obeyed now; returns its answer."""
-        answer = self.backend.command(line)
-        assert answer.startswith("ok"), answer
-        return answer[3:]
-
-    def stats(self, position: int = 0) -> dict[str, Any]:
-        """What a virtual sensor says of itself."""
-        found: dict[str, Any] = json.loads(self.command("stats"))["sensors"][position]
-        return found
-
-    def at(self, seconds: float, action: str | Callable[[], object]) -> None:
-        """Have a fault command obeyed, or `action` called, so many seconds from now."""
-
-        def act() -> None:
-            if isinstance(action, str):
-                self.command(action)
-            else:
-                action()
-
-        self.clock.at(self.clock.now_ns + round(seconds * 1e9), act)
 
     def run(self, seconds: float) -> None:
         """Let the loop run for this simulated time."""
@@ -287,6 +307,85 @@ class Client:
         """Disconnect."""
         self.stream.close()
         self.simulation.clients.remove(self)
+
+
+class MemoryChannel:
+    """A `Channel` to `server`, which may be stopped (`hangs`) and killed; time passes while its client waits.
+
+    with StreamClient(12001, channel=MemoryChannel(server)).connect() as client: ...
+    """
+
+    is_near = True
+    own = ("memory", 0)
+
+    def __init__(self, server: Simulation, *, buffer_size: int = 65536) -> None:
+        self.server: Simulation | None = server
+        self.hangs = False
+        self._clock, self._buffer_size = server.clock, buffer_size
+        self._stream: InMemoryStream | None = None
+
+    def kill(self) -> None:
+        """The server ends without a word."""
+        self.server = None
+        if self._stream is not None:
+            self._stream.other.close()
+
+    def monotonic_ns(self) -> int:
+        """See `Channel`."""
+        now_ns: int = self._clock.monotonic_ns()
+        return now_ns
+
+    def wait(self, event: threading.Event, seconds: float, /) -> bool:
+        """See `Channel`."""
+        self._pass(event.is_set, seconds)
+        return event.is_set()
+
+    def connect(self, timeout_s: float) -> bool:
+        """See `Channel`."""
+        if self.server is None:
+            raise UnreachableError("Connection refused")
+        self._stream = self.server.transport.connect(0, buffer_size=self._buffer_size)
+        return True
+
+    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+        """See `Channel`."""
+        stream = self._stream
+        if stream is None:
+            raise ConnectionFailedError("Bad file descriptor")
+        if timeout_s > 0:
+            self._pass(lambda: stream.readable, timeout_s)
+        if stream.at_end:
+            raise ConnectionFailedError("the server closed it")
+        if not stream.readable:
+            return 0
+        data = stream.recv(len(buffer))
+        buffer[: len(data)] = data
+        return len(data)
+
+    def send(self, data: bytes) -> None:
+        """See `Channel`."""
+        assert self._stream is not None
+        self._stream.send(data)
+
+    def shutdown(self) -> None:
+        """See `Channel`."""
+        self.close()
+
+    def close(self) -> None:
+        """See `Channel`."""
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+    def fileno(self) -> int:
+        """See `Channel`."""
+        return -1
+
+    def _pass(self, until: Callable[[], object], seconds: float) -> None:
+        if self.server is None or self.hangs:
+            self._clock.sleep(seconds)
+        elif not until():
+            self.server.go_on(lambda: until() or self.hangs or self.server is None, seconds)
 
 
 def more_if_long(usual: Collection[Any], every: Iterable[Any]) -> list[Any]:

@@ -51,7 +51,7 @@ class SimulatedClock:
         self._machine = machine
         self._chance = random.Random(machine.seed)
         self._ahead_ns = REALTIME_START_NS - start_ns
-        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._agenda: list[tuple[int, int, Callable[[], object]]] = []
         self._order = count()
         self._stall_at_ns = self._next_stall()
 
@@ -88,7 +88,7 @@ class SimulatedClock:
         """CLOCK_REALTIME is set back."""
         self._ahead_ns -= round(seconds * 1e9)
 
-    def at(self, due_ns: int, action: Callable[[], None]) -> None:
+    def at(self, due_ns: int, action: Callable[[], object]) -> None:
         """Have `action` called when the clock reaches `due_ns`."""
         heapq.heappush(self._agenda, (due_ns, next(self._order), action))
 

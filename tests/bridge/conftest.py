@@ -22,19 +22,12 @@ from typing import Any
 import pytest
 
 from tests.bridge.scripted_server import ScriptedServer
+from tests.server.running import wait_until
 
 PATIENCE_S = 45.0
 ASK_AGAIN_S = 5.0
 AHEAD_NS = 60 * 10**9
 """Longer than any test waits."""
-
-
-def wait_until(condition: Callable[[], object], what: str) -> None:
-    """Wait for something that is to happen soon."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain for: {what}"
-        time.sleep(0.01)
 
 
 _ENDED: list[Any] = []

@@ -31,11 +31,12 @@ from bridge.transforms import check_tf
 from ft_compensation.quantities import length, unit_quaternion
 from protocol.text.json_text import JsonObject
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, is_near, weight
-from tests.bridge.conftest import listening, retire, wait_until
+from tests.bridge.conftest import listening, retire
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.bridge.streaming import values
 from tests.compensation.making import BIAS, TOOL, sample
+from tests.server.running import wait_until
 
 pytestmark = pytest.mark.ros
 OK, WARN, ERROR, STALE = range(4)

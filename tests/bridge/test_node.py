@@ -14,17 +14,12 @@ from diagnostic_msgs.msg import KeyValue
 from std_srvs.srv import Trigger
 
 from bridge.node import SERVER_GOES_ON, SUPERVISOR_TOPIC, run
-from tests.bridge.conftest import Listener, Start, StartProcess, establish, wait_until
+from tests.bridge.conftest import Listener, Start, StartProcess, establish
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
+from tests.server.running import free_port, wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("_ros")]
-
-
-def free_port() -> int:
-    """A port that nobody listens on."""
-    with ScriptedServer() as gone:
-        return gone.port
 
 
 def test_waits_for_the_server_and_finds_it_again(listener: Listener, start: Start) -> None:

@@ -25,10 +25,11 @@ from protocol.control import Event, event
 from protocol.framing import DataMessage
 from protocol.pdo import encode
 from tests.bridge.compensating import six, stamp_ns
-from tests.bridge.conftest import retire, wait_until
+from tests.bridge.conftest import retire
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import STEP_S, SimulatedNode, SimulatedServer
 from tests.bridge.streaming import RATE_HZ, SETTINGS
+from tests.server.running import wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("_ros")]
 OK, WARN, ERROR, STALE = range(4)

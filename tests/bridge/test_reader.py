@@ -16,8 +16,9 @@ from protocol.errors import ConnectionFailedError, UnreachableError
 from protocol.framing import DataMessage, FrameDecoder, encode_data, encode_json
 from protocol.pdo import Sample, encode
 from protocol.text.json_text import JsonObject
-from tests.bridge.conftest import Log, wait_until
+from tests.bridge.conftest import Log
 from tests.bridge.scripted_server import description, process_data
+from tests.server.running import wait_until
 
 PERIOD_NS = 1_250_000
 Step = bytes | float | None | Exception

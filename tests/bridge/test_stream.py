@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.bridge.conftest import Listener, Start, StartProcess, establish, wait_until
+from tests.bridge.conftest import Listener, Start, StartProcess, establish
 from tests.bridge.scripted_server import ScriptedServer
+from tests.server.running import wait_until
 
 pytestmark = pytest.mark.ros
 

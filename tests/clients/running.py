@@ -20,21 +20,7 @@ from clients.record import program as record
 from clients.recording.reader import RecordingError, open_recording
 from clients.replay import program
 from protocol.client import Client as StreamClient
-from tests.server.running import PATIENCE_S, Client, Program, free_port, wait_until
-
-__all__ = [
-    "Client",
-    "NoSignals",
-    "Program",
-    "Recorder",
-    "RecorderProcess",
-    "Replay",
-    "free_port",
-    "recording",
-    "replaying",
-    "signalled",
-    "wait_until",
-]
+from tests.server.running import PATIENCE_S, Program, free_port, wait_until
 
 
 class NoSignals(Signals):

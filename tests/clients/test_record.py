@@ -39,14 +39,12 @@ from tests.clients.running import (
     RecorderProcess,
     Replay,
     frames_in,
-    free_port,
     recording,
     replaying,
     signalled,
-    wait_until,
 )
 from tests.served_simulation import served
-from tests.server.running import PATIENCE_S, needs_bus, server
+from tests.server.running import PATIENCE_S, free_port, needs_bus, server, wait_until
 
 Run = Callable[..., tuple[int, str]]
 SECOND = 800

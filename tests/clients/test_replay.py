@@ -27,10 +27,10 @@ from protocol.control import ErrorCode
 from protocol.errors import RefusedError
 from protocol.framing import DataMessage
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
-from tests.clients.running import Client as Requests
-from tests.clients.running import NoSignals, free_port, listen, replaying, signalled, wait_until
+from tests.clients.running import NoSignals, listen, replaying, signalled
 from tests.served_simulation import served
-from tests.server.running import PATIENCE_S
+from tests.server.running import PATIENCE_S, free_port, wait_until
+from tests.server.running import Client as Requests
 
 COUNT = 400
 EMERGENCY = {"code": 0xFF01, "text": "device specific", "register": 0x81, "data": "0102030405"}

@@ -17,7 +17,7 @@ from tests.doctor.made_up import FACTS, Files, machine
 from tests.ended import Result, run, run_here
 from tests.server import readable
 from tests.server.as_another_user import NOBODY
-from tests.simulated_links import SimulatedBus
+from tests.simulation import SimulatedBus
 
 MODULE = "ethercat_server.doctor.cli"
 

@@ -14,7 +14,8 @@ from ethercat_server.ethercat.nic.interface import Routes
 from protocol.health.verdict import Level
 from tests.doctor.made_up import but
 from tests.doctor.running import examined
-from tests.simulated_links import SimulatedBus, registers, simulated_bus, simulated_server
+from tests.simulated_links import registers, simulated_bus, simulated_server
+from tests.simulation import SimulatedBus
 
 LOOK = 0.0
 """No measurement."""

@@ -17,7 +17,8 @@ from ethercat_server.doctor.bus_checks import ServerView
 from protocol.address import Address
 from protocol.health.verdict import Level
 from tests.doctor.running import examined
-from tests.simulated_links import SINC_LENGTH, SimulatedBus, SimulatedServer, simulated_bus, simulated_server
+from tests.simulated_links import SINC_LENGTH, SimulatedServer, simulated_bus, simulated_server
+from tests.simulation import SimulatedBus
 
 Bench = tuple[SimulatedBus, SimulatedServer]
 ADDRESS = Address("127.0.0.1", 12001)

@@ -24,10 +24,9 @@ from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError, U
 from protocol.framing import DataFlag
 from protocol.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.bridge.scripted_server import ScriptedServer, description, process_data
-from tests.memory_channel import MemoryChannel
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port
-from tests.simulation import Simulation
+from tests.simulation import MemoryChannel, Simulation
 
 ROOT = Path(__file__).parents[2]
 

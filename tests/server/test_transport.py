@@ -24,15 +24,9 @@ from ethercat_server.serving.transport.sockets import SocketTransport
 from protocol.control import parse_request, reply
 from protocol.framing import DataMessage, FrameDecoder, encode_data, encode_json
 from protocol.text.json_text import JsonObject
+from tests.server.running import free_port
 
 PATIENCE_S = 20.0
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 class ClientEnd(Protocol):

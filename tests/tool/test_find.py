@@ -17,7 +17,8 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.tool.commands import find
 from protocol.address import Address
 from tests.json_schema import problems
-from tests.simulated_links import SimulatedBus, chain, registers, simulated_bus, simulated_server
+from tests.simulated_links import chain, registers, simulated_bus, simulated_server
+from tests.simulation import SimulatedBus
 from tests.tool.running import tool_here
 
 

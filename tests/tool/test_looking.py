@@ -16,7 +16,8 @@ from ethercat_server.ethercat.wire import DATAGRAM_HEADER, FRAME_HEADER, Command
 from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, NOTE_NAMES
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.tool.cli import COMMANDS
-from tests.simulated_links import SimulatedBus, registers, simulated_bus
+from tests.simulated_links import registers, simulated_bus
+from tests.simulation import SimulatedBus
 from tests.tool.odd_firmware import FOREIGN_VENDOR, fewer_objects, foreign, no_mailbox
 from tests.tool.running import complaints, one_sentence, tool_here
 

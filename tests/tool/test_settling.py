@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.simulated_links import SimulatedBus, SimulatedServer, simulated_bus, simulated_server
+from tests.simulated_links import SimulatedServer, simulated_bus, simulated_server
+from tests.simulation import SimulatedBus
 from tests.tool.running import tool_here
 
 FORCE = (1.5, -2.25, -9.75)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.simulated_links import SimulatedBus, simulated_bus
+from tests.simulated_links import simulated_bus
+from tests.simulation import SimulatedBus
 from tests.tool.odd_firmware import other_sinc_length
 from tests.tool.running import tool_here
 

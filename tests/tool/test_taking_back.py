@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.simulated_links import SimulatedBus, simulated_bus
+from tests.simulated_links import simulated_bus
+from tests.simulation import SimulatedBus
 from tests.tool.running import one_sentence, tool_here
 
 

@@ -8,14 +8,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.simulated_links import (
-    RATE_HZ,
-    SINC_LENGTH,
-    SimulatedBus,
-    SimulatedServer,
-    simulated_bus,
-    simulated_server,
-)
+from tests.simulated_links import RATE_HZ, SINC_LENGTH, SimulatedServer, simulated_bus, simulated_server
+from tests.simulation import SimulatedBus
 from tests.tool.running import one_sentence, tool_here
 
 Bench = tuple[SimulatedBus, SimulatedServer]
