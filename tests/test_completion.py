@@ -1,8 +1,9 @@
-"""`--print-completion`: every program's script, in a shell that completes with it."""
+"""Every program's options: in the documentation, and in a shell that completes with `--print-completion`."""
 
 from __future__ import annotations
 
 import importlib
+import re
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from typing import Final
 import pytest
 
 from tests.ended import run_here
-from tests.test_programs import PROGRAMS
+from tests.test_programs import PROGRAMS, ROOT
 
 pytest.importorskip("shtab", reason="shtab is missing: pip install shtab")
 
@@ -41,23 +42,31 @@ complete_line() {
 """
 
 
-def printed(name: str, shell: str) -> str:
+def printed(name: str, *arguments: str) -> str:
+    """What a program prints with these arguments."""
     package, _, entry = PROGRAMS[name].partition(":")
     started: list[str] = []
     module = importlib.import_module(package)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "run", started.append)
         getattr(module, entry)()
-    ended = run_here(importlib.import_module(started[0]).main, "--print-completion", shell)
+    ended = run_here(importlib.import_module(started[0]).main, *arguments)
     assert ended.code == 0, ended.err
     return ended.out
+
+
+@pytest.mark.parametrize("name", ["ethercat-sensor", "ethercat-doctor", "ethercat-record", "ethercat-replay"])
+def test_every_option_is_documented(name: str) -> None:
+    options = set(re.findall(r"--[a-z][a-z-]+", printed(name, "--help")))
+    text = "".join(page.read_text() for page in (ROOT / "docs").glob("*.md"))
+    assert not {option for option in options - {"--help", "--version"} if option not in text}
 
 
 def test_a_shell_completes_with_what_is_printed() -> None:
     if (bash := shutil.which("bash")) is None:
         pytest.skip("bash is missing")
     lines = "\n".join(f"complete_line {line!r}" for line in COMPLETED)
-    script = "\n".join(printed(name, "bash") for name in PROGRAMS) + COMPLETE + lines
+    script = "\n".join(printed(name, "--print-completion", "bash") for name in PROGRAMS) + COMPLETE + lines
     done = subprocess.run([bash, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     found = dict(zip(COMPLETED, map(str.split, done.stdout.splitlines()), strict=True))
@@ -65,7 +74,7 @@ def test_a_shell_completes_with_what_is_printed() -> None:
 
 
 def test_zsh_has_interfaces_settings_and_files() -> None:
-    text = printed("ethercat-sensor", "zsh")
+    text = printed("ethercat-sensor", "--print-completion", "zsh")
     assert "_net_interfaces" in text
     assert "fir=true" in text
     assert "_files" in text

@@ -43,23 +43,17 @@ def test_a_good_run() -> None:
     assert verdict(summary, 800) is None
 
 
-def test_a_message_may_overtake_its_sample() -> None:
+def test_a_message_may_overtake_its_sample_and_is_not_judged_before_that_has_come() -> None:
     measurement = measured()
     measurement.take_message(values(801), 801 * PERIOD_NS + 100_000)
     measurement.take_frame(frame(801), 801 * PERIOD_NS + 300_000)
-    assert measurement.messages == 802
-    assert measurement.age_ns == 100_000
-
-
-def test_a_message_whose_sample_is_long_in_coming_is_not_judged_before() -> None:
-    measurement = measured()
-    late_ns = 3 * SECOND_NS  # this process was held up
-    measurement.take_message(values(801), 801 * PERIOD_NS + 100_000)
+    assert (measurement.messages, measurement.age_ns) == (802, 100_000)
     measurement.take_message(values(802), 802 * PERIOD_NS + 100_000)
-    for number in range(801, 900):
-        measurement.take_frame(frame(number), late_ns)
+    measurement.take_message(values(803), 803 * PERIOD_NS + 100_000)
+    for number in range(802, 900):  # this process was held up
+        measurement.take_frame(frame(number), 3 * SECOND_NS)
     assert measurement.summary().all_decoded_right
-    assert measurement.messages == 803
+    assert measurement.messages == 804
 
 
 def test_a_message_whose_sample_was_withheld_is_not_judged() -> None:
@@ -71,30 +65,30 @@ def test_a_message_whose_sample_was_withheld_is_not_judged() -> None:
     assert measurement.messages == 802
 
 
-def test_each_fault_is_found() -> None:
-    lost = measured()
-    lost.take_frame(frame(801), 801 * PERIOD_NS)
-    lost.take_frame(frame(802), 802 * PERIOD_NS)
-    lost.take_message(values(802), 802 * PERIOD_NS)
-    assert lost.summary().lost == 1
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        ([values(802)], None),
+        ([values(800)], "1 messages came twice"),
+        ([[1.5] * 12], "no sample"),
+        ([[math.inf] * 12], "not finite"),
+    ],
+)
+def test_each_fault_is_found(messages: list[list[float]], words: str | None) -> None:
+    measurement = measured()
+    for number in range(801, 830):
+        measurement.take_frame(frame(number), number * PERIOD_NS)
+    for message in messages:
+        measurement.take_message(message, 810 * PERIOD_NS)
+    measurement.take_message(values(829), 829 * PERIOD_NS)
+    summary = measurement.summary()
+    assert words in str(verdict(summary, 800)) if words else verdict(summary, 800) is None
+    assert summary.lost == (27 if words is None else 28)
 
-    repeated = measured()
-    repeated.take_message(values(800), 801 * PERIOD_NS)
-    assert repeated.summary().repeated == 1
-    assert "twice" in str(verdict(repeated.summary(), 800))
 
-    wrong = measured()
-    wrong.take_message([1.5] * 12, 801 * PERIOD_NS)
-    wrong.take_frame(frame(1700), 801 * PERIOD_NS + 2 * SECOND_NS)
-    assert "no sample" in str(verdict(wrong.summary(), 800))
-
-    infinite = measured()
-    infinite.take_message([math.inf] * 12, 801 * PERIOD_NS)
-    assert "finite" in str(verdict(infinite.summary(), 800))
-
+def test_the_rate_is_judged_and_what_came_before_is_lost_too() -> None:
     assert "800.0 messages/s" in str(verdict(measured().summary(), 1600))
     assert "nothing" in str(verdict(Measurement().summary(), 800))
-
     gap = measured()
     gap.take_frame(frame(805, DataFlag.GAP), 805 * PERIOD_NS)
     assert gap.summary().lost_before == 4

@@ -17,19 +17,6 @@ from tests.clients.recordings import frame
 DOCS = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()
 
 
-@pytest.mark.parametrize("program", [record_options, replay_options], ids=["record", "replay"])
-def test_every_option_is_described(program: object, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        program.parse_options(["--help"])  # type: ignore[attr-defined]
-    options = set(re.findall(r"--[a-z][a-z-]+", capsys.readouterr().out)) - {
-        "--help",
-        "--version",
-        "--print-completion",
-    }
-    assert len(options) > 5
-    assert not {option for option in options if f"`{option}" not in DOCS}
-
-
 def test_arguments_and_options_may_stand_in_any_order() -> None:
     recording = record_options.parse_options(["a.mcap", "--seconds", "5", "host:1"])
     assert (recording.path, str(recording.address), recording.seconds) == (Path("a.mcap"), "host:1", 5)
