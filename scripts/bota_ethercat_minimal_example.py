@@ -1,7 +1,15 @@
-"""Listing III.5 of the design note, live values without a server: the same as `ethercat-sensor watch`."""
+"""The listings of the design note by their names there, links to this file: `ethercat-sensor COMMAND`."""
 
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent.parent))  # works from a checkout that is not installed
-sys.exit(__import__("ethercat_server.tool.cli", fromlist=["main"]).main(["watch", *sys.argv[1:]]))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # works from a checkout that is not installed
+from ethercat_server.tool.cli import main
+
+COMMANDS = {
+    "find_ethernet_adapters": "adapters",  # III.1
+    "read_eeprom": "eeprom",  # III.3
+    "bota_ethercat_minimal_example": "watch",  # III.5
+    "sensor_configuration_SDO_reader": "objects",  # III.6
+}
+sys.exit(main([COMMANDS[Path(__file__).stem], *sys.argv[1:]]))
