@@ -33,8 +33,7 @@ from protocol.framing import DataMessage, FrameDecoder, encode_json
 from protocol.pdo import ImuUnits
 from protocol.sensor_choice import MOST_PLACES
 from protocol.text.json_text import JsonObject
-from protocol.text.untrusted import rows
-from protocol.text.visible import printable
+from protocol.text.untrusted import printable, rows
 
 _FIRST_RETRY_NS: Final = 100_000_000
 _LONGEST_RETRY_NS: Final = 1_000_000_000

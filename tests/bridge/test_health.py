@@ -13,8 +13,7 @@ from bridge.diagnostics.observer import CompensationState, Counts, Snapshot
 from bridge.stream.link import SensorInfo
 from bridge.stream.watch import Flags, Watch
 from protocol.framing import DataMessage
-from protocol.health.limits import LIMITS
-from protocol.health.verdict import Level
+from protocol.health.verdict import LIMITS, Level
 from protocol.pdo import encode
 from protocol.sensor.warnings_register import WARNINGS, Severity
 from tests.compensation.making import BIAS, TOOL

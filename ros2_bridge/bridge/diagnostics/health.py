@@ -10,10 +10,8 @@ from typing import NamedTuple
 from bridge.diagnostics.observer import SLOW_ANSWER_S, Snapshot, mapping, row_of
 from protocol.health.judge import SATURATIONS
 from protocol.health.judge import judge as judge_stream
-from protocol.health.limits import Limits
-from protocol.health.verdict import About, Level
-from protocol.text.untrusted import number, whole
-from protocol.text.visible import printable
+from protocol.health.verdict import About, Level, Limits
+from protocol.text.untrusted import number, printable, whole
 
 Values = dict[str, object]
 

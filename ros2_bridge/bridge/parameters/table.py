@@ -14,7 +14,7 @@ from bridge.parameters.compensation import CompensationParameters, gather
 from bridge.parameters.row import NO_TEXTS, Numbers, ParameterError, Row
 from bridge.parameters.wrench_frames import WrenchFrame, parse
 from protocol.client.real_time import HIGHEST_PRIORITY
-from protocol.health.limits import LIMITS, Limits
+from protocol.health.verdict import LIMITS, Limits
 from protocol.pdo import ImuUnits
 
 _UNKNOWN: Final = (0.0, 0.0, 0.0)

@@ -18,8 +18,7 @@ from protocol.control import Event, six_numbers
 from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError, SettingError
 from protocol.settings import SETTINGS, SettingValue
 from protocol.text.json_text import JsonObject
-from protocol.text.untrusted import number, rows
-from protocol.text.visible import printable
+from protocol.text.untrusted import number, printable, rows
 
 CONFIGURE_TIMEOUT_S: Final = 10.0
 DESCRIBE_TIMEOUT_S: Final = 3.0
