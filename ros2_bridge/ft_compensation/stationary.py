@@ -136,8 +136,8 @@ def stationary_means(rows: Array, seconds: float, limits: StationaryLimits) -> S
             f"the sensor turns: its mean angular rate is {rate:.2g} rad/s, the limit is "
             f"{limits.angular_rate:g} rad/s"
         )
-    f, t, a, r = (_triple(mean[first : first + 3]) for first in (0, 3, 6, 9))
-    of_force, of_torque, of_acceleration = (_triple(spread[first : first + 3]) for first in (0, 3, 6))
+    f, t, a, r = (triple(mean[first : first + 3]) for first in (0, 3, 6, 9))
+    of_force, of_torque, of_acceleration = (triple(spread[first : first + 3]) for first in (0, 3, 6))
     return StationaryMeans(Wrench(f, t), a, r, of_force, of_torque, len(rows), seconds, of_acceleration)
 
 
@@ -164,6 +164,7 @@ def _what_is_wrong(sample: Sample) -> str | None:
     return None
 
 
-def _triple(values: Array) -> Vector3:
+def triple(values: Array) -> Vector3:
+    """Three numbers of an array, in plain floats."""
     x, y, z = values.tolist()
     return x, y, z

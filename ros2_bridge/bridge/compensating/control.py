@@ -12,9 +12,8 @@ from typing import Any, Final
 
 from rclpy.node import Node
 
-from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper
+from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper, OwnOffset
 from bridge.compensating.orientations import SourceChoice
-from bridge.compensating.own_offset import OwnOffset
 from bridge.compensating.tool_sources import IMU_IS_OFF, Source
 from bridge.diagnostics.observer import CompensationState
 from bridge.parameters.compensation import CompensationParameters

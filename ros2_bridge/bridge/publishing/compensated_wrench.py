@@ -6,10 +6,9 @@ open. What it goes by is a `Plan`, which the executor's thread replaces as a who
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from bridge.compensating.tool_sources import Source
 from bridge.parameters.compensation import CompensationParameters
@@ -23,9 +22,6 @@ from ft_compensation.stationary import StationaryWindow
 from ft_compensation.stationary_limits import StationaryLimits
 from protocol.framing import DataMessage
 from protocol.pdo import Sample, Vector3
-
-_BEGINS_S: Final = 1.0
-"""How long an orientation may be missing after a start before it is an error."""
 
 
 class Plan(NamedTuple):
@@ -87,11 +83,9 @@ class CompensatedOutput:
         self.stops_on_saturation = self.is_saturated = False
         """Whether saturated samples are not published, and whether the latest was one of them."""
         self.published = self.withheld = 0
-        """Samples since the node started that were compensated, and that were not, but for the beginning."""
+        """Samples since the node started that were compensated, and that were not."""
         self.is_stopped = False
-        """Whether the latest could not be compensated; at the start, whether for long."""
-        self._begins_s = math.inf
-        """Time of a subscription after which nothing was published yet, s; infinite: unknown."""
+        """Whether the latest could not be compensated."""
         self.sample: Sample | None = None
         """The latest that came here."""
         self.time_s = self.stamp_s = 0.0
@@ -102,7 +96,7 @@ class CompensatedOutput:
         self._wanted = tuple(topic for topic in self._all if topic.is_wanted())
         self._noting = tuple(topic for topic in self._wanted if topic.takes_all)
         if not self._wanted:
-            self.is_stopped, self._begins_s = False, math.inf  # nobody misses anything
+            self.is_stopped = False  # nobody misses anything
         return bool(self._wanted) or self.window is not None
 
     @property
@@ -149,12 +143,10 @@ class CompensatedOutput:
         time_s = self.time_s
         self.is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
         if felt is None or self.hold is not None or self.is_saturated:
-            self._begins_s = min(self._begins_s, time_s)
-            is_new = felt is None and not plan.source.is_imu and 0.0 <= time_s - self._begins_s <= _BEGINS_S
-            self.is_stopped = not is_new
-            self.withheld += not is_new
+            self.is_stopped = True
+            self.withheld += 1
             return
-        self.is_stopped, self._begins_s = False, -math.inf
+        self.is_stopped = False
         stages = self._stages(plan, sample, felt, time_s)
         if (watch := plan.watch) is not None and watch.is_due(time_s):
             gravity = -felt[0], -felt[1], -felt[2]

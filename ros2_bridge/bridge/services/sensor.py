@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 
 from bridge.parameters.sensor_settings import SettingsParameters
 from bridge.stream.link import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, Link, RequestFailedError, find_sensor
-from ft_compensation.quantities import AXES
+from ft_compensation.quantities import Wrench, wrench_text
 
 _TARE_S: Final = 0.5
 """How long a tare averages."""
@@ -67,7 +67,7 @@ class Services:
         reply = self._link.ask("tare", timeout_s, sensor=self._link.sensor, samples=samples)
         titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
         parts = [f"{title} {_wrench_text(reply.get(key))}" for key, title in titles]
-        text = f"sensor {self._link.sensor} tared (N, Nm): " + "; ".join(parts)
+        text = f"sensor {self._link.sensor} tared: " + "; ".join(parts)
         if also := self._after_tare():
             text += f". {also}"
         self._log.info(text)
@@ -101,6 +101,7 @@ class Services:
 
 
 def _wrench_text(values: object) -> str:
-    if not isinstance(values, list) or len(values) != 6 or not all(type(v) in (int, float) for v in values):
+    try:
+        return wrench_text(Wrench.of(values))
+    except ValueError:
         return "unknown"
-    return " ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, values, strict=True))

@@ -23,6 +23,7 @@ from ft_compensation.quantities import (
     Wrench,
     length,
 )
+from ft_compensation.stationary import triple
 from protocol.pdo import Vector3
 
 LARGEST_MASS: Final = 500.0
@@ -136,7 +137,7 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
         raise IdentificationError("the poses do not suffice: their equations leave an unknown open") from None
     mass, mass_interval = float(found.mass.value[0]), float(found.mass.half[0])
     _check_mass(mass, mass_interval)
-    payload = Payload(mass, _triple(found.center.value))
+    payload = Payload(mass, triple(found.center.value))
     weight = mass * float(np.linalg.norm(gravity, axis=1).mean())
     moment = weight * max(ARM, length(payload.center))
     forces, torques = found.residuals[:, :3], found.residuals[:, 3:]
@@ -150,7 +151,7 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
         )
     _check_fit(torque, torques, _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment, "Nm")
     residuals = tuple(map(Wrench.of, found.residuals.tolist()))
-    centre_interval = _triple(found.center.half)
+    centre_interval = triple(found.center.half)
     accelerometer = _accelerometer(found.offset, found.scale)
     return Identified(
         payload,
@@ -183,7 +184,7 @@ def _accelerometer(offset: Value | None, scale: Value | None) -> OffsetFit | Non
     limit = _UNKNOWN * NORMAL_95 * OFFSET_PRIOR
     open_axes = "".join(axis for axis, half in zip("xyz", offset.half, strict=True) if half > limit)
     values = offset.value, scale.value, offset.half, scale.half
-    return OffsetFit(Accelerometer(*map(_triple, values)), open_axes)
+    return OffsetFit(Accelerometer(*map(triple, values)), open_axes)
 
 
 def _condition(gravity: Array) -> float:
@@ -226,11 +227,6 @@ def _check_fit(fit: Fit, residuals: Array, limit: float, unit: str) -> None:
             f"{unit}; pose {worst + 1} fits worst; something touched the tool, or it moved: take that pose "
             "again"
         )
-
-
-def _triple(values: Array) -> Vector3:
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, weight: float) -> Fit:

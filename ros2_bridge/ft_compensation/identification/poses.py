@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ft_compensation.bias import gravity_of
 from ft_compensation.quantities import ZERO, CompensationError, Wrench, length
-from ft_compensation.stationary import StationaryMeans
+from ft_compensation.stationary import StationaryMeans, triple
 from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 LEAST_POSES: Final = 4
@@ -109,7 +109,7 @@ def coverage(poses: Sequence[Pose], *, one_axis: bool = False) -> Coverage:
     _, spread, axes = _spread(down)
     return Coverage(
         len(poses),
-        _triple(spread),
+        triple(spread),
         _missing(len(poses), spread, axes, one_axis),
         _sentence(_next_up(down)),
     )
@@ -192,8 +192,3 @@ def _sentence(up: NDArray[np.float64]) -> str:
         return f"turn the sensor so that its {axes[0]} axis points up"
     named = ", ".join(axes[:-1]) + f" and {axes[-1]}"
     return f"turn the sensor so that its {named} axes point up equally steeply"
-
-
-def _triple(values: NDArray[np.float64]) -> Vector3:
-    x, y, z = values.tolist()
-    return x, y, z
