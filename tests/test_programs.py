@@ -58,13 +58,8 @@ def interrupted(name: str, number: int, at: str, arguments: str) -> tuple[int, s
     ("name", "module", "arguments"),
     [
         ("ethercat-sensor", "argparse", "--help"),
-        ("ethercat-sensor", "ethercat_server.access.sensors", "--help"),
         ("ethercat-doctor", "ethercat_server.daemon.options", "--help"),
-        ("ethercat-virtual-sensor", "argparse", "--help"),
-        ("ethercat-identify", "clients.program", "--help"),
-        ("ethercat-record", "clients.record.options", "--help"),
         ("ethercat-report", "jinja2", "--seconds 1"),
-        ("ethercat-monitor", "clients.monitor.options", "--help"),
         ("ethercat-monitor", "clients.monitor.program", "--once"),
         ("ethercat-monitor", "textual.app", ""),
         ("ethercat-server", "ethercat_server.process.signals", "--help"),

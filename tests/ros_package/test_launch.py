@@ -16,8 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.ros_package.package_files import PACKAGE, ROOT
-from tests.ros_package.page_commands import console, in_text
+from tests.ros_package.package_files import PACKAGE, ROOT, console, in_text
 from tests.ros_package.test_launch_files import ARGUMENTS
 from tests.server.running import free_port, needs_bus
 

@@ -19,8 +19,7 @@ import pytest
 import setuptools
 from catkin_pkg.package import parse_package
 
-from tests.ros_package.package_files import PACKAGE, ROOT, SHARED_FOLDERS, shared_files
-from tests.ros_package.page_commands import in_text
+from tests.ros_package.package_files import PACKAGE, ROOT, SHARED_FOLDERS, in_text, shared_files
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 MARKER = "share/ament_index/resource_index/packages"

@@ -15,8 +15,7 @@ from xml.etree import ElementTree
 import pytest
 from catkin_pkg.packages import find_packages
 
-from tests.ros_package.package_files import PACKAGE, ROOT, shared_files
-from tests.ros_package.page_commands import Command, console, in_text
+from tests.ros_package.package_files import PACKAGE, ROOT, Command, console, in_text, shared_files
 
 # What colcon needs for a Python package comes from PyPI; setuptools 80 has lost what --symlink-install needs.
 TOOLS = ("colcon-common-extensions", "rosdep", "setuptools<80", "pytest")
