@@ -70,7 +70,7 @@ def test_tare_asks_first_and_only_y_does_it() -> None:
         assert "Sensor 0  BFT-SENS" in await stage.press("n")
         assert "Tare sensor 1?" in await stage.press("n", "t")
         await stage.press("y")
-        wait_until(lambda: "Sensor 1 was not tared: no connection to the server" in stage.shown(), "a word")
+        wait_until(lambda: "Sensor 1 was not tared: " in stage.shown(), "a word")
         await stage.press("t", "u")
         wait_until(lambda: "The tare of sensor 1 was not undone: " in stage.shown(), "another")
         await stage.press("t", "C")

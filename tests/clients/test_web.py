@@ -18,7 +18,7 @@ import pytest
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from clients.monitor.options import parse
+from clients.monitor.cli import parse
 from clients.monitor.tare import Say
 from clients.monitor.web.hub import MOST_BEHIND, MOST_PAGES, Hub, Page, WebModel, state_text
 from clients.monitor.web.points import CHANNELS, HEADER, STEP_NS, Feed

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import hmac
+import ipaddress
 import json
 import secrets
 import threading
@@ -189,6 +190,16 @@ class Hub:
 
     def _say(self, text: str, bad: bool = False) -> None:
         self._model.say(f"{clock_text()} {text}", bad)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host, without port, is this machine."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def state_text(state: State, position: int, number: int) -> str:

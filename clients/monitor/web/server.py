@@ -26,12 +26,12 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from clients.monitor.options import Options, is_loopback
 from clients.monitor.reader import Reader
 from clients.monitor.tare import start_tare
-from clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, WebModel
+from clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, WebModel, is_loopback
 from clients.program import call_on, say
 from protocol.address import Address
+from protocol.pdo import ImuUnits
 
 STATE_S: Final = 0.2
 POINTS_S: Final = 1 / 30
@@ -65,10 +65,10 @@ _WHY: Final = {
 _QUIET: Final = logging.Logger(__name__, logging.CRITICAL)
 
 
-def run_web(options: Options, where: Address) -> int:
-    """Serve the page until a signal or the time limit; returns the exit code."""
+def run_web(address: Address, where: Address, imu_units: ImuUnits, seconds: float | None) -> int:
+    """Serve the page of the server at `address` until a signal or for `seconds`; returns the exit code."""
     try:
-        asyncio.run(_run(options, where))
+        asyncio.run(_run(address, where, imu_units, seconds))
     except OSError as error:
         if error.errno not in _WHY:
             raise
@@ -77,12 +77,12 @@ def run_web(options: Options, where: Address) -> int:
     return 0
 
 
-async def _run(options: Options, where: Address) -> None:
+async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: float | None) -> None:
     stop = asyncio.Event()
     call_on(asyncio.get_running_loop(), stop.set, "SIGINT", "SIGTERM", "SIGHUP")
-    model = WebModel(str(options.address), options.imu_units)
-    hub = Hub(model, partial(start_tare, options.address))
-    reader = Reader(options.address, model, POINTS_S)
+    model = WebModel(str(address), imu_units)
+    hub = Hub(model, partial(start_tare, address))
+    reader = Reader(address, model, POINTS_S)
     async with serving(hub, model, *where) as port:
         sys.stdout.write(
             f"Open http://{Address(where.host, port)}/#token={hub.token}\n"
@@ -92,7 +92,7 @@ async def _run(options: Options, where: Address) -> None:
         reader.start()
         try:
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(stop.wait(), options.seconds)
+                await asyncio.wait_for(stop.wait(), seconds)
         finally:
             reader.close()
 

@@ -1,6 +1,6 @@
 // Puts the page together: what comes over the link goes into traces, readings, arrows and cards.
 
-import { byId, element, fill, setText } from "./dom.js";
+import { byId, dark, element, fill, setText } from "./dom.js";
 import { Link } from "./link.js";
 import { GROUPS, History, Trace } from "./traces.js";
 import { Wrench } from "./wrench.js";
@@ -225,7 +225,7 @@ function arrows() {
   });
 }
 
-document.addEventListener("theme", () => {
+dark.addEventListener("change", () => {
   drawn = 0;
   for (const trace of traces) trace.plot.redraw();
 });
