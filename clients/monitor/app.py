@@ -116,7 +116,7 @@ class Monitor(App[None]):
         if self._look.paused and self._state is not None:
             state = replace(self._state, message=state.message)
         self._state = state
-        recording = f"REC {duration(self.recorder.seconds(now_s))}" if self.recorder.running else ""
+        recording = f"REC {duration(now_s - self.recorder.since_s)}" if self.recorder.running else ""
         self._view.show(render(state, replace(self._look, recording=recording), *self._view.size))
 
     def action_help_quit(self) -> None:

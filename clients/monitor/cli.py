@@ -10,7 +10,7 @@ import errno
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from clients.arguments import add_imu_units, add_server, address, parser, seconds, server_of
@@ -116,11 +116,10 @@ def run(options: Options) -> int:
     try:
         if live:
             return _live(options, model)
-        answered = reader.wait_for_answer(_ANSWER_S)
+        answered = reader.tried.wait(_ANSWER_S) and model.state(time.monotonic()).server.connected
         if options.once:
             return _once(options, model, answered=answered)
-        every_second(options.seconds, _json_lines(model) if options.json else _lines(options, model))
-        return 0
+        return _each_second(options, model)
     finally:
         reader.close()
 
@@ -157,42 +156,34 @@ def _live(options: Options, model: Model) -> int:
     return app.return_code or 0
 
 
-def every_second(limit_s: float | None, show: Callable[[], None]) -> None:
-    """Call once a second, until the limit."""
+def _each_second(options: Options, model: Model) -> int:
+    """An object, or a line per sensor; trouble with the server is reported once."""
+    from clients.monitor.screen import line  # noqa: PLC0415
+
+    was_wrong = False
+    for _ in ticks(options.seconds):
+        state, now = model.state(time.monotonic()), clock_text()
+        wrong = trouble(state.server)
+        if options.json:
+            _say(json_line(state, time.time()))
+            model.reset()  # peaks and warnings of the next line are those of its own second
+        elif wrong is None:
+            _say(*(line(sensor, now) for sensor in state.sensors), ascii_only=options.ascii)
+        elif not was_wrong:
+            _say(f"{now}  server {wrong}", ascii_only=options.ascii)
+        was_wrong = wrong is not None
+    return 0
+
+
+def ticks(limit_s: float | None) -> Iterator[None]:
+    """Once a second, until the limit; whoever is late does not hurry afterwards."""
     start_s = due_s = time.monotonic()
     while True:
         due_s = max(due_s + _PERIOD_S, time.monotonic())
         if limit_s is not None and due_s > start_s + limit_s + 0.5 * _PERIOD_S:
             return
         time.sleep(max(0.0, due_s - time.monotonic()))
-        show()
-
-
-def _json_lines(model: Model) -> Callable[[], None]:
-    def show() -> None:
-        _say(json_line(model.state(time.monotonic()), time.time()))
-        model.reset()  # peaks and warnings of the next line are those of its own second
-
-    return show
-
-
-def _lines(options: Options, model: Model) -> Callable[[], None]:
-    """A line per sensor; trouble with the server is reported once."""
-    from clients.monitor.screen import line  # noqa: PLC0415
-
-    was_wrong = False
-
-    def show() -> None:
-        nonlocal was_wrong
-        state, now = model.state(time.monotonic()), clock_text()
-        wrong = trouble(state.server)
-        if wrong is None:
-            _say(*(line(sensor, now) for sensor in state.sensors), ascii_only=options.ascii)
-        elif not was_wrong:
-            _say(f"{now}  server {wrong}", ascii_only=options.ascii)
-        was_wrong = wrong is not None
-
-    return show
+        yield
 
 
 def _say(*lines: str, ascii_only: bool = False) -> None:

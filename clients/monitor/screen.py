@@ -115,7 +115,7 @@ def table(state: State) -> list[str]:
     if server.replay:
         lines.append(f"  REPLAY of {server.replay}")
     facts = [f"{name.lower()} {value}" for name, value in words.server_facts(server)]
-    lines += [f"  {wrong}"] if wrong else [f"  {'; '.join(row)}" for row in (facts[:5], facts[5:]) if row]
+    lines += [f"  {wrong}"] if wrong else [f"  {'; '.join(row)}" for row in (facts[:4], facts[4:]) if row]
     lines += [f"  client {words.client(client)}" for client in state.clients]
     for sensor in state.sensors:
         rows = [*_panel(sensor, (), _TABLE_WIDTH, trace=False), *_alerts(sensor, 1 << 16, 1 << 16)]
@@ -190,13 +190,8 @@ def _server(state: State) -> Text:
         return _field("Server", wrong, BAD)
     if server.uptime_s is None:
         return _field("Server", "waiting for its status")
-    text = (
-        f"up {numbers.duration(server.uptime_s)}  missed deadlines {words.count(server.missed_deadlines)}  "
-        f"lost frames {words.count(server.lost_frames)}"
-    )
-    if server.exchange_us is not None:
-        text += f"  exchange {numbers.milliseconds(server.exchange_us.worst)} ms p99"
-    return _field("Server", text)
+    facts = [f"{name.lower()} {value}" for name, value in words.server_facts(server)]
+    return _field("Server", "  ".join(facts[:4]))
 
 
 def _clients(state: State, width: int) -> Text:

@@ -74,13 +74,13 @@ def server_facts(server: ServerState) -> list[tuple[str, str]]:
     if not server.connected or server.uptime_s is None:
         return []
     return [
-        ("Version", server.version or "?"),
         ("Up", duration(server.uptime_s)),
-        ("Cycles", count(server.cycles)),
         ("Missed deadlines", count(server.missed_deadlines)),
         ("Lost frames", count(server.lost_frames)),
-        ("Woke late by", times(server.wake_us, "p99")),
         ("Exchange", times(server.exchange_us, "p99")),
+        ("Woke late by", times(server.wake_us, "p99")),
+        ("Cycles", count(server.cycles)),
+        ("Version", server.version or "?"),
     ]
 
 

@@ -176,12 +176,9 @@ def test_a_line_a_second_until_the_limit(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr(cli, "time", SimpleNamespace(sleep=clock.sleep, monotonic=monotonic))
     times = []
-
-    def show() -> None:
+    for _ in cli.ticks(4.0):
         times.append(round(monotonic() - 1.0, 3))
         clock.sleep(1.8 if len(times) == 1 else 0.3)  # whoever is late does not hurry afterwards
-
-    cli.every_second(4.0, show)
     assert times == [1.0, 2.8, 3.8]
 
 

@@ -45,7 +45,6 @@ class WebModel(Model):
     def __init__(self, address: str, imu_units: ImuUnits = ImuUnits.G_DPS) -> None:
         super().__init__(address, imu_units)
         self.feed = Feed(imu_units)
-        self.on_points: Callable[[], None] = lambda: None  # called when there may be new points
 
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
         """See `Model`."""
@@ -56,7 +55,6 @@ class WebModel(Model):
         """See `Model`."""
         super().take(frames, now_s)
         self.feed.take(frames)
-        self.on_points()
 
 
 class Page:

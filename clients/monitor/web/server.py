@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import itertools
 import logging
 import socket
 import sys
@@ -33,8 +34,8 @@ from clients.program import call_on, say
 from protocol.address import Address
 from protocol.pdo import ImuUnits
 
-STATE_S: Final = 0.2
 POINTS_S: Final = 1 / 30
+POINTS_A_STATE: Final = 6
 STREAM: Final = "/stream"  # where the page opens its WebSocket
 HEADERS: Final = {
     "Content-Security-Policy": (
@@ -83,7 +84,7 @@ async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: f
     model = WebModel(str(address), imu_units)
     hub = Hub(model, partial(start_tare, address))
     reader = Reader(address, model, POINTS_S)
-    async with serving(hub, model, *where) as port:
+    async with serving(hub, *where) as port:
         sys.stdout.write(
             f"Open http://{Address(where.host, port)}/#token={hub.token}\n"
             "With this link the page can tare the sensor; without #token=... it only shows. Ctrl-C ends it.\n"
@@ -99,14 +100,11 @@ async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: f
 
 @contextlib.asynccontextmanager
 async def serving(
-    hub: Hub, model: WebModel, host: str, port: int, clock: Callable[[], float] = time.monotonic
+    hub: Hub, host: str, port: int, clock: Callable[[], float] = time.monotonic
 ) -> AsyncIterator[int]:
     """Serve on a loopback address, `localhost` on both; gives the port. OSError if it cannot be had."""
     listening = _listen(host, port)
-    loop, page_files = asyncio.get_running_loop(), read_page()
-
-    def respond(_: ServerConnection, request: Request) -> Response | None:
-        return answer(page_files, request)
+    page_files = read_page()
 
     async def converse(connection: ServerConnection) -> None:
         page = hub.join(partial(broadcast, [connection]), clock())
@@ -124,22 +122,19 @@ async def serving(
             hub.leave(page)
 
     async def send() -> None:
-        while True:
-            hub.send_states(clock())
+        for count in itertools.count():
+            if count % POINTS_A_STATE == 0:
+                hub.send_states(clock())
             hub.send_points(clock())
-            await asyncio.sleep(STATE_S)
+            await asyncio.sleep(POINTS_S)
 
-    def points_are_due() -> None:  # in the reader's thread
-        loop.call_soon_threadsafe(lambda: hub.send_points(clock()))
-
-    model.on_points = points_are_due
     async with contextlib.AsyncExitStack() as stack:
         for sock in listening:
             await stack.enter_async_context(
                 serve(
                     converse,
                     sock=sock,
-                    process_request=respond,
+                    process_request=lambda _, request: answer(page_files, request),
                     compression=None,
                     max_size=MOST_BYTES,
                     max_queue=4,
@@ -153,7 +148,6 @@ async def serving(
         try:
             yield listening[0].getsockname()[1]
         finally:
-            model.on_points = lambda: None
             sending.cancel()
 
 
