@@ -31,6 +31,7 @@ from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.address import Address
 from protocol.client import Client
 from tests.bridge.scripted_server import ScriptedServer
+from tests.clients.captures import DOCS
 from tests.served_simulation import ServedSimulation, served
 from tests.server.as_another_user import NO_OTHER_USER
 from tests.server.running import PATIENCE_S, free_port, wait_until
@@ -153,15 +154,8 @@ def test_once_without_a_server_is_exit_1_and_one_sentence(run: Run) -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        ["nonsense:port"],
-        ["localhost:0"],
-        ["::1"],
-        ["a", "b"],
-        ["--seconds", "0"],
-        ["--once", "--seconds", "3"],
-    ],
-)
+    [["nonsense:port"], ["localhost:0"], ["::1"], ["a", "b"], ["--seconds=0"], ["--once", "--seconds=3"]],
+)  # fmt: skip
 def test_wrong_usage_is_exit_2(arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         parse(arguments)
@@ -195,11 +189,8 @@ def test_json_has_the_documented_keys(shared: ServedSimulation, run: Run) -> Non
     assert sensor["units"] == ["N", "Nm"]
     assert sensor["clock"]["mode"] in {"locked", "oversampling"}
     assert any(client["this"] for client in line["clients"])
-    assert documented_keys() == keys(line) | ALERT
-
-
-ALERT = {"severity", "text", "remedy"}
-"""Of which there are none on a machine that is not busy."""
+    alert = {"severity", "text", "remedy"}  # of which there are none on a machine that is not busy
+    assert documented_keys() == keys(line) | alert
 
 
 def keys(value: Any) -> set[str]:
@@ -209,8 +200,6 @@ def keys(value: Any) -> set[str]:
 
 
 def documented_keys() -> set[str]:
-    from tests.clients.captures import DOCS
-
     table = (DOCS / "monitor.md").read_text().split("## JSON")[1]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     return {key for row in rows for key in row.replace("`", "").replace(",", " ").split()}
@@ -310,13 +299,6 @@ def test_rate_jitter_age_and_the_own_row_among_the_clients_are_known(shared: Ser
         assert sensor.peaks is not None
 
 
-def test_tare_says_what_is_left() -> None:
-    with simulated_bus("--signal", "rest") as bus, simulated_server(bus):
-        text, bad = tare(Address("localhost", 1), 0)
-    assert not bad
-    assert re.fullmatch(r"Sensor 0 was tared; residual at most [0-9.]+ N and [0-9.]+ Nm", text)
-
-
 @pytest.fixture(autouse=True)
 def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where this user's last tares are kept."""
@@ -324,7 +306,7 @@ def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_tare_is_undone_and_cleared() -> None:
+def test_a_tare_says_what_is_left_and_is_undone_and_cleared() -> None:
     address = Address("localhost", 1)
 
     def offset() -> list[float]:
@@ -337,7 +319,9 @@ def test_a_tare_is_undone_and_cleared() -> None:
             "The tare of sensor 0 was not undone: no tare of it by this user is known; its offset can be "
             "cleared", True,
         )  # fmt: skip
-        tare(address, 0)
+        text, bad = tare(address, 0)
+        assert not bad
+        assert re.fullmatch(r"Sensor 0 was tared; residual at most [0-9.]+ N and [0-9.]+ Nm", text)
         tared = offset()
         assert tare(address, 0, "undo") == ("The tare of sensor 0 was undone", False)
         assert offset() == [0.0] * 6

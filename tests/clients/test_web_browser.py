@@ -106,9 +106,13 @@ def test_what_is_shown_is_what_was_sent(page: Page, web: Web) -> None:
     fits(page, 360)
 
 
-def test_a_lost_server_is_said_and_comes_back(page: Page, web: Web) -> None:
+def test_silence_and_a_lost_server_are_said_and_it_comes_back(page: Page, web: Web) -> None:
     feed(web, 160)
     page.wait_for("!document.body.classList.contains('stale')")
+    web.now_s += 3.0
+    web.model.take_status(made.status(), web.now_s)
+    wait_for_text(page, "#trouble", "No new sample for 3 s: these values are old")
+    assert page.value("document.body.classList.contains('stale')")
     web.model.gone("no server answers (Connection refused)", web.now_s)
     wait_for_text(page, "#trouble", "no server answers (Connection refused); reconnecting")
     assert page.value("document.body.classList.contains('stale')")
@@ -158,16 +162,6 @@ def test_warnings_alone_are_amber(page: Page, web: Web) -> None:
         page.wait_for(f"document.querySelectorAll('#warnings .present').length === {bits.bit_count()}")
         assert page.text(f"#warnings {said}")
         assert edge() == colors[color]
-
-
-@pytest.mark.long
-def test_silence_makes_values_old(page: Page, web: Web) -> None:
-    feed(web, 160)
-    page.wait_for("!document.body.classList.contains('stale')")
-    web.now_s += 3.0
-    web.model.take_status(made.status(), web.now_s)
-    wait_for_text(page, "#trouble", "No new sample for 3 s: these values are old")
-    assert page.value("document.body.classList.contains('stale')")
 
 
 @pytest.mark.long
@@ -229,22 +223,6 @@ def test_a_page_without_the_token_only_shows(chromium: Page, web: Web, token: st
     assert chromium.value("document.querySelector('#tare').disabled") is True
     if token:
         wait_for_text(chromium, "#message", "not that of this run")
-
-
-@pytest.mark.long
-def test_a_page_of_another_site_gets_nothing(chromium: Page, web: Web) -> None:
-    other = Web()
-    with other.serving():
-        chromium.open(f"http://127.0.0.1:{other.port}/")
-        chromium.wait_for("document.readyState === 'complete'")
-        tried = (
-            "new Promise(done => {{ const s = new WebSocket('ws://{0}/stream');"
-            " s.onopen = () => done('open'); s.onerror = () => done('refused'); }})"
-        )
-        assert chromium.value(tried.format(f"127.0.0.1:{other.port}")) == "open"
-        assert chromium.value(tried.format(f"localhost:{web.port}")) == "refused"
-        chromium.open("about:blank")
-        chromium.wait_for("location.href === 'about:blank'")
 
 
 @pytest.mark.long
