@@ -10,6 +10,7 @@ import threading
 import tomllib
 from array import array
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple, cast
@@ -425,6 +426,10 @@ def test_a_page_says_what_the_monitor_says() -> None:
     ]
     assert dict(sensor["stream"])["Temperature"] == "34.6 °C"
     assert found["message"] == {"text": "Sensor 0 is not tared: it is not at rest", "bad": True}
+    assert (sensor["units"], sensor["imu_off"]) == (["N", "Nm"], False)
+    raw = replace(state, settings={"calibration_matrix": False, "imu_active": 0})
+    counts = json.loads(state_text(replace(made.troubled(), sensors=(raw,)), 0, 8))["sensor"]
+    assert (counts["units"], counts["imu_off"]) == (["counts", "counts"], True)
     gone = json.loads(state_text(made.gone(), 0, 8))
     assert gone["trouble"] == "gone at 12:00:00: no server answers (Connection refused); reconnecting"
     assert (gone["server"], gone["sensors"][0]["ok"], gone["sensor"]["old"]) == ([], None, "1m05s")
