@@ -23,12 +23,11 @@ skipped: other missing sequence numbers: the subscription left them out (`every`
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Final
 
-from protocol.framing import DataFlag, DataMessage
+from protocol.framing import DataFlag
 
 NOT_NEW: Final = int(DataFlag.REPEATED | DataFlag.INVALID)
 """Either of these flags says that a frame brings no new sample."""
@@ -97,6 +96,15 @@ class StreamAccounting:
         """Whether a frame has come since `begin`."""
         return self._sequence >= 0
 
+    def take_next(self, sequence: int, monotonic_ns: int) -> bool:
+        """Count a frame without flags that is the one after the last, as nearly all are; False: not so."""
+        if sequence != self._sequence + 1:
+            return False
+        self._sequence = sequence
+        self._monotonic_ns = self.new_ns = monotonic_ns
+        self.counts.new += 1
+        return True
+
     def take(self, sequence: int, monotonic_ns: int, flags: int) -> FrameKind:
         """Count the next frame; what it is."""
         counts, jump = self.counts, 0
@@ -119,22 +127,6 @@ class StreamAccounting:
         counts.new += 1
         self.new_ns = monotonic_ns
         return FrameKind.NEW
-
-    def select_new(self, frames: Iterable[DataMessage], sensor: int) -> list[DataMessage]:
-        """Count those of `frames` that are `sensor`'s; the new ones."""
-        selected = []
-        for frame in frames:
-            sequence, _, monotonic_ns, position, flags, _, _ = frame
-            if position != sensor:
-                continue
-            if sequence == self._sequence + 1 and not flags:  # as `take` has it, but faster
-                self._sequence = sequence
-                self._monotonic_ns = self.new_ns = monotonic_ns
-                self.counts.new += 1
-            elif self.take(sequence, monotonic_ns, flags) is not FrameKind.NEW:
-                continue
-            selected.append(frame)
-        return selected
 
     def _count_missing(self, jump: int, monotonic_ns: int, gap: int) -> None:
         counts = self.counts

@@ -16,7 +16,7 @@ from protocol.sensor.sdo_types import sdo_type
 from protocol.sensor_choice import SensorChoice
 from protocol.settings import check_settings
 from protocol.text.json_text import JsonObject
-from protocol.text.visible import printable
+from protocol.text.untrusted import printable
 
 PROTOCOL_VERSION: Final = 1
 MAX_SDO_BYTES: Final = 112

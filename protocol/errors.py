@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from protocol.text.visible import printable
+from protocol.text.untrusted import printable
 
 
 class ProtocolError(Exception):

@@ -59,7 +59,13 @@ _TYPE_SIZE: Final = 1
 _BODY_OFFSET: Final = _PREFIX.size
 DATA_FLAGS_OFFSET: Final = _PREFIX.size + struct.calcsize(">QQQB")
 """Offset of the flags byte in an encoded DATA message."""
-_DATA_LENGTHS: Final = frozenset(_TYPE_SIZE + _DATA_HEADER.size + size for size in LAYOUTS)
+_LENGTH_SIZE: Final = _LENGTH.size
+_UNPACK_DATA: Final = {
+    _TYPE_SIZE + _DATA_HEADER.size + size: struct.Struct(f">{_PREFIX.size}xQQQBBH{size}s").unpack_from
+    for size in LAYOUTS
+}
+"""The fields of a whole DATA message, by its length."""
+_DATA_LENGTHS: Final = frozenset(_UNPACK_DATA)
 MAX_DATA_MESSAGE_SIZE: Final = _LENGTH.size + max(_DATA_LENGTHS)
 
 
@@ -97,7 +103,10 @@ class FrameDecoder:
 
     def get_buffer(self) -> memoryview:
         """Writable free space to read into; never empty."""
-        self._make_room(4096)
+        if self._start == self._end:
+            self._start = self._end = 0
+        else:
+            self._make_room(4096)
         return memoryview(self._buffer)[self._end :]
 
     def received(self, count: int) -> None:
@@ -148,8 +157,7 @@ class FrameDecoder:
         end = self._start + _LENGTH.size + length
         self._start = end
         if kind == MessageType.DATA:
-            header = _DATA_HEADER.unpack_from(self._buffer, body)
-            return DataMessage._make((*header, bytes(self._buffer[body + _DATA_HEADER.size : end])))
+            return DataMessage._make(_UNPACK_DATA[length](self._buffer, body - _BODY_OFFSET))
         return parse_json_object(bytes(self._buffer[body:end]))
 
     def __iter__(self) -> Iterator[DataMessage | JsonObject]:
@@ -166,12 +174,10 @@ class FrameDecoder:
         if self._accept_data and self._broken is None:
             while end - start >= _BODY_OFFSET:
                 length, kind = _PREFIX.unpack_from(buffer, start)
-                after = start + _LENGTH.size + length
-                if kind != _DATA or length not in _DATA_LENGTHS or after > end:
+                unpack, after = _UNPACK_DATA.get(length), start + _LENGTH_SIZE + length
+                if kind != _DATA or unpack is None or after > end:
                     break
-                body = start + _BODY_OFFSET
-                header = _DATA_HEADER.unpack_from(buffer, body)
-                into.append(DataMessage._make((*header, bytes(buffer[body + _DATA_HEADER.size : after]))))
+                into.append(DataMessage._make(unpack(buffer, start)))
                 self._start = start = after
             if start == end:
                 return None

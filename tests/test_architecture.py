@@ -84,7 +84,7 @@ PACKAGES: Final[dict[str, set[str]]] = {
 
 WITHOUT_ROS: Final = (
     "bridge.stream", "bridge.client", "bridge.middleware", "bridge.signals", "bridge.parameters.table",
-    "bridge.compensating.gravity_sources", "bridge.publishing.compensated_wrench",
+    "bridge.compensating.tool_sources",
     "bridge.diagnostics.health", "bridge.diagnostics.observer",
 )  # fmt: skip
 """What can run, and be tested, where there is no ROS; `bridge.client` loads it later."""

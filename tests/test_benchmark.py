@@ -1,4 +1,4 @@
-"""The benchmark: what it makes of made-up records, and a short run of its parts."""
+"""The benchmark: what it makes of made-up records, its programs, and short runs."""
 
 from __future__ import annotations
 
@@ -26,38 +26,32 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from ethercat_server.virtual_sensor.measurement.signals import decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.pdo import encode
+from protocol.framing import DataMessage, FrameDecoder
+from protocol.pdo import SampleDecoder, encode
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import ScriptError, Setup
-from scripts.benchmarks.modes import comparison, vendor
-from scripts.benchmarks.modes.soak import slope_kb_per_hour
-from scripts.benchmarks.processes import recorder
-from scripts.benchmarks.program import check, renew
+from scripts.benchmarks.modes import comparison, server
+from scripts.benchmarks.processes import masters, recorder
 from scripts.benchmarks.records import Recording, began, write
-from scripts.benchmarks.statistics import Arrivals, Counts, Ints
+from scripts.benchmarks.statistics import Arrivals, Ints
 from tests.clients.running import signalled
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, needs_bus, wait_until
 
 ROOT = Path(__file__).parent.parent
 PERIOD = 1_250_000
+SETUP = Setup(800, 1, 6.0, 0)
 NO_STOPS = np.empty((0, 2), dtype=np.int64)
 
 
-def arrivals(*numbers: int, age: int = 100_000, stamp_error: int = 7) -> Arrivals:
+def arrivals(numbers: Sequence[int], age: int = 100_000) -> Arrivals:
     """Samples of a sensor that began at 10 s."""
     number = np.array(numbers, dtype=np.int64)
     instant = 10 * 10**9 + number * PERIOD
-    return Arrivals(number, instant, instant + stamp_error, instant + age)
-
-
-def stop(first: float, last: float) -> Ints:
-    """A stop from one to another time, both in sample periods since the sensor began."""
-    times = [[10 * 10**9 + int(first * PERIOD), 10 * 10**9 + int(last * PERIOD)]]
-    made: Ints = np.array(times, dtype=np.int64)
-    return made
+    return Arrivals(number, instant, instant + 7, instant + age)
 
 
 # -- lost, repeated, and whose fault it was
@@ -66,14 +60,15 @@ def stop(first: float, last: float) -> Ints:
 @pytest.mark.parametrize(
     ("numbers", "counts"),
     [
-        (range(5, 105), Counts(100, 100, 0, 0, 0)),
-        ((5, 6, 6, 7, 10, 11, 11, 11), Counts(7, 8, lost=2, lost_in_stops=0, repeated=3)),
-        ((5, 7, 6, 8), Counts(4, 4, 0, 0, 0)),  # a late one is not lost
-        ((), Counts(0, 0, 0, 0, 0)),
+        (range(5, 105), (100, 100, 0, 0, 0)),
+        ((5, 6, 6, 7, 10, 11, 11, 11), (7, 8, 2, 0, 3)),
+        ((5, 7, 6, 8), (4, 4, 0, 0, 0)),  # a late one is not lost
     ],
 )
-def test_what_is_lost_and_repeated(numbers: Sequence[int], counts: Counts) -> None:
-    assert statistics.count(arrivals(*numbers), PERIOD, NO_STOPS) == counts
+def test_what_is_lost_and_repeated(numbers: Sequence[int], counts: tuple[int, ...]) -> None:
+    found = statistics.count(arrivals(numbers), PERIOD, NO_STOPS)
+    names = ("made", "arrivals", "lost", "lost_in_stops", "repeated")
+    assert found == dict(zip(names, counts, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -86,9 +81,9 @@ def test_what_is_lost_and_repeated(numbers: Sequence[int], counts: Counts) -> No
     ],
 )
 def test_only_a_stop_at_that_time_explains_a_loss(first: float, last: float, explained: int) -> None:
-    numbers = [n for n in range(100) if n not in {21, 22, 50}]
-    counts = statistics.count(arrivals(*numbers), PERIOD, stop(first, last))
-    assert (counts.lost, counts.lost_in_stops) == (3, explained)
+    stop: Ints = (10 * 10**9 + np.array([[first, last]]) * PERIOD).astype(np.int64)
+    counts = statistics.count(arrivals([n for n in range(100) if n not in {21, 22, 50}]), PERIOD, stop)
+    assert (counts["lost"], counts["lost_in_stops"]) == (3, explained)
 
 
 def test_pauses_become_stops_only_if_longer_than_a_period() -> None:
@@ -107,32 +102,22 @@ def test_what_wraps_in_the_signal_is_made_continuous() -> None:
     ]
     (stream,) = statistics.split(np.array(records, dtype=np.int64))
     assert stream.number.tolist() == [top - 2 + k for k in range(5)]
-    assert statistics.ages(stream).tolist() == [90_000] * 5
-    assert statistics.stamp_errors(stream).size == 0
+    assert stream.ages.tolist() == [90_000] * 5
 
 
 def test_summary_of_two_sensors() -> None:
-    streams = [arrivals(1, 2, 3, age=100_000), arrivals(7, 9, age=200_000)]
+    streams = [arrivals((1, 2, 3), age=100_000), arrivals((7, 9), age=200_000)]
     figures, ages = statistics.summary(streams, PERIOD, NO_STOPS)
     assert (figures["made"], figures["arrivals"], figures["lost"]) == (6, 5, 1)
-    assert figures["age_us"] == {
-        "p50": 100.0, "p99": 200.0, "p999": 200.0, "min": 100.0, "max": 200.0,
-    }  # fmt: skip
+    assert (figures["age_us"]["p50"], figures["age_us"]["min"], figures["age_us"]["max"]) == (100, 100, 200)
     assert figures["stamp_error_us"] == {"p50": 0.0, "p99_absolute": 0.0}
     assert len(ages) == 5
 
 
 def turn(median_us: float, lost: int, cpu: float) -> comparison.Turn:
     ages = np.array([median_us * 1000] * 3)
-    spread = statistics.spread_us(ages)
-    figures = {
-        "made": 100,
-        "lost": lost,
-        "age_us": spread,
-        "cpu_percent": {"server": cpu},
-        "machine_stops": 1,
-    }
-    return {**figures, "longest_stop_us": 10.0 * lost, "server": {"clocks": []}}, ages
+    counts = {"made": 100, "lost": lost, "machine_stops": 1, "longest_stop_us": 10.0 * lost}
+    return {**counts, "age_us": statistics.spread_us(ages), "cpu_percent": {"server": cpu}}, ages
 
 
 def test_turns_are_pooled_and_their_ratios_are_medians() -> None:
@@ -143,8 +128,7 @@ def test_turns_are_pooled_and_their_ratios_are_medians() -> None:
     assert (figures["longest_stop_us"], figures["cpu_percent"]["server"]) == (50.0, 12.0)
     assert (figures["age_us"]["p50"], len(ages)) == (120.0, 9)
     found = comparison.ratios(ours, theirs)
-    assert found["age_p50"] == {"median": 1.2, "min": 1.0, "max": 2.0}
-    assert found["cpu"]["median"] == 2.4
+    assert (found["age_p50"], found["cpu"]) == (1.2, 2.4)
 
 
 def test_turns_alternate() -> None:
@@ -157,33 +141,25 @@ def test_turns_alternate() -> None:
 
         return take
 
-    setup = Setup(800, 1, 6.0, 0)
-    taken = comparison.in_turns(setup, [program("a"), program("b")])
+    taken = comparison.in_turns(SETUP, [program("a"), program("b")])
     assert order == [("a", 2.0), ("b", 2.0)] * 3
     assert [len(each) for each in taken] == [3, 3]
 
 
-# -- recording, soak, table, command line
-
-
-def test_recording_begins_after_the_warm_up(tmp_path: Path) -> None:
-    path = tmp_path / "records"
-    recording = Recording(path, warm_up_s=1.0, seconds=2.0)
-    times = iter(range(0, 10**10, 500_000_000))
-    assert not began(path).exists()
-    taken = 0
-    while recording.take(0, taken, 0, 0, next(times)):
-        taken += 1
-    recording.write()
-    assert began(path).exists()
-    assert statistics.read_numbers(path, 5)[:, 4].tolist() == [n * 500_000_000 for n in range(2, 7)]
+def test_a_repeated_sample_is_as_old_as_when_it_was_returned_first() -> None:
+    number = np.array([1, 1, 2, 4, 4, 4])
+    received = number * PERIOD + [300, 1550, 400, 500, 1750, 3000]
+    found = comparison.first_ages(Arrivals(number, number * PERIOD, 0 * number, received))
+    assert found.tolist() == [300, 400, 500]
 
 
 def test_memory_slope_leaves_the_start_out() -> None:
     seconds = np.arange(0, 3600.0, 10)
     rss = np.where(seconds < 300, 10e6, 20e6 + seconds / 3600 * 5000)
-    assert slope_kb_per_hour(seconds, rss) == pytest.approx(5.0)
+    assert server.slope_kb_per_hour(seconds, rss) == pytest.approx(5.0)
 
+
+# -- table, page, command line
 
 AGES = {"p50": 80.0, "p99": 120.0, "p999": 150.0}
 ABOUT = {"rate_hz": 800, "sensors": 1}
@@ -191,17 +167,13 @@ COUNTS = {"made": 200, "lost": 1, "lost_in_stops": 1}
 ROWS: list[dict[str, Any]] = [
     {**ABOUT, "program": "this", **COUNTS, "age_us": AGES, "cpu_percent": {"server": 9.0}},
     {**ABOUT, "program": "bare C", **COUNTS, "age_us": {"p50": 40.0, "p99": 60.0}},
-    {
-        **ABOUT,
-        "program": "this / C",
-        "ratio": {name: {"median": number} for number, name in enumerate(comparison.RATIOS, 2)},
-    },
+    {**ABOUT, "program": "this / C", "ratio": dict(zip(comparison.RATIOS, (2, 3, 4, 5), strict=True))},
     {**ABOUT, "program": "Bota's driver", "missing": "it cannot be had"},
 ]
 
 
 def test_the_table_has_what_there_is() -> None:
-    _, this, bare_c, ratio, driver = benchmark.cells(comparison.MODE, ROWS)
+    this, bare_c, ratio, driver = benchmark.cells(comparison.MODE, ROWS)
     assert this == ["800 Hz, 1", "this", "1 (1) of 200", "80.0", "120", "150", "-", "9.0", "-"]
     assert bare_c[3:6] == ["40.0", "60.0", "-"]
     assert ratio[2:] == ["", "2.00", "3.00", "4.00", "", "5.00", ""]
@@ -213,36 +185,30 @@ def test_the_table_has_what_there_is() -> None:
 
 def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     load = {"loops": 4, "chain": "TCP, ordinary", "hand_out_us": AGES, "age_us": AGES}
-    error = {"p50": -3, "p99_absolute": 9}
-    card = {"lost_percent": 0, "age_us": AGES, "stamp_error_us": error}
     content = {
         "date": "2026-11-23T01:02:03", "cpus_used": 2, "kernel": "6.1.0-x", "python": "3.11.2",
         "idle_states": True, "stolen_percent": 0.5, "comparison": ROWS, "load": [{**ABOUT, **COUNTS, **load}],
-        "cards": [{**ABOUT, "card": "2 ms", "this": card, "one at a time": {**card, "lost_percent": 13}}],
     }  # fmt: skip
     page = tmp_path / "page.md"
-    names = ("load", "node", "comparison", "cards")
+    names = ("comparison", "load")
     blocks = "".join(f"<!-- measured: {name} -->\nold\n<!-- end -->\n" for name in names)
     page.write_text(f"above\n{blocks}below\n")
     for _ in range(2):
-        renew(page, content)
+        benchmark.renew(page, content)
         text = page.read_text()
-        assert text.startswith("above\n<!-- measured: load -->\n| beside loops |")
-        assert "| 800 Hz, 4 loops: TCP, ordinary | 1 (1) | 80 / 120 / 150 | 80 / 120 / 150 |" in text
-        assert "<!-- measured: node -->\nNot measured: there was no ROS 2.\n<!-- end -->" in text
-        assert "<!-- measured: comparison -->\n**Your controller gets a sample 80 µs (p99 120)" in text
+        assert text.startswith(
+            "above\n<!-- measured: comparison -->\n**Your controller gets a sample 80 µs (p99 120)"
+        )
         assert "A bare C program: 40 µs (p99 60)." in text
-        assert "of one run: 2026-11-23, 2 CPUs, Linux 6.1.0, Python 3.11.2, with idle states." in text
-        assert text.endswith("| 800 Hz, 2 ms | 0 (13) | 80 (80) | -3 / 9 |\n<!-- end -->\nbelow\n")
-    for wrong in ("no place", text * 2, text.replace("cards", "others")):
+        assert "are of one run: 2026-11-23, 2 CPUs, Linux 6.1.0, Python 3.11.2, with idle states." in text
+        row = "| 800 Hz, 4 loops: TCP, ordinary | 1 (1) | 80 / 120 / 150 | 80 / 120 / 150 |"
+        assert text.endswith(f"{row}\n<!-- end -->\nbelow\n")
+    for wrong in ("no place", text * 2, text.replace("load", "others")):
         page.write_text(wrong)
-        with pytest.raises(ScriptError, match="once for each of comparison, load, node, cards"):
-            renew(page, content)
+        with pytest.raises(ScriptError, match="once for each of comparison, load"):
+            benchmark.renew(page, content)
         assert page.read_text() == wrong
-
-
-def test_the_documentations_page_can_be_renewed() -> None:
-    check(ROOT / "docs" / "benchmark.md")
+    benchmark.check(ROOT / "docs" / "benchmark.md")
 
 
 @pytest.mark.parametrize(
@@ -254,8 +220,7 @@ def test_the_documentations_page_can_be_renewed() -> None:
         (["--rt-priority", "99"], "--rt-priority"),
         (["--load", "0"], "--load"),
         (["--load", "65"], "--load"),
-        (["--cards", "0.5"], "0.05, 0.44, 0.86, 2, 3"),
-        (["--node", "--cards"], "not allowed with"),
+        (["--soak", "1", "--path"], "not allowed with"),
     ],
 )
 def test_wrong_arguments_are_refused(wrong: list[str], why: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -270,11 +235,8 @@ def test_wrong_arguments_are_refused(wrong: list[str], why: str, capsys: pytest.
     [
         ([], "comparison", False),
         (["--vendor"], "comparison", True),
-        (["--cards"], "cards", ()),
-        (["--cards", "0.05,3"], "cards", [0.05, 3.0]),
         (["--load", "4"], "load", 4),
         (["--soak", "2"], "soak", 2.0),
-        *[([f"--{name}"], name, True) for name in ("node", "compensation")],
     ],
 )
 def test_an_option_measures_only_what_it_names(given: list[str], mode: str, argument: object) -> None:
@@ -282,7 +244,7 @@ def test_an_option_measures_only_what_it_names(given: list[str], mode: str, argu
     assert (options.mode, options.argument) == (mode, argument)
 
 
-# -- its programs, as threads
+# -- its programs
 
 
 def clock_data(number: int, instant: int | None = None) -> bytes:
@@ -305,13 +267,45 @@ def recorded(program: Callable[..., None], path: Path, seconds: float, **options
     return thread
 
 
-def test_the_client_records_every_sample_and_its_age(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def c_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    try:
+        return masters.build(tmp_path_factory.mktemp("yardstick"))
+    except ScriptError as error:
+        pytest.skip(str(error))
+
+
+def test_numbers_are_written_whole_and_recording_begins_after_the_warm_up(tmp_path: Path) -> None:
+    write(tmp_path / "some", array("q", [1, 2, 3, 4]))
+    assert statistics.read_numbers(tmp_path / "some", 2).tolist() == [[1, 2], [3, 4]]
+    assert [p.name for p in tmp_path.iterdir()] == ["some"]
     path = tmp_path / "records"
-    with served(SensorOptions(signal="clock"), sinc_length=256) as server:
-        recorded(recorder.tcp, path, 0.1, port=server.port).join(PATIENCE_S)
+    recording = Recording(path, warm_up_s=1.0, seconds=2.0)
+    times = iter(range(0, 10**10, 500_000_000))
+    assert not began(path).exists()
+    while recording.take(0, 0, 0, 0, next(times)):
+        pass
+    recording.write()
+    assert began(path).exists()
+    assert statistics.read_numbers(path, 5)[:, 4].tolist() == [n * 500_000_000 for n in range(2, 7)]
+
+
+@pytest.mark.parametrize("client", ["Python", "C"])
+def test_a_client_records_every_sample_and_its_age(
+    client: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    path = tmp_path / "records"
+    with served(SensorOptions(signal="clock"), sinc_length=256) as running:
+        if client == "Python":
+            recorded(recorder.tcp, path, 0.1, port=running.port).join(PATIENCE_S)
+        else:
+            command = [request.getfixturevalue("c_program"), "client", str(running.port), path, "0", "0.1"]
+            subprocess.run(command, check=True, timeout=PATIENCE_S)
+    assert began(path).exists()
     figures, ages = statistics.summary(statistics.read_arrivals(path), 5_000_000, NO_STOPS)
     assert figures["made"] == figures["arrivals"] + figures["lost"] > 1
     assert figures["repeated"] == 0
+    assert figures["stamp_error_us"]
     assert ages.min() > 0
 
 
@@ -327,10 +321,59 @@ def test_the_polling_client_takes_what_is_there_when_it_looks(tmp_path: Path) ->
     looks.join(PATIENCE_S)
     (found,) = statistics.read_arrivals(path)
     counts = statistics.count(found, 1e6, NO_STOPS)
-    assert counts.lost == 0, "it reads one after the other"
-    assert counts.repeated == pytest.approx(counts.made, abs=2)
-    assert statistics.ages(found).min() > 0
+    assert counts["lost"] == 0, "it reads one after the other"
+    assert counts["repeated"] == pytest.approx(counts["made"], abs=2)
+    assert found.ages.min() > 0
     assert not found.stamp.any()
+
+
+def test_the_c_master_looks_once_at_each_sample_and_not_before_it_is_there(
+    c_program: Path, tmp_path: Path
+) -> None:
+    """Of two sensors, the second half a period after the first; one answer in 16 is lost."""
+    period = 5_000_000
+    start = time.monotonic_ns() - 10**9
+    raw, bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    connection, client = socket.socketpair()
+    arguments = (raw.fileno(), connection.fileno(), 200, 0, 2, 2, tmp_path / "own")
+    command = [str(c_program), "master", *map(str, arguments)]
+    asked: list[int] = []
+    with raw, bus, connection, client:
+        running = subprocess.Popen(command, pass_fds=(raw.fileno(), connection.fileno()))
+        bus.settimeout(PATIENCE_S)
+        while len(asked) < 50:
+            frame = bytearray(bus.recv(1514))
+            now = time.monotonic_ns()
+            asked.append(frame[17])
+            if len(asked) % 16:
+                for i in range(2):
+                    number = (now - start - i * period // 2) // period
+                    at = 28 + 61 * i
+                    frame[at : at + 61] = clock_data(number, start + i * period // 2 + number * period)
+                bus.send(frame)
+        running.terminate()
+        bus.send(frame)
+        assert running.wait(PATIENCE_S) == 0
+        received = client.recv(65536)
+    assert asked == [(asked[0] + n) % 256 for n in range(50)]
+    messages = [received[at : at + 94] for at in range(0, len(received), 94)]
+    for sensor in range(2):
+        decoder = FrameDecoder()
+        decoder.feed(b"".join(message for message in messages if message[29] == sensor))
+        data = [message for message in decoder if isinstance(message, DataMessage)]
+        assert [message.sequence for message in data] == list(range(len(data)))
+        numbers = [
+            int(decode_clock(SampleDecoder(61).decode(message.process_data).array).number) for message in data
+        ]
+        assert numbers == sorted(set(numbers)), "each once"
+    assert len(messages) > 40, "hardly an exchange was in vain"
+    assert len(statistics.read_numbers(tmp_path / "own", 2)) >= 46
+
+
+def test_without_a_compiler_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ScriptError, match="apt install gcc"):
+        masters.build(tmp_path)
 
 
 def test_idle_states_are_off_as_long_as_the_device_is_open(
@@ -341,33 +384,32 @@ def test_idle_states_are_off_as_long_as_the_device_is_open(
     with benchmark.no_idle_states() as held:
         assert held
         assert device.read_bytes() == b"\0\0\0\0"
-    monkeypatch.setattr(benchmark, "_LATENCY", tmp_path / "missing" / "device")
+    monkeypatch.setattr(benchmark, "_LATENCY", Path("/dev/null/no_such"))
     with benchmark.no_idle_states() as held:
         assert not held
 
 
-# -- the thing itself
+# -- runs
 
 
 @pytest.mark.parametrize("installed", [True, False])
-def test_what_was_measured_is_shown_and_written(
+def test_what_is_measured_is_shown_and_written(
     installed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    figures, ages = statistics.summary([arrivals(*range(5, 105))], PERIOD, NO_STOPS)
+    figures, ages = statistics.summary([arrivals(range(5, 105))], PERIOD, NO_STOPS)
     measured = {**figures, "rss_mb": {"server": 40.0}, "cpu_percent": {"server": 5.0}}, ages
-    for program in ("bare_c", "project", "polling"):
+    for program in ("bare_c", "project", "polling", "vendor"):
         monkeypatch.setattr(comparison, program, lambda *_, **__: measured)
     monkeypatch.setattr(comparison, "build", lambda _: tmp_path)
-    monkeypatch.setattr(vendor, "installed", lambda: installed)
-    monkeypatch.setattr(vendor, "measure_driver", lambda _: measured)
+    monkeypatch.setattr(comparison, "VENDOR", tmp_path)
+    if installed:
+        (tmp_path / "has-bota-driver==1").touch()
     monkeypatch.setenv("DEMO_DIRECTORY", str(tmp_path))
     monkeypatch.setattr(benchmark, "loopback_up", lambda: None)
     monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)
-    files = ("--json", str(tmp_path / "b.json"), "--plot", str(tmp_path / "b.png"))
     shown = io.StringIO()
-    options = benchmark.parse(
-        [*files, "--vendor", "--no-ros", "--rates", "800", "--sensors", "1", "--rt-priority", "0"]
-    )
+    one = ("--vendor", "--no-ros", "--rates", "800", "--sensors", "1", "--rt-priority", "0")
+    options = benchmark.parse(["--json", str(tmp_path / "b.json"), *one])
     benchmark.run(options, Console(file=shown, width=100), idle_states=True)
     content = json.loads((tmp_path / "b.json").read_text())
     assert all(map(math.isfinite, numbers(content)))
@@ -377,7 +419,7 @@ def test_what_was_measured_is_shown_and_written(
     ]  # fmt: skip
     assert {(row["rate_hz"], row["sensors"]) for row in content["comparison"]} == {(800, 1)}
     assert content["comparison"][-1 - (not installed)]["made"] == 100
-    assert ("bota-driver==1.1.16" in content["comparison"][-1].get("missing", "")) == (not installed)
+    assert ("could not be installed" in content["comparison"][-1].get("missing", "")) == (not installed)
     assert content["idle_states"]
     assert "0 (0) of 300" in shown.getvalue()
     assert (tmp_path / "b.png").exists() == (find_spec("matplotlib") is not None)
@@ -385,10 +427,9 @@ def test_what_was_measured_is_shown_and_written(
 
 def run(tmp_path: Path, *arguments: str) -> subprocess.Popen[str]:
     """The benchmark in a network namespace of its own."""
-    files = ("--json", str(tmp_path / "b.json"), "--plot", str(tmp_path / "b.png"))
-    command = ["unshare", "--net", sys.executable, "-m", "scripts.benchmarks.program", *files, *arguments]
+    command = ["unshare", "--net", sys.executable, "-m", "scripts.benchmarks.program"]
     return subprocess.Popen(
-        command,
+        [*command, "--json", str(tmp_path / "b.json"), *arguments],
         cwd=ROOT,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "TMPDIR": str(tmp_path)},
         stdout=subprocess.PIPE,
@@ -418,45 +459,23 @@ def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     said, _ = running.communicate(timeout=400)
     assert running.returncode == 0, said
     text = Path(page).read_text()
-    for what in ("400 Hz, 2 | this, ROS", "400 Hz, 4 loops: wrench, ", "400 Hz, 0.86 ms", "400 Hz | "):
+    for what in ("400 Hz, 2 | this, ROS", "400 Hz, 4 loops: wrench, "):
         assert f"| {what}" in text, what
     content = json.loads((tmp_path / "b.json").read_text())
     assert all(map(math.isfinite, numbers(content)))
     programs = {(row["sensors"], row["program"]): row for row in content["comparison"]}
     assert (2, "polling") not in programs
-    for key in ((1, "this, ROS"), (2, "this, ROS"), (1, "polling, ROS")):
-        figures = programs[key]
-        assert figures["made"] > 1
-        assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"]
+    for program in ("this", "bare C", "polling", "this, ROS"):
+        if figures := programs.get((1, program)):
+            assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"] > 1
+            assert 0 < figures["age_us"]["p50"] <= figures["age_us"]["p99"] <= figures["age_us"]["max"]
+            assert figures["rss_mb"]["server"] > 1
     assert {"server", "node 0", "node 1"} < set(programs[2, "this, ROS"]["cpu_percent"])
-    assert content["node"][0]["samples"] > 1
-
-
-@needs_bus
-@pytest.mark.bus
-@pytest.mark.long
-def test_a_short_run(tmp_path: Path) -> None:
-    short = ("--no-ros", "--seconds", "1", "--rates", "800", "--sensors", "1")
-    running = run(tmp_path, *short)
-    said, _ = running.communicate(timeout=90)
-    assert running.returncode == 0, said
-    content = json.loads((tmp_path / "b.json").read_text())
-    assert all(map(math.isfinite, numbers(content)))
-    rows = {row["program"]: row for row in content["comparison"]}
-    for program in {"this", "bare C", "polling"} & rows.keys():
-        figures = rows[program]
-        assert figures["made"] > 1
-        assert figures["made"] == figures["arrivals"] - figures["repeated"] + figures["lost"]
-        assert 0 < figures["age_us"]["p50"] <= figures["age_us"]["p99"] <= figures["age_us"]["max"]
-        assert figures["rss_mb"]["server"] > 1
-    if "missing" not in rows["bare C"]:
-        assert rows["this / C"]["ratio"]["age_p50"]["median"] > 0
-    project = rows["this"]
+    project = programs[1, "this"]
     # Some may be lost to a busy machine, but only while it kept the server from running at all.
     unexplained = project["lost"] - project["lost_in_stops"]
     assert unexplained <= project["server"]["missed_deadlines"] + project["server"]["lost_frames"]
     assert project["repeated"] == 0
-    assert (tmp_path / "b.png").exists() == (find_spec("matplotlib") is not None)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -485,12 +504,6 @@ def test_it_can_be_stopped_at_any_time(tmp_path: Path) -> None:
     )
     running.send_signal(signal.SIGINT)
     said, _ = running.communicate(timeout=30)
-    assert running.returncode in {0, 130}, said
+    assert running.returncode == 130, said
     assert "Traceback" not in said
     assert not list(tmp_path.glob("tmp*"))
-
-
-def test_numbers_are_written_whole(tmp_path: Path) -> None:
-    write(tmp_path / "some", array("q", [1, 2, 3, 4]))
-    assert statistics.read_numbers(tmp_path / "some", 2).tolist() == [[1, 2], [3, 4]]
-    assert [p.name for p in tmp_path.iterdir()] == ["some"]

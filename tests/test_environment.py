@@ -25,17 +25,16 @@ def run(script: str, folder: Path) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
-def test_it_says_what_it_installs_how_much_of_it_and_how_long(tmp_path: Path) -> None:
+def test_it_says_what_it_installs_how_much_there_is_and_how_long(tmp_path: Path) -> None:
     (tmp_path / "pip").write_text(PIP)
     script = """
-about=295
 say() { printf '%s\n' "$*" >&2; [[ $* != *numpy* ]] || touch "$filling/seen"; }
 quietly bash "$1/pip" "$1"
 """
     code, said = run(script, tmp_path)
     assert code == 0
     line = said.splitlines()[-1]
-    assert re.fullmatch(rf"\d+ s, \d+ of about 295 MB in {tmp_path} \(numpy\)", line), said
+    assert re.fullmatch(rf"\d+ s, \d+ MB in {tmp_path} \(numpy\)", line), said
 
 
 def test_without_a_network_it_is_one_sentence(tmp_path: Path) -> None:
@@ -72,5 +71,3 @@ def test_the_demo_needs_no_tools_of_developers() -> None:
     (asked,) = re.findall(r"^make_owners_environment (\S+)", (ROOT / "scripts/demo").read_text(), re.M)
     names = {re.split(r"[\[=<>]", line)[0] for extra in asked.split(",") for line in extras[extra]}
     assert names == {"ros-rclpy", "ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "numpy", "rich"}
-    sizes = (ROOT / "scripts/environment").read_text()
-    assert all(f"    {extra}) echo" in sizes for extra in extras if extra != "tools")

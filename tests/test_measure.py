@@ -39,7 +39,7 @@ def test_a_good_run() -> None:
     summary = measured().summary()
     assert (summary.messages, summary.lost, summary.repeated) == (801, 0, 0)
     assert summary.rate_hz == 800.0
-    assert (summary.age_ms, summary.tcp_age_ms) == ((0.4, 0.4), (0.2, 0.2))
+    assert (summary.age_ms, summary.tcp_age_ms) == ([0.4, 0.4], [0.2, 0.2])
     assert verdict(summary, 800) is None
 
 

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from clients.recording.columns import Columns
 from ft_compensation.stationary import (
     BAD_WRENCH,
+    CHANCE,
     NotStationaryError,
     StationaryMeans,
     stationary_means,
@@ -29,7 +30,6 @@ _BLOCK_SAMPLES: Final = 8
 """Minimum number of samples in a block, however slow the sensor is."""
 _LONGEST_GAP_S: Final = 0.5
 _SAME_POSE: Final = math.cos(math.radians(1.5))
-_ALLOWANCE: Final = 5.0
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -107,7 +107,9 @@ def _stretches(
     count = len(rows) // size
     blocks = rows[: count * size].reshape(count, size, rows.shape[1])
     mean, deviation = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
-    quiet = good[: count * size].reshape(count, size).all(axis=1) & _quiet(mean, deviation, limits)
+    quiet = good[: count * size].reshape(count, size).all(axis=1)
+    quiet &= (deviation <= limits.spreads).all(axis=1)
+    quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= limits.angular_rate
     start = 0
     for number in range(1, count + 1):
         if number < count and _goes_on(mean, deviation, quiet, start, number, size, limits):
@@ -115,17 +117,6 @@ def _stretches(
         if quiet[start] and number - start >= 3:
             yield (start + 1) * size, (number - 1) * size
         start = number
-
-
-def _quiet(mean: Floats, deviation: Floats, limits: StationaryLimits) -> Bools:
-    quiet: Bools = (
-        (deviation[:, 0:3].max(axis=1) <= limits.force_spread)
-        & (deviation[:, 3:6].max(axis=1) <= limits.torque_spread)
-        & (deviation[:, 6:9].max(axis=1) <= limits.acceleration_spread)
-        & (deviation[:, 9:12].max(axis=1) <= limits.angular_rate_spread)
-        & (np.linalg.norm(mean[:, 9:12], axis=1) <= limits.angular_rate)
-    )
-    return quiet
 
 
 def _goes_on(
@@ -144,6 +135,6 @@ def _goes_on(
     sizes = float(np.linalg.norm(a[6:9]) * np.linalg.norm(b[6:9]))
     if float(a[6:9] @ b[6:9]) < _SAME_POSE * sizes:
         return False
-    by_chance = _ALLOWANCE * (deviation[start] + deviation[number]) / math.sqrt(size)
+    by_chance = CHANCE * (deviation[start] + deviation[number]) / math.sqrt(size)
     moved = np.abs(b - a) - by_chance
-    return bool(moved[0:3].max() <= limits.force_wander and moved[3:6].max() <= limits.torque_wander)
+    return bool((moved[:6] <= limits.wanders[:6]).all())  # of the acceleration the pose was compared

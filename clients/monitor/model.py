@@ -19,9 +19,8 @@ from typing import Any, Final, NamedTuple
 from protocol.control import Event
 from protocol.framing import DataMessage
 from protocol.health.judge import Observation, emergency, judge, saturated_axes
-from protocol.health.limits import LIMITS
 from protocol.health.observer import COMMON, StreamObserver
-from protocol.health.verdict import NOTHING_WRONG, Finding, Level, Verdict
+from protocol.health.verdict import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from protocol.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
 from protocol.settings import SETTINGS, SettingValue
 from protocol.text.json_text import JsonObject

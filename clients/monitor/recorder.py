@@ -13,7 +13,7 @@ from typing import IO, Final
 
 from clients.program import missing
 from protocol.address import Address
-from protocol.text.visible import printable
+from protocol.text.untrusted import printable
 
 PROGRAM: Final = "ethercat-record"
 _STOP_TIMEOUT_S: Final = 20.0

@@ -1,6 +1,8 @@
-"""Writes batches in a thread of its own, so that a slow disk does not delay reading.
+"""Counts batches and writes them into files in a thread of its own, so that a slow disk does not delay
+reading.
 
-The queue in between is bounded. What does not fit is counted, and an event marks where it is missing.
+The queue in between is bounded. What does not fit is counted, and an event marks where it is missing. With
+rotation there are several files, `run_0.mcap`, `run_1.mcap`, ...
 """
 
 from __future__ import annotations
@@ -8,19 +10,145 @@ from __future__ import annotations
 import json
 import math
 import queue
+import re
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Final
 
 from clients.errors import DiskError
-from clients.record.parts import Parts
 from clients.record.source import Batch, lost
-from clients.record.tally import Tally
-from clients.recording.disk import DiskFile
+from clients.recording.disk import DiskFile, remove
 from clients.recording.reader import Description, Event
 from clients.recording.writer import RecordingWriter
+from protocol.accounting import StreamAccounting, StreamCounts
 from protocol.framing import DataMessage
+from protocol.program.new_file import EXISTS
+
+
+@dataclass(slots=True)
+class Tally:
+    """What came of all sensors."""
+
+    sensors: dict[int, StreamCounts] = field(default_factory=dict)
+    """By position on the bus."""
+    dropped: int = 0
+    """Frames that came but could not be written."""
+    _accounting: dict[int, StreamAccounting] = field(default_factory=dict)
+
+    def count(self, frame: DataMessage) -> None:
+        """Count a frame that is recorded."""
+        accounting = self._accounting.get(frame.sensor)
+        if accounting is None:
+            accounting = self._accounting[frame.sensor] = StreamAccounting(fresh_only=False)
+            self.sensors[frame.sensor] = accounting.counts
+        accounting.take(frame.sequence, frame.monotonic_ns, frame.flags)
+
+    def start_again(self) -> None:
+        """A new connection: the server may have been restarted, and its numbering with it."""
+        for accounting in self._accounting.values():
+            accounting.begin()
+
+    @property
+    def frames(self) -> int:
+        """Frames of all sensors."""
+        return sum(sensor.frames for sensor in self.sensors.values())
+
+    def brief(self) -> str:
+        """The same as `losses` in few words, the sensors' counts joined by +; from any thread."""
+        sensors = [sensor for _, sensor in sorted(dict(self.sensors).items())]
+        missing = self.dropped + sum(sensor.withheld for sensor in sensors)
+        found = [f"{missing} lost"] if missing else []
+        for name, counts in (
+            ("gaps", [sensor.lost for sensor in sensors]),  # without a rate, one for each GAP
+            ("invalid", [sensor.invalid for sensor in sensors]),
+        ):
+            if any(counts):
+                found.append(f"{'+'.join(map(str, counts))} {name}")
+        return ", ".join(found) or "nothing lost"
+
+    def as_json(self) -> dict[str, dict[str, int]]:
+        """By position on the bus: `frames`, and the counts of `protocol.accounting`."""
+        return {
+            str(position): {"frames": sensor.frames, **asdict(sensor)}
+            for position, sensor in sorted(self.sensors.items())
+        }
+
+    def losses(self) -> list[str]:
+        """What is missing, in words; nothing if nothing is."""
+        found = []
+        if self.dropped:
+            found.append(f"{_frames(self.dropped)} came but could not be written")
+        for position, sensor in sorted(self.sensors.items()):
+            if sensor.withheld:
+                found.append(f"{_frames(sensor.withheld)} of sensor {position} not read in time")
+            if lost := sensor.lost:
+                found.append(
+                    f"sensor {position}: {lost} times samples were or may have been lost on the bus (GAP)"
+                )
+            if sensor.invalid:
+                found.append(f"{_frames(sensor.invalid)} of sensor {position} invalid")
+        return found
+
+
+def _frames(count: int) -> str:
+    return "1 frame" if count == 1 else f"{count} frames"
+
+
+class Parts:
+    """Names and opens the files, and decides when to start the next."""
+
+    def __init__(self, path: Path, *, size: int | None, seconds: float | None, overwrite: bool) -> None:
+        """A new file after `size` bytes or `seconds`, whichever is first; one file if both are None."""
+        self.path = path
+        self.made: list[Path] = []
+        self._size = size
+        self._seconds = seconds
+        self._overwrite = overwrite
+        self._opened = 0.0
+
+    @property
+    def rotate(self) -> bool:
+        """Whether there can be more than one."""
+        return self._size is not None or self._seconds is not None
+
+    def check(self) -> None:
+        """DiskError if a file exists and may not be overwritten, or the folder does not exist."""
+        if not self.path.parent.is_dir():
+            raise DiskError(f"{self.path} cannot be created: there is no folder {self.path.parent}")
+        if self.path.is_dir():
+            raise DiskError(f"{self.path} is a folder: name a file in it")
+        found = self._existing()
+        if found and not self._overwrite:
+            raise DiskError(f"{found[0]} {EXISTS}")
+
+    def open(self) -> DiskFile:
+        """The next file; DiskError."""
+        if not self.made and self.rotate:
+            # Leftover files of an older, longer recording would seem to belong to this one.
+            remove(self._existing())
+        path = self._part(len(self.made)) if self.rotate else self.path
+        disk = DiskFile(path, overwrite=self._overwrite)
+        self.made.append(path)
+        self._opened = time.monotonic()
+        return disk
+
+    def is_full(self, size: int) -> bool:
+        """Whether the file, of `size` bytes, is full."""
+        full = self._size is not None and size >= self._size
+        return full or (self._seconds is not None and time.monotonic() - self._opened >= self._seconds)
+
+    def _part(self, number: int) -> Path:
+        return self.path.with_name(f"{self.path.stem}_{number}{self.path.suffix}")
+
+    def _existing(self) -> list[Path]:
+        if not self.rotate:
+            return [self.path] if self.path.exists() else []
+        name = re.compile(f"{re.escape(self.path.stem)}_[0-9]+{re.escape(self.path.suffix)}", re.ASCII)
+        return sorted(path for path in self.path.parent.iterdir() if name.fullmatch(path.name))
+
 
 FLUSH_S: Final = 0.4
 """Longest time until received frames are in the file."""

@@ -9,8 +9,7 @@ from clients.recording.file_format import RECORDER
 from protocol.errors import SettingError
 from protocol.settings import SETTINGS, sampling_rate_hz
 from protocol.text.json_text import JsonObject
-from protocol.text.untrusted import rows
-from protocol.text.visible import visible
+from protocol.text.untrusted import rows, visible
 
 
 class Description(NamedTuple):

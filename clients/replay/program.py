@@ -13,9 +13,8 @@ from functools import partial
 from clients.program import Signals, say
 from clients.recording.reader import RecordedSensor, Recording, RecordingError, open_recording
 from clients.replay.options import ReplayOptions, parse_options
-from clients.replay.player import Player
+from clients.replay.player import Player, Timeline
 from clients.replay.sensors import ReplayedSensors
-from clients.replay.timeline import Timeline
 from ethercat_server.errors import ServerError
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub

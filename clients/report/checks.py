@@ -43,8 +43,7 @@ from clients.report.series import (
 )
 from protocol.accounting import StreamAccounting, StreamCounts
 from protocol.health.judge import Observation, judge
-from protocol.health.limits import LIMITS
-from protocol.health.verdict import Finding, Level
+from protocol.health.verdict import LIMITS, Finding, Level
 from protocol.health.verdict import Verdict as StreamVerdict
 from protocol.pdo import STANDARD_GRAVITY
 from protocol.sensor.warnings_register import WarningFlag, WarningMeaning, explain

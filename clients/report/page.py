@@ -19,7 +19,7 @@ from clients.report.series import CHANNELS, GROUPS, limit_origin
 from protocol.health.verdict import Level
 from protocol.sensor.meaning import meaning, value_meaning
 from protocol.settings import SETTINGS
-from protocol.text.visible import printable, visible
+from protocol.text.untrusted import printable, visible
 
 
 def _plain(value: Any) -> Any:

@@ -20,8 +20,7 @@ from clients.recording.columns import Columns
 from protocol.errors import SettingError
 from protocol.framing import DataFlag
 from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor
-from protocol.text.untrusted import whole
-from protocol.text.visible import printable
+from protocol.text.untrusted import printable, whole
 
 _LONGEST_TEXT: Final = 80
 _MOST_REMARKS: Final = 20

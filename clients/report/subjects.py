@@ -29,7 +29,7 @@ from protocol.pdo import ImuUnits
 from protocol.sensor_choice import MOST_PLACES, SensorChoice
 from protocol.text import untrusted
 from protocol.text.json_text import JsonObject
-from protocol.text.visible import printable
+from protocol.text.untrusted import printable
 
 _MOST_EVENTS_NAMED = 10
 _MOST_SENSORS_NAMED = 4

@@ -12,8 +12,7 @@ import threading
 from collections.abc import Sequence
 from typing import Final
 
-from ethercat_server.daemon.options import ServerOptions, parse_options
-from ethercat_server.daemon.server_settings import SERVER_SETTINGS
+from ethercat_server.daemon.options import SERVER_SETTINGS, ServerOptions, parse_options
 from ethercat_server.errors import UsageError
 from ethercat_server.process import realtime
 from ethercat_server.process.notify import Notifier

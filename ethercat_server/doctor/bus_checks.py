@@ -54,9 +54,8 @@ from protocol.control import Event
 from protocol.framing import DataMessage
 from protocol.health import verdict as health
 from protocol.health.judge import Observation, emergency, judge
-from protocol.health.limits import LIMITS
 from protocol.health.observer import StreamObserver
-from protocol.health.verdict import Level
+from protocol.health.verdict import LIMITS, Level
 from protocol.text.untrusted import number
 
 MOST_PORTS: Final = 4

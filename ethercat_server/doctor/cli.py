@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
 from ethercat_server import __version__
-from ethercat_server.daemon.options import VIRTUAL_INTERFACE
-from ethercat_server.daemon.server_settings import SERVER_SETTINGS
+from ethercat_server.daemon.options import SERVER_SETTINGS, VIRTUAL_INTERFACE
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.nic.claim import MAX_NAME_LENGTH
 from ethercat_server.ethercat.nic.interface import ALLOW_IP, ALLOW_IP_HELP

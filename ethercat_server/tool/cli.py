@@ -10,9 +10,8 @@ from typing import Any, Final, NoReturn
 
 from ethercat_server import __version__
 from ethercat_server.process import command_line
-from ethercat_server.tool.command import Command
+from ethercat_server.tool.command import Command, say_json
 from ethercat_server.tool.commands import bus, find, objects, settings, snapshot, tare, watch
-from ethercat_server.tool.show import say_json
 from protocol.program.completion import OPTION, add_completion
 from protocol.text.did_you_mean import did_you_mean
 

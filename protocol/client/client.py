@@ -288,14 +288,13 @@ class Client:
 
     def _gather(self, timeout_s: float) -> None:
         """Wait at most `timeout_s` until there is something in `session.items`; take all that has arrived."""
-        items = self.session.items
-        left_s = 0.0 if items else timeout_s
-        deadline_ns = self.channel.monotonic_ns() + round(timeout_s * 1e9)
+        items, monotonic_ns = self.session.items, self.channel.monotonic_ns
+        left_s, begun_ns = 0.0 if items else timeout_s, monotonic_ns()
         for _ in range(_MOST_READS):
             count = self._step(left_s)
             if count < _BACKLOG and (items or left_s <= 0):
                 return
-            left_s = 0.0 if items else (deadline_ns - self.channel.monotonic_ns()) * 1e-9
+            left_s = 0.0 if items else timeout_s - (monotonic_ns() - begun_ns) * 1e-9
 
     def _take_items(self) -> list[DataMessage]:
         """The frames among the items; `events` gets the others."""

@@ -22,6 +22,7 @@ _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_T
 _WARNINGS: Final = slice(
     LAYOUTS[min(LAYOUTS)].offsets["warnings"], LAYOUTS[min(LAYOUTS)].offsets["warnings"] + 4
 )
+_NO_WARNINGS: Final = bytes(4)
 
 
 class Condition(IntEnum):
@@ -112,29 +113,34 @@ class SensorState:
         self.accounting.begin()
         self.lost = False
 
-    def take(self, frame: DataMessage, received_ns: int, *, same_clock: bool) -> DataMessage | None:
+    def take(self, frame: DataMessage, received_ns: int, same_clock: bool) -> DataMessage | None:
         """A frame that arrived at `received_ns`; itself if it brings a new, valid sample.
 
         GAP of a frame that brings none is carried to the next that does.
         """
-        accounting, flags = self.accounting, frame.flags
-        restarts = accounting.counts.restarts
-        kind = accounting.take(frame.sequence, frame.monotonic_ns, flags)
-        if kind is FrameKind.OLD:
-            return None
-        if self._anew or accounting.counts.restarts > restarts:
-            self._anew, self._carried = False, _GAP
-        self._flags, self._received_ns = flags, received_ns
-        if kind is not FrameKind.NEW:
-            self._carried |= flags & _GAP
-            return None
-        if self._carried:
-            frame, self._carried = frame._replace(flags=flags | self._carried), 0
-        self._sampled, self._sampled_received_ns, self._same_clock = frame, received_ns, same_clock
-        self._gap = self._gap or frame.flags & _GAP != 0
+        sequence, _, monotonic_ns, _, flags, _, process_data = frame
+        accounting = self.accounting
+        unusual = flags or self._anew or self._carried or self.lost
+        if unusual or not accounting.take_next(sequence, monotonic_ns):
+            restarts = accounting.counts.restarts
+            kind = accounting.take(sequence, monotonic_ns, flags)
+            if kind is FrameKind.OLD:
+                return None
+            if self._anew or accounting.counts.restarts > restarts:
+                self._anew, self._carried = False, _GAP
+            if kind is not FrameKind.NEW:
+                self._flags, self._received_ns = flags, received_ns
+                self._carried |= flags & _GAP
+                return None
+            if self._carried:
+                frame, self._carried = frame._replace(flags=flags | self._carried), 0
+            self._gap = self._gap or frame.flags & _GAP != 0
+            self.lost = False
+        self._flags, self._same_clock = flags, same_clock
+        self._sampled, self._received_ns, self._sampled_received_ns = frame, received_ns, received_ns
         self.unread += 1
-        self._warnings |= int.from_bytes(frame.process_data[_WARNINGS], "little")
-        self.lost = False
+        if (warnings := process_data[_WARNINGS]) != _NO_WARNINGS:
+            self._warnings |= int.from_bytes(warnings, "little")
         return frame
 
     def decode(self, frame: DataMessage) -> Sample:

@@ -33,8 +33,7 @@ from protocol.framing import DataMessage, FrameDecoder, encode_json
 from protocol.pdo import ImuUnits
 from protocol.sensor_choice import MOST_PLACES
 from protocol.text.json_text import JsonObject
-from protocol.text.untrusted import rows
-from protocol.text.visible import printable
+from protocol.text.untrusted import printable, rows
 
 _FIRST_RETRY_NS: Final = 100_000_000
 _LONGEST_RETRY_NS: Final = 1_000_000_000
@@ -162,11 +161,11 @@ class Session:
             if not self.connected and now_ns - self._opened_ns > _HANDSHAKE_NS:
                 raise NoReplyError(f"no reply to describe within {_HANDSHAKE_NS / 1e9:g} s")
             return b""
-        self._decoder.received(count)
-        batch, answer = self._batch, b""
+        decoder, batch, answer = self._decoder, self._batch, b""
+        decoder.received(count)
         try:
             while True:
-                message = self._decoder.take_data(batch)
+                message = decoder.take_data(batch)
                 if batch:
                     self._take(now_ns)
                 if message is None:
@@ -176,15 +175,15 @@ class Session:
             raise ConnectionFailedError(f"what came is not this protocol: {printable(error)}") from None
 
     def _take(self, now_ns: int) -> None:
-        sensors, items, raw, same = self.sensors, self.items, self._raw, self.same_machine
-        for frame in self._batch:
+        sensors, items, batch, same = self.sensors, self.items, self._batch, self.same_machine
+        for frame in batch:
             state = sensors.get(frame.sensor)
-            new = state.take(frame, now_ns, same_clock=same) if state is not None else None
-            if raw:
+            new = state.take(frame, now_ns, same) if state is not None else None
+            if self._raw:
                 items.append(frame)
             elif new is not None:
                 items.append(new)
-        self._batch.clear()
+        batch.clear()
 
     # -- requests
 

@@ -8,11 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
-from protocol.health.limits import LIMITS, Limits
-from protocol.health.verdict import About, Finding, Level, Verdict, verdict
+from protocol.health.verdict import LIMITS, About, Finding, Level, Limits, Verdict, verdict
 from protocol.sensor.warnings_register import Severity, WarningFlag, explain
-from protocol.text.untrusted import number, whole
-from protocol.text.visible import printable
+from protocol.text.untrusted import number, printable, whole
 
 
 class Observation(NamedTuple):

@@ -28,7 +28,8 @@ class NewFile:
     directly.
     """
 
-    def __init__(self, path: Path, *, force: bool) -> None:
+    def __init__(self, path: Path, *, force: bool, mode: int = 0o666) -> None:
+        """`mode`: its permissions, less the umask."""
         self._path, self._force = path, force
         with self._errors():
             refuse_existing(path, force=force)
@@ -38,7 +39,13 @@ class NewFile:
                 self._target = Path(os.path.realpath(path))  # a symbolic link stays one
                 self._beside = self._target.with_name(f".unfinished-{secrets.token_hex(4)}")
             self._in_place = self._beside == self._target
-            self._file = self._beside.open("w" if self._in_place else "x", encoding="utf-8", newline="\n")
+            self._file = open(  # noqa: SIM115 - Path.open has no opener
+                self._beside,
+                "w" if self._in_place else "x",
+                encoding="utf-8",
+                newline="\n",
+                opener=lambda name, flags: os.open(name, flags, mode),
+            )
 
     def write(self, text: str) -> None:
         """Add text."""
@@ -46,12 +53,15 @@ class NewFile:
             self._file.write(text)
 
     def finish(self) -> None:
-        """It is complete."""
+        """It is complete: on disk, and under its name."""
         with self._errors():
-            self._file.close()
+            self._file.flush()
             if not self._in_place:
+                os.fsync(self._file.fileno())
                 refuse_existing(self._path, force=self._force)
                 self._beside.replace(self._target)
+                _sync_directory(self._target.parent)
+            self._file.close()
 
     def close(self) -> None:
         """Discard what is not finished."""
@@ -75,3 +85,13 @@ class NewFile:
             yield
         except OSError as error:
             raise FileError(f"{self._path} cannot be written: {error.strerror or error}") from None
+
+
+def _sync_directory(path: Path) -> None:
+    if not hasattr(os, "O_DIRECTORY"):  # nor is it needed there
+        return
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

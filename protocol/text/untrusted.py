@@ -1,12 +1,19 @@
-"""Values from the peer's JSON: used if they are of the right type, else treated as absent.
-
-Texts lose what a terminal would obey.
-"""
+"""Text and rows from files and the network, made safe to print: one line, no control characters."""
 
 from __future__ import annotations
 
-from protocol.text.json_text import JsonObject
-from protocol.text.visible import printable
+from typing import Any
+
+
+def visible(text: str) -> str:
+    """The same length of text on one line: `?` for each character that is none or that a terminal obeys."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def printable(value: object, limit: int = 200) -> str:
+    """Text from the other side as it may appear in a log: one line, no control characters, not endless."""
+    text = visible(str(value)[: limit + 1])
+    return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
 def text(value: object) -> str:
@@ -31,6 +38,6 @@ def whole(value: object) -> int | None:
     return value
 
 
-def rows(value: object) -> list[JsonObject]:
+def rows(value: object) -> list[dict[str, Any]]:
     """The objects in a list."""
     return [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []

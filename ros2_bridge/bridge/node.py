@@ -28,15 +28,25 @@ from bridge.parameters.declare import LiveParameters, declare, warn_of_others
 from bridge.parameters.row import ParameterError
 from bridge.parameters.sensor_settings import SettingsParameters
 from bridge.parameters.table import Parameters
-from bridge.publishing.topics import make, make_compensated
+from bridge.publishing.compensated_wrench import CompensatedOutput
+from bridge.publishing.filtered_wrench import FilteredTopic
+from bridge.publishing.messages import (
+    ArrayOutput,
+    ImuOutput,
+    Outputs,
+    RawImuOutput,
+    TemperatureOutput,
+    WrenchOutput,
+    make_stages,
+)
+from bridge.publishing.wrench_frames import make_frames
 from bridge.services.bias import BiasServices
 from bridge.services.identify import IdentifyServices
 from bridge.services.sensor import Services
 from bridge.signals import call_on_stop_signal
 from bridge.spinning import OrdinaryExecutor, PromptExecutor, Spinner
-from bridge.stream.link import RequestFailedError
+from bridge.stream.link import RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Reader
-from bridge.stream.requests import RequestRefusedError, Requests
 from protocol.client.channel import Channel
 
 SUPERVISOR_TOPIC = "/supervisor_status_data"
@@ -66,15 +76,29 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
         self.parameters = parameters = declare(self)
-        compensated = make_compensated(self, parameters, lambda: self.reader.link.rate_hz)
-        outputs = make(self, parameters, compensated)
+        compensated = CompensatedOutput(
+            [
+                *make_stages(self, parameters.frame_id),
+                *make_frames(self, parameters),
+                FilteredTopic(self, parameters, lambda: self.reader.link.rate_hz),
+            ]
+        )
+        outputs = Outputs(
+            [
+                ArrayOutput(self, parameters.array_topic),
+                WrenchOutput(self, "wrench", parameters.frame_id),
+                RawImuOutput(self, parameters),
+                ImuOutput(self, parameters),
+                TemperatureOutput(self, "temperature", parameters),
+                compensated,
+            ]
+        )
         self.reader = Reader(
             parameters, outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
         link = self.reader.link
         # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
-        self.requests = Requests(link)
-        self.sensor_settings = SettingsParameters(self, link, self.requests)
+        self.sensor_settings = SettingsParameters(self, link)
         live = LiveParameters(self)
         self.compensation = CompensationControl(
             self, parameters, compensated, link, self.reader.watch, live, lambda: self.reader.not_finite
@@ -83,9 +107,9 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
             self, parameters.limits, self.reader, self.compensation.state, outputs, self.fail
         )
         self.triggers = (
-            Services(self, link, self.requests, self.sensor_settings, self.compensation.after_sensor_tare),
-            BiasServices(self, self.compensation, self.requests),
-            IdentifyServices(self, self.compensation, self.requests),
+            Services(self, link, self.sensor_settings, self.compensation.after_sensor_tare),
+            BiasServices(self, self.compensation),
+            IdentifyServices(self, self.compensation),
         )
         live.listeners.append(self._apply)
         self._outputs = outputs
@@ -129,8 +153,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         if self.exit_code is None:
             self.exit_code = exit_code
         self.on_finish()
-        self.requests.cancel()
-        self.compensation.cancel()
+        self.reader.link.cancel()
 
     def fail(self, reason: str) -> None:
         """End the node with exit code 1, from any thread."""
@@ -142,7 +165,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
             return
         self.get_logger().info("the supervisor stops the force/torque sensors")
         try:
-            self.get_logger().info(self.requests.shut_server_down())
+            self.get_logger().info(self.reader.link.shut_server_down())
         except RequestRefusedError as error:
             self.get_logger().error(str(error))
             self.finish(SERVER_GOES_ON)

@@ -15,10 +15,9 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from bridge.parameters.table import Parameters
-from bridge.stream.reader import Log
 from protocol.client.real_time import make_real_time
 
 STREAM: Final = "reader"
@@ -30,7 +29,7 @@ _SWITCH_S: Final = 0.0002
 """Longest time that the stream waits for Python's lock. A sample takes less, so it is not interrupted."""
 
 
-def prepare(parameters: Parameters, log: Log) -> None:
+def prepare(parameters: Parameters, log: Any) -> None:
     """Give the node's threads, which run, their scheduling as far as allowed, and log one line of it."""
     if not parameters.rt_priority and parameters.cpu < 0:
         return

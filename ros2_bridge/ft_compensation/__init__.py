@@ -1,5 +1,5 @@
-"""Bias, gravity and payload of a force/torque sensor: NumPy, no ROS. Imports only `protocol`.
+"""Bias, tool and payload of a force/torque sensor: NumPy, no ROS.
 
-`compensator` subtracts, `bias` and `orientation` tell what (bias, gravity), `stationary` whether the sensor
-is stationary, `store` keeps the bias, `identification` finds the payload. docs/compensation.md.
+`compensator` subtracts, `bias`, `specific_force` and `orientation` tell what, `stationary` whether the sensor
+is at rest, `store` keeps the bias, `identification` finds the payload. docs/compensation.md.
 """

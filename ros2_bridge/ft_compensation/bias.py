@@ -11,8 +11,6 @@ import math
 import threading
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import (
     NO_PAYLOAD,
@@ -31,8 +29,20 @@ from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 GRAVITY_TOLERANCE: Final = 0.5
 """m/s²: how much a stationary accelerometer may differ from g."""
-_ABOUT_TWO_AXES: Final = 2.45 / NORMAL_95
-"""From half of an interval of one axis to the radius that holds as often about two (Rayleigh)."""
+_ABOUT_THREE_AXES: Final = 2.80 / NORMAL_95
+"""From half of an interval of one axis to the radius that holds as often for three (chi, 3 degrees)."""
+
+
+def check_at_rest(
+    acceleration: Vector3, magnitude: float = STANDARD_GRAVITY, tolerance: float = GRAVITY_TOLERANCE
+) -> None:
+    """CompensationError unless the stationary accelerometer reads `magnitude`, m/s², within `tolerance`."""
+    measured = length(acceleration)
+    if abs(measured - magnitude) > tolerance:
+        raise CompensationError(
+            f"the stationary accelerometer reads {measured:.2f} m/s² where {magnitude:.2f} should be: check "
+            "imu_raw_units, the IMU's settings and its offset"
+        )
 
 
 def gravity_of(
@@ -40,48 +50,39 @@ def gravity_of(
 ) -> Vector3:
     """Gravity in the sensor's frame, m/s², from what the stationary accelerometer reads.
 
-    Only the direction is taken from it; `magnitude` is the length. CompensationError if it reads nothing
-    like g: by more than `tolerance`, m/s².
+    Only the direction is taken from it; `magnitude` is the length. Errors as `check_at_rest`.
     """
-    measured = length(acceleration)
-    if abs(measured - magnitude) > tolerance:
-        raise CompensationError(
-            f"the stationary accelerometer reads {measured:.2f} m/s² where {magnitude:.2f} should be: check "
-            "imu_raw_units, the IMU's settings and its offset"
-        )
-    scale = -magnitude / measured
+    check_at_rest(acceleration, magnitude, tolerance)
+    scale = -magnitude / length(acceleration)
     x, y, z = acceleration
     return x * scale, y * scale, z * scale
 
 
-def tilt_95(gravity: Vector3, accelerometer: Accelerometer) -> float:
-    """In 95 % of cases `gravity` (m/s²), from what it reads at rest, is tilted by less than this, rad."""
-    up = np.array(gravity) / (size := length(gravity))
-    across = np.eye(3) - np.outer(up, up)
-    half = np.hypot(accelerometer.offset_interval, np.multiply(accelerometer.scale_interval, gravity))
-    variance = np.linalg.eigvalsh(across @ np.diag(half**2) @ across)[-1]
-    return _ABOUT_TWO_AXES * math.sqrt(max(float(variance), 0.0)) / size
+def force_bound_95(payload: Payload, accelerometer: Accelerometer) -> float:
+    """N: in 95 % of cases the accelerometer's own offset and scale show as less force than this.
+
+    A tare with the tool on takes the offset's part off.
+    """
+    scale = [STANDARD_GRAVITY * part for part in accelerometer.scale_interval]
+    halves = [
+        math.hypot(offset, part) for offset, part in zip(accelerometer.offset_interval, scale, strict=True)
+    ]
+    return payload.mass * _ABOUT_THREE_AXES * max(halves)
 
 
-def estimate_bias(
-    means: StationaryMeans,
-    payload: Payload = NO_PAYLOAD,
-    gravity: Vector3 | None = None,
-) -> Wrench:
+def estimate_bias(means: StationaryMeans, payload: Payload, specific_force: Vector3) -> Wrench:
     """The bias that makes the compensated wrench of this window zero.
 
     Args:
         means: of a stationary window (`StationaryWindow.means`).
         payload: what hangs on the sensor; its weight is not counted as bias. Without one everything is.
-        gravity: in the sensor's frame, m/s². None: from the window's own accelerometer.
+        specific_force: during the window, in the sensor's frame, m/s².
     """
-    if not payload.mass:
-        return means.wrench
-    return means.wrench.plus(_weight(payload, gravity or gravity_of(means.acceleration)), -1.0)
+    return means.wrench.plus(_weight(payload, specific_force), -1.0)
 
 
-def _weight(payload: Payload, gravity: Vector3) -> Wrench:
-    return Compensator(payload).compensate(ZERO, ZERO, gravity).gravity
+def _weight(payload: Payload, specific_force: Vector3) -> Wrench:
+    return Compensator(payload).compensate(ZERO, ZERO, specific_force).tool
 
 
 class Taken(NamedTuple):
@@ -89,35 +90,35 @@ class Taken(NamedTuple):
 
     payload: Payload = NO_PAYLOAD
     """Whose weight is not part of it."""
-    gravity: Vector3 | None = ZERO
+    specific_force: Vector3 | None = ZERO
     """During the tare, in the sensor's frame, m/s². None: unknown. Zero: of no tare, it holds for any."""
 
     def weighed(self, payload: Payload) -> tuple[Wrench, Taken]:
-        """By how much the bias is another for this payload; nothing if gravity is unknown."""
-        if self.gravity is None or payload == self.payload:
+        """By how much the bias is another for this payload; nothing if the specific force is unknown."""
+        if self.specific_force is None or payload == self.payload:
             return NO_WRENCH, self
-        change = _weight(self.payload, self.gravity).plus(_weight(payload, self.gravity), -1.0)
-        return change, Taken(payload, self.gravity)
+        before, now = (_weight(each, self.specific_force) for each in (self.payload, payload))
+        return before.plus(now, -1.0), Taken(payload, self.specific_force)
 
-    def warning(self, change: Wrench, payload: Payload, magnitude: float) -> str:
+    def warning(self, change: Wrench, payload: Payload) -> str:
         """What `weighed`, and its `change`, mean for a user, a sentence; empty if nothing."""
         if change == NO_WRENCH:
-            return self.doubt(payload, magnitude)
+            return self.doubt(payload)
         return (
             "the tool's parameters are not those of the tare: the bias is what it finds with the new ones, "
             f"another by {wrench_text(change)}; if the tool was put on or exchanged since, tare again"
         )
 
-    def doubt(self, payload: Payload, magnitude: float) -> str:
-        """Why the bias may not fit this payload, a sentence; empty if it does. `magnitude`: gravity's."""
-        if self.gravity is not None or payload == self.payload:
+    def doubt(self, payload: Payload) -> str:
+        """Why the bias may not fit this payload, a sentence; empty if it does."""
+        if self.specific_force is not None or payload == self.payload:
             return ""
         (was, (ax, ay, az)), (mass, (bx, by, bz)) = self.payload, payload
         moved = mass * bx - was * ax, mass * by - was * ay, mass * bz - was * az
         return (
             f"the bias was taken with {self.payload}, and in which pose is not known: with {payload} it may "
-            f"be wrong by {abs(mass - was) * magnitude:.3g} N and {length(moved) * magnitude:.3g} Nm in "
-            "every pose: tare again"
+            f"be wrong by {abs(mass - was) * STANDARD_GRAVITY:.3g} N and "
+            f"{length(moved) * STANDARD_GRAVITY:.3g} Nm in every pose: tare again"
         )
 
 

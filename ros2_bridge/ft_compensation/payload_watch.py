@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from ft_compensation.quantities import ZERO, Payload, length
+import numpy as np
+
+from ft_compensation.quantities import Payload, length
 from ft_compensation.stationary_limits import StationaryLimits
 from protocol.pdo import Vector3
 
@@ -77,7 +79,7 @@ class PayloadWatch:
         return not self.due_s - 1.0 < time_s < self.due_s
 
     def look(self, force: Vector3, gravity: Vector3, angular_rate: Vector3, time_s: float) -> None:
-        """Take a sample: force left after compensation, N; gravity, m/s²; rad/s."""
+        """Take a sample: force left after compensation, N; gravity (of slow motion), m/s²; rad/s."""
         if self._looks and not -1.0 < time_s - self.due_s < 1.0:
             self._restart()  # what was interrupted, or another time
         self.due_s = time_s + _LOOK_S
@@ -117,16 +119,15 @@ class PayloadWatch:
     def _missing_mass(self) -> float | None:
         """kg: that explains the latest windows of as many orientations as one mass can; None if none does."""
         for first in range(len(self._windows) - _FEWEST + 1):
-            windows = self._windows[first:]
-            gravity = _less_mean([window.gravity for window in windows])
-            force = _less_mean([window.force for window in windows])
-            square = sum(_dot(g, g) for g in gravity)
-            if square < _LEAST_SPREAD * sum(_dot(w.gravity, w.gravity) for w in windows):
+            both = np.array(self._windows[first:])
+            force, gravity = np.moveaxis(both - both.mean(axis=0), 1, 0)
+            square = float((gravity**2).sum())
+            if square < _LEAST_SPREAD * float((both[:, 1] ** 2).sum()):
                 return None  # fewer have no more
-            mass = sum(_dot(g, f) for g, f in zip(gravity, force, strict=True)) / square
-            left = sum(_dot(f, f) for f in force) - mass * mass * square
-            degrees = 3 * len(windows) - 4
-            limit = max(_LEAST_MISFIT, _MISFIT * abs(mass) * length(windows[0].gravity))
+            mass = float((gravity * force).sum()) / square
+            left = float((force**2).sum()) - mass * mass * square
+            degrees = 3 * len(both) - 4
+            limit = max(_LEAST_MISFIT, _MISFIT * abs(mass) * length(self._windows[first].gravity))
             if left <= degrees * limit * limit:
                 return mass
         return None
@@ -141,15 +142,5 @@ class PayloadWatch:
             self._say(self.finding)
 
 
-def _dot(a: Vector3, b: Vector3) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _is_same(a: Vector3, b: Vector3) -> bool:
-    return _dot(a, b) > _SAME * length(a) * length(b)
-
-
-def _less_mean(vectors: list[Vector3]) -> list[Vector3]:
-    count = len(vectors)
-    mx, my, mz = (sum(part) / count for part in zip(*vectors, strict=True)) if count else ZERO
-    return [(x - mx, y - my, z - mz) for x, y, z in vectors]
+    return sum(x * y for x, y in zip(a, b, strict=True)) > _SAME * length(a) * length(b)

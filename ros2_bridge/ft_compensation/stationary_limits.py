@@ -31,3 +31,15 @@ class StationaryLimits:
     acceleration_wander: float = 0.05
     """m/s²"""
     least_samples: int = 20
+
+    @property
+    def spreads(self) -> tuple[float, ...]:
+        """By axis: of force, torque, acceleration, angular rate."""
+        each = self.force_spread, self.torque_spread, self.acceleration_spread, self.angular_rate_spread
+        return tuple(limit for limit in each for _ in range(3))
+
+    @property
+    def wanders(self) -> tuple[float, ...]:
+        """By axis: of force, torque, acceleration."""
+        each = self.force_wander, self.torque_wander, self.acceleration_wander
+        return tuple(limit for limit in each for _ in range(3))

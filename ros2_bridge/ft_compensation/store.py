@@ -6,16 +6,16 @@ one.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import tempfile
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from ft_compensation.quantities import CompensationError, Payload, Wrench, vector
+from protocol.errors import FileError
 from protocol.pdo import Vector3
+from protocol.program.new_file import NewFile
 
 _FORMAT: Final = "bota-ethercat-bridge compensation"
 _VERSION: Final = 1
@@ -36,7 +36,7 @@ class Stored(NamedTuple):
     """When, ISO 8601 in UTC."""
     offset: Wrench | None = None
     """The sensor's own offset, which the bias was taken with; None if not known or not needed."""
-    gravity: Vector3 | None = None
+    specific_force: Vector3 | None = None
     """In the sensor's frame during the tare, m/s²; None if not known. Zero: it does not matter."""
 
 
@@ -69,7 +69,7 @@ class CompensationStore:
         bias: Wrench,
         payload: Payload | None = None,
         offset: Wrench | None = None,
-        gravity: Vector3 | None = None,
+        specific_force: Vector3 | None = None,
     ) -> Path:
         """Keep them, in place of what was kept before; returns the file. StoreError if that fails."""
         path = self.path(serial)
@@ -85,11 +85,15 @@ class CompensationStore:
             content["tool_center_of_gravity"] = list(payload.center)
         if offset is not None:
             content["sensor_offset"] = list(offset.values)
-        if gravity is not None:
-            content["gravity"] = list(gravity)
+        if specific_force is not None:
+            content["specific_force"] = list(specific_force)
         try:
             self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-            _replace(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+            with NewFile(path, force=True, mode=0o600) as file:
+                file.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
+                file.finish()
+        except FileError as error:
+            raise StoreError(str(error)) from None
         except OSError as error:
             raise StoreError(f"{path} cannot be written: {error.strerror or error}") from None
         return path
@@ -129,33 +133,13 @@ def _parse(data: bytes, serial: int) -> Stored:
         raise _ContentError(f"it belongs to sensor {content.get('serial')!r:.20}, not {serial}")
     try:
         bias = Wrench.of(content.get("bias"))
-        payload = offset = gravity = None
+        payload = offset = felt = None
         if "sensor_offset" in content:
             offset = Wrench.of(content["sensor_offset"])
         if "tool_mass" in content:
             payload = Payload.of(content["tool_mass"], content.get("tool_center_of_gravity"))
-        if "gravity" in content:
-            gravity = vector(content["gravity"], "gravity")
+        if "specific_force" in content:
+            felt = vector(content["specific_force"], "a specific force")
     except ValueError as error:
         raise _ContentError(str(error)) from None
-    return Stored(bias, payload, str(content.get("saved", ""))[:40], offset, gravity)
-
-
-def _replace(path: Path, text: str) -> None:
-    descriptor, beside = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(beside).replace(path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            Path(beside).unlink()
-        raise
-    # The new name is on disk only when the directory is.
-    directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
+    return Stored(bias, payload, str(content.get("saved", ""))[:40], offset, felt)

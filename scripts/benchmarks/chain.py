@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import fcntl
 import os
 import shutil
@@ -27,16 +26,15 @@ from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 from protocol.client import Client
 from protocol.errors import ProtocolError
 from scripts.benchmarks import statistics
-from scripts.benchmarks.records import began
+from scripts.benchmarks.records import PORT, began
 from scripts.benchmarks.statistics import Floats, Ints
 
-PORT: Final = 12001
 OVERSAMPLING_HZ: Final = 51200  # the sensor's rate is this over its SINC length
 PROCESSES: Final = "scripts.benchmarks.processes"
+PPM: Final = 150.0  # error of the sensors' clocks, with alternating sign, so that samples pass each other
 WARM_UP_S: Final = 1.0
 _START_TIMEOUT_S: Final = 30.0
 _STOP_TIMEOUT_S: Final = 8.0
-_PR_SET_PDEATHSIG: Final = 1
 Figures = dict[str, Any]
 
 
@@ -55,10 +53,7 @@ class Setup:
     rate_hz: int
     sensors: int
     seconds: float
-    priority: int
-    """SCHED_FIFO priority of the master; 0: ordinary scheduling."""
-    ppm: float = 150.0
-    """Error of the sensors' clocks, with alternating sign, so that samples pass each other."""
+    priority: int  # SCHED_FIFO of the master; 0: ordinary scheduling
     ros: bool = True
 
     @property
@@ -72,7 +67,6 @@ class Setup:
         return OVERSAMPLING_HZ // self.rate_hz
 
     def __str__(self) -> str:
-        """Title of this configuration."""
         return f"{self.rate_hz} Hz, {self.sensors} sensor{'s' * (self.sensors > 1)}"
 
 
@@ -84,19 +78,11 @@ class Child:
         self.name, self.result = name, result or directory / name
         self._may_end = result is not None
         self.log = directory / f"{name}.log"
-        libc = ctypes.CDLL(None)
-
-        def die_with_parent() -> None:
-            libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-            signal.pthread_sigmask(signal.SIG_SETMASK, set())
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
         with self.log.open("wb") as log:
             # A session of its own: Ctrl-C reaches this process only, which then ends its children in order.
             self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
-                preexec_fn=die_with_parent,  # noqa: PLW1509 - no threads have been started yet
+                ["setpriv", "--pdeathsig", "SIGTERM", *command],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
         self.pid = self._process.pid
 
@@ -136,50 +122,40 @@ class Usage:
         threads = self._folder.glob("task/*/schedstat")  # finer than the ticks of `stat`
         return sum(int(thread.read_text().split()[0]) for thread in threads) * 1e-9
 
-    def rss(self) -> int:
+    def rss(self) -> float:
         """Resident memory now, bytes."""
-        return int((self._folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        return float((self._folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-class Chain:
+class Chain(contextlib.ExitStack):
     """A context in which programs run, and with which all of them end. `title` is printed."""
 
     def __init__(self, setup: Setup, title: str = "") -> None:
+        super().__init__()
         self.setup = setup
         self.children: list[Child] = []
         self.watched: dict[str, int] = {}  # process ids
         self._canaries: list[Child] = []
-        self._number = 0
+        self.directory = Path(tempfile.mkdtemp(dir=os.environ.get("DEMO_DIRECTORY")))
+        self.callback(shutil.rmtree, self.directory, ignore_errors=True)
+        self.callback(self.stop)
         if title:
             print(f"{setup}: {title}", file=sys.stderr, flush=True)
-
-    def __enter__(self) -> Chain:
-        """Make its directory."""
-        self.directory = Path(tempfile.mkdtemp(dir=os.environ.get("DEMO_DIRECTORY")))
-        self._stack = contextlib.ExitStack()
-        self._stack.callback(shutil.rmtree, self.directory, ignore_errors=True)
-        self._stack.callback(self.stop)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """End everything."""
-        self._stack.close()
 
     def bus(self) -> str:
         """Start a virtual bus and the canaries; its interface. The sensors have a CPU to themselves."""
         setup = self.setup
-        errors = ",".join(str(setup.ppm * (-1) ** position) for position in range(setup.sensors))
+        errors = ",".join(str(PPM * (-1) ** position) for position in range(setup.sensors))
         arguments = f"--sensors {setup.sensors} --signal clock --sinc {setup.sinc} --ppm={errors}"
-        bus = VirtualBus(arguments, setup.priority)
-        self._stack.enter_context(bus)
-        self._stack.callback(self.stop)  # before the bus
+        bus = self.enter_context(VirtualBus(arguments, setup.priority))
+        self.callback(self.stop)  # before the bus
         os.sched_setaffinity(bus.pid, own_cpus()[:1])
         self.watched["sensor"] = bus.pid
         self.canaries()
         return bus.ifname
 
     def start(self, name: str, *command: object, result: Path | None = None, watch: bool = True) -> Child:
-        """Start any program."""
+        """Start any program; `watch`: `record` measures its CPU and memory."""
         child = Child(name, list(map(str, command)), self.directory, result)
         self.children.append(child)
         if watch:
@@ -195,58 +171,60 @@ class Chain:
         priority = min(99, self.setup.priority + 2) if self.setup.priority else 0
         for cpu in sorted(os.sched_getaffinity(0)):
             path = self.directory / f"canary-{cpu}"
-            how = ("--cpu", cpu, "--priority", priority, "--tick-us", self.setup.period_ns / 2000)
+            how = (cpu, priority, self.setup.period_ns / 2000)
             self._canaries.append(
                 self.python(path.name, f"{PROCESSES}.canary", path, *how, result=path, watch=False)
             )
 
-    def server(self, ifname: str, module: str = "ethercat_server.daemon.cli") -> Client:
-        """Start ethercat-server; a connection to it once its sensors stream."""
+    def server(self) -> Client:
+        """Start ethercat-server on a bus; a connection to it once its sensors stream."""
         self.python(
-            "server", module, ifname, PORT, "--set", f"sinc_length={self.setup.sinc}",
+            "server", "ethercat_server.daemon.cli", self.bus(), PORT,
+            "--set", f"sinc_length={self.setup.sinc}",
             "--rt-priority", self.setup.priority, "--cpu", own_cpus()[1],
         )  # fmt: skip
         return self.connect(self.setup.sensors)
 
+    def master(self, *c_program: object) -> Child:
+        """Start what stands in place of the server, on its CPU: the C program, or the polling loop."""
+        path, bus = self.directory / "master", self.bus()
+        how = (path, bus, self.setup.rate_hz, *c_program)
+        child = self.python("server", f"{PROCESSES}.masters", *how, result=path)
+        os.sched_setaffinity(child.pid, own_cpus()[1:])
+        return child
+
     def connect(self, sensors: int) -> Client:
-        """Connect as soon as the server describes this number of sensors."""
+        """Connect as soon as the server describes this number of sensors; closed with the chain."""
         found: list[Client] = []
 
         def ready() -> bool:
             with contextlib.suppress(ProtocolError):
-                client = Client(PORT, stream=False, raw=True, reconnect=False).connect()
-                found.append(client)
-                if len(client.description["sensors"]) == sensors:
-                    return True
-                client.close()
+                found.append(Client(PORT, stream=False, raw=True, reconnect=False).connect())
+                self.callback(found[-1].close)
+                return len(found[-1].description["sensors"]) == sensors
             return False
 
         self.wait(ready, "the server was not ready")
         return found[-1]
 
-    def node(self, *parameters: str, position: int = 0) -> Child:
+    def node(self, *parameters: str, position: int = 0) -> None:
         """Start the ROS 2 node of a sensor, with these parameters."""
         name = "node" if self.setup.sensors == 1 else f"node {position}"
         given = [word for each in (f"server_port:={PORT}", f"sensor:={position}", *parameters)
                  for word in ("-p", each)]  # fmt: skip
-        return self.python(name, "bridge.client", "--ros-args", "-r", f"__node:=bridge_{position}", *given)
+        self.python(name, "bridge.client", "--ros-args", "-r", f"__node:=bridge_{position}", *given)
 
-    def recorder(
-        self, kind: str, *arguments: object, warm_up_s: float = WARM_UP_S, seconds: float | None = None
-    ) -> Child:
-        """Start a recorder (processes/recorder.py) that ends by itself."""
-        self._number += 1
-        path = self.directory / f"{kind}-{self._number}"
-        times = ("--warm-up", warm_up_s, "--seconds", seconds or self.setup.seconds)
+    def recorder(self, kind: str, *arguments: object) -> Child:
+        """Start a recorder (processes/recorder.py, or of kind `c` the program given) that ends by itself."""
+        path = self.directory / f"{kind}-{len(self.children)}"
+        times = (path, WARM_UP_S, self.setup.seconds)
+        if kind == "c":
+            return self.start(path.name, *arguments, PORT, *times, result=path, watch=False)
         module = f"{PROCESSES}.recorder"
-        return self.python(path.name, module, kind, path, *times, *arguments, result=path, watch=False)
+        return self.python(path.name, module, kind, *times, *arguments, result=path, watch=False)
 
-    def wait(
-        self,
-        done: Callable[[], bool],
-        what: str = "a program did not get ready",
-        seconds: float = _START_TIMEOUT_S,
-    ) -> None:
+    def wait(self, done: Callable[[], bool], what: str = "a program did not get ready",
+             seconds: float = _START_TIMEOUT_S) -> None:  # fmt: skip
         """Wait; ScriptError if a program fails or it takes too long."""
         deadline = time.monotonic() + seconds
         while not done():
@@ -261,14 +239,22 @@ class Chain:
         end = time.monotonic() + seconds
         self.wait(lambda: time.monotonic() > end, seconds=seconds + 5)
 
-    def record(self, recorder: Child) -> Figures:
-        """Wait for a recording to be complete; CPU and memory of each program meanwhile."""
-        path = recorder.result
-        self.wait(lambda: began(path).exists() or path.exists(), "nothing was received")
+    def record(self, recorder: Child, memory: list[tuple[float, float]] | None = None) -> Figures:
+        """Wait for a recording to be complete; CPU and memory of each program meanwhile.
+
+        `memory` gets the server's with the time, s and bytes.
+        """
+        path, seconds = recorder.result, self.setup.seconds
+        self.wait(began(path).exists, "nothing was received")
         uses = {name: Usage(pid) for name, pid in self.watched.items()}
-        machine = cpu_of_machine()
-        end = time.monotonic() + self.setup.seconds - 0.1
-        self.wait(lambda: time.monotonic() > end or path.exists(), seconds=self.setup.seconds + 5)
+        machine, end = cpu_of_machine(), time.monotonic() + seconds - 0.1
+
+        def is_over() -> bool:
+            if memory is not None:
+                memory.append((time.monotonic(), uses["server"].rss()))
+            return time.monotonic() > end or path.exists()
+
+        self.wait(is_over, seconds=seconds + 5)
         usage = {
             "cpu_percent": {name: use.cpu_percent() for name, use in uses.items()},
             "rss_mb": {name: round(use.rss() / 1e6, 1) for name, use in uses.items()},
@@ -294,15 +280,14 @@ class Chain:
         pauses = [statistics.read_numbers(each.result, 2) for each in self._canaries if each.result.exists()]
         return statistics.stops(pauses, self.setup.period_ns)
 
-    def figures(self, recorder: Child, usage: Figures | None = None) -> tuple[Figures, Floats]:
+    def figures(self, recorder: Child, usage: Figures) -> tuple[Figures, Floats]:
         """End everything; figures of what was recorded, and all ages in ns."""
         self.stop()
         stopped = self.stops()
         arrivals = statistics.read_arrivals(recorder.result)
         result, ages = statistics.summary(arrivals, self.setup.period_ns, stopped)
-        longest = float(np.max(stopped[:, 1] - stopped[:, 0])) / 1000 if len(stopped) else 0.0
-        stalls = {"machine_stops": len(stopped), "longest_stop_us": round(longest, 1)}
-        return {**result, **stalls, **(usage or {})}, ages
+        longest = round(float(np.max(np.diff(stopped))) / 1000, 1) if len(stopped) else 0.0
+        return {**result, "machine_stops": len(stopped), "longest_stop_us": longest, **usage}, ages
 
 
 def own_cpus() -> tuple[int, int]:

@@ -11,7 +11,7 @@ import re
 import struct
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,7 +31,7 @@ from scripts.benchmarks.chain import (
     stolen_percent,
     stoppable,
 )
-from scripts.benchmarks.modes import cards, comparison, compensation, load, node, path, soak
+from scripts.benchmarks.modes import comparison, path, server
 from scripts.benchmarks.modes.mode import Mode
 from scripts.benchmarks.plot import draw
 from scripts.benchmarks.records import may_be_real_time
@@ -39,18 +39,13 @@ from scripts.benchmarks.records import may_be_real_time
 # Each is an option that measures only this, but for the comparison, which is made without one.
 MODES: Final[Mapping[str, Mode]] = {
     "comparison": comparison.MODE,
-    "load": load.MODE,
-    "node": node.MODE,
-    "cards": cards.MODE,
-    "compensation": compensation.MODE,
+    "load": server.LOAD,
     "path": path.MODE,
-    "soak": soak.MODE,
+    "soak": server.SOAK,
 }
-NEEDS_ROS: Final = ("node", "compensation")
 MOST_CPUS: Final = 4  # CPUs used: each of them runs a canary
 _WIDTH: Final = 108  # minimum width of the tables
 _QUICK_SECONDS: Final = 3.0
-_RATES: Final = tuple(OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512))
 _LATENCY: Final = Path("/dev/cpu_dma_latency")
 _BLOCK: Final = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _ON_PAGE: Final = ("comparison", *(name for name, mode in MODES.items() if mode.page))
@@ -88,17 +83,15 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
     if options.ros and find_spec("rclpy") is None:
         console.print("no ROS 2 here (rclpy): only up to a TCP client")
         options.ros = False
-    if options.mode in NEEDS_ROS and not options.ros:
-        raise ScriptError(f"--{options.mode} needs ROS 2 (rclpy): install the extra 'ros' or source ROS 2")
     wanted = {options.mode: options.argument}
     if options.page:
-        wanted |= {name: MODES[name].page for name in _ON_PAGE[1:] if options.ros or name not in NEEDS_ROS}
+        wanted |= {name: MODES[name].page for name in _ON_PAGE[1:]}
     began, machine = time.monotonic(), cpu_of_machine()
     results = {name: measure(name, argument, options) for name, argument in wanted.items()}
     ages: dict[tuple[int, int], dict[str, Any]] = {}
     for row in results.get("comparison", ()):
-        if (each := row.pop("ages", None)) is not None:
-            ages.setdefault((row["rate_hz"], row["sensors"]), {})[row["program"]] = each
+        if "ages" in row:
+            ages.setdefault((row["rate_hz"], row["sensors"]), {})[row["program"]] = row.pop("ages")
     for name, rows in results.items():
         console.print(table(MODES[name], rows))
     content = {
@@ -109,15 +102,14 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
         "idle_states": idle_states,
         "stolen_percent": stolen_percent(machine),
         "rt_priority": options.rt_priority,
-        "ppm": options.ppm,
         **results,
     }
     options.json.parent.mkdir(parents=True, exist_ok=True)
     options.json.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     written = [options.json]
     if ages and find_spec("matplotlib") is not None:
-        draw(ages, options.plot)
-        written.append(options.plot)
+        written.append((options.page or options.json).with_suffix(".png"))
+        draw(ages, written[-1])
     if options.page:
         renew(options.page, content)
         written.append(options.page)
@@ -134,32 +126,29 @@ def measure(name: str, argument: Any, options: argparse.Namespace) -> list[Figur
         row
         for rate in options.rates or mode.rates[:first]
         for sensors in asked or mode.sensors[:first]
-        for row in mode.measure(
-            Setup(rate, sensors, seconds, options.rt_priority, options.ppm, options.ros), argument
-        )
+        for row in mode.measure(Setup(rate, sensors, seconds, options.rt_priority, options.ros), argument)
     ]
 
 
 def cells(mode: Mode, rows: Sequence[Figures]) -> list[list[str]]:
-    """The table of a mode: headings and rows."""
-    return [list(mode.columns), *([shown(row) for shown in mode.columns.values()] for row in rows)]
+    """The rows of a table."""
+    return [[shown(row) for shown in mode.columns.values()] for row in rows]
 
 
 def table(mode: Mode, rows: Sequence[Figures]) -> Table:
     """For a terminal."""
-    head, *lines = cells(mode, rows)
     made = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
-    for number, name in enumerate(head):
+    for number, name in enumerate(mode.columns):
         made.add_column(name, justify="right" if number > 1 else "left")
-    for line in lines:
+    for line in cells(mode, rows):
         made.add_row(*line)
     return made
 
 
 def markdown(mode: Mode, rows: Sequence[Figures]) -> str:
     """For the page."""
-    head, *lines = cells(mode, rows)
-    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines))
+    lines = [list(mode.columns), ["---"] * len(mode.columns), *cells(mode, rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def check(path: Path) -> None:
@@ -175,17 +164,15 @@ def check(path: Path) -> None:
 def renew(path: Path, content: Mapping[str, Any]) -> None:
     """Put what was measured into the page, between the comments that name it."""
     check(path)
-    idle = "with" if content["idle_states"] else "without"
     where = (
-        f"All figures on this page are of one run: {content['date'][:10]}, {content['cpus_used']} CPUs, "
-        f"Linux {content['kernel'].split('-')[0]}, Python {content['python']}, {idle} idle states. "
+        f"All figures on this page but those with another date are of one run: {content['date'][:10]}, "
+        f"{content['cpus_used']} CPUs, Linux {content['kernel'].split('-')[0]}, Python {content['python']}, "
+        f"{'with' if content['idle_states'] else 'without'} idle states. "
         f"A hypervisor took {content['stolen_percent']} % of the time meanwhile."
     )
 
     def measured(match: re.Match[str]) -> str:
         name = match[2]
-        if name not in content:
-            return f"{match[1]}Not measured: there was no ROS 2.\n{match[3]}"
         text = markdown(MODES[name], content[name])
         if name == "comparison":
             text = "\n\n".join((comparison.answer(content[name]), text, where))
@@ -200,18 +187,18 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         prog="scripts/benchmark",
         description="Measure this project beside a bare C program and a polling design.",
     )
-    here = Path(os.environ.get("CALLED_FROM") or Path.cwd())
-    folder = here / "benchmark-results"
     parser.add_argument("--quick", action="store_true", help="one configuration only, in half a minute")
     parser.add_argument("--seconds", type=_seconds, help="how long each chain is measured (6)")
-    parser.add_argument("--json", type=Path, default=folder / "benchmark.json", metavar="FILE")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png")
+    parser.add_argument("--json", type=Path, default="benchmark-results/benchmark.json", metavar="FILE",
+                        help="where the figures go, and beside it the plot (%(default)s)")  # fmt: skip
     parser.add_argument("--page", type=Path, metavar="FILE.md",
                         help="measure all that this page has (docs/benchmark.md), and renew it")  # fmt: skip
     parser.add_argument("--vendor", action="store_true", help="Bota's own Python driver, too")
-    parser.add_argument("--rates", type=_rates, metavar="HZ,...", help="sample rates (800,1600)")
-    parser.add_argument("--sensors", type=_counts, metavar="N,...", help="sensors on the bus (1,2)")
-    parser.add_argument("--ppm", type=float, default=150.0, help="the sensors' clock error (%(default)g)")
+    rates = [OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512)]
+    parser.add_argument("--rates", type=_numbers(rates), metavar="HZ,...", help="sample rates (800,1600)")
+    parser.add_argument(
+        "--sensors", type=_numbers(range(1, 17)), metavar="N,...", help="sensors on the bus (1,2)"
+    )
     only = parser.add_mutually_exclusive_group()
     for name, mode in list(MODES.items())[1:]:
         only.add_argument(f"--{name}", help=mode.help, **(mode.argument or {"action": "store_true"}))
@@ -222,9 +209,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     asked = {name: getattr(options, name, None) for name in MODES}
     chosen = {name: value for name, value in asked.items() if value is not None and value is not False}
     options.mode, options.argument = next(iter(chosen.items()), ("comparison", options.vendor))
-    options.page = options.page and here / options.page
-    plot = options.page.with_suffix(".png") if options.page else folder / "benchmark.png"
-    options.json, options.plot = here / options.json, here / (options.plot or plot)
+    here = Path(os.environ.get("CALLED_FROM") or Path.cwd())
+    options.json, options.page = here / options.json, options.page and here / options.page
     return options
 
 
@@ -235,19 +221,14 @@ def _seconds(text: str) -> float:
     return value
 
 
-def _numbers(text: str, allowed: Sequence[int]) -> list[int]:
-    numbers = [int(word) for word in text.split(",")]
-    if not set(numbers) <= set(allowed):
-        raise argparse.ArgumentTypeError(f"must be among {', '.join(map(str, sorted(allowed)))}")
+def _numbers(allowed: Sequence[int]) -> Callable[[str], list[int]]:
+    def numbers(text: str) -> list[int]:
+        found = [int(word) for word in text.split(",")]
+        if not set(found) <= set(allowed):
+            raise argparse.ArgumentTypeError(f"must be among {', '.join(map(str, sorted(allowed)))}")
+        return found
+
     return numbers
-
-
-def _rates(text: str) -> list[int]:
-    return _numbers(text, _RATES)
-
-
-def _counts(text: str) -> list[int]:
-    return _numbers(text, range(1, 17))
 
 
 def _benchmark() -> int:

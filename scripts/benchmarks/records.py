@@ -14,6 +14,7 @@ from array import array
 from pathlib import Path
 from typing import Final
 
+PORT: Final = 12001  # of the server and what is compared with it
 COLUMNS: Final = 5
 _NS: Final = 1_000_000_000
 
@@ -23,10 +24,8 @@ class Recording:
 
     def __init__(self, path: Path, warm_up_s: float, seconds: float) -> None:
         self._path = path
-        self._warm_up_ns = int(warm_up_s * _NS)
-        self._length_ns = int(seconds * _NS)
-        self._from_ns = 0
-        self._until_ns = 0
+        self._warm_up_ns, self._length_ns = int(warm_up_s * _NS), int(seconds * _NS)
+        self._from_ns = self._until_ns = 0
         self._values = array("q")
 
     def take(self, position: int, number: int, instant_ns: int, stamp_ns: int, received_ns: int) -> bool:
@@ -87,7 +86,7 @@ def sleep_until(due_ns: int) -> int:
     return time.monotonic_ns()
 
 
-def connect(port: int) -> socket.socket:
+def connect(port: int = PORT) -> socket.socket:
     """Connect to a program on this machine as soon as it listens."""
     while True:
         try:

@@ -7,6 +7,7 @@ no ROS.
 
 from __future__ import annotations
 
+import functools
 import math
 from array import array
 from collections import OrderedDict, deque
@@ -16,17 +17,16 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from protocol.accounting import FrameKind, StreamAccounting
-from protocol.framing import DataFlag, DataMessage
+from protocol.framing import DataMessage
 from protocol.pdo import Sample, SampleDecoder
-from scripts.benchmarks.statistics import COVERED, Ints, covered
+from scripts.benchmarks.statistics import Ints, in_stops
 
 _REMEMBERED: Final = 8192  # samples: some seconds' worth
-_AROUND_A_GAP_NS: Final = 1_000_000_000  # a message may be of a sample withheld so long before
 FULL_RATE: Final = 0.95  # fewer messages than this part of the samples: something could not keep up
 _LEAST_RATE: Final = 0.6  # fewer than this part, and something is wrong
 NO_STOPS: Final[Ints] = np.empty((0, 2), dtype=np.int64)
 
-Values = tuple[float, ...]
+_decoder = functools.cache(SampleDecoder)
 
 
 class Summary(NamedTuple):
@@ -34,18 +34,14 @@ class Summary(NamedTuple):
 
     messages: int
     rate_hz: float
-    lost: int
-    """Samples that came from the server, but not on the topic."""
-    lost_before: int
-    """Samples that were lost, or withheld from the client, before that."""
-    lost_in_stops: int
-    """Of both: those made while the machine stopped."""
+    lost: int  # samples that came from the server, but not on the topic
+    lost_before: int  # samples that were lost, or withheld from the client, before that
+    lost_in_stops: int  # of both: those made while the machine stopped
     stops: int
     longest_stop_ms: float
     repeated: int
-    age_ms: tuple[float, float]
-    """Of messages at the subscriber: median, 99th percentile."""
-    tcp_age_ms: tuple[float, float]
+    age_ms: Sequence[float]  # of messages at the subscriber: median, 99th percentile
+    tcp_age_ms: Sequence[float]
     all_finite: bool
     all_decoded_right: bool
 
@@ -57,14 +53,11 @@ class Measurement:
         """`rate_hz` is the sensor's: a gap is as long as its rate has it."""
         self.rate_hz = rate_hz
         self.latest: Sample | None = None
-        self.age_ns = 0
-        """Age of the newest message on its arrival."""
+        self.age_ns = 0  # of the newest message on its arrival
         self._stream = StreamAccounting()
         self._made_ns = array("q")  # of each sample that came from the server
-        self._known: OrderedDict[Values, int] = OrderedDict()  # its index there
-        self._waiting: deque[tuple[Values, int]] = deque()  # messages whose sample has not come
-        self._decoders: dict[int, SampleDecoder] = {}
-        self._gap_ns = -(10**18)  # when the latest gap in what comes from the server ended
+        self._known: OrderedDict[tuple[float, ...], int] = OrderedDict()  # its index there
+        self._waiting: deque[tuple[tuple[float, ...], int]] = deque()  # messages whose sample has not come
         self._indices = array("q")  # of the samples that came as messages
         self._last_ns = 0
         self.begin()
@@ -72,8 +65,8 @@ class Measurement:
     def begin(self) -> None:
         """Count from here: what came while things were starting is none of the figures."""
         self._missing_before = self._stream.counts.missing
+        # Messages, those of a sample that an earlier one had, those that equal no sample.
         self.messages = self.repeated = self._not_finite = self._unknown = 0
-        """Messages; those of a sample that an earlier one had; ... that equal no sample."""
         self._missing_ns: list[float] = []  # when the missing samples were made
         self._ages_ns, self._tcp_ages_ns = array("q"), array("q")
         self._indices = self._indices[-1:]
@@ -81,18 +74,13 @@ class Measurement:
 
     def take_frame(self, frame: DataMessage, now_ns: int) -> None:
         """A frame came from the server."""
-        if frame.flags & DataFlag.GAP:
-            self._gap_ns = frame.monotonic_ns
         before, self._stream.rate_hz = self._stream.counts.missing, self.rate_hz
         kind = self._stream.take(frame.sequence, frame.monotonic_ns, frame.flags)
         if missing := self._stream.counts.missing - before:
-            between = np.linspace(self._passed_ns, frame.monotonic_ns, missing + 2)[1:-1]
-            self._missing_ns += between.tolist()
+            self._missing_ns += np.linspace(self._passed_ns, frame.monotonic_ns, missing + 2)[1:-1].tolist()
         if kind is not FrameKind.NEW:
             return
-        size = len(frame.process_data)
-        decoder = self._decoders.get(size) or self._decoders.setdefault(size, SampleDecoder(size))
-        self.latest = decoder.decode(frame.process_data)
+        self.latest = _decoder(len(frame.process_data)).decode(frame.process_data)
         values = tuple(self.latest.array)
         self._known[values] = len(self._made_ns)
         self._known.move_to_end(values)
@@ -129,8 +117,7 @@ class Measurement:
                 return  # its sample may still come
             elif self._indices:  # before the first match the two streams need not overlap
                 self.messages += 1
-                # Where samples were withheld from the server's client, this one may be among them.
-                self._unknown += arrived_ns > self._gap_ns + _AROUND_A_GAP_NS
+                self._unknown += 1
             self._waiting.popleft()
 
     @property
@@ -149,38 +136,31 @@ class Measurement:
         found = self._indices
         return found[-1] - found[0] + 1 - len(set(found)) if found else 0
 
-    def _lost_in(self, stops: Ints) -> int:
-        """How many of all that are missing were made in these stops of the machine."""
-        missing = set(range(self._indices[0], self._indices[-1])) if self._indices else set()
-        made = [*self._missing_ns, *(self._made_ns[n] for n in missing.difference(self._indices))]
-        if not made or not self.rate_hz:
-            return 0
-        return int(np.count_nonzero(covered(np.array(made), 1e9 / self.rate_hz, stops) >= COVERED))
-
     def summary(self, stops: Ints = NO_STOPS) -> Summary:
         """The figures so far; `stops` of the machine, (n, 2), begin and end in CLOCK_MONOTONIC ns."""
-        seconds = (self._last_ns - self._first_ns) / 1e9
+        found, seconds = self._indices, (self._last_ns - self._first_ns) / 1e9
+        lost = set(range(found[0], found[-1])).difference(found) if found else ()
+        missing = np.array([*self._missing_ns, *(self._made_ns[n] for n in lost)])
         return Summary(
             messages=self.messages,
-            rate_hz=(len(self._indices) - 1) / seconds if seconds > 0 else 0.0,
+            rate_hz=(len(found) - 1) / seconds if seconds > 0 else 0.0,
             lost=self.lost,
             lost_before=self.lost_before,
-            lost_in_stops=self._lost_in(stops),
+            lost_in_stops=in_stops(missing, 1e9 / self.rate_hz, stops) if self.rate_hz else 0,
             stops=len(stops),
-            longest_stop_ms=float((stops[:, 1] - stops[:, 0]).max()) / 1e6 if len(stops) else 0.0,
+            longest_stop_ms=float(np.max(np.diff(stops), initial=0)) / 1e6,
             repeated=self.repeated,
             age_ms=_median_and_p99_ms(self._ages_ns),
             tcp_age_ms=_median_and_p99_ms(self._tcp_ages_ns),
             all_finite=self._not_finite == 0,
-            all_decoded_right=self._unknown == 0,
+            # Where samples were withheld from the server's client, a message may be one of them.
+            all_decoded_right=self._unknown <= self._stream.counts.missing,
         )
 
 
-def _median_and_p99_ms(ages_ns: array[int]) -> tuple[float, float]:
-    if not ages_ns:
-        return 0.0, 0.0
-    median, p99 = np.percentile(ages_ns, (50, 99), method="higher")
-    return median / 1e6, p99 / 1e6
+def _median_and_p99_ms(ages_ns: array[int]) -> list[float]:
+    points: list[float] = (np.percentile(ages_ns or [0], (50, 99), method="higher") / 1e6).tolist()
+    return points
 
 
 def explanation(summary: Summary) -> str | None:

@@ -21,7 +21,6 @@ from rich.table import Table
 from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from protocol.client import Client
 from scripts.benchmarks.chain import (
-    PORT,
     Chain,
     ScriptError,
     Setup,
@@ -30,7 +29,7 @@ from scripts.benchmarks.chain import (
     loopback_up,
     stoppable,
 )
-from scripts.benchmarks.records import began, may_be_real_time
+from scripts.benchmarks.records import PORT, began, may_be_real_time
 from scripts.demonstration.measure import FULL_RATE, Measurement, Summary, explanation, verdict
 
 TOPIC: Final = "/sensone_sensor_data"
@@ -106,26 +105,22 @@ class Screen:
         if now_s - self._at_s >= 0.9:
             self._rate_hz = (measurement.messages - self._messages) / (now_s - self._at_s)
             self._messages, self._at_s = measurement.messages, now_s
-        sample = measurement.latest
-        assert sample is not None
         lost, age = measurement.lost + measurement.lost_before, f"{measurement.age_ns / 1e6:.2f} ms"
         rows = [
-            (f"{name}, {unit}", unit, [f"{v:+.{digits}f}" for v in getattr(sample, vector)])
+            (name, unit, [f"{value:+.{digits}f}" for value in getattr(measurement.latest, vector)])
             for name, vector, unit, digits in _ROWS
         ]
         if self.live is None:
-            values = "  ".join(f"{unit} {' '.join(numbers)}" for _, unit, numbers in rows)
-            repeated = measurement.repeated
-            print(
-                f"{self._rate_hz:7.1f} Hz  age {age}  lost {lost}  repeated {repeated}  {values}", flush=True
-            )
+            values = "  ".join(f"{unit} {' '.join(xyz)}" for _, unit, xyz in rows)
+            figures = f"{self._rate_hz:7.1f} Hz  age {age}  lost {lost}  repeated {measurement.repeated}"
+            print(f"{figures}  {values}", flush=True)
             return
         table = Table(title=self._title, title_justify="left", caption="Ctrl-C ends it")
         table.add_column("", min_width=22)
         for axis in "xyz":
             table.add_column(axis, justify="right", min_width=10)
-        for name, _, numbers in rows:
-            table.add_row(name, *numbers)
+        for name, unit, xyz in rows:
+            table.add_row(f"{name}, {unit}", *xyz)
         table.add_section()
         table.add_row("Messages a second", f"{self._rate_hz:.1f}")
         table.add_row("Age at the subscriber", age)
@@ -135,18 +130,17 @@ class Screen:
 
 def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
     """The figures of the whole run."""
-    table = Table(title="What arrived on the ROS topic", title_justify="left", show_header=False)
-    table.add_column(min_width=34)
-    table.add_column(justify="right", min_width=12)
+    table = Table("", "", title="What arrived on the ROS topic", title_justify="left", show_header=False)
+    table.columns[1].justify = "right"
     for name, value in (
-        ("Messages", str(summary.messages)),
+        ("Messages", summary.messages),
         ("Mean rate", f"{summary.rate_hz:.1f} Hz"),
         ("Sensor's own rate", f"{sensor['rate_hz']} Hz"),
-        ("Lost", str(summary.lost + summary.lost_before)),
-        ("  before or withheld (GAP)", str(summary.lost_before)),
-        ("  between server and subscriber", str(summary.lost)),
-        ("  of both, while the machine stopped", str(summary.lost_in_stops)),
-        ("Repeated", str(summary.repeated)),
+        ("Lost", summary.lost + summary.lost_before),
+        ("  before or withheld (GAP)", summary.lost_before),
+        ("  between server and subscriber", summary.lost),
+        ("  of both, while the machine stopped", summary.lost_in_stops),
+        ("Repeated", summary.repeated),
         ("Age at the subscriber, p50", f"{summary.age_ms[0]:.2f} ms"),
         ("Age at the subscriber, p99", f"{summary.age_ms[1]:.2f} ms"),
         ("Age at a TCP client, p50", f"{summary.tcp_age_ms[0]:.2f} ms"),
@@ -154,7 +148,7 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
         ("All finite", "yes" if summary.all_finite else "NO"),
         ("All decoded right", "yes" if summary.all_decoded_right else "NO"),
     ):
-        table.add_row(name, value)
+        table.add_row(name, str(value))
     console = Console(highlight=False, markup=False)
     console.print(table)
     if why := explanation(summary):

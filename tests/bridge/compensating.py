@@ -13,12 +13,7 @@ from tests.compensation.making import TOOL, load
 
 UP, SIDE, OVER = (0, 0, 1), (1, 0, 0), (0, 0, -1)
 ZERO6 = [0.0] * 6
-QUICK: dict[str, object] = {
-    "rest.duration": 0.3,
-    "bias_ramp_time": 0.0,
-    "accelerometer.time_constant": 0.05,
-    "accelerometer.tilt_limit": 0.1,
-}
+QUICK: dict[str, object] = {"rest.duration": 0.3, "bias_ramp_time": 0.0}
 
 
 def sensed(
@@ -48,8 +43,8 @@ class Stages:
 
     def __init__(self, node: SimulatedNode) -> None:
         self._node = node
-        names = ("wrench_compensated", "compensation/bias", "compensation/gravity", "compensation/inertia")
-        self.all = self.final, self.bias, self.gravity, self.inertia = [node.hear(name) for name in names]
+        names = ("wrench_compensated", "compensation/bias", "compensation/tool")
+        self.all = self.final, self.bias, self.tool = [node.hear(name) for name in names]
 
     def forget(self) -> None:
         for messages in self.all:

@@ -17,7 +17,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 
@@ -338,24 +338,12 @@ def listener(_ros: None) -> Iterator[Listener]:
     opened.close()
 
 
-Kind = TypeVar("Kind", NodeThread, NodeProcess)
-
-
-def starter(listener: Listener) -> contextlib.AbstractContextManager[Start]:
-    """Gives a function that starts nodes which publish to `listener`; ends them at the end."""
-    return _starter(listener, NodeThread)
-
-
-def process_starter(listener: Listener) -> contextlib.AbstractContextManager[StartProcess]:
-    """The same with a process for each node."""
-    return _starter(listener, NodeProcess)
-
-
 @contextlib.contextmanager
-def _starter(listener: Listener, kind: Callable[..., Kind]) -> Iterator[Callable[..., Kind]]:
-    started: list[Kind] = []
+def starter(listener: Listener, kind: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
+    """Gives a function that starts nodes of a kind which publish to `listener`; ends them at the end."""
+    started: list[Any] = []
 
-    def start_node(port: int, **parameters: object) -> Kind:
+    def start_node(port: int, **parameters: object) -> Any:
         values = {"server_port": port, "array_topic": listener.topic, **parameters}
         options = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
         remaps = (
@@ -376,13 +364,13 @@ def _starter(listener: Listener, kind: Callable[..., Kind]) -> Iterator[Callable
 
 @pytest.fixture
 def start(listener: Listener) -> Iterator[Start]:
-    with starter(listener) as start_node:
+    with starter(listener, NodeThread) as start_node:
         yield start_node
 
 
 @pytest.fixture
 def start_process(listener: Listener) -> Iterator[StartProcess]:
-    with process_starter(listener) as start_node:
+    with starter(listener, NodeProcess) as start_node:
         yield start_node
 
 

@@ -1,4 +1,4 @@
-"""wrench_compensated, its parameters and the tare, with the accelerometer, in simulated time."""
+"""wrench_compensated, its parameters and the tare, by the IMU, in simulated time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 from ft_compensation.quantities import Payload
 from protocol.control import Event, event
 from protocol.framing import DataFlag
-from protocol.pdo import encode
+from protocol.pdo import STANDARD_GRAVITY
 from tests.bridge.compensating import (
     OVER,
     QUICK,
@@ -44,8 +44,7 @@ START: dict[str, Any] = {
     "tool_center_of_gravity": [*TOOL.center],
     "bias": ZERO6,
     "bias_ramp_time": 0.0,
-    "orientation_source": "accelerometer",
-    "compensate_inertia": False,
+    "gravity_source": "imu",
 }
 
 
@@ -82,8 +81,8 @@ def test_what_is_subtracted_stands_beside_it(stages: Stages, node: SimulatedNode
     stages.forget()
     node.run(0.1)
     assert is_near(stages.bias[0], bias)
-    assert is_near(stages.gravity[0], weight(UP))
-    assert [len(messages) for messages in (measured, *stages.all)] == [10] * 5
+    assert is_near(stages.tool[0], weight(UP))
+    assert [len(messages) for messages in (measured, *stages.all)] == [10] * 4
     for wrench, *parts in zip(measured, *stages.all, strict=True):
         assert {stamp_ns(part) for part in parts} == {stamp_ns(wrench)}, "the sample's, in all of them"
         assert {part.header.frame_id for part in parts} == {"ft_sensor"}
@@ -91,7 +90,7 @@ def test_what_is_subtracted_stands_beside_it(stages: Stages, node: SimulatedNode
         assert six(wrench) == pytest.approx(total, abs=1e-9)
 
 
-def test_gravity_goes_along_with_the_pose(stages: Stages, server: SimulatedServer) -> None:
+def test_the_weight_goes_along_with_the_pose(stages: Stages, server: SimulatedServer) -> None:
     for up in (SIDE, OVER, (1, 1, 1)):
         hold(server, up)
         stages.settle(ZERO6)
@@ -233,13 +232,13 @@ def test_a_bias_that_was_given_is_not_of_a_tool(
     assert node.parameters("bias") == [pytest.approx([*BIAS.values])]
 
 
-def test_a_tool_that_a_tare_without_gravity_does_not_know(
+def test_a_tool_that_a_tare_without_a_source_does_not_know(
     stages: Stages, server: SimulatedServer, node: SimulatedNode
 ) -> None:
     assert node.set_parameter("tool_mass", 0.0) == (True, "")
-    assert node.set_parameter("orientation_source", "none") == (True, "")
+    assert node.set_parameter("gravity_source", "none") == (True, "")
     assert node.trigger("tare")[0]
-    assert node.set_parameter("orientation_source", "accelerometer") == (True, "")
+    assert node.set_parameter("gravity_source", "imu") == (True, "")
     node.until(compensation=OK)
     bias = node.parameters("bias")
     assert node.set_parameter("tool_mass", 1.5) == (True, "")
@@ -272,36 +271,12 @@ def test_a_tare_is_refused(
     assert list(node.parameters("bias")[0]) == ZERO6
 
 
-def test_a_tare_while_the_force_moves_is_refused(
-    stages: Stages, server: SimulatedServer, node: SimulatedNode
-) -> None:
-    still, pushed = sensed(UP), sensed(UP, force_y=9.0)
-    for position in range(100):
-        server.once(process_data=pushed if position // 3 % 2 else still)
-    done, text = node.trigger("tare")
-    assert not done
-    assert "the sensor is not stationary: force y moved by" in text
-    assert list(node.parameters("bias")[0]) == ZERO6
-
-
 def every_other(server: SimulatedServer, **bad: Any) -> None:
     """Every other sample of the next second is so."""
     good = server.changes
     for _ in range(50):
         server.once(**good)
         server.once(**{**good, **bad})
-
-
-def test_a_saturated_sample_spoils_a_tare(
-    stages: Stages, server: SimulatedServer, node: SimulatedNode
-) -> None:
-    mask = encode(61, {"force_torque_saturated": 4})
-    saturated = bytes(a | b for a, b in zip(sensed(UP), mask, strict=True))
-    for position in range(30):
-        server.once(process_data=saturated if position == 15 else sensed(UP))
-    done, text = node.trigger("tare")
-    assert not done
-    assert "force or torque was saturated" in text
 
 
 def test_a_sample_that_is_not_finite_spoils_a_tare(
@@ -363,27 +338,11 @@ def test_a_bias_is_ramped_in(stages: Stages, node: SimulatedNode) -> None:
     assert sum(step > 0 for step in steps) > 55
 
 
-def test_it_stops_when_the_accelerometer_is_of_no_use(
-    stages: Stages, server: SimulatedServer, node: SimulatedNode
-) -> None:
-    status = node.until("gravity is subtracted", compensation=OK)["compensation"]
-    assert status.message == "gravity is subtracted"
-    assert values(status)["tool_mass"] == "0.8"
-    assert values(status)["orientation_source"] == "accelerometer"
-    assert float(values(status)["orientation_age_s"]) == 0
-    withheld = int(values(status)["withheld"])
-    hold(server, UP, acceleration_z=0.5)  # it is being shaken
-    node.run(0.45)
-    assert not stages.are_silent(), "what was known holds for half a second"
-    node.until("wrench_compensated has stopped: the accelerometer has not for", compensation=ERROR)
-    assert stages.are_silent()
-    done, text = node.trigger("tare")
-    assert not done
-    assert "accelerometer reads" in text
-    hold(server, UP)
-    stages.settle(ZERO6)
-    status = node.until("gravity is subtracted", compensation=OK)["compensation"]
-    assert int(values(status)["withheld"]) > withheld + 10
+def test_what_is_subtracted_is_told(stages: Stages, server: SimulatedServer, node: SimulatedNode) -> None:
+    status = node.until(compensation=OK)["compensation"]
+    assert status.message == "subtracted: weight and inertia of the tool"
+    told = values(status)
+    assert (told["tool_mass"], told["gravity_source"], told["orientation_age_s"]) == ("0.8", "imu", "0.0")
 
 
 def test_it_says_that_the_imu_is_off(stages: Stages, server: SimulatedServer, node: SimulatedNode) -> None:
@@ -392,37 +351,22 @@ def test_it_says_that_the_imu_is_off(stages: Stages, server: SimulatedServer, no
 
 
 def test_without_a_source_nothing_with_weight_is_compensated(stages: Stages, node: SimulatedNode) -> None:
-    assert node.set_parameter("orientation_source", "none") == (True, "")
-    node.until("orientation_source is none", compensation=ERROR)
+    assert node.set_parameter("gravity_source", "none") == (True, "")
+    node.until("gravity_source is none", compensation=ERROR)
     assert stages.are_silent()
-    assert "orientation_source is none" in node.trigger("tare")[1]
+    assert "gravity_source is none" in node.trigger("tare")[1]
     assert node.set_parameter("tool_mass", 0.0) == (True, "")
     stages.settle(weight(UP))  # nothing to turn: the bias alone needs no orientation
 
 
-def test_the_sensors_own_estimate(stages: Stages, server: SimulatedServer, node: SimulatedNode) -> None:
-    assert node.set_parameter("orientation_source", "sensor") == (True, "")
-    node.until("settings.orientation_estimation", compensation=ERROR)
-    over = {"orientation_x": 1.0}  # half a turn about x, while the accelerometer says something else
-    hold(server, OVER, size=77, acceleration_x=5.0, **over)
+def test_a_tool_that_is_accelerated_is_no_contact(stages: Stages, server: SimulatedServer) -> None:
+    """By 1 m/s² along x: its mass pulls the other way."""
+    pulled = {"force_x": -TOOL.mass, "torque_y": -TOOL.mass * TOOL.center[2]}
+    pulled["torque_z"] = TOOL.mass * TOOL.center[1]
+    hold(server, UP, acceleration_x=1 / STANDARD_GRAVITY, **pulled)
     stages.settle(ZERO6)
-    node.until("gravity is subtracted", compensation=OK)
-
-
-def test_inertia_is_taken_off_where_it_is_asked_for(
-    stages: Stages, server: SimulatedServer, node: SimulatedNode
-) -> None:
-    assert node.set_parameter("orientation_source", "sensor") == (True, "")
-    # The tool is accelerated by 1 m/s² along x: its mass pulls the other way.
-    pulled = {"force_x": -TOOL.mass, "acceleration_x": 1 / 9.80665, "orientation_w": 1.0}
-    pulled |= {"torque_y": -TOOL.mass * TOOL.center[2], "torque_z": TOOL.mass * TOOL.center[1]}
-    hold(server, UP, size=77, **pulled)
-    left = [pulled["force_x"], 0, 0, 0, pulled["torque_y"], pulled["torque_z"]]
-    stages.settle(left)
-    assert is_near(stages.inertia[-1], ZERO6)
-    assert node.set_parameter("compensate_inertia", True) == (True, "")
-    stages.settle(ZERO6)
-    assert is_near(stages.inertia[-1], left)
+    inertia = [pulled["force_x"], 0.0, 0.0, 0.0, pulled["torque_y"], pulled["torque_z"]]
+    assert is_near(stages.tool[-1], [a + b for a, b in zip(weight(UP), inertia, strict=True)])
 
 
 @pytest.mark.parametrize(
@@ -435,7 +379,7 @@ def test_inertia_is_taken_off_where_it_is_asked_for(
         ("tool_center_of_gravity", [0.0, 0.0, float("nan")], "it must be 3 numbers"),
         ("gravity", [0, 0, 0], "must be at least 0.1 m/s² long"),
         ("bias", [1.0] * 7, "it must be 6 numbers"),
-        ("orientation_source", "imu", "it must be none or accelerometer or sensor or topic_pose"),
+        ("gravity_source", "accelerometer", "it must be none or imu or topic_pose"),
         ("orientation.mounting", [1.0, 0.0, 0.0, 1.0], "a rotation is a quaternion of length 1"),
         ("bias_directory", "", "it must be text that is not empty"),
         ("frame_id", "other", "read-only"),

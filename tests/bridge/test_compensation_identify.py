@@ -44,7 +44,7 @@ def started(node: SimulatedNode, server: SimulatedServer) -> SimulatedNode:
     node.run(0.1)
     done, text = node.trigger("identify/start")
     assert done
-    assert "gravity is known by accelerometer" in text
+    assert "gravity is known by imu" in text
     assert "turn the sensor so that its +z axis points up" in text
     return node
 
@@ -101,7 +101,7 @@ def test_from_six_poses_to_a_compensated_wrench(
 def test_the_offset_of_the_accelerometer_is_found_and_subtracted_from_then_on(
     started: SimulatedNode, server: SimulatedServer, folder: Path
 ) -> None:
-    """Gravity, tare and the inertial term go by the corrected acceleration: 0.2 m/s² are 0.16 N here."""
+    """Wrench and tare go by the corrected acceleration: 0.2 m/s² are 0.16 N here."""
     off = {"acceleration_x": 0.02, "acceleration_y": -0.015}  # g
     for up in AXES:
         hold(server, up, bias=BIAS, **off)
@@ -127,10 +127,8 @@ def test_the_offset_of_the_accelerometer_is_found_and_subtracted_from_then_on(
     assert started.trigger("tare")[0]
     hold(server, (-2, 1, 1), bias=BIAS, **off)
     stages.settle(ZERO6, within=1e-2)
-    assert started.set_parameter("compensate_inertia", True)[0]
-    stages.settle(ZERO6, within=1e-2)
     for name, value in (
-        ("compensate_inertia", False), ("tool_mass", 0.0), ("accelerometer.offset", [0.0] * 3),
+        ("tool_mass", 0.0), ("accelerometer.offset", [0.0] * 3),
         ("accelerometer.scale", [1.0] * 3), ("accelerometer.offset_interval", [0.784] * 3),
         ("accelerometer.scale_interval", [0.0098] * 3),
     ):  # fmt: skip
@@ -187,7 +185,7 @@ def test_a_pose_that_is_no_good_is_not_taken(
     assert "pose 2 taken" in take(SIDE)
     done, text = started.trigger("identify/drop_pose")
     assert done
-    assert "1 are left" in text
+    assert "1 are left; not enough yet" in text
     assert "pose 2 taken" in take(OVER)
 
 
@@ -220,11 +218,11 @@ def test_starting_again_drops_what_was_there(started: SimulatedNode, take: Take)
 
 
 def test_it_does_not_start_without_an_orientation(node: SimulatedNode) -> None:
-    assert node.set_parameter("orientation_source", "none") == (True, "")
+    assert node.set_parameter("gravity_source", "none") == (True, "")
     done, text = node.trigger("identify/start")
     assert not done
-    assert "orientation_source is none" in text
-    assert node.set_parameter("orientation_source", "accelerometer") == (True, "")
+    assert "gravity_source is none" in text
+    assert node.set_parameter("gravity_source", "imu") == (True, "")
 
 
 def test_a_file_that_cannot_be_written(started: SimulatedNode, take: Take) -> None:

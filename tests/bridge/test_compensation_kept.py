@@ -351,7 +351,9 @@ def test_a_kept_bias_of_a_tool_whose_pose_is_not_known(bench: Bench) -> None:
         stored = bench.store.load(1)
         assert stored is not None
         assert stored.bias == BIAS.plus(Wrench.of([1.0] * 6))
-        assert (stored.payload, stored.gravity) == (Payload(1.5, (0.0, 0.0, 0.1)), None), "as it was taken"
+        assert (stored.payload, stored.specific_force) == (Payload(1.5, (0.0, 0.0, 0.1)), None), (
+            "as it was taken"
+        )
 
 
 def test_the_node_ends_while_a_tare_waits(bench: Bench) -> None:
@@ -372,7 +374,7 @@ def test_the_node_ends_while_a_tare_waits(bench: Bench) -> None:
 )
 def test_a_wrong_parameter_is_told_in_a_sentence(wrong: dict[str, Any]) -> None:
     with pytest.raises(StartError) as caught:
-        SimulatedNode(SimulatedServer(), orientation_source="topic_imu", **wrong)
+        SimulatedNode(SimulatedServer(), gravity_source="topic_imu", **wrong)
     assert next(iter(wrong)) in str(caught.value)
     assert "\n" not in str(caught.value)
 

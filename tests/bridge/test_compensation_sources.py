@@ -9,7 +9,6 @@ import math
 import sys
 import threading
 import time
-import types
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -18,28 +17,22 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 import rclpy
-from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped, Quaternion, QuaternionStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
 
-from bridge.compensating.gravity_sources import ListenerSource, Oriented, SensorSource
-from bridge.compensating.orientations import (
-    OrientationListener,
-    Tf,
-    UnusableError,
-    check_tf,
-    look_up,
-    multiply,
-    unit,
-)
+from bridge.compensating.orientations import OrientationListener, multiply
+from bridge.compensating.tool_sources import ListenerSource, Oriented
 from bridge.node import StartError
-from bridge.parameters.compensation import CompensationParameters, OrientationParameters
+from bridge.parameters.compensation import DEFAULTS
 from bridge.parameters.row import ParameterError
-from ft_compensation.quantities import length
+from bridge.transforms import check_tf
+from ft_compensation.quantities import length, unit_quaternion
 from protocol.text.json_text import JsonObject
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, is_near, weight
 from tests.bridge.conftest import listening, retire, wait_until
+from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.bridge.streaming import values
 from tests.compensation.making import BIAS, TOOL, sample
@@ -122,7 +115,7 @@ def node(_robot: Robot) -> Iterator[SimulatedNode]:
     given = {
         "tool_mass": TOOL.mass,
         "tool_center_of_gravity": [*TOOL.center],
-        "orientation_source": "topic_pose",
+        "gravity_source": "topic_pose",
         "orientation.topic": "arm/pose",
         "orientation.stale_after": 0.5,
     }
@@ -139,7 +132,7 @@ def stages(node: SimulatedNode) -> Stages:
 def listen(node: SimulatedNode, source: str, topic: str) -> str:
     """Have the node listen there; the topic's whole name."""
     assert node.set_parameter("orientation.topic", topic) == (True, "")
-    assert node.set_parameter("orientation_source", source) == (True, "")
+    assert node.set_parameter("gravity_source", source) == (True, "")
     return node.name.replace("bridge", topic)
 
 
@@ -201,8 +194,8 @@ def test_a_source_that_falls_silent_and_comes_back(robot: Robot, stages: Stages,
             "older than the sample (limit 0.5 s): it has stopped, is slow, or has another clock",
         ),
         ({"offset_s": 30.0}, "after the sample (limit 0.5 s): the clocks of the two computers differ"),
-        ({"quaternion": (0.0, 0.0, 0.0, 0.0)}, "a quaternion of length 0 instead of 1"),
-        ({"quaternion": (0.0, math.nan, 0.0, 1.0)}, "a quaternion of length nan instead of 1"),
+        ({"quaternion": (0.0, 0.0, 0.0, 0.0)}, "a quaternion of length 1, this one's is 0"),
+        ({"quaternion": (0.0, math.nan, 0.0, 1.0)}, "a quaternion of length 1, this one's is nan"),
     ],
 )
 def test_what_cannot_be_used(
@@ -280,7 +273,7 @@ def test_the_orientation_is_taken_in_while_a_service_waits(
     node.at(0.8, turn)  # longer than an orientation holds
     node.at(1.6, reply)
     assert node.trigger("sensor_tare") == (False, "no (denied)")
-    assert is_near(stages.gravity[-1], weight(OVER))
+    assert is_near(stages.tool[-1], weight(OVER))
     del robot.answers["tare"]
 
 
@@ -293,7 +286,7 @@ def test_the_orientation_is_taken_in_while_a_service_waits(
             "wrench",
             "'wrench': this node itself has that topic, with WrenchStamped messages and not",
         ),
-        ("orientation_source", "tf", "sudo apt install ros-$ROS_DISTRO-tf2-ros-py"),
+        ("gravity_source", "tf", "sudo apt install ros-$ROS_DISTRO-tf2-ros-py"),
     ],
 )
 def test_a_source_that_cannot_be_had(
@@ -314,59 +307,23 @@ def test_nothing_listens_where_no_source_is_chosen(robot: Robot, stages: Stages,
         return [subscription.topic_name for subscription in node.node.subscriptions]
 
     assert node.name.replace("bridge", "arm/pose") in topics()
-    assert node.set_parameter("orientation_source", "accelerometer") == (True, "")
+    assert node.set_parameter("gravity_source", "imu") == (True, "")
     assert node.name.replace("bridge", "arm/pose") not in topics()
     robot.sending = False
     hold(robot, UP)
     stages.settle(ZERO6)
     status = node.until(compensation=OK)["compensation"]
-    assert values(status)["orientation_source"] == "accelerometer"
+    assert values(status)["gravity_source"] == "imu"
 
 
 @pytest.mark.usefixtures("_ros")
 def test_tf_that_is_missing_is_told_at_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tf2_ros", None)
-    with pytest.raises(StartError, match="parameter orientation_source is 'tf': it needs tf2_ros"):
-        SimulatedNode(SimulatedServer(), orientation_source="tf")
+    with pytest.raises(StartError, match="parameter gravity_source is 'tf': it needs tf2_ros"):
+        SimulatedNode(SimulatedServer(), gravity_source="tf")
 
 
-# TF, by a buffer that is handed in: tf2_ros is not on PyPI.
-
-
-class FakeTfError(Exception):
-    """What a lookup raises."""
-
-
-class FakeBuffer:
-    """A `tf2_ros.Buffer` that knows one transform."""
-
-    def __init__(self) -> None:
-        self.quaternion = UPRIGHT
-        self.stamp_ns = 0
-        self.error: str | None = "frame does not exist"
-        self.asked: list[tuple[str, str, Any]] = []
-
-    def lookup_transform(self, target_frame: str, source_frame: str, time_: Any) -> Any:
-        self.asked.append((target_frame, source_frame, time_))
-        if self.error:
-            raise FakeTfError(self.error)
-        found = TransformStamped()
-        found.header.stamp.sec, found.header.stamp.nanosec = divmod(self.stamp_ns, 10**9)
-        r = found.transform.rotation
-        r.x, r.y, r.z, r.w = self.quaternion
-        return found
-
-
-def test_tf_is_asked_for_the_sensor_in_the_base() -> None:
-    buffer = FakeBuffer()
-    tf = Tf(buffer, FakeTfError, "latest", lambda: None)
-    with pytest.raises(UnusableError, match="TF has no pose of ft_sensor in base_link: frame does not exist"):
-        look_up(tf, "base_link", "ft_sensor")
-    buffer.error, buffer.quaternion, buffer.stamp_ns = None, TILTED, 12_000_000_345
-    assert look_up(tf, "base_link", "ft_sensor") == Oriented(pytest.approx(TILTED), 12_000_000_345)  # type: ignore[arg-type]
-    assert buffer.asked[-1] == ("base_link", "ft_sensor", "latest")
-    buffer.stamp_ns = 0  # static transforms only: they have no time
-    assert abs(look_up(tf, "base_link", "ft_sensor").stamp_ns - time.time_ns()) < 60 * 10**9
+# TF.
 
 
 @pytest.fixture
@@ -376,43 +333,54 @@ def ros_node(_ros: None) -> Iterator[Node]:
     made.destroy_node()
 
 
-def tf_of(buffer: Any, closed: Callable[[], object] = lambda: None) -> Callable[[Node], Tf]:
-    """What opens a buffer that is there already."""
-    return lambda _node: Tf(buffer, FakeTfError, "latest", closed)
-
-
-def test_the_source_tf(ros_node: Node) -> None:
-    buffer = FakeBuffer()
-    closed = threading.Event()
-    chosen = OrientationParameters("tf", base_frame="world", mounting=ROLLED, stale_after=0.5)
-    group = MutuallyExclusiveCallbackGroup()
-    opened = OrientationListener(ros_node, chosen, "ft", group, tf_of(buffer, closed.set))
+def test_the_source_tf(ros_node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    tf = FakeTf(monkeypatch)
+    check_tf()
+    chosen = DEFAULTS.orientation._replace(source="tf", base_frame="world", mounting=ROLLED, stale_after=0.5)
+    opened = OrientationListener(ros_node, chosen, "ft", MutuallyExclusiveCallbackGroup())
     with listening(ros_node) as raised:
-        source = ListenerSource(CompensationParameters(orientation=chosen), opened)
+        source = ListenerSource(DEFAULTS._replace(orientation=chosen), opened)
 
-        def gravity(time_s: float) -> Any:
-            return source.gravity(sample(), time_s, time_s)
+        def felt(time_s: float) -> Any:
+            return source.specific_force(sample(), time_s, time_s)
 
-        wait_until(lambda: buffer.asked, "a lookup")
-        assert gravity(1000.0) is None
+        wait_until(lambda: tf.asked, "a lookup")
+        assert set(tf.asked) == {("world", "ft")}
+        assert felt(1000.0) is None
         words = "no orientation from TF from world to ft: TF has no pose of ft in world: frame does not exist"
-        wait_until(lambda: source.why_none(1000.0, 1000.0) == words, words)
-        buffer.quaternion, buffer.stamp_ns = TILTED, 1000 * 10**9
-        buffer.error = None
-        wait_until(lambda: gravity(1000.0) is not None, "gravity")
+        wait_until(lambda: source.why_none(sample(), 1000.0) == words, words)
+        tf.quaternion, tf.stamp_ns, tf.error = TILTED, lambda: 1000 * 10**9, None
+        wait_until(lambda: felt(1000.0) is not None, "a specific force")
         # The frames say all, so `mounting` is not for TF.
-        assert gravity(1000.0) == pytest.approx((-9.80665, 0.0, 0.0))
-        assert gravity(1000.6) is None
-        assert "older than the sample (limit 0.5 s)" in source.why_none(1000.6, 1000.6)
-        buffer.error = "the tree fell apart"
-        wait_until(lambda: "the tree fell apart" in source.why_none(1000.6, 1000.6), "the reason")
-        buffer.stamp_ns = 1001 * 10**9
-        buffer.error = None
-        wait_until(lambda: gravity(1001.0) is not None, "gravity again")
+        assert felt(1000.0) == pytest.approx((9.80665, 0.0, 0.0))
+        assert felt(1000.6) is None
+        assert "older than the sample (limit 0.5 s)" in source.why_none(sample(), 1000.6)
+        tf.error = "the tree fell apart"
+        wait_until(lambda: "the tree fell apart" in source.why_none(sample(), 1000.6), "the reason")
+        tf.stamp_ns, tf.error = lambda: 1001 * 10**9, None
+        wait_until(lambda: felt(1001.0) is not None, "one again")
+        tf.stamp_ns = lambda: 0  # static transforms only: they hold at any time
+        wait_until(lambda: felt(time.time()) is not None, "what is always so")
+        assert tf.listening == 1
         opened.close()
-    assert closed.is_set()
+    assert tf.listening == 0
     assert not raised
     assert not list(ros_node.timers)
+
+
+def test_a_source_that_fails_ends_the_executor(ros_node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> int:
+        raise LookupError("unforeseen")
+
+    tf = FakeTf(monkeypatch)
+    tf.error, tf.stamp_ns = None, fail
+    opened = OrientationListener(
+        ros_node, DEFAULTS.orientation._replace(source="tf"), "ft", MutuallyExclusiveCallbackGroup()
+    )
+    with listening(ros_node) as raised:
+        wait_until(lambda: raised, "the failure")
+    assert str(raised[0]) == "unforeseen"
+    opened.close()
 
 
 @pytest.mark.usefixtures("_ros")
@@ -420,53 +388,12 @@ def test_topics_are_remapped_as_those_of_the_node_are() -> None:
     remaps = ["--ros-args", "-r", "pose:=/left/pose"]
     node = rclpy.create_node("bridge", namespace="/test_remap", cli_args=remaps)
     group = MutuallyExclusiveCallbackGroup()
-    by_topic = OrientationListener(node, OrientationParameters("topic_pose", "pose"), "ft", group)
+    by_topic = OrientationListener(
+        node, DEFAULTS.orientation._replace(source="topic_pose", topic="pose"), "ft", group
+    )
     assert by_topic.describe == "topic /left/pose"
     by_topic.close()
     node.destroy_node()
-
-
-def test_a_source_that_fails_ends_the_executor(ros_node: Node) -> None:
-    class Broken:
-        def lookup_transform(self, target_frame: str, source_frame: str, time: Any) -> Any:
-            raise LookupError("unforeseen")
-
-    group = MutuallyExclusiveCallbackGroup()
-    opened = OrientationListener(ros_node, OrientationParameters("tf"), "ft", group, tf_of(Broken()))
-    with listening(ros_node) as raised:
-        wait_until(lambda: raised, "the failure")
-    assert str(raised[0]) == "unforeseen"
-    opened.close()
-
-
-def test_open_tf_uses_tf2_ros_as_it_is(monkeypatch: pytest.MonkeyPatch, ros_node: Node) -> None:
-    """What of tf2_ros is used, by its public names: a stand-in with the same signatures."""
-    made: list[Any] = []
-
-    class Buffer:
-        def __init__(self, cache_time: Any = None, node: Any = None) -> None:
-            made.append(self)
-
-    class TransformListener:
-        def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
-            made.append((buffer, node, spin_thread))
-
-        def unregister(self) -> None:
-            made.append("unregistered")
-
-    names = {"Buffer": Buffer, "TransformListener": TransformListener, "TransformException": FakeTfError}
-    module = types.ModuleType("tf2_ros")
-    vars(module).update(names)
-    monkeypatch.setitem(sys.modules, "tf2_ros", module)
-    from bridge.compensating.orientations import open_tf
-
-    check_tf()
-    tf = open_tf(ros_node)
-    assert isinstance(tf.buffer, Buffer)
-    assert tf.errors is FakeTfError
-    assert tf.latest.nanoseconds == 0
-    tf.close()
-    assert made == [tf.buffer, (tf.buffer, ros_node, False), "unregistered"]
 
 
 def test_without_tf2_ros(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -485,19 +412,15 @@ def test_a_clock_that_goes_back_does_not_stop_a_source_for_ever() -> None:
         describe = "topic /x"
 
     listening = Listening()
-    source = ListenerSource(CompensationParameters(), listening)
-    assert source.gravity(sample(), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, -9.80665))
+    source = ListenerSource(DEFAULTS, listening)
+    assert source.specific_force(sample(), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, 9.80665))
     listening.latest = Oriented(TILTED, 100 * 10**9)
-    assert source.gravity(sample(), 100.0, 100.0) == pytest.approx((-9.80665, 0.0, 0.0))
-    own = SensorSource(CompensationParameters())
-    assert own.gravity(sample(orientation=UPRIGHT), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, -9.80665))
-    assert own.gravity(sample(orientation=TILTED), 100.0, 100.0) == pytest.approx((-9.80665, 0.0, 0.0))
-    assert own.gravity(sample(), 101.0, 101.0) is None
+    assert source.specific_force(sample(), 100.0, 100.0) == pytest.approx((9.80665, 0.0, 0.0))
 
 
 def test_rotations_multiply_in_the_order_that_is_said() -> None:
     both = multiply(TILTED, (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))
     assert length(both[:3]) ** 2 + both[3] ** 2 == pytest.approx(1.0)
     assert multiply(UPRIGHT, TILTED) == multiply(TILTED, UPRIGHT) == pytest.approx(TILTED)
-    assert unit(Quaternion(x=0.0, y=0.0, z=0.0, w=0.995)) == UPRIGHT
+    assert unit_quaternion((0.0, 0.0, 0.0, 0.995)) == UPRIGHT
     assert weight(UP)[2] < 0

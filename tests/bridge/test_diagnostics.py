@@ -14,7 +14,7 @@ from protocol.framing import DataFlag
 from protocol.pdo import encode
 from protocol.sensor.warnings_register import WARNINGS
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
-from tests.bridge.streaming import SETTINGS, status, streaming_description, values
+from tests.bridge.streaming import SETTINGS, status, values
 
 pytestmark = pytest.mark.ros
 OK, WARN, ERROR, STALE = range(4)
@@ -51,7 +51,7 @@ def test_a_healthy_stream(node: SimulatedNode) -> None:
     assert array["compensation"].message == (
         "nothing is subtracted: there is no bias and no tool_mass; nobody has subscribed"
     )
-    assert (compensation["tared"], compensation["orientation_source"]) == ("false", "accelerometer")
+    assert (compensation["tared"], compensation["gravity_source"]) == ("false", "imu")
 
 
 def test_it_is_published_every_second_and_at_once_when_a_level_changes(
@@ -104,20 +104,6 @@ def test_lost_samples_are_counted(node: SimulatedNode, server: SimulatedServer) 
     assert values(array["stream"])["server_lost"] == "11"
 
 
-def test_what_the_server_found_not_finite_is_told(node: SimulatedNode, server: SimulatedServer) -> None:
-    answer = status()
-    answer["sensors"][0]["not_finite"] = 3
-    server.answers["status"] = lambda _: answer
-    array = node.until("Samples have values that are not finite", stream=ERROR)
-    assert values(array["stream"])["server_not_finite"] == "3"
-    node.until(**HEALTHY)
-
-
-def test_another_rate_than_expected(node: SimulatedNode, server: SimulatedServer) -> None:
-    server.description["sensors"][0]["rate_hz"] = 200
-    node.until("100 samples a second instead of 200", stream=ERROR)
-
-
 def test_a_change_says_the_rate_that_its_settings_do_not(
     node: SimulatedNode, server: SimulatedServer
 ) -> None:
@@ -129,9 +115,18 @@ def test_a_change_says_the_rate_that_its_settings_do_not(
         assert node.node.reader.link.rate_hz == 50
 
 
-def test_samples_that_come_late(node: SimulatedNode, server: SimulatedServer) -> None:
+def test_what_is_wrong_with_the_stream(node: SimulatedNode, server: SimulatedServer) -> None:
+    answer = status(mode="oversampling")
+    answer["sensors"][0]["not_finite"] = 3
+    server.answers["status"] = lambda _: answer
+    array = node.until("values that are not finite", "does not follow", stream=ERROR, clock=WARN)
+    assert values(array["stream"])["server_not_finite"] == "3"
+    server.answers["status"] = lambda _: status()
+    node.until(**HEALTHY)
     server.ahead_ns = -12_000_000
     node.until("Samples are 12.0 ms old on arrival (p99)", stream=WARN)
+    server.description["sensors"][0]["rate_hz"] = 200
+    node.until("100 samples a second instead of 200", stream=ERROR)
 
 
 def test_a_sensor_that_repeats_itself(node: SimulatedNode, server: SimulatedServer) -> None:
@@ -153,11 +148,6 @@ def test_a_lost_sensor(node: SimulatedNode, server: SimulatedServer) -> None:
     node.until(**HEALTHY)
 
 
-def test_a_clock_that_is_not_followed(node: SimulatedNode, server: SimulatedServer) -> None:
-    server.answers["status"] = lambda _: status(mode="oversampling")
-    node.until("does not follow", clock=WARN)
-
-
 def test_a_server_that_does_not_answer(node: SimulatedNode, server: SimulatedServer) -> None:
     owed: list[dict[str, object]] = []
     answer, server.answers["status"] = server.answers["status"], owed.append
@@ -177,14 +167,6 @@ def test_a_server_that_is_gone_and_comes_back(node: SimulatedNode, server: Simul
     server.listens = True
     array = node.until("was interrupted", link=WARN)
     assert values(array["link"])["reconnects"] == "1"
-    node.until(**HEALTHY)
-
-
-def test_a_server_that_has_no_such_sensor_any_more(node: SimulatedNode, server: SimulatedServer) -> None:
-    server.description = {**streaming_description(), "sensors": []}
-    server.drop()
-    node.until("not connected to localhost:12001: the server has no sensor 0", link=ERROR, stream=STALE)
-    server.description = streaming_description()
     node.until(**HEALTHY)
 
 

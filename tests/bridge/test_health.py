@@ -8,15 +8,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
-from bridge.diagnostics.compensation_state import CompensationState
 from bridge.diagnostics.health import Status, judge, text_of
-from bridge.diagnostics.observer import ServerCounts, Snapshot
-from bridge.stream.frame_selector import FrameCounts
+from bridge.diagnostics.observer import CompensationState, Counts, Snapshot
 from bridge.stream.link import SensorInfo
 from bridge.stream.watch import Flags, Watch
 from protocol.framing import DataMessage
-from protocol.health.limits import LIMITS
-from protocol.health.verdict import Level
+from protocol.health.verdict import LIMITS, Level
 from protocol.pdo import encode
 from protocol.sensor.warnings_register import WARNINGS, Severity
 from tests.compensation.making import BIAS, TOOL
@@ -25,16 +22,16 @@ pytestmark = pytest.mark.ros
 SAFEOP = SensorInfo(0, "", "", "", "SAFEOP")
 GOOD = Snapshot(
     sensor=0, address="localhost:1", connected=True, problem="", is_reachable=True,
-    connection_s=5.0, connects=1, new_connects=0,
+    connection_s=5.0,
     info=SensorInfo(0, "name", "7", "800", "OP"), lost=None, silent_s=0.0, rate_hz=800.0, expected_hz=800.0,
-    age_us=(100.0, 300.0), counts=FrameCounts(), new=FrameCounts(), not_finite=0, new_not_finite=0,
+    age_us=(100.0, 300.0), counts=Counts(connects=1), new=Counts(),
     flags=Flags(), temperature=30.0, server={"sensors": [{"clock": {"mode": "locked"}}]},
-    new_server=ServerCounts(), answer_s=0.0,
+    answer_s=0.0,
 )  # fmt: skip
 
 
 STOPPED = CompensationState(has_subscribers=True, why_stopped="why")
-FULL = CompensationState(has_subscribers=True, payload=TOOL, inertia=True, bias=BIAS)
+FULL = CompensationState(has_subscribers=True, payload=TOOL, source="imu", bias=BIAS)
 
 
 def statuses(**changes: Any) -> dict[str, Status]:
@@ -72,36 +69,38 @@ def test_good_is_good() -> None:
         ("sensor", Level.TROUBLE, "are counts", {"settings": {"calibration_matrix": False}}),
         ("sensor", Level.LOOK, "correct the URDF", {"settings": {"coordinate_system": True}}),
         ("sensor", Level.GOOD, "as it should be", {"settings": {"coordinate_system": False}}),
-        ("compensation", Level.LOOK, "3 samples were not compensated while the sensor", {"new_withheld": 3}),
+        ("compensation", Level.LOOK, "3 samples were not compensated while the sensor",
+         {"new": Counts(uncompensated=3)}),
         ("compensation", Level.LOOK, "3 samples were not compensated, for lack of a current orientation",
-         {"new_withheld": 3, "compensation": FULL}),
+         {"new": Counts(uncompensated=3), "compensation": FULL}),
+        ("compensation", Level.LOOK, "the IMU's range was exceeded",
+         {"flags": Flags(acceleration_saturated=4), "compensation": FULL}),
         ("compensation", Level.LOOK, "not kept", {"compensation": CompensationState(problem="not kept")}),
-        ("compensation", Level.GOOD, "bias, gravity and inertia are subtracted", {"compensation": FULL}),
-        ("compensation", Level.GOOD, "bias is subtracted", {"compensation": CompensationState(bias=BIAS)}),
-        ("link", Level.LOOK, "again", {"connects": 2, "new_connects": 1}),
+        ("compensation", Level.GOOD, "bias, weight and inertia", {"compensation": FULL}),
+        ("compensation", Level.GOOD, "subtracted: bias;", {"compensation": CompensationState(bias=BIAS)}),
+        ("link", Level.LOOK, "again", {"counts": Counts(connects=2), "new": Counts(connects=1)}),
         ("stream", Level.TROUBLE, "No new sample for 0.6 s", {"silent_s": 0.6}),
         ("stream", Level.TROUBLE, "server does not answer: it is stopped",
          {"silent_s": 2.0, "answer_s": 1.5}),
         ("stream", Level.TROUBLE, "in state SAFEOP", {"silent_s": 2.0, "info": SAFEOP}),
-        ("stream", Level.TROUBLE, "again and again", {"silent_s": 2.0, "new": FrameCounts(repeated=1)}),
+        ("stream", Level.TROUBLE, "again and again", {"silent_s": 2.0, "new": Counts(repeated=1)}),
         ("stream", Level.TROUBLE, "does not answer the bus",
-         {"silent_s": 2.0, "new": FrameCounts(invalid=1)}),
+         {"silent_s": 2.0, "new": Counts(invalid=1)}),
         ("stream", Level.LOOK, "700 samples a second instead of 800: the filters", {"rate_hz": 700.0}),
         ("stream", Level.GOOD, "798", {"rate_hz": 798.0}),
         ("stream", Level.LOOK, "12.0 ms old", {"age_us": (1.0, 12_000.0)}),
         ("stream", Level.TROUBLE, "120.0 ms old", {"age_us": (1.0, 120_000.0)}),
         ("stream", Level.TROUBLE, "600 samples a second", {"rate_hz": 600.0}),
-        ("stream", Level.LOOK, "3 of 803 samples (0.37 %) were lost", {"new": FrameCounts(new=800, lost=3)}),
-        ("stream", Level.LOOK, "4 of 804", {"new": FrameCounts(new=800),
-         "new_server": ServerCounts(lost_samples=4)}),
-        ("stream", Level.TROUBLE, "50 of 800", {"new": FrameCounts(new=750, lost=50), "rate_hz": 750.0}),
-        ("stream", Level.LOOK, "1 frame was invalid", {"new": FrameCounts(new=799, invalid=1)}),
-        ("stream", Level.LOOK, "has it back", {"new_server": ServerCounts(recoveries=1)}),
+        ("stream", Level.LOOK, "3 of 803 samples (0.37 %) were lost", {"new": Counts(samples=800, lost=3)}),
+        ("stream", Level.LOOK, "4 of 804", {"new": Counts(samples=800, server_lost_samples=4)}),
+        ("stream", Level.TROUBLE, "50 of 800", {"new": Counts(samples=750, lost=50), "rate_hz": 750.0}),
+        ("stream", Level.LOOK, "1 frame was invalid", {"new": Counts(samples=799, invalid=1)}),
+        ("stream", Level.LOOK, "has it back", {"new": Counts(server_recoveries=1)}),
         ("stream", Level.LOOK, "has it back: the server's computer stood still",
-         {"new_server": ServerCounts(recoveries=1, missed_deadlines=24)}),
-        ("stream", Level.LOOK, "5 old samples skipped", {"new": FrameCounts(stale=5)}),
-        ("stream", Level.TROUBLE, "not finite: power-cycle", {"new_not_finite": 1}),
-        ("stream", Level.TROUBLE, "not finite", {"new_server": ServerCounts(not_finite=2)}),
+         {"new": Counts(server_recoveries=1, server_missed_deadlines=24)}),
+        ("stream", Level.LOOK, "5 old samples skipped", {"new": Counts(stale=5)}),
+        ("stream", Level.TROUBLE, "not finite: power-cycle", {"new": Counts(not_finite=1)}),
+        ("stream", Level.TROUBLE, "not finite", {"new": Counts(server_not_finite=2)}),
         ("sensor", Level.TROUBLE, "no power; check its cable", {"lost": "no power"}),
         ("sensor", Level.NOT_POSSIBLE, "see stream", {"silent_s": 2.0}),
         ("sensor", Level.TROUBLE, "saturated: Fy: reduce", {"flags": Flags(0, 0, 2)}),

@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import KeyValue
 from std_srvs.srv import Trigger
 
 from bridge.node import SERVER_GOES_ON, SUPERVISOR_TOPIC, run
-from tests.bridge.conftest import Listener, NodeProcess, Start, StartProcess, establish, wait_until
+from tests.bridge.conftest import Listener, Start, StartProcess, establish, wait_until
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 
@@ -44,21 +44,6 @@ def test_waits_for_the_server_and_finds_it_again(listener: Listener, start: Star
     assert node.ends() == 0
 
 
-def test_the_supervisor_shuts_the_server_down_and_ends_the_node(
-    server: ScriptedServer, listener: Listener, start: Start
-) -> None:
-    node = start(server.port)
-    node.says("connected to")
-    for key, value in (("ft_sensors", "0"), ("camera", "1"), ("ft_sensors", "11")):
-        listener.supervise(key, value)
-    listener.supervise("ft_sensors", "1")
-    assert node.ends() == 0
-    actions = [request["action"] for request in server.requests]
-    assert actions[:2] == ["describe", "subscribe"]
-    assert actions.count("shutdown") == 1
-    assert "is shutting down" in node.log
-
-
 @pytest.mark.parametrize(
     ("service", "action", "words"),
     [
@@ -73,7 +58,7 @@ def test_the_supervisor_is_heard_during_each_service(
     server: ScriptedServer, listener: Listener, start: Start, service: str, action: str, words: str
 ) -> None:
     """In real time, with rclpy's own executors: which callback waits for which is what is tested."""
-    node = start(server.port, **{"rest.duration": 60.0, "orientation_source": "accelerometer"})
+    node = start(server.port, **{"rest.duration": 60.0})
     node.says("connected to")
     if service == "identify/add_pose":
         assert listener.trigger("identify/start")[0]
@@ -179,7 +164,7 @@ def test_a_wrong_parameter_is_one_sentence(start_process: StartProcess) -> None:
         ({"qos_overrides.NS/wrench.publisher.reliability": "foo"}, "check qos_overrides"),
         ({"qos_overrides.NS/wrench.publisher.depth": -1}, "check qos_overrides"),
         (
-            {"orientation_source": "topic_pose", "orientation.topic": "imu/data_raw"},
+            {"gravity_source": "topic_pose", "orientation.topic": "imu/data_raw"},
             "this node itself has that topic, with Imu messages and not PoseStamped",
         ),
     ],
@@ -192,14 +177,6 @@ def test_topics_that_cannot_be_made_are_one_sentence(
     lines = [line for line in node.log.splitlines() if line.startswith("bridge-client: ")]
     assert words in lines[-1]
     assert "Traceback" not in node.log
-
-
-def test_a_wrong_setting_at_start_is_one_sentence(start: Start) -> None:
-    node = start(12001, **{"settings.acceleration_range_g": 3})
-    assert node.ends() == 2
-    (line,) = node.log.splitlines()
-    assert line.startswith("bridge-client: parameter settings.acceleration_range_g: ")
-    assert "2, 4, 8, 16" in line
 
 
 def test_arguments_that_are_not_understood(capsys: pytest.CaptureFixture[str]) -> None:
@@ -219,14 +196,6 @@ def test_without_a_home_it_says_what_to_set(
     node = start_process(12001)
     assert node.ends() == 1
     assert "set HOME, or ROS_LOG_DIR to a directory for its log" in node.log.splitlines()[-1]
-
-
-def test_help() -> None:
-    """In a process: the program blocks signals before anything else."""
-    node = NodeProcess("--help")
-    assert node.ends() == 0
-    assert node.log.startswith("usage: ros2 run bridge client")
-    node.close()
 
 
 def test_a_signal_while_it_starts_is_no_traceback(

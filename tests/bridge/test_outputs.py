@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-import types
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,7 +12,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 import rclpy
-from geometry_msgs.msg import TransformStamped, WrenchStamped
+from geometry_msgs.msg import WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 
 from bridge.node import StartError
@@ -27,6 +26,7 @@ from protocol.framing import DataMessage
 from protocol.pdo import encode
 from tests.bridge.compensating import six, stamp_ns
 from tests.bridge.conftest import retire, wait_until
+from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import STEP_S, SimulatedNode, SimulatedServer
 from tests.bridge.streaming import RATE_HZ, SETTINGS
 
@@ -79,7 +79,7 @@ def test_nothing_more_unless_it_is_configured() -> None:
         prefix = node.name.removesuffix("bridge")
         assert {name.removeprefix(prefix) for name in node.topics if name.startswith(prefix)} == {
             "sensone_sensor_data", "wrench", "wrench_compensated", "compensation/bias",
-            "compensation/gravity", "compensation/inertia", "imu/data_raw", "imu/data", "temperature",
+            "compensation/tool", "imu/data_raw", "imu/data", "temperature",
         }  # fmt: skip
         node.run(0.2)
         assert "wrench_filtered" not in node.log
@@ -222,31 +222,6 @@ def test_a_frame_by_its_pose() -> None:
         assert six(tip[-1]) == pytest.approx([5.0, 0.0, 0.0, 0.0, 0.5, 0.0], abs=1e-9)
 
 
-class FakeTfError(Exception):
-    """What a lookup raises."""
-
-
-class FakeTf:
-    """tf2_ros, which is not on PyPI: knows one transform, and who listens."""
-
-    def __init__(self, server: Sensor) -> None:
-        self.error: str | None = "frame does not exist"
-        self.stamp_ns: Callable[[], int] = server.time_ns
-        self.length = 1.0
-        self.asked: list[tuple[str, str]] = []
-        self.listening = 0
-
-    def lookup_transform(self, target_frame: str, source_frame: str, _time: Any) -> TransformStamped:
-        self.asked.append((target_frame, source_frame))
-        if self.error:
-            raise FakeTfError(self.error)
-        found = TransformStamped()
-        found.header.stamp.sec, found.header.stamp.nanosec = divmod(self.stamp_ns(), 10**9)
-        found.transform.translation.z = -0.2
-        found.transform.rotation.w = self.length
-        return found
-
-
 @pytest.fixture
 def server() -> Sensor:
     return Sensor(shakes=False)
@@ -254,20 +229,8 @@ def server() -> Sensor:
 
 @pytest.fixture
 def tf(server: Sensor, monkeypatch: pytest.MonkeyPatch) -> FakeTf:
-    fake = FakeTf(server)
-
-    class TransformListener:
-        def __init__(self, buffer: Any, node: Any, *, spin_thread: bool) -> None:
-            fake.listening += 1
-
-        def unregister(self) -> None:
-            fake.listening -= 1
-
-    module = types.ModuleType("tf2_ros")
-    vars(module).update(
-        Buffer=lambda: fake, TransformListener=TransformListener, TransformException=FakeTfError
-    )
-    monkeypatch.setitem(sys.modules, "tf2_ros", module)
+    fake = FakeTf(monkeypatch)
+    fake.stamp_ns, fake.height = server.time_ns, -0.2
     return fake
 
 
@@ -315,9 +278,9 @@ def test_a_frame_that_tf_does_not_know(node: SimulatedNode, tf: FakeTf) -> None:
     node.until(words, compensation=ERROR)
     assert not got
     assert others
-    tf.error, tf.length = None, 0.5
+    tf.error, tf.quaternion = None, (0.0, 0.0, 0.0, 0.5)
     node.until("a rotation is a quaternion of length 1", compensation=ERROR)
-    tf.length = 1.0
+    tf.quaternion = (0.0, 0.0, 0.0, 1.0)
     node.until(compensation=OK)
     assert got
 

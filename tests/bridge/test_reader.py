@@ -9,12 +9,12 @@ from typing import Any, cast
 
 import pytest
 
-from bridge.parameters.table import Parameters
-from bridge.stream.link import RequestFailedError, find_sensor, sentence
+from bridge.parameters.table import DEFAULTS
+from bridge.stream.link import sentence
 from bridge.stream.reader import Reader
 from protocol.errors import ConnectionFailedError, UnreachableError
-from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
-from protocol.pdo import ImuUnits, Sample, encode
+from protocol.framing import DataMessage, FrameDecoder, encode_data, encode_json
+from protocol.pdo import Sample, encode
 from protocol.text.json_text import JsonObject
 from tests.bridge.conftest import Log, wait_until
 from tests.bridge.scripted_server import description, process_data
@@ -140,7 +140,7 @@ class Bench:
         self.log = Log(None)
         self.failures: list[str] = []
         self.channel = Memory(self.clock, attempts)
-        chosen = Parameters("localhost", 12001, 0, 0.0, "array", ImuUnits.G_DPS)._replace(**parameters)
+        chosen = DEFAULTS._replace(**parameters)
         self.reader = Reader(
             chosen, self.outputs, self.log, self.failures.append, channel=self.channel, clock=self.clock
         )
@@ -170,14 +170,6 @@ def test_every_sample_once_with_its_stamp() -> None:
     at = bench.outputs.output.samples[0][1]
     assert [stamp - at for _, stamp in bench.outputs.output.samples] == [0, PERIOD_NS, 2 * PERIOD_NS]
     assert "connected to localhost:12001: sensor 0 (BFT-SENS-ECAT-M8, serial 1, 800 Hz, OP)" in lines(bench)
-
-
-def test_what_is_not_new_is_not_published() -> None:
-    bench = Bench()
-    flags = (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.INVALID | DataFlag.REPEATED | DataFlag.GAP)
-    stream = [bench.frame(n, n, flags=int(flag)) for n, flag in enumerate(flags, 1)]
-    bench = Bench([*stream, bench.frame(4, 4, sensor=1), bench.frame(5, 5)])
-    assert bench.run() == [5.0]
 
 
 def test_attempts_to_connect_back_off_and_one_line_says_so() -> None:
@@ -326,14 +318,6 @@ def test_a_server_that_does_not_fit_is_named_once_and_tried_again(
     assert words in line
     assert line.isprintable()
     assert len(line) < 400
-
-
-def test_find_sensor_takes_the_row_it_is_asked_for() -> None:
-    rows = [{"sensor": 1, "name": "A"}, {"sensor": 0, "name": "B", "rate_hz": "\n"}]
-    info = find_sensor({"sensors": rows}, 0)
-    assert (info.name, info.serial, info.rate_hz) == ("B", "?", "?")
-    with pytest.raises(RequestFailedError, match="it has: 1, 0"):
-        find_sensor({"sensors": rows}, 2)
 
 
 def test_an_error_of_ours_is_reported() -> None:

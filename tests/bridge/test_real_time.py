@@ -15,16 +15,14 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
 from bridge import real_time
-from bridge.parameters.table import PARAMETERS, Parameters
+from bridge.parameters.table import DEFAULTS
 from protocol.client import Scheduling
-from protocol.pdo import ImuUnits
 from tests.bridge.conftest import StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 from tests.limited import needs_root, skip_if_forbidden
 
 pytestmark = pytest.mark.ros
-DEFAULT = next(row.default for row in PARAMETERS if row.name == "rt_priority")
-assert isinstance(DEFAULT, int)
+DEFAULT = DEFAULTS.rt_priority
 BELOW = DEFAULT - 1
 
 
@@ -85,7 +83,7 @@ def test_what_is_refused_is_a_warning_and_changes_nothing(
 
     monkeypatch.setattr(real_time, "make_real_time", refuse)
     lines = Lines()
-    parameters = Parameters("localhost", 12001, 0, 0.0, "array", ImuUnits.SI, rt_priority=40, cpu=1)
+    parameters = DEFAULTS._replace(rt_priority=40, cpu=1)
     real_time.prepare(parameters, lines)
     assert asked == [(40, 1, stream.native_id)]
     assert not lines.infos
@@ -98,5 +96,5 @@ def test_what_is_refused_is_a_warning_and_changes_nothing(
 @pytest.mark.usefixtures("stream")
 def test_nothing_is_said_where_nothing_was_asked_for() -> None:
     lines = Lines()
-    real_time.prepare(Parameters("localhost", 12001, 0, 0.0, "array", ImuUnits.SI), lines)
+    real_time.prepare(DEFAULTS._replace(rt_priority=0), lines)
     assert not lines.infos + lines.warnings

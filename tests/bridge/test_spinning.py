@@ -92,24 +92,6 @@ def test_told_before_and_once_more_after_the_end(bench: Bench) -> None:
     bench.spinner.stop()
 
 
-def test_told_by_a_callback(bench: Bench) -> None:
-    bench.node.create_timer(0.001, bench.spinner.stop)
-    bench.thread.start()
-    assert bench.ends()
-
-
-def test_told_by_many_at_once(bench: Bench) -> None:
-    bench.node.create_timer(0.0002, bench.tick)
-    bench.thread.start()
-    bench.count(10)
-    tellers = [threading.Thread(target=bench.spinner.stop) for _ in range(8)]
-    for teller in tellers:
-        teller.start()
-    for teller in tellers:
-        teller.join()
-    assert bench.ends()
-
-
 def test_a_callback_that_raises_ends_it_and_is_told(bench: Bench) -> None:
     def fail() -> Any:
         raise LookupError("of the callback")

@@ -192,7 +192,7 @@ def test_from_poses_to_the_force_of_the_environment(tmp_path: Path) -> None:
         node.run(2.0)
         wrenches.clear()
         node.run(5.0)
-        node.until("bias and gravity are subtracted", compensation=OK)
+        node.until("subtracted: bias, weight and inertia of the tool", compensation=OK)
         rows = [six(message)[:3] for message in wrenches]
         assert len(rows) > 490
         rms = [math.sqrt(sum(row[axis] ** 2 for row in rows) / len(rows)) for axis in range(3)]

@@ -778,19 +778,20 @@ def test_reconfigured_is_counted(server: PlayedServer) -> None:
     [
         ({"rate_hz": 400}, 3),
         ({"rate_hz": 800, "sensor": 1}, 7),
-        ({}, 1),
-        ({"rate_hz": 0}, 1),
-        ({"rate_hz": -1}, 1),
-        ({"rate_hz": 1e300}, 1),
-        ({"rate_hz": "400"}, 1),
+        ({}, 7),
+        ({"rate_hz": 0}, 7),
+        ({"rate_hz": -1}, 7),
+        ({"rate_hz": 1e300}, 7),
+        ({"rate_hz": "400"}, 7),
     ],
 )
-def test_what_is_lost_after_reconfigured_counts_by_the_new_rate(
-    server: PlayedServer, event: JsonObject, lost: int
+@pytest.mark.parametrize("name", ["reconfigured", "sensor_back"])
+def test_what_is_lost_after_an_event_counts_by_the_new_rate(
+    server: PlayedServer, name: str, event: JsonObject, lost: int
 ) -> None:
     """10 ms without a sample are 8 periods before, and 4 at 400 Hz."""
     with stream(server) as running:
-        server.send({"event": "reconfigured", "sensor": 0, "settings": {}, **event})
+        server.send({"event": name, "sensor": 0, "settings": {}, **event})
         server.send(
             *(
                 encode_data(n, 5, 10**9 + at_ms * 10**6, 0, flags, 3, encode(61, {}))

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from clients.export.cli import main
-from clients.export.table import COLUMNS
+from clients.export.program import COLUMNS
 from clients.record.options import parse_options as record_options
-from clients.record.progress import Progress
+from clients.record.program import Progress
 from protocol.framing import DataFlag
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
 from tests.ended import Result, run_here

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from clients.errors import DiskError
-from clients.record.parts import Parts
+from clients.record.recorder import Parts
 from clients.recording.disk import DiskFile
 
 

@@ -24,9 +24,8 @@ from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
 from clients.record import cli, program, recorder
-from clients.record import parts as record_parts
-from clients.record.parts import Parts
-from clients.record.recorder import FLUSH_S, Recorder
+from clients.record import recorder as record_parts
+from clients.record.recorder import FLUSH_S, Parts, Recorder
 from clients.record.source import BATCH_S, Batch, Source
 from clients.recording.file_format import FORMAT_VERSION, frame_topic
 from clients.recording.reader import open_recording
@@ -272,7 +271,7 @@ def test_frames_get_into_the_file_before_it_ends(out: Path, monkeypatch: pytest.
 
     queued = batches()
     played = SimpleNamespace(get=lambda timeout: next(queued), put=lambda batch: None, empty=lambda: True)
-    monkeypatch.setattr(recorder, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr(recorder, "time", SimpleNamespace(monotonic=lambda: now_s[0], time_ns=time.time_ns))
     monkeypatch.setattr(recorder, "queue", SimpleNamespace(SimpleQueue=lambda: played, Empty=queue.Empty))
     new_recorder(out).stop("")
     assert in_file == [10], "though no more come"
@@ -281,7 +280,9 @@ def test_frames_get_into_the_file_before_it_ends(out: Path, monkeypatch: pytest.
 def test_a_backlog_does_not_delay_its_end(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a machine so loaded that writing all of it would take minutes, and more came than can be queued."""
     calls = itertools.count()
-    monkeypatch.setattr(recorder, "time", SimpleNamespace(monotonic=lambda: next(calls) * 0.1))
+    monkeypatch.setattr(
+        recorder, "time", SimpleNamespace(monotonic=lambda: next(calls) * 0.1, time_ns=time.time_ns)
+    )
     monkeypatch.setattr(recorder, "MAX_BACKLOG", 20_000)
     came: list[Batch] = [
         [frame(number) for number in range(first, first + 64)] for first in range(0, 32_000, 64)
@@ -314,7 +315,9 @@ def test_of_a_file_that_is_removed_nothing_is_said_to_be_there(out: Path) -> Non
 def test_a_part_that_was_taken_away_is_none_of_its_business(
     endless: Replay, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(record_parts, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic()))
+    monkeypatch.setattr(
+        record_parts, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic(), time_ns=time.time_ns)
+    )
     part = out.with_name("out_0.mcap")
     with recording(out, endless.port, "--rotate-seconds", "1") as recorder:
         wait_until(out.with_name("out_1.mcap").exists, "the second file")
@@ -387,7 +390,9 @@ def test_a_full_disk_ends_it_with_what_was_written_whole(endless: Replay, small_
 def test_rotation_loses_nothing_between_the_files(
     endless: Replay, out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(record_parts, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic()))
+    monkeypatch.setattr(
+        record_parts, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic(), time_ns=time.time_ns)
+    )
     with recording(out, endless.port, "--rotate-seconds", "1") as recorder:
         wait_until(lambda: len(list(out.parent.glob("out_*.mcap"))) >= 3, "three files")
         assert recorder.stop() == 0

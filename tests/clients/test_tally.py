@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from clients.record.tally import Tally
+from clients.record.recorder import Tally
 from protocol.framing import DataFlag, DataMessage
 from tests.clients.recordings import frame
 

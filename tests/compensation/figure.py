@@ -1,5 +1,7 @@
 """Draws docs/compensation.svg: the residual after each stage of compensation, and what mistakes look like.
 
+usage: python -m tests.compensation.figure
+
 The virtual sensor runs in simulated time.
 """
 
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from ethercat_server.virtual_sensor.measurement import scene
 from ethercat_server.virtual_sensor.measurement.motion import TURN_LENGTH, Turning
 from ft_compensation.compensator import Compensator
-from ft_compensation.orientation import AccelerometerGravity, QuaternionGravity
+from ft_compensation.orientation import QuaternionGravity
 from ft_compensation.quantities import Payload, Wrench
 from protocol.pdo import STANDARD_GRAVITY
 
@@ -25,8 +27,6 @@ FIGURE: Final = Path(__file__).parents[2] / "docs" / "compensation.svg"
 BIAS: Final = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)
 """What this sensor reads without load, N and Nm."""
 _RATE: Final = 100
-_SETTLING_S: Final = 2
-"""The end of the previous turn, for the source of gravity to settle."""
 _EVERY: Final = 40
 """One sample in this many is drawn."""
 _COLUMNS: Final = 3
@@ -60,22 +60,15 @@ class Samples(NamedTuple):
 def samples(noise: bool = True) -> Samples:
     """One slow full turn."""
     signal = scene.Scene(1, noise, Turning())
-    source = AccelerometerGravity()
     rows: list[tuple[float, ...]] = []
-    for number in range(-_SETTLING_S * _RATE, int(TURN_LENGTH * _RATE)):
+    for number in range(int(TURN_LENGTH * _RATE)):
         time_s = number / _RATE
         reading = signal.reading(number, 0, time_s)
         ax, ay, az = (part * STANDARD_GRAVITY for part in reading.acceleration)
-        rx, ry, rz = (np.radians(part) for part in reading.angular_rate)
-        source.update((ax, ay, az), (float(rx), float(ry), float(rz)), time_s)
-        gravity = source.gravity(time_s)
-        if number < 0:
-            continue
-        assert gravity is not None
         push = _PUSH if _TOUCH[0] <= time_s < _TOUCH[1] else (0.0, 0.0, 0.0)
         load = [*push, *scene.cross(scene.CONTACT_POINT, push)]
         measured = [a + b + c for a, b, c in zip(reading.force_torque, BIAS, load, strict=True)]
-        rows.append((time_s, *measured, *gravity, *reading.orientation))
+        rows.append((time_s, *measured, -ax, -ay, -az, *reading.orientation))
     table = np.array(rows)
     return Samples(table[:, 0], table[:, 1:4], table[:, 4:7], table[:, 7:10], table[:, 10:14])
 
@@ -85,7 +78,7 @@ def compensated(
 ) -> Array:
     """What compensation leaves, (n, 6): right, or with a mistake in what is given."""
     compensator = Compensator(Payload(mass, scene.TOOL_CENTRE), Wrench.of(bias))
-    rows = zip(data.force, data.torque, data.gravity if gravity is None else gravity, strict=True)
+    rows = zip(data.force, data.torque, -(data.gravity if gravity is None else gravity), strict=True)
     return np.array([compensator.compensate(*(row.tolist() for row in three)).final.values for three in rows])
 
 
@@ -102,8 +95,8 @@ def turned_the_wrong_way(data: Samples) -> Array:
 def tare() -> Array:
     """The bias of somebody who tares with the tool on at the first pose, (6,): the weight is in it."""
     weight = Compensator(Payload(scene.TOOL_MASS, scene.TOOL_CENTRE)).compensate(
-        (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, -STANDARD_GRAVITY)
-    ).gravity  # fmt: skip
+        (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, STANDARD_GRAVITY)
+    ).tool  # fmt: skip
     both: Array = np.array(BIAS) + np.array(weight.values)
     return both
 
@@ -122,7 +115,7 @@ def panels(data: Samples) -> Iterator[tuple[str, Array]]:
     """Title, and what is left, (n, 6)."""
     yield "as measured", np.hstack([data.force, data.torque])
     yield "bias subtracted (IV.1)", compensated(data, mass=0.0)
-    yield "gravity subtracted too (IV.5)", compensated(data)
+    yield "weight and inertia subtracted too (IV.5)", compensated(data)
     for name, left in mistakes(data):
         yield f"mistake: {name}", left
 
@@ -170,3 +163,8 @@ def _panel(name: str, times: Array, left: Array, limit: float | None) -> Iterato
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in drawn)
         yield f'<polyline fill="none" stroke="{color}" stroke-width="0.7" points="{points}"/>'
     yield f'<rect width="{width}" height="{height}" fill="none" stroke="black" stroke-width="0.8"/>'
+
+
+if __name__ == "__main__":
+    turn = samples()
+    draw(FIGURE, turn, dict(panels(turn)))

@@ -10,7 +10,7 @@ from ethercat_server.virtual_sensor.firmware.flash import Flash
 from ethercat_server.virtual_sensor.measurement import scene
 from ethercat_server.virtual_sensor.measurement.motion import MOVE_LENGTH, POSE_LENGTH, POSES
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ft_compensation.identification.session import IdentificationSession
+from ft_compensation.identification.poses import Pose, pose_of
 from ft_compensation.stationary import StationaryMeans, StationaryWindow
 from protocol.pdo import Sample, SampleDecoder
 
@@ -69,12 +69,9 @@ def windows_of_poses(stream: Stream, seconds: float = 1.5) -> Iterator[Stationar
             window = None
 
 
-def take_poses(stream: Stream) -> IdentificationSession:
+def take_poses(stream: Stream) -> list[Pose]:
     """Take every pose of the signal `poses`."""
-    session = IdentificationSession()
-    for means in windows_of_poses(stream):
-        session.add(means)
-    return session
+    return [pose_of(means) for means in windows_of_poses(stream)]
 
 
 def deviations(sinc: int = SINC) -> tuple[float, ...]:

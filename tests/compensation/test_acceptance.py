@@ -17,10 +17,10 @@ from ethercat_server.virtual_sensor.measurement.motion import TURN_LENGTH
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ft_compensation.bias import estimate_bias
 from ft_compensation.compensator import Compensator
-from ft_compensation.identification.payload import Identified
-from ft_compensation.orientation import AccelerometerGravity
+from ft_compensation.identification.payload import Identified, identify
 from ft_compensation.quantities import Payload, Wrench
-from ft_compensation.stationary import NotStationaryError, StationaryWindow
+from ft_compensation.specific_force import ImuSpecificForce
+from ft_compensation.stationary import NotStationaryError, StationaryMeans, StationaryWindow
 from protocol.pdo import Sample, SampleDecoder
 from tests.compensation.streaming import (
     OFFSET,
@@ -40,28 +40,19 @@ TOOL = Payload(scene.TOOL_MASS, scene.TOOL_CENTRE)
 SHAKEN = 128
 """SINC length where the wrist sways: what compensation does not know of that is below this noise."""
 RATE_HZ = 51200 / SHAKEN
-START_S = 1.3
-"""Until the accelerometer is believed."""
 WITHIN_3_SIGMA = 0.9973
 """The share of pure noise that lies within three standard deviations."""
 
 
-def compensated(
-    stream: Stream, payload: Payload, bias: Wrench, *, inertia: bool = False
-) -> tuple[Rows, Rows]:
+def compensated(stream: Stream, payload: Payload, bias: Wrench) -> tuple[Rows, Rows]:
     """Times (n,) and what compensation leaves (n, 6)."""
-    source = AccelerometerGravity()
-    compensator = Compensator(payload, bias, inertia=inertia)
+    imu, compensator = ImuSpecificForce(payload.center), Compensator(payload, bias)
     times, rows = [], []
     for time_s, sample in stream:
-        source.update(sample.acceleration, sample.angular_rate, time_s)
-        gravity = source.gravity(time_s)
-        if gravity is not None:
-            stages = compensator.compensate(
-                sample.force, sample.torque, gravity, sample.acceleration, sample.angular_rate
-            )
-            times.append(time_s)
-            rows.append(stages.final.values)
+        felt = imu.follow(sample.acceleration, sample.angular_rate, time_s)
+        assert felt is not None
+        times.append(time_s)
+        rows.append(compensator.compensate(sample.force, sample.torque, felt).final.values)
     return np.array(times), np.array(rows)
 
 
@@ -85,13 +76,17 @@ def smooth(left: Rows, count: int = 40) -> Rows:
 
 @pytest.fixture(scope="module")
 def identified() -> Identified:
-    return take_poses(samples("poses", POSES_TAKE, part=STILL)).solve()
+    return identify(take_poses(samples("poses", POSES_TAKE, part=STILL)))
 
 
 @pytest.fixture(scope="module")
 def touched() -> Stream:
     """Three contacts."""
     return list(samples("scene", 20.0, seed=4, sinc=SHAKEN))
+
+
+def bias_of(means: StationaryMeans) -> Wrench:
+    return estimate_bias(means, TOOL, means.acceleration)
 
 
 def check_identified(found: Identified) -> None:
@@ -104,7 +99,7 @@ def check_identified(found: Identified) -> None:
 def test_six_poses_give_mass_within_one_percent_and_centre_within_two_millimetres(
     seed: int, sinc: int
 ) -> None:
-    found = take_poses(samples("poses", POSES_TAKE, seed, sinc, STILL)).solve()
+    found = identify(take_poses(samples("poses", POSES_TAKE, seed, sinc, STILL)))
     check_identified(found)
     assert found.bias.force == pytest.approx(OFFSET[:3], abs=0.1)
     assert found.bias.torque == pytest.approx(OFFSET[3:], abs=0.002)
@@ -117,18 +112,15 @@ def test_through_a_slow_full_turn_only_noise_is_left(identified: Identified) -> 
     sigma = np.array(deviations())
     # What is left of the noise in a mean of 40, and a fifth of its standard deviation for everything else.
     assert (np.abs(smooth(left)) <= 4.0 * sigma / 40**0.5 + 0.2 * sigma).all()
-    assert within_three_sigma(left).min() > WITHIN_3_SIGMA - 0.002
+    # The accelerometer's noise on this tool comes on top.
+    assert within_three_sigma(left).min() > WITHIN_3_SIGMA - 0.03
 
 
-@pytest.mark.parametrize("inertia", [False, True])
-def test_contacts_of_the_scene_show_up_undistorted(
-    identified: Identified, touched: Stream, inertia: bool
-) -> None:
-    times, left = compensated(touched, identified.payload, identified.bias, inertia=inertia)
+def test_contacts_of_the_scene_show_up_undistorted(identified: Identified, touched: Stream) -> None:
+    times, left = compensated(touched, identified.payload, identified.bias)
     touch = truth(times)
     error = left - touch
-    # The wrist shakes with up to 0.2 m/s²: 0.16 N on this tool, which only the inertial term takes off.
-    assert within_three_sigma(error, SHAKEN).min() > WITHIN_3_SIGMA - (0.002 if inertia else 0.05)
+    assert within_three_sigma(error, SHAKEN).min() > WITHIN_3_SIGMA - 0.004
     touching = np.abs(touch[:, 2]) > 1.0
     assert touching.sum() > 300
     for axis in (0, 1, 2, 3, 4):
@@ -142,7 +134,7 @@ def test_the_bias_can_be_taken_with_the_tool_on_in_any_pose_and_not_while_it_swa
     for time_s, sample in samples("poses", 2.0):
         if window.add(sample, time_s):
             break
-    assert estimate_bias(window.means(), TOOL).force == pytest.approx(OFFSET[:3], abs=0.05)
+    assert bias_of(window.means()).force == pytest.approx(OFFSET[:3], abs=0.05)
     window = StationaryWindow(1.0)
     for time_s, sample in samples("scene", 2.0):
         if window.add(sample, time_s):
@@ -177,15 +169,15 @@ class Bench:
 
 
 def check_contact(bench: Bench, payload: Payload, bias: Wrench) -> None:
-    times, left = compensated(bench.stream("scene", 6.0), payload, bias, inertia=True)
-    assert len(left) == pytest.approx((6.0 - START_S) * RATE_HZ, rel=0.1)
+    times, left = compensated(bench.stream("scene", 6.0), payload, bias)
+    assert len(left) == pytest.approx(6.0 * RATE_HZ, rel=0.1)
     assert within_three_sigma(left - truth(times), SHAKEN).min() > WITHIN_3_SIGMA - 0.005
     assert left[:, 2].min() == pytest.approx(scene.CONTACT_FORCE[2], abs=4 * deviations(SHAKEN)[2])
 
 
 def check_turn(bench: Bench, payload: Payload, bias: Wrench, seconds: float) -> None:
     _, left = compensated(bench.stream("turn", seconds), payload, bias)
-    assert len(left) == pytest.approx((seconds - START_S) * RATE_HZ, rel=0.1)
+    assert len(left) == pytest.approx(seconds * RATE_HZ, rel=0.1)
     assert within_three_sigma(left, SHAKEN).min() > WITHIN_3_SIGMA - 0.005
 
 
@@ -194,7 +186,7 @@ def test_through_the_server_bias_contact_and_the_beginning_of_a_turn() -> None:
     for time_s, sample in bench.stream("poses", 2.5):
         if window.add(sample, time_s):
             break
-    bias = estimate_bias(window.means(), TOOL)
+    bias = bias_of(window.means())
     assert bias.values == pytest.approx([0.0] * 6, abs=0.1), "this sensor's offset is zero, its tool is not"
     check_turn(bench, TOOL, bias, 2.0)
     check_contact(bench, TOOL, bias)
@@ -203,7 +195,7 @@ def test_through_the_server_bias_contact_and_the_beginning_of_a_turn() -> None:
 @pytest.mark.long
 def test_through_the_server_identification_contact_and_a_full_turn() -> None:
     bench = Bench()
-    found = take_poses(bench.stream("poses", POSES_TAKE)).solve()
+    found = identify(take_poses(bench.stream("poses", POSES_TAKE)))
     check_identified(found)
     check_turn(bench, found.payload, found.bias, TURN_LENGTH)
     check_contact(bench, found.payload, found.bias)

@@ -76,7 +76,7 @@ def test_the_figure_can_be_drawn_and_shows_what_its_titles_say(tmp_path: Path) -
     data = figure.samples()
     quiet = (data.times < 19.0) | (data.times > 25.0)
     shown = dict(figure.panels(data))
-    assert np.abs(shown["gravity subtracted too (IV.5)"][quiet, :3]).mean() < 0.3
+    assert np.abs(shown["weight and inertia subtracted too (IV.5)"][quiet, :3]).mean() < 0.3
     for title, left in shown.items():
         assert not title.startswith("mistake") or np.abs(left[quiet, :3]).max() > 1.5, title
     out = tmp_path / "figure.svg"

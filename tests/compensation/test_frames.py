@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ft_compensation.outputs.frames import Quaternion, WrenchTransform
-from ft_compensation.quantities import ZERO
+from ft_compensation.outputs.frames import WrenchTransform
+from ft_compensation.quantities import ZERO, Quaternion
 from protocol.pdo import Vector3
 from tests.compensation.equations import matrix_from_quaternion
 

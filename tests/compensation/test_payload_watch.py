@@ -37,6 +37,7 @@ class Arm:
         seconds: float = 2.0,
     ) -> None:
         gravity = gravity_for(up)
+        felt = -gravity[0], -gravity[1], -gravity[2]
         for _ in range(round(seconds / PERIOD_S)):
             self.time_s += PERIOD_S
             if not self.watch.is_due(self.time_s):
@@ -45,7 +46,7 @@ class Arm:
             x, y, z = (
                 part + more + self._noise.gauss(0.0, NOISE_N) for part, more in zip(force, touch, strict=True)
             )
-            final = Compensator(TOOL, BIAS).compensate((x, y, z), torque, gravity).final
+            final = Compensator(TOOL, BIAS).compensate((x, y, z), torque, felt).final
             self.watch.look(final.force, gravity, (turn, 0.0, 0.0), self.time_s)
 
 

@@ -31,7 +31,7 @@ def test_what_is_saved_is_loaded(store: CompensationStore) -> None:
     store.save(SERIAL, BIAS, TOOL)
     stored = store.load(SERIAL)
     assert stored is not None
-    assert (stored.bias, stored.payload, stored.gravity) == (BIAS, TOOL, None)
+    assert (stored.bias, stored.payload, stored.specific_force) == (BIAS, TOOL, None)
     store.save(SERIAL, BIAS, TOOL, BIAS, (0.0, 3.0, -9.0))
     stored = store.load(SERIAL)
     assert stored is not None
@@ -118,7 +118,7 @@ def whole(**changed: Any) -> dict[str, Any]:
         (json.dumps(whole(bias=None)).encode(), "a wrench is 6 finite numbers"),
         (json.dumps(whole(tool_mass=-1, tool_center_of_gravity=[0, 0, 0])).encode(), "cannot be negative"),
         (json.dumps(whole(tool_mass=1)).encode(), "a center of gravity is 3 finite numbers"),
-        (json.dumps(whole(gravity=[0, 0])).encode(), "gravity is 3 finite numbers"),
+        (json.dumps(whole(specific_force=[0, 0])).encode(), "a specific force is 3 finite numbers"),
     ],
 )
 def test_a_file_that_is_no_good_is_one_sentence(

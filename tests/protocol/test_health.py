@@ -11,9 +11,8 @@ import pytest
 
 from protocol.framing import DataFlag, DataMessage
 from protocol.health.judge import Observation, judge
-from protocol.health.limits import LIMITS
 from protocol.health.observer import StreamObserver
-from protocol.health.verdict import Level, Verdict
+from protocol.health.verdict import LIMITS, Level, Verdict
 from protocol.pdo import encode
 from tests.clients.simulated import simulate
 

@@ -42,20 +42,16 @@ def data_files_of_colcon(monkeypatch: pytest.MonkeyPatch) -> dict[str, set[str]]
 
 
 def test_both_install_everything_in_the_shared_folders(monkeypatch: pytest.MonkeyPatch) -> None:
-    for installed in (data_files_of_pip(), data_files_of_colcon(monkeypatch)):
-        found = [installed[f"share/bridge/{folder}"] for folder in SHARED_FOLDERS]
-        assert set().union(*found) == shared_files()
-        for folder, files in zip(SHARED_FOLDERS, found, strict=True):
-            assert all(Path(file).parent.name == folder for file in files)
-
-
-def test_both_install_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     pip = data_files_of_pip()
     # colcon makes this one itself, from the entry point.
     assert pip.pop("lib/bridge") == {"resource/client"}
     assert pip == data_files_of_colcon(monkeypatch)
     assert pip[MARKER] == {"resource/bridge"}
     assert pip["share/bridge"] == {"package.xml"}
+    found = [pip[f"share/bridge/{folder}"] for folder in SHARED_FOLDERS]
+    assert set().union(*found) == shared_files()
+    for folder, files in zip(SHARED_FOLDERS, found, strict=True):
+        assert all(Path(file).parent.name == folder for file in files)
 
 
 def test_no_other_folder_has_files() -> None:

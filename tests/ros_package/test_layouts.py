@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Iterator
 from typing import Any
 from xml.etree import ElementTree
 
@@ -20,7 +19,7 @@ TOPICS = {
     "/wrench": "geometry_msgs/WrenchStamped",
     "/wrench_compensated": "geometry_msgs/WrenchStamped",
     "/compensation/bias": "geometry_msgs/WrenchStamped",
-    "/compensation/gravity": "geometry_msgs/WrenchStamped",
+    "/compensation/tool": "geometry_msgs/WrenchStamped",
     "/imu/data_raw": "sensor_msgs/Imu",
     "/temperature": "sensor_msgs/Temperature",
     "/diagnostics": "diagnostic_msgs/DiagnosticArray",
@@ -56,15 +55,6 @@ def test_plotjuggler_subscribes_to_topics_of_the_node() -> None:
     assert streamer.get("name") == plugin.get("ID") == "ROS2 Topic Subscriber"
 
 
-def test_plotjuggler_splits_its_tabs_into_as_many_as_there_are() -> None:
-    for splitter in plotjuggler().iter("DockSplitter"):
-        count = len(splitter)
-        assert splitter.get("count") == str(count)
-        sizes = [float(size) for size in str(splitter.get("sizes")).split(";")]
-        assert len(sizes) == count
-        assert sum(sizes) == pytest.approx(1, abs=1e-3)
-
-
 def test_plotjuggler_curves_are_fields_of_the_topics_it_subscribes_to() -> None:
     curves = [str(curve.get("name")) for curve in plotjuggler().iter("curve")]
     assert curves
@@ -82,40 +72,14 @@ def foxglove() -> dict[str, Any]:
     return layout
 
 
-def panels(node: Any) -> Iterator[str]:
-    """The panels of a layout tree."""
-    if isinstance(node, str):
-        yield node
-        return
-    assert node["direction"] in {"row", "column"}
-    assert 0 < node["splitPercentage"] < 100
-    yield from panels(node["first"])
-    yield from panels(node["second"])
-
-
-def test_foxglove_has_each_panel_once() -> None:
-    layout = foxglove()
-    by_id = layout["configById"]
-    placed = list(panels(layout["layout"]))
-    for name in [name for name in placed if name.startswith("Tab!")]:
-        for tab in by_id[name]["tabs"]:
-            placed += panels(tab["layout"])
-    assert sorted(placed) == sorted(by_id)
-
-
-def test_foxglove_plots_fields_of_the_node_s_topics() -> None:
-    values = [path["value"] for panel in foxglove()["configById"].values() for path in panel.get("paths", ())]
+def test_foxglove_plots_fields_of_the_node_s_topics_and_shows_the_diagnostics() -> None:
+    panels = foxglove()["configById"].values()
+    values = [path["value"] for panel in panels for path in panel.get("paths", ())]
     assert values
     for value in values:
         topic, *fields = value.split(".")
         assert_shown(topic, fields)
-
-
-def test_foxglove_shows_the_diagnostics() -> None:
-    named = {
-        panel["topicToRender"] for panel in foxglove()["configById"].values() if "topicToRender" in panel
-    }
-    assert named == {"/diagnostics"}
+    assert {panel["topicToRender"] for panel in panels if "topicToRender" in panel} == {"/diagnostics"}
 
 
 def test_rviz_shows_the_wrenches() -> None:

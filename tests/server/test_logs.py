@@ -15,9 +15,15 @@ from typing import cast
 
 import pytest
 
-from ethercat_server.process import log_queue, logs
-from ethercat_server.process.log_queue import MOST_LINES, QueuedHandler
-from ethercat_server.process.logs import JournalFormatter, PlainFormatter, Repetitions, goes_to_journal
+from ethercat_server.process import logs
+from ethercat_server.process.logs import (
+    MOST_LINES,
+    JournalFormatter,
+    PlainFormatter,
+    QueuedHandler,
+    Repetitions,
+    goes_to_journal,
+)
 from protocol.errors import ConnectionFailedError
 from tests.server.running import ATTEMPTS, PATIENCE_S, Client, free_port, needs_bus, wait_until
 
@@ -119,7 +125,7 @@ def test_who_logs_does_not_wait_and_learns_what_was_dropped(
     pipe: Pipe, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A real pipe, because only that blocks. The first line may be with the writer already."""
-    monkeypatch.setattr(log_queue, "_FLUSH_S", 0.01)
+    monkeypatch.setattr(logs, "_FLUSH_S", 0.01)
     handler = QueuedHandler(pipe.writing)
     handler.setFormatter(PlainFormatter())
     for number in range(MOST_LINES + 100):

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ethercat_server.daemon.options import parse_options
-from ethercat_server.daemon.server_settings import SERVER_SETTINGS
+from ethercat_server.daemon.options import SERVER_SETTINGS, parse_options
 from ethercat_server.errors import UsageError
 
 

@@ -10,9 +10,7 @@ from pathlib import Path
 import pytest
 
 from bridge.parameters.table import PARAMETERS
-from ethercat_server.daemon.config_file import EMPTY, read_config
-from ethercat_server.daemon.options import parse_options
-from ethercat_server.daemon.server_settings import SERVER_SETTINGS
+from ethercat_server.daemon.options import EMPTY, SERVER_SETTINGS, parse_options, read_config
 from ethercat_server.ethercat.nic import lock
 from ethercat_server.process import realtime
 from protocol.settings import check_settings, start_up_defaults

@@ -15,7 +15,7 @@ from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.slave.coe import Steps, finish
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
-from ethercat_server.tool.snapshot_file import RESTORABLE
+from ethercat_server.tool.commands.snapshot import RESTORABLE
 from protocol.settings import sinc_length_of
 from tests.bridge.scripted_server import ScriptedServer, description
 from tests.server.running import needs_bus

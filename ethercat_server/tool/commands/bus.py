@@ -14,8 +14,7 @@ from ethercat_server.errors import BusError
 from ethercat_server.ethercat.slave import sii_content
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.sensor import Found, Identity
-from ethercat_server.tool.command import DONE, Command, add_sensor_arguments
-from ethercat_server.tool.show import columns, say, say_json
+from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, columns, say, say_json
 
 
 def _eeprom_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,8 +13,7 @@ from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.nic.interface import network_trouble
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.scan import NoSlaveError
-from ethercat_server.tool.command import DONE, Command
-from ethercat_server.tool.show import columns, say, say_json
+from ethercat_server.tool.command import DONE, Command, columns, say, say_json
 
 
 class _Found(NamedTuple):

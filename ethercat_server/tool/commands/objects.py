@@ -16,8 +16,16 @@ from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION, Objec
 from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, find_objects, similar_names
 from ethercat_server.sensor.sensor import Found
 from ethercat_server.sensor.set_up import read_sinc
-from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, sensors_of
-from ethercat_server.tool.show import columns, say, say_json, value_text
+from ethercat_server.tool.command import (
+    DONE,
+    Command,
+    add_sensor_arguments,
+    columns,
+    say,
+    say_json,
+    sensors_of,
+    value_text,
+)
 from protocol.pdo import INPUT_OBJECT
 from protocol.sensor.meaning import value_meaning
 

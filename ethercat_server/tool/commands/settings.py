@@ -8,16 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from ethercat_server.access.sensors import Sensors
-from ethercat_server.daemon.config_file import EMPTY, read_config
-from ethercat_server.daemon.options import ServerOptions, parse_assignments
+from ethercat_server.daemon.options import EMPTY, ServerOptions, parse_assignments, read_config
 from ethercat_server.errors import BusError, UsageError
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.process.signals import signals_held_back
 from ethercat_server.sensor.configuration import Change, save
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.sensor import Found, Sensor
-from ethercat_server.tool.command import CHANGES, DONE, Command, add_sensor_arguments, sensors_of
-from ethercat_server.tool.show import columns, report, value_text
+from ethercat_server.tool.command import (
+    CHANGES,
+    DONE,
+    Command,
+    add_sensor_arguments,
+    columns,
+    report,
+    sensors_of,
+    value_text,
+)
 from protocol.errors import SettingError
 from protocol.sensor.meaning import meaning, value_meaning
 from protocol.settings import SETTINGS, SettingValue

@@ -13,9 +13,8 @@ from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.process.signals import signals_held_back
 from ethercat_server.sensor.sensor import Found
 from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
-from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, sensors_of
+from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, columns, report, sensors_of
 from ethercat_server.tool.commands.settings import UNSAVED
-from ethercat_server.tool.show import columns, report
 from protocol.control import ACTIONS, MAX_TARE_SAMPLES
 from protocol.program.tare_memory import Tared, recall, remember
 

@@ -12,12 +12,19 @@ from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.clock import Clock, Deadline
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.sensor import Found
-from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, sensors_of
+from ethercat_server.tool.command import (
+    DONE,
+    Command,
+    add_sensor_arguments,
+    columns,
+    say,
+    say_json,
+    sensors_of,
+)
 from ethercat_server.tool.commands.block import Block
-from ethercat_server.tool.show import columns, say, say_json
 from protocol.framing import DataFlag, DataMessage
 from protocol.health.judge import Observation, judge
-from protocol.health.limits import LIMITS
+from protocol.health.verdict import LIMITS
 
 _TERMINAL_INTERVAL_S: Final = 0.25
 _LINE_INTERVAL_S: Final = 1.0

@@ -1,24 +1,21 @@
 """What the compensation is to do: parameters made into a `Plan`, the bias with its history, the source.
 
-Lives in the executor's thread, but for `link_changed` and `cancel`. The parameter `bias` is the bias: every
+Lives in the executor's thread, but for `link_changed`. The parameter `bias` is the bias: every
 change goes through it, so that it always shows what is in force, or ramped in.
 """
 
 from __future__ import annotations
 
-import contextlib
 import threading
-from collections.abc import Callable, Iterator
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final
 
 from rclpy.node import Node
 
-from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper
-from bridge.compensating.gravity_sources import NoSource, Source
-from bridge.compensating.obstacles import Obstacles
-from bridge.compensating.orientations import SourceChoice, is_same_source
-from bridge.compensating.own_offset import OwnOffset
-from bridge.diagnostics.compensation_state import CompensationState
+from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper, OwnOffset
+from bridge.compensating.orientations import SourceChoice
+from bridge.compensating.tool_sources import IMU_IS_OFF, Source
+from bridge.diagnostics.observer import CompensationState
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.declare import LiveParameters
 from bridge.parameters.row import ParameterError
@@ -26,10 +23,10 @@ from bridge.parameters.table import Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
 from bridge.stream.link import Link
 from bridge.stream.watch import Watch
-from ft_compensation.bias import BiasRamp, Taken
+from ft_compensation.bias import BiasRamp, Taken, force_bound_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.payload_watch import PayloadWatch
-from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, length, wrench_text
+from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
 
 _MEASURED: Final = ("tare", "identified")
 """Where a bias comes from that is one even if it is zero."""
@@ -56,23 +53,23 @@ class CompensationControl:
         """Where the bias in force comes from."""
         self.sensors = 1
         """How many have been there: what was measured on one is of no use with another."""
-        self.ending = False
+        self._model = ""
+        """Of the sensor that is or was there."""
         self._log = node.get_logger()
         self._choice = SourceChoice(node, parameters.frame_id)
         self._keeper = BiasKeeper(self._log)
         self._own_offset = OwnOffset(link)
         self.count_not_finite = count_not_finite
         """Samples so far that were not finite somewhere."""
-        self._next_origin = FROM_PARAMETER
-        self._next_taken: Taken | None = None
-        """Of the bias that is being put in force, where that is a tare."""
+        self._next: tuple[str, Taken | None] = (FROM_PARAMETER, None)
+        """Origin of the bias that is being put in force, and what it was taken with if by a tare."""
         self._choice.check(self.parameters)
         self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
         self._shifting = threading.Lock()
         """For whoever shifts the ramp, or replaces it and the plan."""
-        self._watch: PayloadWatch | None = None
+        self._payload_watch: PayloadWatch | None = None
         self._watched: object = None
-        self.obstacles, self._live = Obstacles(link, watch), live
+        self._watch, self._live = watch, live
         live.checks.append(lambda wanted: self._check(wanted.compensation))
         live.listeners.append(lambda wanted: self._apply(wanted.compensation))
         self._guard = node.create_guard_condition(self._follow_sensor)
@@ -82,17 +79,13 @@ class CompensationControl:
 
         ParameterError if it cannot be had.
         """
-        self._choice.open(self.parameters)
-        self.output.stops_on_saturation = self.parameters.on_saturation == "stop"
+        self._choice.open(self.parameters, self._model)
+        self.output.tune(self.parameters)
         self._make_plan()
 
     def close(self) -> None:
         """Stop listening for orientations."""
         self._choice.close()
-
-    def cancel(self) -> None:
-        """Make whoever waits for samples give up; from any thread: the node ends."""
-        self.ending = True
 
     def link_changed(self) -> None:
         """There is another connection, or none; for the reader's thread."""
@@ -103,7 +96,7 @@ class CompensationControl:
         else:
             self._follow_offset()
             if self.output.hold is not _LOOKING_UP:
-                self.obstacles.hold(self.parameters, self.output)
+                self._hold()
 
     @property
     def keeping(self) -> str:
@@ -112,7 +105,7 @@ class CompensationControl:
 
     @property
     def source(self) -> Source:
-        """Where gravity is taken from."""
+        """Where the weight of the tool is taken from."""
         return self._choice.source
 
     @property
@@ -126,28 +119,26 @@ class CompensationControl:
 
     def state(self) -> CompensationState:
         """How things are, for the diagnostics' thread."""
-        output, source, watch = self.output, self._choice.source, self._watch
+        output, source, watch = self.output, self._choice.source, self._payload_watch
         payload = self.parameters.payload
         return CompensationState(
             has_subscribers=output.has_subscribers,
             published=output.published,
             withheld=output.withheld,
-            why_stopped=self.obstacles.stopping(self.parameters, output, source, self._choice.listener),
+            why_stopped=self._why_stopped(),
             why_partly=output.problem,
             source=source.describe,
             age_s=source.age_s(output.time_s),
-            tilt=source.tilt,
+            bound=force_bound_95(payload, self.parameters.accelerometer) if source.is_imu else None,
             payload=payload,
-            weight=payload.mass * length(self.parameters.gravity),
-            inertia=self.parameters.compensate_inertia,
             bias=self.bias,
             origin=self.origin,
             is_ramping=self.is_ramping,
             keep=self.parameters.bias_keep,
             stops_on_saturation=output.stops_on_saturation,
-            problem=self.obstacles.conflict(self.parameters)
+            problem=self.conflict()
             or self._own_offset.doubt()
-            or self._ramp.taken.doubt(payload, length(self.parameters.gravity))
+            or self._ramp.taken.doubt(payload)
             or self.keeping
             or (watch.finding if watch is not None else ""),
         )
@@ -157,15 +148,56 @@ class CompensationControl:
         """Whether it is on the way to `bias`, as of the latest sample."""
         return not self._ramp.arrived(self.output.time_s)
 
+    def conflict(self, *, needs_tool: bool = False) -> str | None:
+        """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
+        specific force in the frame of the wrench, a sentence that says what to do."""
+        settings = self.link.settings
+        if settings.get("calibration_matrix") is False:
+            return (
+                "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
+                "switch it on"
+            )
+        if settings.get("inertia_compensation") is True and self.parameters.payload.mass:
+            return (
+                "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
+                "or set tool_mass to 0"
+            )
+        return self._blind() if needs_tool else None
+
+    def _blind(self) -> str | None:
+        if self.parameters.orientation.source != "imu":
+            return None
+        if self.link.settings.get("coordinate_system") is True:
+            return (
+                "settings.coordinate_system is on, so the wrench is in a frame configured in the sensor, and "
+                "the rotation from the IMU to it is unknown: switch it off, or take the orientation of that "
+                "frame from the robot (gravity_source)"
+            )
+        return IMU_IS_OFF if self.link.settings.get("imu_active") == 0 else None
+
+    def _hold(self) -> None:
+        """Publish nothing while the specific force is needed and cannot be known."""
+        self.output.hold = self._blind() if self.parameters.payload.mass else None
+
+    def _why_stopped(self) -> str | None:
+        """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
+        output, source, watch = self.output, self._choice.source, self._watch
+        sample, stamp_s = output.sample, output.stamp_s
+        if not output.has_subscribers:
+            if not self.parameters.payload.mass:
+                return output.hold
+            sample, stamp_s = watch.sample, watch.stamp_ns * 1e-9
+        elif not output.is_stopped:
+            return None
+        elif output.is_saturated:
+            return output.hold or "force or torque is saturated, and on_saturation is stop"
+        why = source.why_none(sample, stamp_s) if sample is not None else ""
+        return output.hold or why or ("what is known of the tool is too old" if output.is_stopped else None)
+
     def set_bias(self, bias: Wrench, origin: str, taken: Taken | None = None) -> None:
         """Put a bias in force, `taken` by a tare, and keep it if that is asked for."""
         self._own_offset.begin(bias, is_measured=origin in _MEASURED)
-        self._next_taken = taken
-        try:
-            with self._origin(origin):
-                self._live.put(bias=[*bias.values])
-        finally:
-            self._next_taken = None
+        self._put(origin, taken, bias=[*bias.values])
 
     def undo_bias(self) -> Wrench:
         """Go back to the bias before, and return it; CompensationError if there is none."""
@@ -176,23 +208,22 @@ class CompensationControl:
 
     def set_payload(self, payload: Payload, bias: Wrench, accelerometer: Accelerometer | None = None) -> None:
         """Put an identified payload, its bias and the accelerometer's correction in force, all at once."""
-        values: dict[str, object] = {
+        values: dict[str, Any] = {
             "tool_mass": payload.mass,
             "tool_center_of_gravity": [*payload.center],
             "bias": [*bias.values],
         }
         if accelerometer is not None:
             values |= {f"accelerometer.{name}": [*part] for name, part in accelerometer._asdict().items()}
-        with self._origin("identified"):
-            self._live.put(**values)
+        self._put("identified", **values)
 
-    @contextlib.contextmanager
-    def _origin(self, origin: str) -> Iterator[None]:
-        self._next_origin = origin
+    def _put(self, origin: str, taken: Taken | None = None, **values: Any) -> None:
+        """Set parameters, the bias among them."""
+        self._next = origin, taken
         try:
-            yield
+            self._live.put(**values)
         finally:
-            self._next_origin = FROM_PARAMETER
+            self._next = FROM_PARAMETER, None
 
     def _check(self, wanted: CompensationParameters) -> None:
         """ParameterError if they cannot be had here."""
@@ -205,55 +236,45 @@ class CompensationControl:
 
     def _apply(self, wanted: CompensationParameters) -> None:
         was, self.parameters = self.parameters, wanted
-        if not is_same_source(wanted, was):
-            try:
-                self._choice.open(wanted)
-            except ParameterError as error:  # too late to refuse the parameter
-                self._log.error(str(error))
-                self._choice.source = NoSource(str(error))
+        self._open_source()
         self.output.tune(wanted)
         self._ramp.seconds = wanted.bias_ramp_time
-        before = self.bias
+        before, (origin, taken) = self.bias, self._next
         # A parameter that the shift of the bias has not reached yet is no wish.
-        is_wish = self._next_taken is not None or wanted.bias not in (was.bias, before)
+        is_wish = taken is not None or wanted.bias not in (was.bias, before)
         with self._shifting:
             if wanted.payload != was.payload:
                 self._ramp = self._ramp.weighed(wanted.payload)
             if is_wish:
-                self._ramp.go(wanted.bias, self.output.time_s, self._next_taken or Taken())
-                self._own_offset.begin(wanted.bias, is_measured=self._next_origin in _MEASURED)
-                self.origin = self._next_origin
+                self._ramp.go(wanted.bias, self.output.time_s, taken or Taken())
+                self._own_offset.begin(wanted.bias, is_measured=origin in _MEASURED)
+                self.origin = origin
             self._make_plan()
         if wanted.payload != was.payload and not is_wish:
-            self._say_weighed(self.bias.plus(before, -1.0))
-        self.output.stops_on_saturation = wanted.on_saturation == "stop"
+            # The bias of a tare is another one with it.
+            if warning := self._ramp.taken.warning(self.bias.plus(before, -1.0), wanted.payload):
+                self._log.warning(warning)
+            self._guard.trigger()  # the parameter follows
         if self.output.hold is not _LOOKING_UP:
-            self.obstacles.hold(self.parameters, self.output)
+            self._hold()
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
             self._keeper.forget()
         self._keeper.keep(self._ramp, wanted, self._own_offset.to_keep)
 
-    def _say_weighed(self, change: Wrench) -> None:
-        """The payload is another one, and so the bias of a tare, by `change`."""
-        parameters = self.parameters
-        if warning := self._ramp.taken.warning(change, parameters.payload, length(parameters.gravity)):
-            self._log.warning(warning)
-        self._guard.trigger()  # the parameter follows
+    def _open_source(self) -> None:
+        try:
+            self._choice.open(self.parameters, self._model)
+        except ParameterError as error:  # too late to refuse the parameter
+            self._log.error(str(error))
 
     def _make_plan(self) -> None:
-        wanted = self.parameters
-        has_weight = wanted.payload.mass > 0.0
-        compensator = Compensator(
-            wanted.payload,
-            inertia=wanted.compensate_inertia and has_weight,
-            imu_position=wanted.imu_position,
-            accelerometer=wanted.accelerometer.reading,
-        )
-        watched = wanted.payload, self.bias, self.sensors
+        payload, rest = self.parameters.payload, self.parameters.rest
+        watched = payload, self.bias, self.sensors
         if watched != self._watched:
             self._watched = watched
-            self._watch = PayloadWatch(wanted.payload, self._log.warning, wanted.rest) if has_weight else None
-        self.output.plan = Plan(self._choice.source, compensator, self._ramp, has_weight, self._watch)
+            self._payload_watch = PayloadWatch(payload, self._log.warning, rest) if payload.mass else None
+        source, has_tool = self._choice.source, payload.mass > 0.0
+        self.output.plan = Plan(source, Compensator(payload), self._ramp, has_tool, self._payload_watch)
 
     def _is_same_sensor(self) -> bool:
         info = self.link.info
@@ -274,17 +295,16 @@ class CompensationControl:
             elif is_another:
                 # What was before in its history was the other's too.
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
-                self._make_plan()
-            if is_another:
-                self._choice.another_sensor(self.parameters)
-                self._make_plan()
-                self.sensors += 1
+            self._model = info.name
+            self._open_source()
+            self.sensors += is_another
+            self._make_plan()
             if not self.keeping and self.bias != NO_WRENCH:
                 self._keeper.keep(self._ramp, self.parameters, self._own_offset.to_keep)
         self._follow_offset()
         if self.bias != self.parameters.bias:
             self._live.put(bias=[*self.bias.values])  # shifted
-        self.obstacles.hold(self.parameters, self.output)
+        self._hold()
         if not self._is_same_sensor():
             self.link_changed()
 
@@ -302,8 +322,6 @@ class CompensationControl:
     def _begin_with(self, begin: Beginning) -> None:
         """Put a bias in force at once, with nothing before it."""
         problem = self.keeping
-        with self._origin(begin.origin):
-            self._ramp = BiasRamp(begin.bias, self.parameters.bias_ramp_time, begin.taken)
-            self._live.put(bias=[*begin.bias.values])
+        self._ramp = BiasRamp(begin.bias, self.parameters.bias_ramp_time, begin.taken)
+        self._put(begin.origin, bias=[*begin.bias.values])
         self.origin, self._keeper.problem = begin.origin, problem
-        self._make_plan()

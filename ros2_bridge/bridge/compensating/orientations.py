@@ -1,16 +1,16 @@
-"""The sensor's orientation from ROS: three kinds of message, or TF.
+"""The sensor's orientation from ROS, by messages or TF, and the choice of the source of the tool's load.
 
-Every source gives the same: the sensor's orientation in the base frame as a quaternion x, y, z, w (the
-rotation that takes the sensor's vectors to the base's) and its time, or a sentence that says why not. They
-are listened to in a callback group of its own, which waits for no service: a pose that is not taken is old.
+Every orientation is a quaternion x, y, z, w (the rotation that takes the sensor's vectors to the base's) and
+its time, or a sentence that says why there is none. They are listened to in a callback group of their own,
+which waits for no service: a pose that is not taken is old.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple, Protocol
+from operator import attrgetter
+from typing import Any, Final
 
 from geometry_msgs.msg import PoseStamped, QuaternionStamped
 from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
@@ -18,67 +18,34 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from bridge.compensating.gravity_sources import (
-    AccelerometerSource,
-    ListenerSource,
-    NoSource,
-    Oriented,
-    SensorSource,
-    Source,
-)
-from bridge.parameters.compensation import (
-    TOPIC_SOURCES,
-    CompensationParameters,
-    OrientationParameters,
-    Quaternion,
-)
+from bridge.compensating.tool_sources import ImuSource, ListenerSource, Oriented, Source
+from bridge.parameters.compensation import TOPIC_SOURCES, CompensationParameters, OrientationParameters
 from bridge.parameters.row import ParameterError
-from ft_compensation.attitude.tilt import GyroscopeOffset
+from bridge.transforms import Tf, UnusableError, check_tf, follow_tf, look_up, stamp_ns
+from ft_compensation.quantities import Quaternion, unit_quaternion
+from protocol.pdo import Vector3
+from protocol.sensor.frames import IMU_HEIGHTS
 
-_NORM_TOLERANCE: Final = 0.01
-_NS_PER_S: Final = 1_000_000_000
-TF_PERIOD_S: Final = 0.005
-"""Period of the TF lookups."""
 _LET_GO_S: Final = 1.0
 """How long an executor may take to release the previous subscription: DDS has one type per topic."""
-
-
-class UnusableError(Exception):
-    """There is no orientation to be had just now; the text says why."""
-
-
-class TopicKind(NamedTuple):
-    """A kind of message that carries an orientation."""
-
-    type: Any
-    quaternion: Callable[[Any], Any]
-    """The quaternion in a message."""
-
-
-TOPIC_KINDS: Final = {
-    "topic_pose": TopicKind(PoseStamped, lambda message: message.pose.orientation),
-    "topic_quaternion": TopicKind(QuaternionStamped, lambda message: message.quaternion),
-    "topic_imu": TopicKind(Imu, lambda message: message.orientation),
+TOPIC_KINDS: Final[dict[str, tuple[Any, Callable[[Any], Any]]]] = {
+    "topic_pose": (PoseStamped, attrgetter("pose.orientation")),
+    "topic_quaternion": (QuaternionStamped, attrgetter("quaternion")),
+    "topic_imu": (Imu, attrgetter("orientation")),
 }
-"""By the value of the parameter `orientation_source`."""
+"""Type of the messages, and the quaternion in one, by the value of the parameter `gravity_source`."""
 
 
-def read_message(kind: TopicKind, message: Any) -> Oriented:
+def read_message(message: Any, quaternion: Any) -> Oriented:
     """The orientation in a message; UnusableError if it has none that can be used."""
-    if kind.type is Imu and message.orientation_covariance[0] == -1.0:
+    if isinstance(message, Imu) and message.orientation_covariance[0] == -1.0:
         raise UnusableError("its messages say that they have none (orientation_covariance[0] is -1)")
-    stamp = message.header.stamp
-    if not stamp.sec and not stamp.nanosec:
+    if not (stamp := stamp_ns(message.header.stamp)):
         raise UnusableError("its messages have no time stamp: the publisher must fill in header.stamp")
-    return Oriented(unit(kind.quaternion(message)), stamp.sec * _NS_PER_S + stamp.nanosec)
-
-
-def unit(q: Any) -> Quaternion:
-    """A message's quaternion, made exactly one long; UnusableError if it is not nearly so."""
-    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
-    if not abs(norm - 1.0) <= _NORM_TOLERANCE:  # a NaN is not either
-        raise UnusableError(f"what it sends is no rotation: a quaternion of length {norm:g} instead of 1")
-    return q.x / norm, q.y / norm, q.z / norm, q.w / norm
+    try:
+        return Oriented(unit_quaternion((quaternion.x, quaternion.y, quaternion.z, quaternion.w)), stamp)
+    except ValueError as error:
+        raise UnusableError(f"what it sends is none: {error}") from None
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -93,98 +60,10 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-class TransformBuffer(Protocol):
-    """The part of `tf2_ros.Buffer` that is used here."""
-
-    def lookup_transform(self, target_frame: str, source_frame: str, time: Any) -> Any:
-        """A TransformStamped that takes vectors of `source_frame` to `target_frame`."""
-
-
-class Tf(NamedTuple):
-    """What is used of tf2_ros."""
-
-    buffer: TransformBuffer
-    errors: type[Exception]
-    """What a lookup raises."""
-    latest: Any
-    """The time that stands for the latest there is."""
-    close: Callable[[], object] = lambda: None
-    """Ends listening."""
-
-
-def look_up(tf: Tf, base: str, frame: str) -> Oriented:
-    """The orientation of `frame` in `base` by TF, the latest there is; UnusableError if there is none."""
-    try:
-        found = tf.buffer.lookup_transform(base, frame, tf.latest)
-    except tf.errors as error:
-        raise UnusableError(f"TF has no pose of {frame} in {base}: {' '.join(str(error).split())}") from None
-    stamp = found.header.stamp
-    stamp_ns = stamp.sec * _NS_PER_S + stamp.nanosec
-    # A chain of static transforms only has no time: it holds at any, so now.
-    return Oriented(unit(found.transform.rotation), stamp_ns or time.time_ns())
-
-
-def check_tf(
-    wanted: str = "parameter orientation_source is 'tf'", instead: str = "take another source"
-) -> None:
-    """ParameterError if tf2_ros is missing. `wanted`: what needs it, `instead`: what to do without it."""
-    try:
-        import tf2_ros  # noqa: F401, PLC0415 - only where it is asked for: not everybody has it
-    except ImportError as error:
-        raise ParameterError(
-            f"{wanted}: it needs tf2_ros, which cannot be loaded ({error}): "
-            f"sudo apt install ros-$ROS_DISTRO-tf2-ros-py and source ROS 2, or {instead}"
-        ) from None
-
-
-def open_tf(node: Any) -> Tf:
-    """A buffer that `node` fills from /tf and /tf_static as it spins, in a callback group of tf2_ros's."""
-    from rclpy.time import Time  # noqa: PLC0415
-    from tf2_ros import Buffer, TransformException, TransformListener  # noqa: PLC0415 - see check_tf
-
-    buffer = Buffer()
-    listener = TransformListener(buffer, node, spin_thread=False)
-    return Tf(buffer, TransformException, Time(), listener.unregister)
-
-
-def check_can_listen(
-    node: Node, chosen: OrientationParameters, listening: OrientationListener | None = None
-) -> None:
-    """ParameterError if that source is not available on this machine, or its topic's name is invalid.
-
-    `listening` is what will be closed before.
-    """
-    if chosen.source == "tf":
-        check_tf()
-    if chosen.source in TOPIC_SOURCES:
-        try:
-            resolved = node.resolve_topic_name(chosen.topic)
-        except RuntimeError as error:  # rclpy has no public name for it
-            reason = str(error).removeprefix("failed to resolve name: ").partition(", at /")[0]
-            raise ParameterError(f"parameter orientation.topic is {chosen.topic!r}: {reason}") from None
-        wanted = TOPIC_KINDS[chosen.source].type
-        for own in (*node.publishers, *node.subscriptions):
-            # DDS has one type for a topic in a process.
-            if listening is not None and own is listening.subscription:
-                continue
-            if own.topic_name == resolved and own.msg_type is not wanted:
-                raise ParameterError(
-                    f"parameter orientation.topic is {chosen.topic!r}: this node itself has that topic, with "
-                    f"{own.msg_type.__name__} messages and not {wanted.__name__}"
-                )
-
-
 class OrientationListener:
     """From construction to `close`. Read `latest` and `problem` from any thread: they are replaced."""
 
-    def __init__(
-        self,
-        node: Node,
-        chosen: OrientationParameters,
-        frame: str,
-        group: CallbackGroup,
-        open_buffer: Callable[[Node], Tf] = open_tf,
-    ) -> None:
+    def __init__(self, node: Node, chosen: OrientationParameters, frame: str, group: CallbackGroup) -> None:
         """`chosen.source` is a key of TOPIC_KINDS, or `tf`: then `frame` is the sensor's.
 
         ParameterError if ROS refuses to listen there.
@@ -194,42 +73,39 @@ class OrientationListener:
         """What was wrong with what came last; empty if nothing was."""
         self.subscription: Any = None
         """To a topic; None: to TF."""
-        self._node, self._group = node, group
-        self._close: Callable[[], object]
-        if chosen.source == "tf":
-            self._mounting = None
-            self._listen_to_tf(open_buffer(node), chosen.base_frame, frame)
-        else:
-            self._mounting = chosen.mounting
-            self._listen_to_topic(chosen)
+        self.close: Callable[[], object]
+        """Stop listening."""
+        if chosen.source != "tf":
+            self._subscribe(node, chosen, group)
+            return
 
-    def _listen_to_tf(self, tf: Tf, base: str, frame: str) -> None:
-        self.describe = f"TF from {base} to {frame}"
-        timer = self._node.create_timer(
-            TF_PERIOD_S, lambda: self._take(lambda: look_up(tf, base, frame)), self._group
-        )
+        def read(tf: Tf) -> Oriented:
+            _, rotation, stamp = look_up(tf, chosen.base_frame, frame)
+            return Oriented(rotation, stamp or time.time_ns())  # static transforms hold at any time, so now
 
-        def close() -> None:
-            self._node.destroy_timer(timer)
-            tf.close()
+        self.describe = f"TF from {chosen.base_frame} to {frame}"
+        self.close = follow_tf(node, group, lambda tf: self._take(lambda: read(tf)))
 
-        self._close = close
-
-    def _listen_to_topic(self, chosen: OrientationParameters) -> None:
-        kind = TOPIC_KINDS[chosen.source]
-        resolved = self._node.resolve_topic_name(chosen.topic)
+    def _subscribe(self, node: Node, chosen: OrientationParameters, group: CallbackGroup) -> None:
+        kind, find = TOPIC_KINDS[chosen.source]
+        resolved = node.resolve_topic_name(chosen.topic)
         self.describe = f"topic {resolved}"
         self.problem = "nothing has come on it yet"
+
+        def read(message: Any) -> Oriented:
+            quaternion, stamp = read_message(message, find(message))
+            return Oriented(multiply(quaternion, chosen.mounting), stamp)
+
         profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         deadline_s = time.monotonic() + _LET_GO_S
         while self.subscription is None:
             try:
-                self.subscription = self._node.create_subscription(
-                    kind.type,
+                self.subscription = node.create_subscription(
+                    kind,
                     resolved,
-                    lambda message: self._take(lambda: read_message(kind, message)),
+                    lambda message: self._take(lambda: read(message)),
                     profile,
-                    callback_group=self._group,
+                    callback_group=group,
                 )
             except RuntimeError as error:
                 if time.monotonic() < deadline_s:
@@ -239,70 +115,83 @@ class OrientationListener:
                     f"parameter orientation.topic is {chosen.topic!r}: ROS refuses to listen there "
                     f"({error}); choose another topic"
                 ) from None
-        self._close = lambda: self._node.destroy_subscription(self.subscription)
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._close()
+        self.close = lambda: node.destroy_subscription(self.subscription)
 
     def _take(self, read: Callable[[], Oriented]) -> None:
         try:
-            found = read()
+            self.latest, self.problem = read(), ""
         except UnusableError as error:
             self.problem = str(error)
-        else:
-            quaternion = found.quaternion
-            if self._mounting is not None:
-                quaternion = multiply(quaternion, self._mounting)
-            self.latest, self.problem = Oriented(quaternion, found.stamp_ns), ""
 
 
 class SourceChoice:
-    """Opens the source of gravity that the parameters name, and closes the previous one."""
+    """Opens the source of the tool's load that the parameters name, and closes the previous one."""
 
     def __init__(self, node: Node, frame: str) -> None:
         """`frame` is the sensor's, for TF."""
-        self.source: Source = NoSource()
-        self.listener: OrientationListener | None = None
-        """The listener of a source that uses a topic or TF."""
+        self.source: Source = Source()
+        self._listener: OrientationListener | None = None
+        self._opened: object = None
+        """What the open source depends on."""
         self._node, self._frame = node, frame
-        self._listening = MutuallyExclusiveCallbackGroup()
-        self._gyroscope = GyroscopeOffset()
+        self._group = MutuallyExclusiveCallbackGroup()
 
     def check(self, wanted: CompensationParameters) -> None:
-        """ParameterError if it is not available on this machine."""
-        check_can_listen(self._node, wanted.orientation, self.listener)
+        """ParameterError if it is not available on this machine, or its topic's name is invalid."""
+        chosen = wanted.orientation
+        if chosen.source == "tf":
+            check_tf()
+        if chosen.source not in TOPIC_SOURCES:
+            return
+        try:
+            resolved = self._node.resolve_topic_name(chosen.topic)
+        except RuntimeError as error:  # rclpy has no public name for it
+            reason = str(error).removeprefix("failed to resolve name: ").partition(", at /")[0]
+            raise ParameterError(f"parameter orientation.topic is {chosen.topic!r}: {reason}") from None
+        kind, _ = TOPIC_KINDS[chosen.source]
+        previous = self._listener.subscription if self._listener is not None else None
+        for own in (*self._node.publishers, *self._node.subscriptions):
+            # DDS has one type for a topic in a process.
+            if own is not previous and own.topic_name == resolved and own.msg_type is not kind:
+                raise ParameterError(
+                    f"parameter orientation.topic is {chosen.topic!r}: this node itself has that topic, with "
+                    f"{own.msg_type.__name__} messages and not {kind.__name__}"
+                )
 
-    def open(self, wanted: CompensationParameters) -> None:
-        """Open the source that is wanted; ParameterError if it is not available."""
+    def open(self, wanted: CompensationParameters, model: str) -> None:
+        """Open the source that is wanted, for a sensor of this model, unless it is open.
+
+        ParameterError if that cannot be; then there is none.
+        """
+        name, listened = wanted.orientation.source, (wanted.orientation, wanted.gravity)
+        position = imu_position(wanted, model)
+        opened = (wanted.accelerometer, position, wanted.payload.center) if name == "imu" else listened
+        if opened == self._opened:
+            return
         self.close()
-        self.source = self._opened(wanted)
-
-    def _opened(self, wanted: CompensationParameters) -> Source:
-        name = wanted.orientation.source
         if name == "none":
-            return NoSource()
-        if name == "accelerometer":
-            return AccelerometerSource(wanted, self._gyroscope)
-        if name == "sensor":
-            return SensorSource(wanted)
-        self.listener = OrientationListener(self._node, wanted.orientation, self._frame, self._listening)
-        return ListenerSource(wanted, self.listener)
-
-    def another_sensor(self, wanted: CompensationParameters) -> None:
-        """Forget the previous sensor's IMU."""
-        self._gyroscope = GyroscopeOffset()
-        if isinstance(self.source, AccelerometerSource):
-            self.source = AccelerometerSource(wanted, self._gyroscope)
+            self.source = Source()
+        elif name == "imu":
+            self.source = ImuSource(wanted, position)
+        else:
+            try:
+                self._listener = OrientationListener(self._node, wanted.orientation, self._frame, self._group)
+            except ParameterError as error:
+                self.source = Source(str(error))
+                raise
+            self.source = ListenerSource(wanted, self._listener)
+        self._opened = opened
 
     def close(self) -> None:
         """Stop listening for orientations."""
-        if self.listener is not None:
-            self.listener.close()
-            self.listener = None
+        self._opened = None
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
 
 
-def is_same_source(one: CompensationParameters, other: CompensationParameters) -> bool:
-    """Whether they ask for the same source."""
-    parts = [(each.orientation, each.accelerometer, each.gravity) for each in (one, other)]
-    return parts[0] == parts[1]
+def imu_position(wanted: CompensationParameters, model: str) -> Vector3:
+    """The IMU's position in frame_id, m: as given, else as the drawings of the model have it."""
+    if any(wanted.imu_position):
+        return wanted.imu_position
+    return 0.0, 0.0, IMU_HEIGHTS.get(model[4:8], 0.0)

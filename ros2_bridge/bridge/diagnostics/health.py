@@ -5,16 +5,13 @@ Five statuses. A message says what is wrong and what to do; the values are for t
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 from bridge.diagnostics.observer import SLOW_ANSWER_S, Snapshot, mapping, row_of
 from protocol.health.judge import SATURATIONS
 from protocol.health.judge import judge as judge_stream
-from protocol.health.limits import Limits
-from protocol.health.verdict import About, Finding, Level, Verdict
-from protocol.text.untrusted import number, whole
-from protocol.text.visible import printable
+from protocol.health.verdict import About, Level, Limits
+from protocol.text.untrusted import number, printable, whole
 
 Values = dict[str, object]
 
@@ -28,83 +25,61 @@ class Status(NamedTuple):
     values: Values
 
 
-class _Verdict:
-    """Collects problems: the worst level, and the sentences of all, the worst first."""
+Problems = list[tuple[Level, str]]
+"""How bad, and a sentence."""
 
-    def __init__(self) -> None:
-        self.level = Level.GOOD
-        self.sentences: list[str] = []
 
-    def add(self, level: Level, sentence: str) -> None:
-        self.sentences.insert(0 if level > self.level else len(self.sentences), sentence)
-        self.level = max(self.level, level)
-
-    def add_all(self, findings: Iterable[Finding]) -> None:
-        for finding in findings:
-            self.add(finding.level, finding.sentence)
-
-    def status(self, name: str, good: str, values: Values) -> Status:
-        return Status(name, self.level, "; ".join(self.sentences) or good, values)
+def _status(name: str, problems: Problems, good: str, values: Values) -> Status:
+    """The worst level, and all sentences, the worst first; `good` if there is none."""
+    problems = sorted(problems, key=lambda problem: problem[0], reverse=True)
+    sentences = "; ".join(sentence for _, sentence in problems)
+    return Status(name, problems[0][0] if problems else Level.GOOD, sentences or good, values)
 
 
 def judge(snapshot: Snapshot, limits: Limits) -> list[Status]:
     """The five statuses, in the order in which one would look for a cause."""
-    findings = stream_verdict(snapshot, limits).findings
+    findings = judge_stream(snapshot.observation, limits).findings
+
+    def about(subject: About) -> Problems:
+        return [(finding.level, finding.sentence) for finding in findings if finding.about is subject]
+
     is_silent = snapshot.silent_s > limits.stale_after
     return [
-        _link(snapshot, _about(findings, About.LINK)),
-        _stream(snapshot, _about(findings, About.STREAM), limits),
-        _sensor(snapshot, _about(findings, About.SENSOR), is_silent=is_silent),
-        _clock(snapshot, _about(findings, About.CLOCK), is_silent=is_silent),
+        _link(snapshot, about(About.LINK)),
+        _stream(snapshot, about(About.STREAM), limits),
+        _sensor(snapshot, about(About.SENSOR), is_silent=is_silent),
+        _clock(snapshot, about(About.CLOCK), is_silent=is_silent),
         _compensation(snapshot, is_silent=is_silent),
     ]
 
 
-def stream_verdict(snapshot: Snapshot, limits: Limits) -> Verdict:
-    """The verdict of the judge of all streams."""
-    return judge_stream(snapshot.observation, limits)
-
-
-def _about(findings: Iterable[Finding], subject: About) -> list[Finding]:
-    return [finding for finding in findings if finding.about is subject]
-
-
-def _link(s: Snapshot, findings: list[Finding]) -> Status:
-    verdict = _Verdict()
-    if not s.connected:
-        verdict.add(
-            Level.TROUBLE,
-            f"no server at {s.address}: {s.problem}; start ethercat-server there, or set server_host and "
-            "server_port to where it is (the node keeps trying)"
-            if not s.is_reachable
-            else f"not connected to {s.address}: {s.problem} (the node keeps trying)",
-        )
+def _link(s: Snapshot, problems: Problems) -> Status:
+    if not s.connected and s.is_reachable:
+        text = f"not connected to {s.address}: {s.problem} (the node keeps trying)"
+        problems = [(Level.TROUBLE, text)]
+    elif not s.connected:
+        text = f"no server at {s.address}: {s.problem}; start ethercat-server there, or set server_host and "
+        problems = [(Level.TROUBLE, text + "server_port to where it is (the node keeps trying)")]
     elif s.answer_s > SLOW_ANSWER_S:
-        verdict.add(
-            Level.LOOK,
-            f"the server at {s.address} has not answered for {s.answer_s:.0f} s: it is stopped or overloaded",
-        )
-    else:
-        verdict.add_all(findings)
+        text = f"the server at {s.address} has not answered for {s.answer_s:.0f} s"
+        problems = [(Level.LOOK, f"{text}: it is stopped or overloaded")]
     values: Values = {
         "address": s.address,
         "connected": s.connected,
         "connected_s" if s.connected else "disconnected_s": round(s.connection_s, 1),
-        "reconnects": max(s.connects - 1, 0),
+        "reconnects": max(s.counts.connects - 1, 0),
         "server_uptime_s": s.server.get("uptime_s", ""),
         "last_problem": s.problem,
     }
-    return verdict.status("link", f"connected to {s.address}", values)
+    return _status("link", problems, f"connected to {s.address}", values)
 
 
-def _stream(s: Snapshot, findings: list[Finding], limits: Limits) -> Status:
-    verdict = _Verdict()
+def _stream(s: Snapshot, problems: Problems, limits: Limits) -> Status:
     if not s.connected:
-        verdict.add(Level.NOT_POSSIBLE, "no samples: there is no connection to the server, see link")
-    else:
-        verdict.add_all(findings)
-        if s.new.stale >= limits.lost_warn:
-            verdict.add(Level.LOOK, f"{s.new.stale} old samples skipped: the node or the server was stopped")
+        problems = [(Level.NOT_POSSIBLE, "no samples: there is no connection to the server, see link")]
+    elif s.new.stale >= limits.lost_warn:
+        skipped = f"{s.new.stale} old samples skipped: the node or the server was stopped"
+        problems = [*problems, (Level.LOOK, skipped)]
     mine, recent = s.server_row, mapping(s.server.get("last_10s"))
     age = row_of(recent.get("age_us"), s.sensor)
     wake, exchange = mapping(recent.get("wake_us")), mapping(recent.get("exchange_us"))
@@ -113,13 +88,13 @@ def _stream(s: Snapshot, findings: list[Finding], limits: Limits) -> Status:
         "expected_hz": s.expected_hz or "",
         "age_p50_us": "" if s.age_us is None else round(s.age_us[0]),
         "age_p99_us": "" if s.age_us is None else round(s.age_us[1]),
-        "samples": s.counts.new,
-        "lost": s.counts.missing,
+        "samples": s.counts.samples,
+        "lost": s.counts.lost,
         "skipped": s.counts.stale,
         "limited": s.counts.limited,
         "repeated": s.counts.repeated,
         "invalid": s.counts.invalid,
-        "not_finite": s.not_finite,
+        "not_finite": s.counts.not_finite,
         "server_not_finite": mine.get("not_finite", ""),
         "server_lost": mine.get("lost_samples", ""),
         "server_recoveries": mine.get("recoveries", ""),
@@ -131,7 +106,7 @@ def _stream(s: Snapshot, findings: list[Finding], limits: Limits) -> Status:
         "server_age_p50_us": age.get("p50", ""),
         "server_age_p99_us": age.get("p99", ""),
     }
-    return verdict.status("stream", _rate_text(s), values)
+    return _status("stream", problems, _rate_text(s), values)
 
 
 def _lost_text(lost: str) -> str:
@@ -139,16 +114,13 @@ def _lost_text(lost: str) -> str:
     return lost if "check " in lost else f"{lost}; check its cable and power"
 
 
-def _sensor(s: Snapshot, findings: list[Finding], *, is_silent: bool) -> Status:
-    verdict = _Verdict()
+def _sensor(s: Snapshot, problems: Problems, *, is_silent: bool) -> Status:
     if not s.connected:
-        verdict.add(Level.NOT_POSSIBLE, "unknown: there is no connection to the server, see link")
+        problems = [(Level.NOT_POSSIBLE, "unknown: there is no connection to the server, see link")]
     elif s.lost is not None:
-        verdict.add(Level.TROUBLE, _lost_text(s.lost))
+        problems = [(Level.TROUBLE, _lost_text(s.lost))]
     elif is_silent:
-        verdict.add(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")
-    else:
-        verdict.add_all(findings)
+        problems = [(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")]
     last = mapping(s.server_row.get("emergency"))
     code, ago_s = whole(last.get("code")), number(last.get("ago_s"))
     emergency = "" if code is None else f"emergency 0x{code:04X} ({printable(last.get('text'), 80)})"
@@ -163,49 +135,59 @@ def _sensor(s: Snapshot, findings: list[Finding], *, is_silent: bool) -> Status:
         "status_byte": f"{s.flags.status:#04x}",
         "warnings_register": f"{s.flags.warnings:#010x}",
         **{row.field: f"{getattr(s.flags, row.field):#x}" for row in SATURATIONS},
-        "saturated_samples": s.saturated,
+        "saturated_samples": s.counts.saturated,
         "emergencies": s.server_row.get("emergencies", ""),
         "last_emergency": emergency,
         "last_emergency_ago_s": "" if ago_s is None else ago_s,
     }
-    return verdict.status("sensor", "as it should be", values)
+    return _status("sensor", problems, "as it should be", values)
 
 
-def _clock(s: Snapshot, findings: list[Finding], *, is_silent: bool) -> Status:
+def _clock(s: Snapshot, problems: Problems, *, is_silent: bool) -> Status:
     clock = mapping(s.server_row.get("clock"))
-    verdict = _Verdict()
     if not s.connected or s.lost is not None or is_silent:
-        verdict.add(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")
+        problems = [(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")]
     elif clock.get("mode") is None:
-        verdict.add(Level.NOT_POSSIBLE, "the server has not said yet")
-    else:
-        verdict.add_all(findings)
+        problems = [(Level.NOT_POSSIBLE, "the server has not said yet")]
     values: Values = {
         name: clock.get(name, "") for name in ("mode", "stamps", "period_us", "offset_ppm", "uncertainty_us")
     }
-    return verdict.status("clock", "locked to the sensor's clock", values)
+    return _status("clock", problems, "locked to the sensor's clock", values)
 
 
 def _compensation(s: Snapshot, *, is_silent: bool) -> Status:
-    verdict, c = _Verdict(), s.compensation
+    problems, c = Problems(), s.compensation
     if not s.connected or s.lost is not None or is_silent:
-        verdict.add(Level.NOT_POSSIBLE, "there are no new samples, see stream")
+        problems.append((Level.NOT_POSSIBLE, "there are no new samples, see stream"))
     elif c.why_stopped is not None:
         state = "has stopped" if c.has_subscribers else "could not be published if somebody subscribed"
-        verdict.add(Level.TROUBLE, f"wrench_compensated {state}: {c.why_stopped}")
+        problems.append((Level.TROUBLE, f"wrench_compensated {state}: {c.why_stopped}"))
     elif c.why_partly:
-        verdict.add(Level.TROUBLE, c.why_partly)
-    elif s.new_withheld:
-        verdict.add(Level.LOOK, f"{s.new_withheld} samples were not compensated{_why_withheld(s)}")
+        problems.append((Level.TROUBLE, c.why_partly))
+    elif (
+        c.source == "imu"
+        and c.payload.mass
+        and (s.flags.acceleration_saturated or s.flags.angular_rate_saturated)
+    ):
+        problems.append(
+            (
+                Level.LOOK,
+                "the IMU's range was exceeded, so wrench_compensated was wrong meanwhile: set "
+                "settings.acceleration_range_g and settings.angular_rate_range_dps higher",
+            )
+        )
+    elif s.new.uncompensated:
+        problems.append((Level.LOOK, f"{s.new.uncompensated} samples were not compensated{_why_withheld(s)}"))
     if c.problem:
-        verdict.add(Level.NOT_POSSIBLE if verdict.level is Level.NOT_POSSIBLE else Level.LOOK, c.problem)
-    return verdict.status("compensation", c.good, c.values)
+        is_stale = any(level is Level.NOT_POSSIBLE for level, _ in problems)
+        problems.append((Level.NOT_POSSIBLE if is_stale else Level.LOOK, c.problem))
+    return _status("compensation", problems, c.good, c.values)
 
 
 def _why_withheld(s: Snapshot) -> str:
     """What may have been the reason."""
     c, reasons = s.compensation, []
-    if c.stops_on_saturation and s.new_saturated:
+    if c.stops_on_saturation and s.new.saturated:
         reasons.append("because force or torque was saturated (on_saturation)")
     if c.payload.mass:
         reasons.append(f"for lack of a current orientation ({c.source})")

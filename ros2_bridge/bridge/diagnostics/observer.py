@@ -1,17 +1,16 @@
-"""Sums up what reader and server know into snapshots, and keeps what "since the last report" means."""
+"""Sums up what reader and server know into snapshots, and keeps what is new since the last report. No ROS."""
 
 from __future__ import annotations
 
-import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
-from bridge.diagnostics.compensation_state import CompensationState
-from bridge.stream.frame_selector import FrameCounts
 from bridge.stream.link import Link, SensorInfo
 from bridge.stream.reader import Reader
 from bridge.stream.watch import Flags
+from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
 from protocol.errors import ConnectionFailedError
 from protocol.health.judge import Observation, emergency
 from protocol.health.observer import p99
@@ -23,8 +22,109 @@ SLOW_ANSWER_S: Final = 2.0
 """A server that owes an answer for this time is stopped or overloaded."""
 
 
+class CompensationState(NamedTuple):
+    """How the compensation is at one moment."""
+
+    has_subscribers: bool = False
+    published: int = 0
+    withheld: int = 0
+    """Samples since the node started that were compensated, and that could not be."""
+    why_stopped: str | None = None
+    """Why the latest sample was not compensated, or would not be with a subscriber; None: it was."""
+    why_partly: str = ""
+    """Why single topics have stopped, a sentence; empty if none has."""
+    source: str = "none"
+    age_s: float = math.inf
+    """Of the orientation."""
+    bound: float | None = None
+    """N: in 95 % of cases the accelerometer's own errors are a smaller force; None where it is not used."""
+    payload: Payload = Payload()
+    bias: Wrench = NO_WRENCH
+    origin: str = "parameter"
+    """Where the bias comes from."""
+    is_ramping: bool = False
+    keep: bool = False
+    """Whether the bias is to survive a restart."""
+    stops_on_saturation: bool = False
+    problem: str = ""
+    """What is not as it should be, a sentence."""
+
+    @property
+    def good(self) -> str:
+        """What to say when all is well."""
+        parts = ["bias"] if self.bias != NO_WRENCH else []
+        if self.payload.mass:
+            parts += ["weight and inertia of the tool"] if self.source == "imu" else ["weight of the tool"]
+        if not parts:
+            text = "nothing is subtracted: there is no bias and no tool_mass"
+        else:
+            text = f"subtracted: {', '.join(parts)}"
+        return text if self.has_subscribers else f"{text}; nobody has subscribed"
+
+    @property
+    def values(self) -> dict[str, object]:
+        """By name."""
+        uses_source = bool(self.payload.mass) and self.has_subscribers
+        return {
+            "gravity_source": self.source,
+            "orientation_age_s": round(self.age_s, 4) if uses_source and math.isfinite(self.age_s) else "",
+            "accelerometer_force": "" if self.bound is None else round(self.bound, 3),
+            "tool_mass": round(self.payload.mass, 4),
+            "tool_center_of_gravity": _numbers(self.payload.center),
+            "tared": self.bias != NO_WRENCH,
+            "bias": _numbers(self.bias.values),
+            "bias_from": self.origin,
+            "bias_ramping": self.is_ramping,
+            "bias_keep": self.keep,
+            "subscribed": self.has_subscribers,
+            "compensated": self.published,
+            "withheld": self.withheld,
+        }
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:.4f}" for value in values)
+
+
+class Counts(NamedTuple):
+    """What was counted since the node and, of the server's, the server started, or in some time."""
+
+    connects: int = 0
+    samples: int = 0
+    lost: int = 0
+    """And withheld."""
+    stale: int = 0
+    limited: int = 0
+    repeated: int = 0
+    invalid: int = 0
+    not_finite: int = 0
+    saturated: int = 0
+    """Samples whose force or torque was saturated."""
+    uncompensated: int = 0
+    """Samples that could not be compensated."""
+    server_lost_samples: int = 0
+    server_not_finite: int = 0
+    server_recoveries: int = 0
+    server_missed_deadlines: int = 0
+
+    def with_server(self, status: Mapping[str, Any], position: int) -> Counts:
+        """With those of a `status` reply, of our sensor or of all; 0 for what it does not say."""
+        row = {**status, **row_of(status.get("sensors"), position)}
+        said = {name: row.get(name.removeprefix(_SERVER)) for name in _OF_SERVER}
+        return self._replace(**{name: value for name, value in said.items() if type(value) is int})
+
+    def since(self, then: Counts, *, same_server: bool) -> Counts:
+        """What was added since `then`; nothing of the server's unless it is the `same_server`."""
+        added = [max(now - before, 0) for now, before in zip(self, then, strict=True)]
+        return Counts(*(added if same_server else added[: -len(_OF_SERVER)]))
+
+
+_SERVER: Final = "server_"
+_OF_SERVER: Final = tuple(name for name in Counts._fields if name.startswith(_SERVER))
+
+
 class Snapshot(NamedTuple):
-    """What is known at one moment. "New" is since the last regular report."""
+    """What is known at one moment."""
 
     sensor: int
     address: str
@@ -34,8 +134,6 @@ class Snapshot(NamedTuple):
     """Whether there is a server there, connected or not."""
     connection_s: float
     """How long there has been, or has not been, a connection."""
-    connects: int
-    new_connects: int
     info: SensorInfo | None
     lost: str | None
     silent_s: float
@@ -45,51 +143,44 @@ class Snapshot(NamedTuple):
     expected_hz: float
     age_us: tuple[float, float] | None
     """p50 and p99; None without samples or where the server's clock is another machine's."""
-    counts: FrameCounts
-    new: FrameCounts
-    not_finite: int
-    new_not_finite: int
+    counts: Counts
+    new: Counts
+    """Since the last regular report."""
     flags: Flags
     temperature: float | None
     server: Mapping[str, Any]
     """The latest `status` reply of this connection; empty if there is none yet."""
-    new_server: ServerCounts
     answer_s: float
     """How long the server has owed an answer; 0 if it owes none."""
     settings: Mapping[str, object] = {}
     """The sensor's settings, as far as they are known."""
-    saturated: int = 0
-    new_saturated: int = 0
-    """Samples whose force or torque was saturated."""
     compensation: CompensationState = CompensationState()
-    new_withheld: int = 0
-    """Samples that could not be compensated."""
 
     @property
     def observation(self) -> Observation:
         """The same as every judge of a stream wants it."""
-        mode = mapping(self.server_row.get("clock")).get("mode")
+        mode, new = mapping(self.server_row.get("clock")).get("mode"), self.new
         return Observation(
             seconds=1.0,
-            samples=self.new.new,
-            lost=max(self.new.missing, self.new_server.lost_samples),
-            repeated=self.new.repeated,
-            invalid=self.new.invalid,
+            samples=new.samples,
+            lost=max(new.lost, new.server_lost_samples),
+            repeated=new.repeated,
+            invalid=new.invalid,
             silent_s=self.silent_s,
             rate_hz=self.rate_hz,
             nominal_hz=self.expected_hz,
             age_p99_us=None if self.age_us is None else self.age_us[1],
             # The node checks those that it publishes, the server all.
-            not_finite=max(self.new_not_finite, self.new_server.not_finite),
+            not_finite=max(new.not_finite, new.server_not_finite),
             warnings=self.flags.warnings,
             force_torque_saturated=self.flags.force_torque_saturated,
             acceleration_saturated=self.flags.acceleration_saturated,
             angular_rate_saturated=self.flags.angular_rate_saturated,
             temperature=self.temperature,
             locked=None if mode is None else mode == "locked",
-            recoveries=self.new_server.recoveries,
-            missed_deadlines=self.new_server.missed_deadlines,
-            reconnects=self.new_connects if self.connects > 1 else 0,
+            recoveries=new.server_recoveries,
+            missed_deadlines=new.server_missed_deadlines,
+            reconnects=new.connects if self.counts.connects > 1 else 0,
             is_lost=self.lost is not None,
             state="?" if self.info is None else self.info.state,
             server_silent=self.answer_s > SLOW_ANSWER_S / 2,
@@ -111,27 +202,6 @@ def mapping(value: object) -> Mapping[str, Any]:
 def row_of(rows: object, position: int) -> Mapping[str, Any]:
     """The object at `position` of a JSON list; empty if there is none."""
     return mapping(rows[position] if isinstance(rows, list) and position < len(rows) else None)
-
-
-class ServerCounts(NamedTuple):
-    """What the server itself has counted, of our sensor or at all, by the names in `status`."""
-
-    lost_samples: int = 0
-    not_finite: int = 0
-    recoveries: int = 0
-    missed_deadlines: int = 0
-
-    @classmethod
-    def of(cls, status: Mapping[str, Any], position: int) -> ServerCounts:
-        """Those in a `status` reply; 0 for what it does not say."""
-        row = {**status, **row_of(status.get("sensors"), position)}
-        return cls(*(value if type(value := row.get(name)) is int else 0 for name in cls._fields))
-
-    def since(self, then: ServerCounts | None) -> ServerCounts:
-        """What was added since `then`, if that is known."""
-        if then is None:
-            return ServerCounts()
-        return ServerCounts(*(max(now - before, 0) for now, before in zip(self, then, strict=True)))
 
 
 class ServerStatus:
@@ -190,9 +260,8 @@ class Observer:
         """The last number of fresh samples, when it changed, and the link's epoch."""
         self._rate_fresh, self._rate_s, self._rate_ns = 0, self._fresh_s, -1
         """Where the rate is measured from: samples, time here, and the newest one's stamp."""
-        self._then, self._then_not_finite = FrameCounts(), 0
-        self._then_connects = self._then_withheld = self._then_saturated = 0
-        self._then_server: ServerCounts | None = None
+        self._then, self._same_server = Counts(), False
+        """As of the last regular report, and whether the server's counts are in it."""
 
     def look(self, now_s: float) -> Snapshot:
         """How things are now."""
@@ -200,17 +269,18 @@ class Observer:
         described = self._poll.collect(link)
         if described is not None:
             link.described(described)
-        counts = dataclasses.replace(reader.counts)
+        status, compensation, seen = self._poll.status, self._compensation(), reader.counts
+        counts = Counts(
+            link.connects, seen.new, seen.missing, seen.stale, seen.limited, seen.repeated, seen.invalid,
+            reader.not_finite, reader.watch.saturated, compensation.withheld,
+        ).with_server(status, link.sensor)  # fmt: skip
         if link.epoch != self._epoch:
             self._epoch, self._rate_hz = link.epoch, None
-            self._rate_fresh, self._rate_s, self._rate_ns = counts.new, now_s, reader.newest_ns
-        if counts.new != self._fresh:
-            self._fresh, self._fresh_s = counts.new, now_s
+            self._rate_fresh, self._rate_s, self._rate_ns = counts.samples, now_s, reader.newest_ns
+        if counts.samples != self._fresh:
+            self._fresh, self._fresh_s = counts.samples, now_s
         self._flags = self._flags.merge(reader.watch.take_flags())
-        status = self._poll.status
-        counted = ServerCounts.of(status, link.sensor).since(self._then_server) if status else ServerCounts()
-        silent_since_s = max(self._fresh_s, link.since_s)
-        sample, compensation = reader.watch.sample, self._compensation()
+        sample = reader.watch.sample
         return Snapshot(
             sensor=link.sensor,
             address=link.address,
@@ -218,28 +288,20 @@ class Observer:
             problem=link.problem,
             is_reachable=link.is_reachable,
             connection_s=now_s - link.since_s,
-            connects=link.connects,
-            new_connects=link.connects - self._then_connects,
             info=link.info,
             lost=link.lost,
-            silent_s=max(now_s - silent_since_s, 0.0),
+            silent_s=max(now_s - max(self._fresh_s, link.since_s), 0.0),
             rate_hz=self._rate_hz,
             expected_hz=link.rate_hz,
             age_us=self._age_us,
             counts=counts,
-            new=_difference(counts, self._then),
-            not_finite=reader.not_finite,
-            new_not_finite=reader.not_finite - self._then_not_finite,
+            new=counts.since(self._then, same_server=self._same_server and bool(status)),
             flags=self._flags,
             temperature=None if sample is None else sample.temperature,
             server=status,
-            new_server=counted,
             answer_s=self._poll.owed_s(now_s),
             settings=link.settings,
-            saturated=reader.watch.saturated,
-            new_saturated=reader.watch.saturated - self._then_saturated,
             compensation=compensation,
-            new_withheld=compensation.withheld - self._then_withheld,
         )
 
     def measure(self, now_s: float) -> None:
@@ -260,20 +322,10 @@ class Observer:
     def begin_interval(self, reported: Snapshot, now_s: float) -> None:
         """`reported` was a regular report: what is new counts from there on. Asks the server again."""
         self._flags = Flags()
-        self._then, self._then_not_finite = reported.counts, reported.not_finite
-        self._then_connects, self._then_withheld = reported.connects, reported.compensation.withheld
-        self._then_saturated = reported.saturated
-        if reported.server:
-            self._then_server = ServerCounts.of(reported.server, self._link.sensor)
-        elif not reported.connected:
-            self._then_server = None  # the next server counts from 0
+        counts = reported.counts
+        if not reported.server:  # what it had counted before is still known, unless it is another one then
+            of_server = zip(_OF_SERVER, self._then[-len(_OF_SERVER) :], strict=True)
+            counts = counts._replace(**dict(of_server))
+        self._then = counts
+        self._same_server = bool(reported.server) or (self._same_server and reported.connected)
         self._poll.ask(now_s)
-
-
-def _difference(now: FrameCounts, then: FrameCounts) -> FrameCounts:
-    return FrameCounts(
-        **{
-            field.name: getattr(now, field.name) - getattr(then, field.name)
-            for field in dataclasses.fields(FrameCounts)
-        }
-    )

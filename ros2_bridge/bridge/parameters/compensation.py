@@ -5,7 +5,6 @@ All can be set while the node runs. A wrong value is refused with a sentence and
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
@@ -17,23 +16,24 @@ from ft_compensation.quantities import (
     ZERO,
     Accelerometer,
     Payload,
+    Quaternion,
     Wrench,
     length,
+    unit_quaternion,
 )
 from ft_compensation.stationary_limits import StationaryLimits
 from protocol.pdo import Vector3
 
-Quaternion = tuple[float, float, float, float]
 AUTO: Final = "auto"
 """The value of a path that is for the node to choose."""
 TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
-SOURCES: Final = ("none", "accelerometer", "sensor", *TOPIC_SOURCES, "tf")
+SOURCES: Final = ("none", "imu", *TOPIC_SOURCES, "tf")
 _LEAST_GRAVITY: Final = 0.1
 _LEAST_SCALE: Final = 0.5
 _REST: Final = StationaryLimits()
 
 _TABLE: Final = (
-    Row("tool_mass", 0.0, "Mass of what hangs on the sensor, kg; 0 = gravity is not compensated", 0, 1000),
+    Row("tool_mass", 0.0, "Mass of what hangs on the sensor, kg; 0 = it is not compensated", 0, 1000),
     Row("tool_center_of_gravity", ZERO, "Its center of gravity in frame_id, m", 0, 10, lengths=(3,)),
     Row("gravity", DEFAULT_GRAVITY,
         "Gravity, m/s², in the base frame: that of the orientations", 0, 100, lengths=(3,)),
@@ -43,28 +43,20 @@ _TABLE: Final = (
     Row("bias_keep", False, "Whether the bias is kept across restarts, by the sensor's serial number"),
     Row("bias_directory", AUTO,
         "Where it is kept; auto = bota-ethercat-bridge in $XDG_STATE_HOME or ~/.local/state"),
-    Row("compensate_inertia", False, "Whether the inertial force of the tool is subtracted too"),
     Row("imu_position", ZERO,
-        "Position of the IMU in frame_id, m, for compensate_inertia", 0, 1, lengths=(3,)),
+        "Position of the IMU in frame_id, m; zeros = that of the sensor's model", 0, 1, lengths=(3,)),
     Row("on_saturation", "publish",
         "What wrench_compensated does on samples whose force or torque is saturated",
         choices=("publish", "stop")),
-    Row("orientation_source", "accelerometer",
-        "Source of the sensor's orientation; used only with a tool_mass", choices=SOURCES),
+    Row("gravity_source", "imu",
+        "Where the tool's weight is from: imu (with its inertia), or an orientation of the robot's",
+        choices=SOURCES),
     Row("orientation.topic", "orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}"),
     Row("orientation.base_frame", "base_link", "Frame that gravity is given in, for the source tf"),
     Row("orientation.mounting", (0.0, 0.0, 0.0, 1.0),
         "Quaternion x y z w: frame_id in the frame of the topic", 0, 1, lengths=(4,)),
     Row("orientation.stale_after", 0.1,
         "Largest difference of the stamps of orientation and sample, s", 0.001, 10),
-    Row("accelerometer.stale_after", 0.5,
-        "Longest gap between samples that the gyroscope bridges, s", 0.001, 10),
-    Row("accelerometer.time_constant", 0.5,
-        "Time constant of the trust in a steady accelerometer, s", 0.001, 60),
-    Row("accelerometer.gate", 0.5,
-        "Largest deviation of a usable 50 ms mean from the magnitude of gravity, m/s²", 0.01, 10),
-    Row("accelerometer.tilt_limit", 0.2,
-        "Stop while gravity may be tilted by more, rad; at the start by 3 degrees", 0.1, 3),
     Row("accelerometer.offset", ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
     Row("accelerometer.scale", EXACT.scale,
         "Its scale factors; ~/identify finds them", 0, 2, lengths=(3,)),
@@ -100,49 +92,30 @@ ROWS: Final = tuple(row._replace(live=True) for row in _TABLE)
 class OrientationParameters(NamedTuple):
     """Where the orientation comes from."""
 
-    source: str = "accelerometer"
-    topic: str = "orientation"
-    base_frame: str = "base_link"
-    mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
-    stale_after: float = 0.1
-
-
-class AccelerometerParameters(NamedTuple):
-    """How the accelerometer is made into an orientation."""
-
-    stale_after: float = 0.5
-    time_constant: float = 0.5
-    gate: float = 0.5
-    tilt_limit: float = 0.2
-    offset: Vector3 = EXACT.offset
-    scale: Vector3 = EXACT.scale
-    offset_interval: Vector3 = EXACT.offset_interval
-    scale_interval: Vector3 = EXACT.scale_interval
-
-    @property
-    def reading(self) -> Accelerometer:
-        """The correction of its readings."""
-        return Accelerometer(self.offset, self.scale, self.offset_interval, self.scale_interval)
+    source: str
+    topic: str
+    base_frame: str
+    mounting: Quaternion
+    stale_after: float
 
 
 class CompensationParameters(NamedTuple):
     """The values, checked."""
 
-    payload: Payload = Payload()
-    gravity: Vector3 = DEFAULT_GRAVITY
-    bias: Wrench = Wrench(ZERO, ZERO)
-    bias_ramp_time: float = 0.5
-    bias_keep: bool = False
-    bias_directory: str = AUTO
-    compensate_inertia: bool = False
-    imu_position: Vector3 = ZERO
-    on_saturation: str = "publish"
-    orientation: OrientationParameters = OrientationParameters()
-    accelerometer: AccelerometerParameters = AccelerometerParameters()
-    rest_duration: float = 1.0
-    rest: StationaryLimits = _REST
-    identify_file: str = AUTO
-    filter: FilterSettings = FilterSettings()
+    payload: Payload
+    gravity: Vector3
+    bias: Wrench
+    bias_ramp_time: float
+    bias_keep: bool
+    bias_directory: str
+    imu_position: Vector3
+    on_saturation: str
+    orientation: OrientationParameters
+    accelerometer: Accelerometer
+    rest_duration: float
+    rest: StationaryLimits
+    identify_file: str
+    filter: FilterSettings
 
 
 def gather(values: Mapping[str, Any]) -> CompensationParameters:
@@ -153,13 +126,10 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
             f"parameter gravity is {list(gravity)}: it must be at least {_LEAST_GRAVITY} m/s² long; for no "
             "compensation of gravity set tool_mass to 0"
         )
-    norm = math.sqrt(sum(part * part for part in mounting))
-    if abs(norm - 1.0) > 0.01:
-        raise ParameterError(
-            f"parameter orientation.mounting is {list(mounting)}: a rotation is a quaternion of length 1, "
-            f"this one's is {norm:g}"
-        )
-
+    try:
+        mounting = unit_quaternion(mounting)
+    except ValueError as error:
+        raise ParameterError(f"parameter orientation.mounting is {list(mounting)}: {error}") from None
     if min(values["accelerometer.scale"]) < _LEAST_SCALE:
         raise ParameterError(
             f"parameter accelerometer.scale is {list(values['accelerometer.scale'])}: each must be at least "
@@ -176,21 +146,19 @@ def gather(values: Mapping[str, Any]) -> CompensationParameters:
             raise ParameterError(
                 f"parameter {name} is {values[name]:g}: it must be 0, for none, or at least {least:g} Hz"
             )
-    orientation = group("orientation.") | {"mounting": tuple(part / norm for part in mounting)}
+    orientation = group("orientation.") | {"mounting": mounting}
+    names = set(CompensationParameters._fields) & values.keys() - {"bias"}
     return CompensationParameters(
+        **{name: values[name] for name in names},
         payload=Payload(values["tool_mass"], values["tool_center_of_gravity"]),
-        gravity=gravity,
         bias=Wrench.of(values["bias"]),
-        bias_ramp_time=values["bias_ramp_time"],
-        bias_keep=values["bias_keep"],
-        bias_directory=values["bias_directory"],
-        compensate_inertia=values["compensate_inertia"],
-        imu_position=values["imu_position"],
-        on_saturation=values["on_saturation"],
-        orientation=OrientationParameters(values["orientation_source"], **orientation),
-        accelerometer=AccelerometerParameters(**group("accelerometer.")),
+        orientation=OrientationParameters(values["gravity_source"], **orientation),
+        accelerometer=Accelerometer(**group("accelerometer.")),
         rest_duration=duration,
         rest=StationaryLimits(**rest),
         identify_file=values["identify.file"],
         filter=FilterSettings(**group("filter.")),
     )
+
+
+DEFAULTS: Final = gather({row.name: row.default for row in ROWS})

@@ -150,7 +150,8 @@ def _convert(parameters: Sequence[Parameter]) -> list[Parameter]:
 
 
 def _converted(parameter: Parameter) -> Parameter:
-    row = _LIVE.get(parameter.name)
-    value = parameter.value if row is None else row.convert(parameter.value)
-    # Only where it is another: rclpy cannot tell the type of an empty array.
-    return parameter if value is parameter.value else Parameter(parameter.name, value=value)
+    try:
+        value = _LIVE[parameter.name].check(parameter.value)
+    except (KeyError, ParameterError):  # of others, or refused soon, with a sentence
+        return parameter
+    return Parameter(parameter.name, value=[*value] if isinstance(value, tuple) else value)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from array import array
 from typing import Final, NamedTuple
 
 Numbers = tuple[float, ...]
@@ -43,16 +42,6 @@ class Row(NamedTuple):
         if checked is None:
             raise ParameterError(f"parameter {self.name} is {value!r}: it must be {self.allowed()}")
         return checked
-
-    def convert(self, value: object) -> object:
-        """`value` with whole numbers made into the floats that this row means; otherwise as it is."""
-        if isinstance(self.default, float) and type(value) is int:
-            return float(value)
-        if isinstance(self.default, tuple) and isinstance(value, list | tuple | array):
-            items = list(value)
-            if items and all(type(item) in (int, float) for item in items):
-                return [float(item) for item in items]
-        return value
 
     def _one(self, value: object) -> ParameterValue | None:
         wanted = type(self.default)

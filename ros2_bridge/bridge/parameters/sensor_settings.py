@@ -17,8 +17,7 @@ from rclpy.parameter import Parameter
 
 from bridge.parameters.declare import SETTINGS_PREFIX as PREFIX
 from bridge.parameters.row import ParameterError
-from bridge.stream.link import Link, RequestFailedError
-from bridge.stream.requests import CONFIGURE_TIMEOUT_S, Requests
+from bridge.stream.link import CONFIGURE_TIMEOUT_S, Link, RequestFailedError
 from protocol.errors import SettingError
 from protocol.settings import SETTINGS, Setting, SettingValue, check_settings
 
@@ -26,8 +25,8 @@ from protocol.settings import SETTINGS, Setting, SettingValue, check_settings
 class SettingsParameters:
     """Lives in the executor's thread, but for `changed`."""
 
-    def __init__(self, node: Node, link: Link, requests: Requests) -> None:
-        self._node, self._link, self._requests = node, link, requests
+    def __init__(self, node: Node, link: Link) -> None:
+        self._node, self._link = node, link
         self._wanted: dict[str, SettingValue] = {}
         """What this node's user gave at start or set since."""
         self._following = True
@@ -106,9 +105,7 @@ class SettingsParameters:
         return SetParametersResult(successful=True)
 
     def _configure(self, wanted: dict[str, SettingValue]) -> None:
-        reply = self._requests.ask(
-            "configure", CONFIGURE_TIMEOUT_S, sensor=self._link.sensor, settings=wanted
-        )
+        reply = self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=self._link.sensor, settings=wanted)
         in_force = reply.get("settings")
         in_force = in_force if isinstance(in_force, dict) else {}
         self._link.take_settings(reply)

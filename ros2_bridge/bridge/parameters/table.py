@@ -14,7 +14,7 @@ from bridge.parameters.compensation import CompensationParameters, gather
 from bridge.parameters.row import NO_TEXTS, Numbers, ParameterError, Row
 from bridge.parameters.wrench_frames import WrenchFrame, parse
 from protocol.client.real_time import HIGHEST_PRIORITY
-from protocol.health.limits import LIMITS, Limits
+from protocol.health.verdict import LIMITS, Limits
 from protocol.pdo import ImuUnits
 
 _UNKNOWN: Final = (0.0, 0.0, 0.0)
@@ -87,18 +87,18 @@ class Parameters(NamedTuple):
     publishing_frequency: float
     array_topic: str
     imu_units: ImuUnits
-    frame_id: str = "ft_sensor"
-    imu_frame_id: str = "ft_sensor_imu"
-    orientation_covariance: Numbers = _UNKNOWN
-    angular_velocity_covariance: Numbers = _UNKNOWN
-    linear_acceleration_covariance: Numbers = _UNKNOWN
-    temperature_variance: float = 0.0
-    wrench_frames: tuple[WrenchFrame, ...] = ()
-    limits: Limits = LIMITS
-    compensation: CompensationParameters = CompensationParameters()
+    frame_id: str
+    imu_frame_id: str
+    orientation_covariance: Numbers
+    angular_velocity_covariance: Numbers
+    linear_acceleration_covariance: Numbers
+    temperature_variance: float
+    wrench_frames: tuple[WrenchFrame, ...]
+    limits: Limits
+    compensation: CompensationParameters
     """As they are at start."""
-    rt_priority: int = 0
-    cpu: int = -1
+    rt_priority: int
+    cpu: int
 
 
 def gather_all(values: dict[str, Any]) -> Parameters:
@@ -124,3 +124,6 @@ def gather_all(values: dict[str, Any]) -> Parameters:
     return Parameters(
         **values, imu_units=units, wrench_frames=frames, limits=limits, compensation=compensation
     )
+
+
+DEFAULTS: Final = gather_all({row.name: row.default for row in PARAMETERS})

@@ -1,4 +1,4 @@
-"""`wrench_compensated` and what was subtracted, a topic each: the compensation as the reader runs it. No ROS.
+"""`wrench_compensated` and what was subtracted, a topic each: the compensation as the reader runs it.
 
 The reader calls `publish` for every selected sample, but only while somebody has subscribed or a window is
 open. What it goes by is a `Plan`, which the executor's thread replaces as a whole: there are no locks.
@@ -6,24 +6,22 @@ open. What it goes by is a `Plan`, which the executor's thread replaces as a who
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import NamedTuple
 
-from bridge.compensating.gravity_sources import NoSource, Source
+from bridge.compensating.tool_sources import Source
 from bridge.parameters.compensation import CompensationParameters
+from bridge.publishing.filtered_wrench import FilteredTopic
+from bridge.publishing.messages import StageTopic
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
-from ft_compensation.stationary import StationaryMeans, StationaryWindow
+from ft_compensation.stationary import StationaryWindow
 from ft_compensation.stationary_limits import StationaryLimits
 from protocol.framing import DataMessage
 from protocol.pdo import Sample, Vector3
-
-_BEGINS_S: Final = 1.0
-"""How long gravity may be unknown after a start before it is an error."""
 
 
 class Plan(NamedTuple):
@@ -32,84 +30,40 @@ class Plan(NamedTuple):
     source: Source
     compensator: Compensator
     ramp: BiasRamp
-    needs_gravity: bool
+    has_tool: bool
     """Whether anything has weight."""
     watch: PayloadWatch | None = None
     """Checks now and then whether the payload is still the one that is compensated."""
 
 
-class RestWindow:
-    """Samples of some time at rest, and where gravity pointed meanwhile."""
+class RestWindow(StationaryWindow):
+    """Samples of some time at rest, and the specific force meanwhile."""
 
     def __init__(self, seconds: float, limits: StationaryLimits, source: Source) -> None:
+        super().__init__(seconds, limits)
         self.source = source
         self.done = threading.Event()
-        self._window = StationaryWindow(seconds, limits)
-        self._fewest = limits.least_samples
-        self._gravity = ZERO
-        self._count = 0
-        self._blind: str | None = None
+        self._sum, self._felt = ZERO, 0
+        self._blind = ""
 
-    def add(self, sample: Sample, time_s: float, stamp_s: float, gravity: Vector3 | None) -> bool:
-        """Take a sample, for the reader. True: the window is complete."""
-        if gravity is not None:
-            (x, y, z), (gx, gy, gz) = self._gravity, gravity
-            self._gravity = (x + gx, y + gy, z + gz)
-            self._count += 1
-        elif self._blind is None:
-            self._blind = self.source.why_none(time_s, stamp_s)
-        window = self._window
-        # Too few samples, as of a slow sensor or a busy machine, make it longer.
-        if not window.add(sample, time_s) or not (window.count >= self._fewest or window.spoiled):
-            return False
-        self.done.set()
-        return True
+    def take(self, sample: Sample, time_s: float, stamp_s: float, felt: Vector3 | None) -> bool:
+        """Take a sample and its specific force, for the reader. True: the window is complete."""
+        if felt is None:
+            self._blind = self._blind or self.source.why_none(sample, stamp_s) or "not in every sample"
+        else:
+            (x, y, z), (fx, fy, fz) = self._sum, felt
+            self._sum = (x + fx, y + fy, z + fz)
+            self._felt += 1
+        if self.add(sample, time_s):
+            self.done.set()
+        return self.done.is_set()
 
-    @property
-    def count(self) -> int:
-        """Samples so far."""
-        return self._window.count
-
-    def means(self) -> StationaryMeans:
-        """What was read; CompensationError if the sensor did not rest."""
-        return self._window.means()
-
-    def gravity(self) -> Vector3 | None:
-        """Mean gravity in the sensor's frame, m/s²; None: from the means' own acceleration.
-
-        CompensationError if it was not known all the time.
-        """
-        if self.source.is_accelerometer:
-            return None
-        if self._blind is not None:
-            raise CompensationError(f"the orientation is not known: {self._blind}")
-        x, y, z = self._gravity
-        return x / self._count, y / self._count, z / self._count
-
-
-class StageTopic(Protocol):
-    """One stage of the compensation as a topic, as it is or worked on: `publishing.messages.StageTopic`."""
-
-    index: int
-    """Of the stage in `Stages`."""
-    takes_all: bool
-    """Whether it also needs samples that are not published: `note`."""
-
-    @property
-    def problem(self) -> str:
-        """Why it publishes nothing, a sentence; "" if it does."""
-
-    def is_wanted(self) -> bool:
-        """Whether anybody has subscribed."""
-
-    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
-        """Publish a force and a torque."""
-
-    def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
-        """Take a sample that `publishing_frequency` leaves out."""
-
-    def tune(self, parameters: CompensationParameters) -> None:
-        """Take other parameters; for the executor's thread."""
+    def specific_force(self) -> Vector3:
+        """Its mean in the sensor's frame, m/s²; CompensationError if it was not known all the time."""
+        if self._blind or not self._felt:
+            raise CompensationError(f"the weight of the tool is not known: {self._blind or 'no sample came'}")
+        x, y, z = self._sum
+        return x / self._felt, y / self._felt, z / self._felt
 
 
 class CompensatedOutput:
@@ -117,34 +71,32 @@ class CompensatedOutput:
 
     fields = ("force", "torque")
 
-    def __init__(self, topics: Sequence[StageTopic]) -> None:
+    def __init__(self, topics: Sequence[StageTopic | FilteredTopic]) -> None:
         self._all = topics
-        self._wanted: tuple[StageTopic, ...] = ()
-        self._noting: tuple[StageTopic, ...] = ()
-        self.plan = Plan(NoSource(), Compensator(), BiasRamp(), needs_gravity=False)
+        self._wanted: tuple[StageTopic | FilteredTopic, ...] = ()
+        self._noting: tuple[StageTopic | FilteredTopic, ...] = ()
+        self.plan = Plan(Source(), Compensator(), BiasRamp(), has_tool=False)
         self.window: RestWindow | None = None
         """The one that is open."""
         self.hold: str | None = None
         """Why nothing may be published for now, whatever else is known."""
         self.stops_on_saturation = self.is_saturated = False
         """Whether saturated samples are not published, and whether the latest was one of them."""
-        self.broken: str | None = None
-        """What of the latest sample cannot be used although gravity is known; a sentence."""
         self.published = self.withheld = 0
-        """Samples since the node started that were compensated, and that were not, but for the beginning."""
+        """Samples since the node started that were compensated, and that were not."""
         self.is_stopped = False
-        """Whether the latest could not be compensated; at the start, whether for long."""
-        self._begins_s = math.inf
-        """Time of a subscription after which nothing was published yet, s; infinite: unknown."""
+        """Whether the latest could not be compensated."""
+        self.sample: Sample | None = None
+        """The latest that came here."""
         self.time_s = self.stamp_s = 0.0
-        """The latest sample's, seconds: by the server's monotonic clock, and since the Unix epoch."""
+        """Its time, s: by the server's monotonic clock, and since the Unix epoch."""
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed to any of the topics, or a window is open."""
         self._wanted = tuple(topic for topic in self._all if topic.is_wanted())
         self._noting = tuple(topic for topic in self._wanted if topic.takes_all)
         if not self._wanted:
-            self.is_stopped, self._begins_s = False, math.inf  # nobody misses anything
+            self.is_stopped = False  # nobody misses anything
         return bool(self._wanted) or self.window is not None
 
     @property
@@ -158,65 +110,53 @@ class CompensatedOutput:
         return "; ".join(topic.problem for topic in self._wanted if topic.problem)
 
     def tune(self, parameters: CompensationParameters) -> None:
-        """Take what parameters say of single topics; for the executor's thread."""
+        """Take what parameters say of the topics; for the executor's thread."""
+        self.stops_on_saturation = parameters.on_saturation == "stop"
         for topic in self._all:
             topic.tune(parameters)
 
     def follow(self, sample: Sample, frame: DataMessage) -> None:
         """Give source, open window and filters a sample that is not published."""
         plan = self.plan
-        gravity = self._gravity(plan, sample, frame)
-        if self._noting and gravity is not None and self.hold is None and not self._unusable(plan, sample):
-            stages = self._stages(plan, sample, gravity, self.time_s)
+        felt = self._felt(plan, sample, frame)
+        if self._noting and felt is not None and self.hold is None:
+            stages = self._stages(plan, sample, felt, self.time_s)
             for topic in self._noting:
                 topic.note(*stages[topic.index], frame)
 
-    def _gravity(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
-        """Gravity as far as it is needed, None if it is not known; the open window takes the sample in."""
-        self.time_s, self.stamp_s = time_s, stamp_s = frame.monotonic_ns * 1e-9, frame.stamp_ns * 1e-9
+    def _felt(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
+        """The specific force as far as it is needed, None if it is not known; the window takes the sample."""
+        self.sample, time_s, stamp_s = sample, frame.monotonic_ns * 1e-9, frame.stamp_ns * 1e-9
+        self.time_s, self.stamp_s = time_s, stamp_s
         window = self.window
-        gravity: Vector3 | None = ZERO
-        if plan.needs_gravity or window is not None:
-            gravity = plan.source.gravity(sample, time_s, stamp_s)
-            if window is not None and window.add(sample, time_s, stamp_s, gravity):
-                self.window = None
-            if not plan.needs_gravity:
-                gravity = ZERO
-        return gravity
+        if not plan.has_tool and window is None:
+            return ZERO
+        felt = plan.source.specific_force(sample, time_s, stamp_s)
+        if window is not None and window.take(sample, time_s, stamp_s, felt):
+            self.window = None
+        return felt if plan.has_tool else ZERO
 
     def publish(self, sample: Sample, frame: DataMessage) -> None:
-        """Compensate a sample and publish its stages; nothing if gravity is needed and not known."""
+        """Compensate a sample and publish its stages; nothing if the tool's weight is not known."""
         plan = self.plan
-        gravity = self._gravity(plan, sample, frame)
+        felt = self._felt(plan, sample, frame)
         time_s = self.time_s
         self.is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
-        self.broken = self._unusable(plan, sample)
-        if gravity is None or self.hold is not None or self.is_saturated or self.broken is not None:
-            self._begins_s = min(self._begins_s, time_s)
-            is_new = gravity is None and 0.0 <= time_s - self._begins_s <= _BEGINS_S
-            self.is_stopped = not is_new
-            self.withheld += not is_new
+        if felt is None or self.hold is not None or self.is_saturated:
+            self.is_stopped = True
+            self.withheld += 1
             return
-        self.is_stopped, self._begins_s = False, -math.inf
-        stages = self._stages(plan, sample, gravity, time_s)
+        self.is_stopped = False
+        stages = self._stages(plan, sample, felt, time_s)
         if (watch := plan.watch) is not None and watch.is_due(time_s):
+            gravity = -felt[0], -felt[1], -felt[2]
             watch.look(stages.final.force, gravity, sample.angular_rate, time_s)
         for topic in self._wanted:
             topic.send(*stages[topic.index], frame)
         self.published += 1
 
     @staticmethod
-    def _unusable(plan: Plan, sample: Sample) -> str | None:
-        if plan.compensator.inertia and not math.isfinite(
-            sum(sample.acceleration) + sum(sample.angular_rate)
-        ):
-            return "the IMU, which compensate_inertia needs, sends NaN or infinity: see the status stream"
-        return None
-
-    @staticmethod
-    def _stages(plan: Plan, sample: Sample, gravity: Vector3, time_s: float) -> Stages:
+    def _stages(plan: Plan, sample: Sample, felt: Vector3, time_s: float) -> Stages:
         compensator = plan.compensator
         compensator.set_bias(plan.ramp.at(time_s))
-        return compensator.compensate(
-            sample.force, sample.torque, gravity, sample.acceleration, sample.angular_rate
-        )
+        return compensator.compensate(sample.force, sample.torque, felt)

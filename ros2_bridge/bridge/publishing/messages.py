@@ -1,7 +1,7 @@
 """The ROS messages, which are published in serialized form.
 
 An output's `publish` runs in the reader's thread, for every selected sample and only while somebody has
-subscribed, so it must not block and should not allocate. `topics` lists them.
+subscribed, so it must not block and should not allocate.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Temperature
+from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from bridge.parameters.compensation import CompensationParameters
+from bridge.parameters.row import Numbers
 from bridge.parameters.table import Parameters
 from ft_compensation.compensator import Stages
 from protocol.cdr import StampedNumbers
@@ -30,6 +31,8 @@ from protocol.pdo import Sample, Vector3
 ARRAY_LABEL: Final = "Fx Fy Fz Mx My Mz Ax Ay Az Rx Ry Rz"
 """The label of the array's one dimension: what its values are, in order."""
 ARRAY_SIZE: Final = len(ARRAY_LABEL.split())
+_NO_ORIENTATION: Final = (-1.0, *(0.0,) * 8)
+"""REP 145: the covariance of a missing orientation."""
 _DEPTH: Final = 10
 """Short: what a subscriber is too slow for is replaced by newer samples."""
 
@@ -164,9 +167,55 @@ class StageTopic(WrenchTopic):
 
 def make_stages(node: Node, frame_id: str) -> list[StageTopic]:
     """The topics of the compensation."""
-    stages = ("final", "bias", "gravity", "inertia")
-    names = ("wrench_compensated", "compensation/bias", "compensation/gravity", "compensation/inertia")
-    return [StageTopic(node, name, frame_id, stage) for name, stage in zip(names, stages, strict=True)]
+    stages = {"wrench_compensated": "final", "compensation/bias": "bias", "compensation/tool": "tool"}
+    return [StageTopic(node, name, frame_id, stage) for name, stage in stages.items()]
+
+
+class RawImuOutput(Topic):
+    """`imu/data_raw`: `sensor_msgs/Imu`, m/s² and rad/s."""
+
+    name = "imu/data_raw"
+    fields: tuple[str, ...] = ("acceleration", "angular_rate")
+
+    def __init__(self, node: Node, parameters: Parameters) -> None:
+        super().__init__(node, Imu, self.name)
+        self._pack = StampedNumbers(parameters.imu_frame_id, 37).pack
+        self.configure(parameters)
+
+    def configure(self, parameters: Parameters) -> None:
+        """Take these covariances, from any thread."""
+        self._covariances = (
+            _covariance(parameters.orientation_covariance),
+            _covariance(parameters.angular_velocity_covariance),
+            _covariance(parameters.linear_acceleration_covariance),
+        )
+
+    def publish(self, sample: Sample, frame: DataMessage) -> None:
+        """Publish acceleration and angular rate."""
+        self._send(sample, frame, (0.0, 0.0, 0.0, 1.0), _NO_ORIENTATION)
+
+    def _send(
+        self, sample: Sample, frame: DataMessage, orientation: Sequence[float], covariance: Sequence[float]
+    ) -> None:
+        _, of_rate, of_acceleration = self._covariances
+        self._publish(
+            self._pack(
+                frame.stamp_ns, *orientation, *covariance,
+                *sample.angular_rate, *of_rate, *sample.acceleration, *of_acceleration,
+            )
+        )  # fmt: skip
+
+
+class ImuOutput(RawImuOutput):
+    """`imu/data`: the same with the sensor's own estimate of its orientation; nothing where there is none."""
+
+    name = "imu/data"
+    fields = (*RawImuOutput.fields, "orientation")
+
+    def publish(self, sample: Sample, frame: DataMessage) -> None:
+        """Publish acceleration, angular rate and orientation."""
+        if sample.orientation is not None:
+            self._send(sample, frame, sample.orientation, self._covariances[0])
 
 
 class TemperatureOutput(Topic):
@@ -192,3 +241,10 @@ def _is_finite(value: float | Sequence[float] | None) -> bool:
     if value is None:
         return True
     return math.isfinite(sum(value) if isinstance(value, Sequence) else value)
+
+
+def _covariance(values: Numbers) -> Numbers:
+    """Nine numbers, row by row, from nine or from three variances."""
+    if len(values) == 9:
+        return values
+    return tuple(values[position // 4] if position % 4 == 0 else 0.0 for position in range(9))

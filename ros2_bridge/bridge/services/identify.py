@@ -9,12 +9,11 @@ from rclpy.node import Node
 from bridge.compensating.bias_keeper import directory_of, expand
 from bridge.compensating.control import CompensationControl
 from bridge.parameters.compensation import AUTO
-from bridge.services.triggers import create_triggers
-from bridge.services.window import take_window
-from bridge.stream.requests import Requests
+from bridge.services.bias import take_window
+from bridge.services.sensor import create_triggers
 from ft_compensation.identification.parameter_file import write_yaml
-from ft_compensation.identification.payload import Identified
-from ft_compensation.identification.session import IdentificationSession, accelerometer_text, summary
+from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
+from ft_compensation.identification.poses import Pose, coverage, pose_of
 from ft_compensation.quantities import CompensationError, length, wrench_text
 from protocol.errors import FileError
 
@@ -22,11 +21,12 @@ from protocol.errors import FileError
 class IdentifyServices:
     """One identification at a time. A pose blocks the executor for `rest.duration`, and never the stream."""
 
-    def __init__(self, node: Node, control: CompensationControl, requests: Requests) -> None:
-        self._control, self._requests, self._log = control, requests, node.get_logger()
-        self._session: IdentificationSession | None = None
+    def __init__(self, node: Node, control: CompensationControl) -> None:
+        self._control, self._log = control, node.get_logger()
+        self._poses: list[Pose] | None = None
+        """Those taken so far; None: no identification was started."""
         self._sensor = self._sensor_now()
-        """As of the session's start."""
+        """As of its start."""
         self._result: Identified | None = None
         """The latest solution, of the current poses."""
         acts = {
@@ -41,41 +41,46 @@ class IdentifyServices:
 
     def _start(self) -> str:
         if self._control.parameters.orientation.source == "none":
-            raise CompensationError(
-                "orientation_source is none, so a pose says nothing: set it first (accelerometer needs "
-                "nothing but the sensor)"
-            )
-        before = f", the {len(self._session.poses)} poses before are dropped" if self._session else ""
-        self._session = IdentificationSession(length(self._control.parameters.gravity))
+            raise CompensationError("gravity_source is none, so a pose says nothing: set it, such as to imu")
+        before = "" if self._poses is None else f", the {len(self._poses)} poses before are dropped"
+        self._poses, self._result = [], None
         self._sensor = self._sensor_now()
-        self._result = None
         return self._said(
             f"identification started{before}; gravity is known by {self._control.source.describe}; "
-            f"{self._session.coverage.next_pose}, hold it still with nothing touching the tool, and call "
+            f"{coverage([]).next_pose}, hold it still with nothing touching the tool, and call "
             "identify/add_pose"
         )
 
     def _add_pose(self) -> str:
-        session = self._started()
-        window = take_window(self._control, self._requests, needs_gravity=True)
+        poses = self._started()
+        window = take_window(self._control, needs_tool=True)
         means = window.means()
-        text = session.add(means, window.gravity())
+        x, y, z = window.specific_force()
+        magnitude = length(self._control.parameters.gravity)
+        poses.append(pose_of(means, None if window.source.is_imu else (-x, -y, -z), magnitude))
         self._result = None
-        return self._said(text)
+        x, y, z = (round(part, 2) + 0.0 for part in poses[-1].up)
+        return self._said(
+            f"pose {len(poses)} taken (up is {x:.2f}, {y:.2f}, {z:.2f} in the sensor's frame); "
+            f"{coverage(poses).advice}"
+        )
 
     def _drop_pose(self) -> str:
-        text = self._started().drop()
+        poses = self._started()
+        if not poses:
+            raise CompensationError("there is no pose to take back")
+        poses.pop()
         self._result = None
-        return self._said(text)
+        return self._said(f"the pose is dropped, {len(poses)} are left; {coverage(poses).advice}")
 
     def _solve(self) -> str:
-        result = self._result = self._started().solve()
+        result = self._result = identify(self._started())
         parts = [summary(result), *details(result)]
         parts.append(f"{self._write(result, parts)}; identify/apply puts it in force")
         return self._said(". ".join(parts))
 
     def _apply(self) -> str:
-        if self._session is not None:
+        if self._poses is not None:
             self._started()
         result = self._result
         if result is None:
@@ -91,24 +96,22 @@ class IdentifyServices:
         )
 
     def _cancel(self) -> str:
-        session = self._started()
-        self._session = self._result = None
-        return self._said(
-            f"identification cancelled, {len(session.poses)} poses dropped; nothing was changed"
-        )
+        poses = self._started()
+        self._poses = self._result = None
+        return self._said(f"identification cancelled, {len(poses)} poses dropped; nothing was changed")
 
-    def _started(self) -> IdentificationSession:
-        if self._session is not None and self._sensor != (now := self._sensor_now()):
-            self._session = self._result = None
+    def _started(self) -> list[Pose]:
+        if self._poses is not None and self._sensor != (now := self._sensor_now()):
+            self._poses = self._result = None
             what = (
                 "the sensor's own offset was changed"
                 if now[0] == self._sensor[0]
                 else "another sensor is there now"
             )
             raise CompensationError(f"{what}, so the previous poses were dropped: call identify/start again")
-        if self._session is None:
+        if self._poses is None:
             raise CompensationError("no identification was started: call identify/start first")
-        return self._session
+        return self._poses
 
     def _sensor_now(self) -> tuple[int, object]:
         """What all poses must share: the sensor and its own offset."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 from rclpy.node import Node
+from std_srvs.srv import Trigger
 
 from bridge.parameters.sensor_settings import SettingsParameters
-from bridge.services.triggers import create_triggers
-from bridge.stream.link import Link, RequestFailedError, find_sensor
-from bridge.stream.requests import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, Requests
-from ft_compensation.quantities import AXES
+from bridge.stream.link import CONFIGURE_TIMEOUT_S, DESCRIBE_TIMEOUT_S, Link, RequestFailedError, find_sensor
+from ft_compensation.quantities import Wrench, wrench_text
 
 _TARE_S: Final = 0.5
 """How long a tare averages."""
@@ -22,6 +21,23 @@ _TARE_PATIENCE: Final = 6.0
 _TARE_EXTRA_S: Final = 4.0
 
 
+def create_triggers(node: Node, acts: Mapping[str, Callable[[], str]], failure: type[Exception]) -> None:
+    """A service `~/NAME` for each act, which returns what it did; a `failure` says why it was not done."""
+    for name, act in acts.items():
+
+        def answer(_request: Any, response: Any, name: str = name, act: Callable[[], str] = act) -> Any:
+            try:
+                response.message = act()
+                response.success = True
+            except failure as error:
+                response.message = str(error)
+                response.success = False
+                node.get_logger().warning(f"{name} failed: {error}")
+            return response
+
+        node.create_service(Trigger, f"~/{name}", answer)
+
+
 class Services:
     """Each blocks the executor until the server has answered or a time-out, and never the stream."""
 
@@ -29,13 +45,12 @@ class Services:
         self,
         node: Node,
         link: Link,
-        requests: Requests,
         settings: SettingsParameters,
         after_tare: Callable[[], str],
     ) -> None:
         """`after_tare` says what a new offset in the sensor means for the rest of the node; "" if nothing."""
         self._after_tare = after_tare
-        self._link, self._requests, self._log = link, requests, node.get_logger()
+        self._link, self._log = link, node.get_logger()
         self._settings = settings
         acts = {
             "sensor_tare": self._sensor_tare,
@@ -49,17 +64,17 @@ class Services:
         rate_hz = self._link.rate_hz or 800.0
         samples = min(max(round(_TARE_S * rate_hz), _FEWEST_SAMPLES), _MOST_SAMPLES)
         timeout_s = _TARE_EXTRA_S + _TARE_PATIENCE * samples / rate_hz
-        reply = self._requests.ask("tare", timeout_s, sensor=self._link.sensor, samples=samples)
+        reply = self._link.ask("tare", timeout_s, sensor=self._link.sensor, samples=samples)
         titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
         parts = [f"{title} {_wrench_text(reply.get(key))}" for key, title in titles]
-        text = f"sensor {self._link.sensor} tared (N, Nm): " + "; ".join(parts)
+        text = f"sensor {self._link.sensor} tared: " + "; ".join(parts)
         if also := self._after_tare():
             text += f". {also}"
         self._log.info(text)
         return text
 
     def _get_settings(self) -> str:
-        reply = self._requests.ask("describe", DESCRIBE_TIMEOUT_S)
+        reply = self._link.ask("describe", DESCRIBE_TIMEOUT_S)
         info = find_sensor(reply, self._link.sensor)
         return json.dumps({**info.settings, "rate_hz": info.rate})
 
@@ -77,7 +92,7 @@ class Services:
                 f"{self._link.address}, or the sensor has none"
             )
         name, value = setting
-        self._requests.ask(
+        self._link.ask(
             "configure", CONFIGURE_TIMEOUT_S, sensor=self._link.sensor, settings={name: value}, save=True
         )
         text = f"sensor {self._link.sensor} keeps its settings and offset in its flash now"
@@ -86,6 +101,7 @@ class Services:
 
 
 def _wrench_text(values: object) -> str:
-    if not isinstance(values, list) or len(values) != 6 or not all(type(v) in (int, float) for v in values):
+    try:
+        return wrench_text(Wrench.of(values))
+    except ValueError:
         return "unknown"
-    return " ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, values, strict=True))

@@ -1,4 +1,4 @@
-"""What is known of the server and the sensor. The reader writes it, every thread may read it.
+"""What is known of the server and the sensor, and requests. The reader writes it, every thread may read it.
 
 Attributes are replaced, never changed in place, so that reading one needs no lock. What the server says is
 not trusted.
@@ -15,17 +15,23 @@ from ft_compensation.quantities import Wrench, wrench_text
 from protocol.client.client import Client
 from protocol.client.session import Disconnected
 from protocol.control import Event, six_numbers
-from protocol.errors import SettingError
+from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError, SettingError
 from protocol.settings import SETTINGS, SettingValue
 from protocol.text.json_text import JsonObject
-from protocol.text.untrusted import number, rows
-from protocol.text.visible import printable
+from protocol.text.untrusted import number, printable, rows
 
+CONFIGURE_TIMEOUT_S: Final = 10.0
+DESCRIBE_TIMEOUT_S: Final = 3.0
+SHUTDOWN_TIMEOUT_S: Final = 3.0
 _MOST_HZ: Final = 1e6
 
 
 class RequestFailedError(Exception):
     """The server did not do it; the text is its sentence, or says why there is none."""
+
+
+class RequestRefusedError(RequestFailedError):
+    """The server refused; the text is its own sentence."""
 
 
 class SensorInfo(NamedTuple):
@@ -80,6 +86,8 @@ class Link:
         self.connects = 0
         self.since_s = clock.monotonic()
         """CLOCK_MONOTONIC when the connection was made or lost."""
+        self.ending = False
+        """The node ends: whoever waits for something gives up."""
         self.epoch = 0
         """Raised by everything that interrupts the stream or changes its rate."""
 
@@ -149,6 +157,58 @@ class Link:
             if info.rate != self.rate_hz:
                 self.epoch += 1
             self.rate_hz = info.rate
+
+    # -- requests, from other threads than the reader's: every one answered, refused or timed out
+
+    def cancel(self) -> None:
+        """Make whoever waits for a reply give up, now and from now on: the node ends."""
+        self.ending = True
+        self.client.close()
+
+    def ask(self, action: str, timeout_s: float, **values: object) -> JsonObject:
+        """The reply that grants the request; RequestFailedError otherwise. Blocks for `timeout_s` at most."""
+        if not self.is_connected:
+            raise RequestFailedError(f"{self.absence}: ask again when the node is connected")
+        try:
+            return self.client.ask(action, timeout_s, **values)
+        except RefusedError as error:
+            raise RequestRefusedError(f"{error} ({error.code})") from None
+        except ConnectionFailedError as error:
+            if not self.ending and not isinstance(error, NoReplyError):
+                raise RequestFailedError(f"the server at {self.address} is gone: {error}") from None
+            why = "the node ends" if self.ending else f"no reply within {timeout_s:g} s"
+            raise RequestFailedError(
+                f"the server at {self.address} did not answer {action}: {why}; "
+                "whether it was done is not known"
+            ) from None
+
+    def shut_server_down(self, timeout_s: float = SHUTDOWN_TIMEOUT_S) -> str:
+        """Ask the server to shut down; a sentence. RequestRefusedError if it will not, RequestFailedError if
+        nobody knows.
+
+        Where there is no connection it makes one attempt of its own.
+        """
+        client, address = self.client, self.address
+        try:
+            if self.is_connected:
+                client.ask("shutdown", timeout_s)
+            else:
+                host, port = client.address
+                with Client(port, host, stream=False, reconnect=False) as own:
+                    own.connect().ask("shutdown", timeout_s)
+        except RefusedError as error:
+            raise RequestRefusedError(
+                f"the server at {address} refused to shut down: {error} ({error.code})"
+            ) from None
+        except NoReplyError:
+            raise RequestFailedError(
+                f"the server at {address} did not answer the request to shut down"
+            ) from None
+        except ConnectionFailedError as error:
+            raise RequestFailedError(
+                f"the server at {address} could not be told to shut down: {error}"
+            ) from None
+        return f"the server at {address} is shutting down"
 
 
 def known_settings(settings: object) -> dict[str, SettingValue]:

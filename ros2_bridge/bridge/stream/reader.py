@@ -18,6 +18,7 @@ from bridge.stream.link import Link, sentence
 from bridge.stream.watch import Watch
 from protocol.client.channel import Channel
 from protocol.client.client import Client
+from protocol.client.reading import Condition
 from protocol.client.session import ClientEvent, Connected, Disconnected
 from protocol.control import Event
 from protocol.errors import ConnectionFailedError
@@ -25,19 +26,10 @@ from protocol.framing import DataMessage
 from protocol.pdo import LAYOUTS, Sample, SampleDecoder
 
 SILENCE_S: Final = 1.0
+_SILENCE_NS: Final = round(0.99e9 * SILENCE_S)  # a wait may end some microseconds early
 _LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
 """The latest time that a ROS message can carry."""
 _WARN_EVERY_S: Final = 10.0
-
-
-class Log(Protocol):
-    """The part of a ROS logger that is used here."""
-
-    def info(self, message: str) -> Any:
-        """Log what happened."""
-
-    def warning(self, message: str) -> Any:
-        """Log what is not as it should be."""
 
 
 class Outputs(Protocol):
@@ -61,7 +53,7 @@ class Reader:
         self,
         parameters: Parameters,
         outputs: Outputs,
-        log: Log,
+        log: Any,
         on_failure: Callable[[str], object],
         *,
         channel: Channel | None = None,
@@ -78,14 +70,15 @@ class Reader:
         self.client = Client(
             parameters.server_port, parameters.server_host, sensors=[self._sensor], channel=channel
         )
-        self._accounting = self.client.session.state(self._sensor).accounting
-        self._accounting.counts = self.counts
+        self._state = self.client.session.state(self._sensor)
+        self._state.accounting.counts = self.counts
         self._clock = clock
         self.link = Link(self.client, self._sensor, clock)
         self.watch = Watch()
         self._limit_hz = parameters.publishing_frequency
         self._selector = FrameSelector(self.counts, same_clock=True, limit_hz=self._limit_hz)
         self._problem: str | None = None
+        self._is_silent = False
         self._next_warning_s = 0.0
         self._thread = threading.Thread(target=self._run, name="reader", daemon=True)
 
@@ -109,7 +102,7 @@ class Reader:
     @property
     def newest_ns(self) -> int:
         """CLOCK_MONOTONIC of the server when the newest sample was taken; -1 before the first."""
-        return self._accounting.new_ns
+        return self._state.accounting.new_ns
 
     def _warn_of_aliases(self) -> None:
         if 0 < self._limit_hz < self.link.rate_hz:
@@ -127,58 +120,55 @@ class Reader:
 
     def run(self) -> None:
         """Connect and read, again and again, until `stop`."""
-        client, counts, sensor = self.client, self.counts, self._sensor
-        frames: list[DataMessage] = []
-        silent = False
+        poll, sensor = self.client.poll_all, self._sensor
         while True:
-            before = counts.frames
             try:
-                items = client.poll_all(SILENCE_S)
+                items = poll(SILENCE_S)
             except ConnectionFailedError:  # `client` has been closed: every other end is an event
                 return
-            if counts.frames != before:
-                if silent:
-                    self._log.info(f"{self.link.address} sends again")
-                silent = False
-            elif not items and not silent and self.link.is_connected:
-                self._log.warning(f"nothing came from {self.link.address} for {SILENCE_S:g} s")
-                silent = True
+            if self._is_silent or not items:
+                self._watch_silence()
+            frames = []
             for item in items:
-                if not isinstance(item, DataMessage):
-                    self._publish(frames)
-                    frames.clear()
-                    self._take_event(item)
-                    silent = silent and self.link.is_connected
-                elif item.sensor == sensor:
-                    frames.append(item)
+                if isinstance(item, DataMessage):
+                    if item.sensor == sensor:
+                        frames.append(item)
+                    continue
+                self._publish(frames)
+                frames = []
+                self._take_event(item)
             self._publish(frames)
-            frames.clear()
+
+    def _watch_silence(self) -> None:
+        """Log, once, that nothing came for SILENCE_S, and that something came again."""
+        was, connected = self._is_silent, self.link.is_connected
+        why = self._state.why_old(_SILENCE_NS, self._clock.monotonic_ns(), connected=connected)
+        self._is_silent = why is Condition.SILENT
+        if self._is_silent and not was:
+            self._log.warning(f"nothing came from {self.link.address} for {SILENCE_S:g} s")
+        elif was and not self._is_silent and connected:
+            self._log.info(f"{self.link.address} sends again")
 
     def _publish(self, frames: Sequence[DataMessage]) -> None:
         if not frames:
             return
-        watch, decoders, outputs, monotonic_ns = (
-            self.watch,
-            self._decoders,
-            self._outputs,
-            self._clock.monotonic_ns,
-        )
+        watch, monotonic_ns = self.watch, self._clock.monotonic_ns
         watch.see(frames)
         selected = self._selector.select(frames, monotonic_ns())
         for frame in self._selector.passed_over:
             self._follow(frame)
         for frame in selected:
-            sample = decoders[len(frame.process_data)].decode(frame.process_data)
+            sample = self._decoders[len(frame.process_data)].decode(frame.process_data)
             if frame.stamp_ns > _LAST_STAMP_NS:
                 self._warn_sometimes(
                     f"a sample with the impossible time {frame.stamp_ns} ns was not published"
                 )
             elif sample.is_finite:
-                for output in outputs.wanted:
+                for output in self._outputs.wanted:
                     output.publish(sample, frame)
                 watch.sample, watch.stamp_ns = sample, frame.stamp_ns
             else:
-                outputs.publish_finite(sample, frame)
+                self._outputs.publish_finite(sample, frame)
                 self.not_finite += 1
                 self._warn_sometimes(
                     f"a sample with numbers that are not finite was not published ({self.not_finite} so far)"

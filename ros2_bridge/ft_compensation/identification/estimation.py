@@ -15,8 +15,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ft_compensation.identification.student import two_sided
-from ft_compensation.identification.weighted import Array, Known, Solution, solve
+from ft_compensation.identification.weighted import Array, Known, Solution, solve, two_sided
 from ft_compensation.quantities import OFFSET_PRIOR, SCALE_PRIOR
 
 _LENGTH_DEVIATION: Final = 0.002

@@ -1,24 +1,17 @@
 """Payload identification: mass, center of gravity, bias and the accelerometer's offset from static poses.
 
-Checks what is given, has `estimation` solve it, and judges the answer.
+Checks what is given, has `estimation` solve it, and judges how well the poses fit one payload.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from ft_compensation.identification.estimation import Value, estimate
-from ft_compensation.identification.judgement import (
-    ARM,
-    Fit,
-    fit_notes,
-    interval_notes,
-    judge,
-    offset_notes,
-)
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
 from ft_compensation.identification.weighted import Array
 from ft_compensation.quantities import (
@@ -30,6 +23,7 @@ from ft_compensation.quantities import (
     Wrench,
     length,
 )
+from ft_compensation.stationary import triple
 from protocol.pdo import Vector3
 
 LARGEST_MASS: Final = 500.0
@@ -42,18 +36,31 @@ _FORGIVEN_MISFIT: Final = 1.0
 _UNKNOWN: Final = 0.5
 """Of the interval before anything is measured: an offset no better known than so is not determined."""
 
+ARM: Final = 0.05
+"""m: what makes a torque of a force where the center of gravity is nearer."""
+_SUSPICIOUS: Final = 3.0
+_NEGLIGIBLE: Final = 0.01
+"""Of the weight: a residual below it is not worth a word."""
+_RARE: Final = 3.09
+"""Standard deviations that noise exceeds once in a thousand times."""
+
 
 class IdentificationError(CompensationError):
     """The poses do not give an answer; the text is one sentence that says why and what to do."""
 
 
-class Residual(NamedTuple):
-    """What the answer leaves of one pose: measured minus modelled."""
+class Fit(NamedTuple):
+    """How well force or torque fits."""
 
-    force: Vector3
-    """N"""
-    torque: Vector3
-    """Nm"""
+    rms: float
+    """Of the residuals, with the degrees of freedom taken into account, N or Nm."""
+    degrees: float
+    """Of freedom."""
+    chi_square: float | None
+    """Squares of the residuals in units of what the windows' noise explains, per degree of freedom: 1 is
+    ideal. None where that noise is not known."""
+    verdict: str
+    """`noise` explains the residuals, or they are `small` (1 % of the weight) all the same, or `large`."""
 
 
 class OffsetFit(NamedTuple):
@@ -79,8 +86,8 @@ class Identified(NamedTuple):
     """N, Nm"""
     confidence: float
     """Of the intervals: 0.95 as a rule. Student's t; each axis has the variance that its residuals show."""
-    residuals: tuple[Residual, ...]
-    """One a pose, in order."""
+    residuals: tuple[Wrench, ...]
+    """What the answer leaves of each pose, in order: measured minus modelled."""
     force_rms: float
     """Of the residuals, with the degrees of freedom taken into account, N."""
     torque_rms: float
@@ -130,7 +137,7 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
         raise IdentificationError("the poses do not suffice: their equations leave an unknown open") from None
     mass, mass_interval = float(found.mass.value[0]), float(found.mass.half[0])
     _check_mass(mass, mass_interval)
-    payload = Payload(mass, _triple(found.center.value))
+    payload = Payload(mass, triple(found.center.value))
     weight = mass * float(np.linalg.norm(gravity, axis=1).mean())
     moment = weight * max(ARM, length(payload.center))
     forces, torques = found.residuals[:, :3], found.residuals[:, 3:]
@@ -143,8 +150,8 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
             f"{mass:.3g} kg, which cannot be: something held or touched the tool, or there is no tool"
         )
     _check_fit(torque, torques, _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment, "Nm")
-    residuals = tuple(Residual(_triple(row[:3]), _triple(row[3:])) for row in found.residuals)
-    centre_interval = _triple(found.center.half)
+    residuals = tuple(map(Wrench.of, found.residuals.tolist()))
+    centre_interval = triple(found.center.half)
     accelerometer = _accelerometer(found.offset, found.scale)
     return Identified(
         payload,
@@ -177,7 +184,7 @@ def _accelerometer(offset: Value | None, scale: Value | None) -> OffsetFit | Non
     limit = _UNKNOWN * NORMAL_95 * OFFSET_PRIOR
     open_axes = "".join(axis for axis, half in zip("xyz", offset.half, strict=True) if half > limit)
     values = offset.value, scale.value, offset.half, scale.half
-    return OffsetFit(Accelerometer(*map(_triple, values)), open_axes)
+    return OffsetFit(Accelerometer(*map(triple, values)), open_axes)
 
 
 def _condition(gravity: Array) -> float:
@@ -222,6 +229,82 @@ def _check_fit(fit: Fit, residuals: Array, limit: float, unit: str) -> None:
         )
 
 
-def _triple(values: Array) -> Vector3:
-    x, y, z = values.tolist()
-    return x, y, z
+def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, weight: float) -> Fit:
+    """How `residuals` (n, 3) of "force" or "torque" fit; `weight` in N, or Nm at its arm."""
+    freedom = max(float(degrees.sum()), 1.0)
+    rms = math.sqrt(float((residuals**2).sum()) / freedom)
+    spread = np.array([getattr(pose, f"{name}_spread") for pose in poses])
+    chi_square = None
+    if spread.all():
+        expected = spread**2 / np.array([[pose.samples] for pose in poses])
+        chi_square = float((residuals**2 / expected).sum()) / freedom
+        # The quantile by Wilson and Hilferty.
+        ninth = 2.0 / (9.0 * freedom)
+        if chi_square <= (1.0 - ninth + _RARE * math.sqrt(ninth)) ** 3:
+            return Fit(rms, freedom, chi_square, "noise")
+    return Fit(rms, freedom, chi_square, "small" if rms <= _NEGLIGIBLE * weight else "large")
+
+
+def fit_notes(
+    poses: Sequence[Pose], residuals: Array, fit: Fit, name: str, unit: str, weight: float
+) -> Iterator[str]:
+    """A pose that fits worse than the others, or residuals that noise does not explain; as for `judge`."""
+    sizes = np.linalg.norm(residuals, axis=1)
+    worst = int(sizes.argmax())
+    others = float(np.sqrt(np.mean(np.delete(sizes, worst) ** 2)))
+    by_chance = length(getattr(poses[worst], f"{name}_spread")) / poses[worst].samples ** 0.5
+    if sizes[worst] > max(_SUSPICIOUS * others, _SUSPICIOUS * by_chance, _NEGLIGIBLE * weight):
+        yield (
+            f"pose {worst + 1} fits worse than the others: {sizes[worst]:.2g} {unit} of residual {name}; if "
+            "something touched the tool, take it again"
+        )
+    elif fit.verdict == "large" and fit.chi_square is not None:
+        yield (
+            f"the residual {name}, {fit.rms:.2g} {unit}, is {math.sqrt(fit.chi_square):.0f} times what the "
+            "noise explains: a cable pulls, the tool moves, or the orientation is not exact"
+        )
+
+
+def interval_notes(mass: float, mass_interval: float, centre_interval: float) -> Iterator[str]:
+    """Of wide intervals; kg and m."""
+    if mass_interval > 0.05 * mass:
+        yield (
+            f"the mass is known to ± {100 * mass_interval / mass:.0f} % only: take more poses, or longer ones"
+        )
+    if centre_interval > 0.01:
+        yield (
+            f"the center of gravity is known to ± {1000 * centre_interval:.0f} mm only: take more poses, or "
+            "longer ones"
+        )
+
+
+def offset_notes(undetermined: str) -> Iterator[str]:
+    """Of axes, as in "xz", whose offset of the accelerometer the poses do not determine."""
+    if undetermined:
+        yield (
+            f"the poses do not determine the accelerometer's offset along {' and '.join(undetermined)}, so "
+            "nearly none is assumed there: take poses with that axis once up and once down"
+        )
+
+
+def summary(result: Identified) -> str:
+    """The answer in one sentence with its confidence interval, and the notes as further ones."""
+    x, y, z = (1000.0 * part for part in result.payload.center)
+    ix, iy, iz = (1000.0 * part for part in result.centre_interval)
+    text = (
+        f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, center of gravity ({x:.2f} ± "
+        f"{ix:.2f}, {y:.2f} ± {iy:.2f}, {z:.2f} ± {iz:.2f}) mm ({100 * result.confidence:g} % confidence) "
+        f"from {result.coverage.poses} poses; residual {result.force_rms:.2g} N "
+        f"({result.force_fit.verdict}), {result.torque_rms:.2g} Nm ({result.torque_fit.verdict})"
+    )
+    return ". ".join([text, *result.notes])
+
+
+def accelerometer_text(fit: OffsetFit) -> str:
+    """Offset and sensitivities of the accelerometer with their confidence intervals, a sentence."""
+    found = fit.calibration
+    axes = zip("xyz", found.offset, found.offset_interval, strict=True)
+    offset = ", ".join(f"{axis} {value:.3f} ± {half:.3f}" for axis, value, half in axes)
+    axes = zip("xyz", found.scale, found.scale_interval, strict=True)
+    scale = ", ".join(f"{axis} {value:.4f} ± {half:.4f}" for axis, value, half in axes)
+    return f"Accelerometer: offset {offset} m/s², scale {scale}"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ft_compensation.bias import gravity_of
 from ft_compensation.quantities import ZERO, CompensationError, Wrench, length
-from ft_compensation.stationary import StationaryMeans
+from ft_compensation.stationary import StationaryMeans, triple
 from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 LEAST_POSES: Final = 4
@@ -83,12 +83,17 @@ class Coverage(NamedTuple):
     poses: int
     spread: Vector3
     """Standard deviation of gravity's direction along three axes, in g, best seen first; 0.58 is ideal."""
-    worst: Vector3
-    """The worst seen direction, in the sensor's frame, length 1."""
     missing: str | None
     """Why the poses do not suffice, a sentence; None if they do."""
     next_pose: str
     """What to do next, a sentence."""
+
+    @property
+    def advice(self) -> str:
+        """What is missing and what to do next, a sentence."""
+        if self.missing is None:
+            return f"the poses suffice; one more would help most: {self.next_pose}"
+        return f"not enough yet: {self.missing}; {self.next_pose}"
 
 
 def directions(poses: Sequence[Pose]) -> NDArray[np.float64]:
@@ -100,15 +105,11 @@ def coverage(poses: Sequence[Pose], *, one_axis: bool = False) -> Coverage:
     """What `poses` have seen. With `one_axis`, poses about one axis may suffice (see `payload.identify`)."""
     down = directions(poses)
     if not poses:
-        return Coverage(
-            0, ZERO, (0.0, 0.0, 1.0), "there is no pose yet", _sentence(np.array((0.0, 0.0, 1.0)))
-        )
+        return Coverage(0, ZERO, "there is no pose yet", _sentence(np.array((0.0, 0.0, 1.0))))
     _, spread, axes = _spread(down)
-    worst = axes[2]
     return Coverage(
         len(poses),
-        _triple(spread),
-        _triple(worst * np.sign(worst[np.abs(worst).argmax()])),
+        triple(spread),
         _missing(len(poses), spread, axes, one_axis),
         _sentence(_next_up(down)),
     )
@@ -191,8 +192,3 @@ def _sentence(up: NDArray[np.float64]) -> str:
         return f"turn the sensor so that its {axes[0]} axis points up"
     named = ", ".join(axes[:-1]) + f" and {axes[-1]}"
     return f"turn the sensor so that its {named} axes point up equally steeply"
-
-
-def _triple(values: NDArray[np.float64]) -> Vector3:
-    x, y, z = values.tolist()
-    return x, y, z

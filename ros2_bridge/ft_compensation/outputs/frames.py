@@ -10,14 +10,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, Self
 
-from ft_compensation.quantities import ZERO, Wrench
+from ft_compensation.quantities import ZERO, Quaternion, Wrench, unit_quaternion
 from protocol.pdo import Vector3
 
-Quaternion = tuple[float, float, float, float]
-"""x, y, z, w"""
 Rotation = tuple[Vector3, Vector3, Vector3]
 """A rotation matrix, row by row."""
-_NORM_TOLERANCE = 0.01
 _IDENTITY: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -32,13 +29,9 @@ class WrenchTransform(NamedTuple):
     @classmethod
     def of(cls, translation: Vector3, quaternion: Quaternion) -> Self:
         """From the pose of the source frame in the target frame, as TF gives it. ValueError if it is none."""
-        x, y, z, w = quaternion
-        norm = math.sqrt(x * x + y * y + z * z + w * w)
-        if not abs(norm - 1.0) <= _NORM_TOLERANCE:  # a NaN is not either
-            raise ValueError(f"a rotation is a quaternion of length 1, this one's is {norm:g}")
+        x, y, z, w = unit_quaternion(quaternion)
         if not math.isfinite(sum(translation)):
             raise ValueError("a translation is three finite numbers")
-        x, y, z, w = x / norm, y / norm, z / norm, w / norm
         rotation = (
             (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
             (2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),

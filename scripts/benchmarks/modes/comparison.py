@@ -1,6 +1,8 @@
 """This project beside a bare C program, Bota's driver and the polling design, on virtual sensors.
 
-This project and the C program alternate in short turns, so that the machine's noise meets both.
+This project and the C program alternate in short turns, so that the machine's noise meets both. Bota's closed
+Python driver (package bota-driver) is no dependency of the project: scripts/benchmark installs it into
+.venv-vendor before the program enters its network namespace.
 """
 
 from __future__ import annotations
@@ -15,24 +17,15 @@ from typing import Any, Final
 import numpy as np
 
 from scripts.benchmarks import statistics
-from scripts.benchmarks.chain import (
-    PORT,
-    PROCESSES,
-    WARM_UP_S,
-    Chain,
-    Child,
-    Figures,
-    ScriptError,
-    Setup,
-    own_cpus,
-)
-from scripts.benchmarks.modes import vendor
+from scripts.benchmarks.chain import PROCESSES, WARM_UP_S, Chain, Child, Figures, ScriptError, Setup
 from scripts.benchmarks.modes.mode import NONE, Mode, losses
-from scripts.benchmarks.processes.polling import TOPIC
-from scripts.benchmarks.processes.yardstick import build
-from scripts.benchmarks.statistics import Floats
+from scripts.benchmarks.processes.masters import build
+from scripts.benchmarks.statistics import Arrivals, Floats
 
 _MOST_TURNS: Final = 3
+VENDOR: Final = Path(__file__).parents[3] / ".venv-vendor"
+# What the ROS packages in .venv set is not for another environment's Python.
+_WITHOUT_ROS: Final = ("env", "-u", "LD_LIBRARY_PATH", "-u", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
 THIS, C_CLIENT, BARE_C, BY_C = "this", "this, C client", "bare C", "this / C"
 DRIVER, POLLING = "Bota's driver", "polling"
 RATIOS: Final = {
@@ -50,32 +43,16 @@ Turn = tuple[Figures, Floats]
 
 
 def project(setup: Setup, program: Path | None = None) -> Turn:
-    """The server, with a TCP client in Python or in C."""
+    """The server, with a TCP client in Python, or in C by this program."""
     with Chain(setup, C_CLIENT if program else THIS) as chain:
-        link = chain.server(chain.bus())
-        client = _c_client(chain, program) if program else chain.recorder("tcp", "--port", PORT)
+        link = chain.server()
+        client = chain.recorder("c", program, "client") if program else chain.recorder("tcp")
         usage = chain.record(client)
         status = link.ask("status")
-        link.close()
         usage["server"] = {
             name: status[name] for name in ("wake_us", "exchange_us", "missed_deadlines", "lost_frames")
         }
         return chain.figures(client, usage)
-
-
-def _c_client(chain: Chain, program: Path) -> Child:
-    path = chain.directory / "c-client"
-    times = (WARM_UP_S, chain.setup.seconds)
-    return chain.start("c-client", program, "client", PORT, path, *times, result=path, watch=False)
-
-
-def _master(chain: Chain, module: str, *arguments: object) -> Child:
-    """A program in place of the server, on its CPU."""
-    path = chain.directory / "master"
-    how = ("--ifname", chain.bus(), "--port", PORT, "--rate", chain.setup.rate_hz)
-    child = chain.python("server", f"{PROCESSES}.{module}", *arguments, path, *how, result=path)
-    os.sched_setaffinity(child.pid, own_cpus()[1:])
-    return child
 
 
 def _with_loop(turn: Turn, master: Child) -> Turn:
@@ -88,26 +65,23 @@ def _with_loop(turn: Turn, master: Child) -> Turn:
 def bare_c(setup: Setup, program: Path) -> Turn:
     """The C program with its C client."""
     with Chain(setup, BARE_C) as chain:
-        master = _master(chain, "yardstick", "--priority", setup.priority, program)
-        client = _c_client(chain, program)
+        master = chain.master(program, setup.priority)
+        client = chain.recorder("c", program, "client")
         return _with_loop(chain.figures(client, chain.record(client)), master)
 
 
-def polling(setup: Setup, *, ros: bool) -> Turn:
-    """The polling loop, with a polling client or node."""
-    with Chain(setup, f"{POLLING}, ROS" if ros else POLLING) as chain:
-        master = _master(chain, "polling", "server")
-        how = ("--port", PORT, "--rate", setup.rate_hz)
-        if ros:
-            chain.python("node", f"{PROCESSES}.polling", "node", chain.directory, *how)
-        client = chain.recorder("ros", "--arrays", TOPIC) if ros else chain.recorder("polling", *how)
+def polling(setup: Setup) -> Turn:
+    """The polling loop, with a polling client."""
+    with Chain(setup, POLLING) as chain:
+        master = chain.master()
+        client = chain.recorder("polling", "--rate", setup.rate_hz)
         return _with_loop(chain.figures(client, chain.record(client)), master)
 
 
 def project_ros(setup: Setup) -> Turn:
     """The server, a node for each sensor, and a ROS subscriber."""
     with Chain(setup, f"{THIS}, ROS") as chain:
-        chain.server(chain.bus()).close()
+        chain.server()
         topics = [f"/benchmark_{position}" for position in range(setup.sensors)]
         for position, topic in enumerate(topics):
             chain.node(f"array_topic:={topic}", position=position)
@@ -115,34 +89,50 @@ def project_ros(setup: Setup) -> Turn:
         return chain.figures(client, chain.record(client))
 
 
+def vendor(setup: Setup) -> Turn:
+    """Bota's driver, with the server's priority, for which it does not ask; the ages of first returns."""
+    with Chain(setup, DRIVER) as chain:
+        path = chain.directory / "driver"
+        driver = chain.start(
+            "server", *_WITHOUT_ROS, VENDOR / "bin" / "python", "-m", f"{PROCESSES}.vendor_driver", path,
+            WARM_UP_S, setup.seconds, chain.bus(), setup.sinc, setup.rate_hz, setup.priority, result=path,
+        )  # fmt: skip
+        figures, _ = chain.figures(driver, chain.record(driver))
+        ages = first_ages(statistics.read_arrivals(path)[0])
+    return {**figures, "age_us": statistics.spread_us(ages), "every_age_us": figures["age_us"]}, ages
+
+
+def first_ages(arrivals: Arrivals) -> Floats:
+    """How old each sample was when it arrived first, ns."""
+    return arrivals.ages[np.unique(arrivals.number, return_index=True)[1]]
+
+
 def measure(setup: Setup, with_driver: bool) -> list[Figures]:
     """A row for each program; `ages` are all of its ages, in ns."""
     taken: dict[str, Turn] = {}
     result: list[Figures] = []
     missing: dict[str, str] = {}
+    found: dict[str, Any] = {}
     try:
         program = build(Path(os.environ["DEMO_DIRECTORY"]))
     except ScriptError as error:
         missing[BARE_C] = str(error)
         taken[THIS] = together(in_turns(setup, [project])[0])
     else:
-        turns = in_turns(
-            setup, [project, partial(project, program=program), partial(bare_c, program=program)]
-        )
+        in_c = [partial(each, program=program) for each in (project, bare_c)]
+        turns = in_turns(setup, [project, *in_c])
         taken |= dict(zip((THIS, C_CLIENT, BARE_C), map(together, turns), strict=True))
         found = ratios(turns[0], turns[2])
     one = setup.sensors == 1  # the others know one sensor only
     if with_driver and one:
-        if vendor.installed():
-            taken[DRIVER] = vendor.measure_driver(setup)
+        if [*VENDOR.glob("has-bota-driver*")]:
+            taken[DRIVER] = vendor(setup)
         else:
-            missing[DRIVER] = f"{vendor.REQUIREMENT} could not be installed by scripts/benchmark"
+            missing[DRIVER] = "bota-driver could not be installed by scripts/benchmark"
     if one:
-        taken[POLLING] = polling(setup, ros=False)
+        taken[POLLING] = polling(setup)
     if setup.ros:
         taken[f"{THIS}, ROS"] = project_ros(setup)
-        if one:
-            taken[f"{POLLING}, ROS"] = polling(setup, ros=True)
     about = {"rate_hz": setup.rate_hz, "sensors": setup.sensors}
     for name, (figures, ages) in taken.items():
         result.append({**about, "program": name, **figures, "ages": ages})
@@ -177,14 +167,13 @@ def _pool(values: Sequence[Any], name: str = "") -> Any:
     return round(float(np.median(values)), 1)
 
 
-def ratios(ours: Sequence[Turn], theirs: Sequence[Turn]) -> dict[str, dict[str, float]]:
-    """This project by the C program: median, smallest and largest of the turns."""
-    found = {}
-    for name, (table, key) in RATIOS.items():
-        each = [a[table][key] / b[table][key] for (a, _), (b, _) in zip(ours, theirs, strict=True)]
-        figures = {"median": np.median(each), "min": min(each), "max": max(each)}
-        found[name] = {point: round(float(value), 2) for point, value in figures.items()}
-    return found
+def ratios(ours: Sequence[Turn], theirs: Sequence[Turn]) -> dict[str, float]:
+    """This project by the C program: median of the turns."""
+    pairs = list(zip((a for a, _ in ours), (b for b, _ in theirs), strict=True))
+    return {
+        name: round(float(np.median([a[table][key] / b[table][key] for a, b in pairs])), 2)
+        for name, (table, key) in RATIOS.items()
+    }
 
 
 def answer(rows: Sequence[Figures]) -> str:
@@ -202,7 +191,7 @@ def answer(rows: Sequence[Figures]) -> str:
 def _shown(table: str, key: str, ratio: str = "") -> Callable[[Figures], str]:
     def show(row: Figures) -> str:
         if "ratio" in row:
-            return f"{row['ratio'][ratio]['median']:.2f}" if ratio else ""
+            return f"{row['ratio'][ratio]:.2f}" if ratio else ""
         value = (row.get(table) or {}).get(key)
         return NONE if value is None else f"{value:.{1 if value < 100 else 0}f}"
 
@@ -210,9 +199,7 @@ def _shown(table: str, key: str, ratio: str = "") -> Callable[[Figures], str]:
 
 
 def _lost(row: Figures) -> str:
-    if "made" not in row:
-        return str(row.get("missing", ""))
-    return f"{losses(row)} of {row['made']}"
+    return f"{losses(row)} of {row['made']}" if "made" in row else str(row.get("missing", ""))
 
 
 MODE: Final = Mode(

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import gc
 import select
-import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,10 +18,10 @@ from protocol.client import make_real_time
 from protocol.control import request
 from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from protocol.pdo import SampleDecoder
-from scripts.benchmarks.records import Recording, connect, sleep_until
+from scripts.benchmarks.records import PORT, Recording, connect, sleep_until
 
 SIZE: Final = 61
-DEPTH: Final = 50
+_DEPTH: Final = 50
 
 
 def tcp(arguments: argparse.Namespace, recording: Recording) -> None:
@@ -50,28 +49,21 @@ def polling(arguments: argparse.Namespace, recording: Recording) -> None:
         while True:
             due += period_ns * max(1, (now - due) // period_ns)
             sleep_until(due)
-            data = poll(connection)
+            data = connection.recv(SIZE) if select.select([connection], [], [], 0)[0] else b""
             now = time.monotonic_ns()
             if len(data) == SIZE and not recording.take(0, *decode_clock(decode(data).array), 0, now):
                 return
 
 
-def poll(connection: socket.socket) -> bytes:
-    """One message if there is one: what the polling design does at each tick of its timer."""
-    return connection.recv(SIZE) if select.select([connection], [], [], 0)[0] else b""
-
-
 def ros(arguments: argparse.Namespace, recording: Recording) -> None:
-    """A subscriber: of `wrench`, of all topics of a node (only `wrench` is recorded), or of arrays.
+    """A subscriber: of `wrench`, or of arrays.
 
     It waits for and takes messages itself, because rclpy's executor takes longer for that than everything
     else on the way: what is measured is to be the way to the subscriber, not the subscriber.
     """
     import rclpy  # noqa: PLC0415 - the arguments come first
-    from diagnostic_msgs.msg import DiagnosticArray  # noqa: PLC0415
     from geometry_msgs.msg import WrenchStamped  # noqa: PLC0415
     from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: PLC0415
-    from sensor_msgs.msg import Imu, Temperature  # noqa: PLC0415
     from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
 
     def wrench(message: Any) -> tuple[float, ...]:
@@ -81,15 +73,10 @@ def ros(arguments: argparse.Namespace, recording: Recording) -> None:
     kinds: list[tuple[Any, str, Callable[[Any], Any]]]
     kinds = [(Float64MultiArray, topic, lambda message: message.data) for topic in arguments.arrays]
     kinds = kinds or [(WrenchStamped, "wrench", wrench)]
-    recorded = len(kinds)
-    if arguments.all:
-        rest = {"/sensone_sensor_data": Float64MultiArray, "imu/data_raw": Imu, "temperature": Temperature,
-                "/diagnostics": DiagnosticArray}  # fmt: skip
-        kinds += [(kind, topic, tuple) for topic, kind in rest.items()]
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
     handles = [
-        node.create_subscription(kind, topic, lambda _message: None, arguments.depth).handle
+        node.create_subscription(kind, topic, lambda _message: None, _DEPTH).handle
         for kind, topic, _ in kinds
     ]
     with node.context.handle:
@@ -103,8 +90,7 @@ def ros(arguments: argparse.Namespace, recording: Recording) -> None:
         for position, (handle, (kind, _, values)) in enumerate(zip(handles, kinds, strict=True)):
             while goes_on and (taken := handle.take_message(kind, False)) is not None:
                 now = time.monotonic_ns()
-                if position < recorded:
-                    goes_on = recording.take(position, *decode_clock(values(taken[0])), 0, now)
+                goes_on = recording.take(position, *decode_clock(values(taken[0])), 0, now)
     node.destroy_node()
     rclpy.try_shutdown()
 
@@ -115,14 +101,12 @@ def main() -> None:
     kinds = {"tcp": tcp, "polling": polling, "ros": ros}
     parser.add_argument("kind", choices=kinds)
     parser.add_argument("path", type=Path)
-    parser.add_argument("--warm-up", type=float, default=1.0)
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--port", type=int)
+    parser.add_argument("warm_up", type=float)
+    parser.add_argument("seconds", type=float)
+    parser.add_argument("--port", type=int, default=PORT)
     parser.add_argument("--rate", type=float)
     parser.add_argument("--rt-priority", type=int, default=0, help="of all its threads")
     parser.add_argument("--arrays", nargs="*", default=(), help="topics of arrays; the sensors' positions")
-    parser.add_argument("--all", action="store_true", help="every topic of the node's")
-    parser.add_argument("--depth", type=int, default=DEPTH)
     arguments = parser.parse_args()
     recording = Recording(arguments.path, arguments.warm_up, arguments.seconds)
     gc.disable()

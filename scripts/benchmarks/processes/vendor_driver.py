@@ -3,13 +3,15 @@
 Run by the Python of .venv-vendor. Over EtherCAT to sensors of the first generation, `read_frame` returns the
 sample that the driver's own thread fetched last and has that thread fetch the next one; it does not wait, and
 `read_frame_blocking` is refused. So the loop here calls it at absolute deadlines, as Bota's example does.
+
+Arguments: FILE WARM_UP_S SECONDS IFACE SINC CALLS_PER_S PRIORITY
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
+import sys
 import time
 from pathlib import Path
 from typing import Final
@@ -24,19 +26,11 @@ _ATTEMPTS: Final = 5
 
 def main() -> None:
     """Record, then end."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("path", type=Path)
-    parser.add_argument("--warm-up", type=float, required=True)
-    parser.add_argument("--seconds", type=float, required=True)
-    parser.add_argument("--ifname", required=True)
-    parser.add_argument("--sinc", type=int, required=True)
-    parser.add_argument("--calls", type=float, required=True, help="per second")
-    parser.add_argument("--priority", type=int, default=0)
-    arguments = parser.parse_args()
-    recording = Recording(arguments.path, arguments.warm_up, arguments.seconds)
-    steady(arguments.priority)  # before the driver starts its threads, which inherit it
-    driver = active_driver(configuration(arguments.ifname, arguments.sinc))
-    record(driver, recording, int(1e9 / arguments.calls))
+    path, warm_up_s, seconds, ifname, sinc, rate_hz, priority = sys.argv[1:]
+    recording = Recording(Path(path), float(warm_up_s), float(seconds))
+    steady(int(priority))  # before the driver starts its threads, which inherit it
+    driver = active_driver(configuration(ifname, int(sinc)))
+    record(driver, recording, int(1e9 / float(rate_hz)))
     recording.write()
     # In version 1.1.16 deactivate(), and so the destructor, never returns: it joins a thread that waits for
     # the next read_frame().

@@ -129,6 +129,9 @@ public:
         return read(options_.sensors.empty() ? std::uint8_t{0} : options_.sensors.front());
     }
 
+    /// `Options::max_age` from now on, for a sensor whose rate is another now.
+    void set_max_age(nanoseconds max_age) noexcept { options_.max_age = max_age; }
+
     /// Why there is no connection, or what the server last complained of. A sentence, for a person.
     const char* error() const noexcept { return connection_.error().c_str(); }
     Link link() const noexcept { return connection_.link(); }
@@ -238,12 +241,11 @@ private:
             message["message"].get(connection_.set_error());
         } else if (event.is("sensor_back") && of_a_sensor) {
             sensors_[place].lost = false;
+            set_rate(place, message);
         } else if (event.is("reconfigured")) {
             const auto& wanted = options_.sensors;
             if (!of_a_sensor || wanted.empty() || std::memchr(wanted.data(), place, wanted.size())) ++reconfigurations_;
-            double rate_hz = 0.0;
-            message["rate_hz"].get(rate_hz);
-            if (of_a_sensor) set_rate(place, rate_hz);
+            if (of_a_sensor) set_rate(place, message);
         } else if (event.is("shutting_down")) {
             connection_.is_shutting_down();
         }
@@ -270,6 +272,12 @@ private:
         for (std::size_t i = 0; i < kPlaces; ++i) sensors_[i].begin(options_.every, options_.fresh_only);
         for (std::size_t i = 0; i < description_.sensor_count; ++i)
             set_rate(description_.sensors[i].sensor, description_.sensors[i].rate_hz);
+    }
+
+    /// What an event says of a sensor's rate; if it says nothing, the rate is what it was.
+    void set_rate(std::uint8_t place, json::Value event) noexcept {
+        double rate_hz = 0.0;
+        if (event["rate_hz"].get(rate_hz) && rate_hz > 0.0 && rate_hz <= kHighestRateHz) sensors_[place].accounting.rate_hz = rate_hz;
     }
 
     void set_rate(std::uint8_t place, double rate_hz) noexcept {

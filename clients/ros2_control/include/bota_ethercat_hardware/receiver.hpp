@@ -1,8 +1,8 @@
-// The thread that receives: it makes and checks connections, reads what arrives, and leaves the newest reading to the
-// control thread, which so makes no system call (a recv() of TCP costs 10 us and more, because it sends the acknowledgement).
+// The thread that receives: it reads what arrives and leaves the newest reading to the control thread, which so makes no
+// system call (a recv() of TCP costs 10 us and more, because it sends the acknowledgement).
 //
-// A connection that is lost, or whose sensor was reconfigured, is replaced by another one whose sensor and settings are
-// those of `open`.
+// After a new connection, and after the sensor was reconfigured, samples are unchecked until sensor and settings are found to
+// be those of `open`.
 #pragma once
 
 #include <poll.h>
@@ -47,19 +47,23 @@ public:
         stop();
         const auto end = bota_ethercat::monotonic_now_ns() + static_cast<std::int64_t>(parameters_.connect_timeout * 1e9);
         pinned_.reset();
-        for (;;) {
-            bool may_come = false;
-            Identity found;
-            if ((client_ = attempt(found, why, may_come))) {
-                pinned_ = found;
-                latest_.next() = Received{{}, true, true, bota_ethercat::monotonic_now_ns(), max_age_ns_};
-                latest_.publish();
-                start();
-                return true;
-            }
+        bota_ethercat::Options options;
+        options.host = parameters_.host;
+        options.port = parameters_.port;
+        options.sensors = {parameters_.sensor};
+        options.imu_units = parameters_.imu_raw_units;
+        options.judge_imu = parameters_.wants_imu || parameters_.wants_orientation;
+        options.reconnect = bota_ethercat::Reconnect::when_told;
+        client_ = std::make_unique<bota_ethercat::Client>(options);
+        bool may_come = false;
+        while (!connect(why, may_come)) {
             if (!may_come || bota_ethercat::monotonic_now_ns() >= end) return false;
             std::this_thread::sleep_for(std::chrono::milliseconds(100));
         }
+        latest_.next() = Received{{}, true, true, bota_ethercat::monotonic_now_ns(), max_age_ns_};
+        latest_.publish();
+        start();
+        return true;
     }
 
     /// The sensor of `open`.
@@ -84,8 +88,6 @@ public:
     void tell(int condition) noexcept { condition_.store(condition, std::memory_order_relaxed); }
 
 private:
-    using Client = bota_ethercat::Client;
-
     static constexpr int kPaceMs = 5;  // without anything from the server: how soon it is seen that nothing comes
     static constexpr std::int64_t kRetryNs = 100'000'000, kQuietNs = 1'000'000'000;
     static constexpr auto kPatience = std::chrono::seconds(1);  // for one attempt, and the request before it
@@ -113,14 +115,12 @@ private:
             if (!is_asked) log_(Level::warning, client_->connected() ? "the sensor's settings were changed" : client_->error());
             is_asked = true;
             retry_ns = now + kRetryNs;
-            Identity found;
             std::string why;
             bool may_come = false;
-            if (auto client = attempt(found, why, may_come)) {
-                log_(Level::info, "connected again to " + detail::named(found));
+            if (connect(why, may_come)) {
+                log_(Level::info, "connected again to " + detail::named(*pinned_));
                 is_asked = false;
                 said.clear();
-                client_ = std::move(client);
             } else if (why != said) {
                 log_(may_come ? Level::warning : Level::error, why);
                 said = why;
@@ -128,17 +128,18 @@ private:
         }
     }
 
-    /// Wait for something, read all of it and hand it over. False: another connection is needed.
+    /// Wait for something, read all of it and hand it over. False: it needs to be connected, or checked.
     bool receive() noexcept {
         pollfd one{client_->fd(), POLLIN, 0};
         (void)::poll(&one, one.fd < 0 ? 0 : 1, kPaceMs);
         Received& received = latest_.next();
         received.reading = client_->latest(parameters_.sensor);
-        received.is_checked = client_->reconfigurations() == 0;
+        const bool is_checked = is_checked_ && client_->reconfigurations() == checked_at_;
+        received.is_checked = is_checked && received.reading.received_ns >= checked_ns_;
         received.max_age_ns = max_age_ns_;
         received.at_ns = bota_ethercat::monotonic_now_ns();
         received.is_connected = client_->connected();
-        const bool is_good = received.is_checked && received.is_connected;
+        const bool is_good = is_checked && received.is_connected;
         latest_.publish();
         return is_good;
     }
@@ -151,25 +152,31 @@ private:
                                      ": samples come late on a busy machine; allow it, or set receive_priority to 0");
     }
 
-    /// One attempt. Null: `why`, and whether it may succeed later without anybody doing something about the sensor.
-    std::unique_ptr<Client> attempt(Identity& found, std::string& why, bool& may_come) {
-        if (!inspect(found, why, may_come)) return nullptr;
-        bota_ethercat::Options options;
-        options.host = parameters_.host;
-        options.port = parameters_.port;
-        options.sensors = {parameters_.sensor};
-        options.imu_units = parameters_.imu_raw_units;
-        options.judge_imu = parameters_.wants_imu || parameters_.wants_orientation;
-        options.max_age = bota_ethercat::nanoseconds(std::llround(max_age(parameters_, found) * 1e9));
-        options.reconnect = bota_ethercat::Reconnect::when_told;
-        auto client = std::make_unique<Client>(options);
+    /// Connect, if it is not connected, and check the sensor. False: `why`, and whether it may succeed later without anybody
+    /// doing something about the sensor.
+    bool connect(std::string& why, bool& may_come) {
+        Identity found;
+        const bool is_new = !client_->connected();
+        if (is_new) {
+            is_checked_ = false;
+            if (!inspect(found, why, may_come)) return false;
+            if (!client_->connect(kPatience)) return why = client_->error(), may_come = true, false;
+        }
+        const auto reconfigurations = client_->reconfigurations();  // those to come are told on this connection
+        if (!inspect(found, why, may_come)) {
+            if (is_new) client_->close();
+            return false;
+        }
         may_come = true;
-        if (!client->connect(kPatience)) return why = client->error(), nullptr;
-        // What is changed from here on is told on this connection. What was changed before that:
-        const double rate_hz = found.rate_hz;
-        if (!inspect(found, why, may_come)) return nullptr;
-        if (std::fabs(found.rate_hz - rate_hz) < 1e-3) return max_age_ns_ = options.max_age.count(), std::move(client);
-        return why = "the sensor is being reconfigured", may_come = true, nullptr;
+        if (!pinned_) pinned_ = found;
+        (void)client_->update();  // what came meanwhile is of the settings before
+        if (client_->reconfigurations() != reconfigurations) return why = "the sensor is being reconfigured", false;
+        max_age_ns_ = std::llround(max_age(parameters_, found) * 1e9);
+        client_->set_max_age(bota_ethercat::nanoseconds(max_age_ns_));
+        checked_at_ = reconfigurations;
+        checked_ns_ = bota_ethercat::monotonic_now_ns();
+        is_checked_ = true;
+        return true;
     }
 
     /// Whether this is the sensor that is wanted, and set so that its numbers mean what they should.
@@ -208,7 +215,10 @@ private:
     std::optional<Identity> pinned_;
     std::thread thread_;
     std::int64_t max_age_ns_ = 0;     // of the client's samples
-    std::unique_ptr<Client> client_;  // the receiving thread's while there is one
+    std::unique_ptr<bota_ethercat::Client> client_;  // the receiving thread's while there is one
+    bool is_checked_ = false;         // the sensor, on this connection
+    std::uint32_t checked_at_ = 0;    // number of reconfigurations
+    std::int64_t checked_ns_ = 0;     // samples received before are not used
     Latest latest_;
     std::atomic<bool> stopping_{false};
     std::atomic<int> condition_{0};

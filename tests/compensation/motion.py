@@ -1,0 +1,195 @@
+"""An arm in motion as sensor and IMU feel it, with nothing touching the tool: rigid-body motion, seeded.
+
+Independent of the virtual sensor and of the equations: position and attitude are functions of time, and what
+is felt follows from them by differences on a grid that is fine enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ft_compensation.quantities import Payload
+from protocol.pdo import STANDARD_GRAVITY, Vector3
+
+Array = NDArray[np.float64]
+Path = Callable[[Array], tuple[Array, Array]]
+"""Times (n,), s, to position (n, 3), m, and three angles (n, 3), rad."""
+GRAVITY: Final = np.array((0.0, 0.0, -STANDARD_GRAVITY))
+IMU: Final[Vector3] = (0.0, 0.0, -0.0257)
+"""Where a SensONE has it."""
+_STEP_S: Final = 5e-5
+
+
+class Imperfection(NamedTuple):
+    """Of the IMU."""
+
+    acceleration_noise: float = 0.02
+    """m/s²"""
+    rate_noise: float = 0.0017
+    """rad/s"""
+    rate_offset: float = 0.02
+    """rad/s, on each axis"""
+    acceleration_offset: Vector3 = (0.0, 0.0, 0.0)
+    """m/s²"""
+    scale: Vector3 = (1.0, 1.0, 1.0)
+
+
+class Felt(NamedTuple):
+    """What the sensor measures: n samples."""
+
+    times: Array
+    """(n,) s"""
+    force: Array
+    """(n, 3) N"""
+    torque: Array
+    """(n, 3) Nm, about the wrench origin"""
+    acceleration: Array
+    """(n, 3) m/s²"""
+    rate: Array
+    """(n, 3) rad/s"""
+
+
+HEALTHY: Final = Imperfection()
+
+
+def feel(
+    path: Path,
+    tool: Payload,
+    seconds: float,
+    rate_hz: float = 800.0,
+    *,
+    seed: int = 0,
+    imu: Imperfection = HEALTHY,
+) -> Felt:
+    """The samples of `path` with the wrench's origin on it."""
+    times = np.arange(0.0, seconds, 1.0 / rate_hz)
+    moments = times[:, None] + _STEP_S * np.arange(-2, 3)  # (n, 5)
+    shape = moments.shape
+    positions, angles = (part.reshape(*shape, 3) for part in path(moments.ravel()))
+    turned = rotations(angles)  # sensor to world
+    rates = [_rate(turned[:, k - 1], turned[:, k + 1]) for k in (1, 2, 3)]
+    rate, spin = rates[1], (rates[2] - rates[0]) / (2 * _STEP_S)
+    moved = (positions[:, 3] - 2 * positions[:, 2] + positions[:, 1]) / _STEP_S**2
+    origin = np.einsum("nji,nj->ni", turned[:, 2], moved - GRAVITY)
+
+    def at(place: Vector3) -> Array:
+        d = np.array(place)
+        found: Array = origin + np.cross(spin, d) + np.cross(rate, np.cross(rate, d))
+        return found
+
+    draw = np.random.default_rng(seed)
+    force = -tool.mass * at(tool.center)
+    acceleration = at(IMU) * imu.scale + imu.acceleration_offset
+    acceleration += draw.normal(scale=imu.acceleration_noise, size=acceleration.shape)
+    measured = rate + imu.rate_offset + draw.normal(scale=imu.rate_noise, size=rate.shape)
+    return Felt(times, force, np.cross(tool.center, force), acceleration, measured)
+
+
+def rotations(angles: Array) -> Array:
+    """(..., 3, 3) that turn the sensor's vectors into the world's, of angles about z, y and x in turn."""
+    (cz, cy, cx), (sz, sy, sx) = np.moveaxis(np.cos(angles), -1, 0), np.moveaxis(np.sin(angles), -1, 0)
+    rows = (
+        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
+        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
+        (-sy, cy * sx, cy * cx),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _rate(before: Array, after: Array) -> Array:
+    """(n, 3), rad/s in the sensor's frame, in the middle of two attitudes two steps apart."""
+    turn = np.einsum("nji,njk->nik", before, after)
+    x, y, z = turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]
+    return np.stack([x, y, z], axis=-1) / (4 * _STEP_S)
+
+
+# -- what arms do
+
+
+def waypoints(move_s: float, rest_s: float, seed: int, *, metres: float = 0.25, radians: float = 1.0) -> Path:
+    """From one random pose to the next with the least jerk, and rests between."""
+    draw = np.random.default_rng(seed)
+    poses = draw.uniform(-1, 1, size=(64, 6)) * ([0.5 * metres] * 3 + [0.5 * radians] * 3)
+
+    def path(t: Array) -> tuple[Array, Array]:
+        number, within = np.divmod(np.maximum(t, 0.0), move_s + rest_s)
+        share = np.clip((within - rest_s) / move_s, 0.0, 1.0)[:, None]
+        smooth = share**3 * (10 - 15 * share + 6 * share**2)
+        which = number.astype(int) % (len(poses) - 1)
+        found = poses[which] + smooth * (poses[which + 1] - poses[which])
+        return found[:, :3], found[:, 3:]
+
+    return path
+
+
+def guided(
+    seed: int, *, metres: float = 0.06, radians: float = 0.4, hertz: tuple[float, float] = (0.2, 1.5)
+) -> Path:
+    """By hand: never at rest."""
+    draw = np.random.default_rng(seed)
+    frequencies, phases = draw.uniform(*hertz, size=(4, 6)), draw.uniform(0, 2 * np.pi, size=(4, 6))
+    sizes = np.array([metres] * 3 + [radians] * 3) / 4
+
+    def path(t: Array) -> tuple[Array, Array]:
+        found = (sizes * np.sin(2 * np.pi * frequencies * t[:, None, None] + phases)).sum(axis=1)
+        return found[:, :3], found[:, 3:]
+
+    return path
+
+
+def together(*paths: Path) -> Path:
+    """One motion on top of the other; the angles are added."""
+
+    def path(t: Array) -> tuple[Array, Array]:
+        each = [one(t) for one in paths]
+        return sum(place for place, _ in each), sum(angles for _, angles in each)  # type: ignore[return-value]
+
+    return path
+
+
+def shaken(hertz: float, acceleration: float = 2.0) -> Path:
+    """A vibration along x, m/s²."""
+    size = acceleration / (2 * np.pi * hertz) ** 2
+
+    def path(t: Array) -> tuple[Array, Array]:
+        found = np.zeros((len(t), 3))
+        found[:, 0] = size * np.sin(2 * np.pi * hertz * t)
+        return found, np.zeros_like(found)
+
+    return path
+
+
+def driven(acceleration: float = 0.5, seconds: float = 3.0) -> Path:
+    """A vehicle that speeds up and brakes along x, each for so long."""
+    corners = np.arange(0.0, 60.0, seconds)
+
+    def path(t: Array) -> tuple[Array, Array]:
+        x = np.zeros_like(t)
+        place = v = 0.0
+        for number, (begin, end) in enumerate(pairwise(corners)):
+            a = acceleration if number % 4 in {0, 3} else -acceleration
+            inside = (t >= begin) & (t < end)
+            dt = t[inside] - begin
+            x[inside] = place + v * dt + 0.5 * a * dt**2
+            place, v = place + v * seconds + 0.5 * a * seconds**2, v + a * seconds
+        return np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1), np.zeros((len(t), 3))
+
+    return path
+
+
+def moves(seed: int) -> dict[str, Path]:
+    """What is to be survived, by name."""
+    circle = guided(seed + 4, metres=0.05, radians=0.2, hertz=(1.5, 2.5))
+    return {
+        "pick and place": waypoints(0.6, 1.0, seed),
+        "fast": waypoints(0.4, 0.1, seed + 1),
+        "hand-guiding": guided(seed + 2),
+        "polishing": circle,
+        "mobile base": together(driven(), waypoints(0.6, 0.3, seed + 3)),
+        "vibration": together(shaken(31.0), guided(seed + 5)),
+    }
