@@ -123,7 +123,7 @@ class Hub:
                 page.send(texts[page.sensor])
 
     def send_points(self, now_s: float) -> None:
-        """Send the points that are due to the pages that keep up: whoever lags misses them and is told so."""
+        """Send new points to the pages that keep up. A page that lags is later told that it has missed some."""
         silent = now_s - self._points_s > _SILENT_S
         for position, batch in self._model.feed.batches(silent=silent).items():
             self._points_s = now_s
@@ -214,11 +214,11 @@ def state_text(state: State, position: int, number: int) -> str:
         "events": state.events,
         "sensors": [
             {
-                "position": sensor.position,
-                "name": sensor.name,
-                "ok": None if trouble else sensor.verdict.level is not Level.TROUBLE,
+                "position": s.position,
+                "name": s.name,
+                "ok": None if trouble else s.verdict.level < Level.TROUBLE,
             }
-            for sensor in state.sensors
+            for s in state.sensors
         ],
         "sensor": next((_sensor(sensor) for sensor in state.sensors if sensor.position == position), None),
     }
@@ -249,15 +249,8 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
         "peaks": sensor.peaks and dict(zip(AXES, sensor.peaks, strict=True)),
         "saturated": sorted(sensor.saturated),
         "alerts": [
-            {
-                "severity": alert.level.key,
-                "level": alert.level.words,
-                "text": alert.text,
-                "remedy": alert.remedy,
-                "when": words.seen(alert.ago_s),
-                "present": alert.ago_s is None,
-            }
-            for alert in sensor.alerts
+            words.alert(a) | {"level": a.level.words, "when": words.seen(a.ago_s), "present": a.ago_s is None}
+            for a in sensor.alerts
         ],
         "stream": list(stream.items()),
         "losses": words.losses(sensor),

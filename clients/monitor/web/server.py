@@ -59,10 +59,10 @@ _TRY_AGAIN_LATER: Final = 1013
 _WHY: Final = {
     errno.EADDRINUSE: "is in use",
     errno.EACCES: "is reserved for root",
-    errno.EADDRNOTAVAIL: "cannot be had: this machine has no such address",
+    errno.EADDRNOTAVAIL: "is no address of this machine",
 }
 
-# What a peer does wrong is no business of the terminal's, and requests are not logged.
+# Neither requests nor errors of clients are written to the terminal.
 _QUIET: Final = logging.Logger(__name__, logging.CRITICAL)
 
 
@@ -102,7 +102,7 @@ async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: f
 async def serving(
     hub: Hub, host: str, port: int, clock: Callable[[], float] = time.monotonic
 ) -> AsyncIterator[int]:
-    """Serve on a loopback address, `localhost` on both; gives the port. OSError if it cannot be had."""
+    """Serve on a loopback address, `localhost` on both; yields the port. OSError if it cannot be bound."""
     listening = _listen(host, port)
     page_files = read_page()
 
