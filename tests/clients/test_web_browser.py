@@ -200,18 +200,6 @@ def test_a_page_with_the_token_tares_after_a_question(page: Page, web: Web) -> N
 
 
 @pytest.mark.long
-def test_a_page_opened_later_shows_what_was_before(page: Page, web: Web) -> None:
-    feed(web)
-    page.wait_for("document.querySelector('#force').plot.data[0].length > 150")
-    page.open("about:blank")
-    page.wait_for("location.href === 'about:blank'")
-    page.open(web.origin)
-    page.wait_for("document.querySelector('#force')?.plot?.data[0].length > 150")
-    assert trace(page, "force")[3].count(-412.0) == 1
-    assert page.complaints == []
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("token", ["", "#token=of-another-run"])
 def test_a_page_without_the_token_only_shows(chromium: Page, web: Web, token: str) -> None:
     chromium.open("about:blank")

@@ -123,7 +123,7 @@ class Hub:
                 page.send(texts[page.sensor])
 
     def send_points(self, now_s: float) -> None:
-        """Send new points to the pages that keep up. A page that lags is later told that it has missed some."""
+        """Send new points to the pages that keep up; one that lags is told later that it has missed some."""
         silent = now_s - self._points_s > _SILENT_S
         for position, batch in self._model.feed.batches(silent=silent).items():
             self._points_s = now_s
