@@ -12,7 +12,7 @@ from protocol.address import Address
 from protocol.client import Client
 from protocol.control import six_numbers
 from protocol.errors import ConnectionFailedError, ProtocolError
-from protocol.program.tare_memory import Tared, recall, remember
+from protocol.program.tare_memory import former, remember
 from protocol.text.json_text import JsonObject
 from protocol.text.untrusted import number, rows, whole
 
@@ -52,7 +52,7 @@ def tare(address: Address, position: int, way: str = "tare") -> tuple[str, bool]
                     residual = _residual(reply.get("residual"))
                 else:
                     before = _offset(client.description, position)
-                    after = _former(serial, before) if way == "undo" else [0.0] * 6
+                    after = _former(serial, position, before) if way == "undo" else [0.0] * 6
                     _replace(client, position, before, after)
             except ConnectionFailedError as error:
                 return f"It is unknown whether {done}: {error}", True
@@ -60,7 +60,7 @@ def tare(address: Address, position: int, way: str = "tare") -> tuple[str, bool]
         return f"{failed[0].upper()}{failed[1:]}: {error}", True
     with contextlib.suppress(OSError):  # then it cannot be undone
         if serial is not None:
-            remember(serial, Tared(list(before), list(after)))
+            remember(serial, before, after)
     return f"{done[0].upper()}{done[1:]}{residual}", False
 
 
@@ -75,13 +75,11 @@ def _offset(description: JsonObject, position: int) -> Sequence[float]:
         raise ValueError("its offset is unknown to the server") from None
 
 
-def _former(serial: int | None, now: Sequence[float]) -> Sequence[float]:
-    last = None if serial is None else recall(serial)
-    if last is None:
-        raise ValueError("no tare of it by this user is known; its offset can be cleared")
-    if array("f", last.after) != array("f", now):  # as the sensor keeps it
-        raise ValueError("its offset has changed since the last tare by this user; it can be cleared")
-    return last.before
+def _former(serial: int | None, position: int, now: Sequence[float]) -> Sequence[float]:
+    try:
+        return former(serial, now, f"sensor {position}")
+    except ValueError as error:
+        raise ValueError(f"{error}; clear the offset, or tare again") from None
 
 
 def _replace(client: Client, position: int, before: Sequence[float], after: Sequence[float]) -> None:

@@ -316,8 +316,8 @@ def test_a_tare_says_what_is_left_and_is_undone_and_cleared() -> None:
 
     with simulated_bus("--signal", "rest") as bus, simulated_server(bus):
         assert tare(address, 0, "undo") == (
-            "The tare of sensor 0 was not undone: no tare of it by this user is known; its offset can be "
-            "cleared", True,
+            "The tare of sensor 0 was not undone: no tare of sensor 0 by this user is known; clear the "
+            "offset, or tare again", True,
         )  # fmt: skip
         text, bad = tare(address, 0)
         assert not bad
@@ -331,7 +331,7 @@ def test_a_tare_says_what_is_left_and_is_undone_and_cleared() -> None:
         assert offset() == [0.0] * 6
         with Client(address.port, stream=False).connect() as client:
             client.ask("sdo_write", sensor=0, index=0x8000, subindex=1, type="f32", value=1.0)
-        assert "its offset has changed since" in tare(address, 0, "undo")[0]
+        assert "the offset of sensor 0 has changed since" in tare(address, 0, "undo")[0]
         bus.command("on-write 0x8000 2 abort 0x8000 3 0x08000022")
         text, bad = tare(address, 0, "clear")
         assert bad
