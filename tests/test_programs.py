@@ -60,7 +60,7 @@ def interrupted(name: str, number: int, at: str, arguments: str) -> tuple[int, s
         ("ethercat-sensor", "argparse", "--help"),
         ("ethercat-doctor", "ethercat_server.daemon.options", "--help"),
         ("ethercat-report", "jinja2", "--seconds 1"),
-        ("ethercat-monitor", "clients.monitor.program", "--once"),
+        ("ethercat-monitor", "clients.monitor.screen", "--once"),
         ("ethercat-monitor", "textual.app", ""),
         ("ethercat-server", "ethercat_server.process.signals", "--help"),
     ],

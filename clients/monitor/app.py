@@ -38,27 +38,19 @@ class View(Widget):
     def __init__(self) -> None:
         super().__init__()
         self._rows: list[Text] = []
-        self._strips: list[Strip] = []
 
     def show(self, rows: list[Text]) -> None:
         """Show these rows."""
-        width, before = self.size.width, self._rows
-        self._rows = rows
+        before, self._rows = self._rows, rows
         if len(rows) != len(before):
-            self._strips = [self._strip(row, width) for row in rows]
             self.refresh()
-            return
-        for y, row in enumerate(rows):
-            if row != before[y]:
-                self._strips[y] = self._strip(row, width)
-                self.refresh(Region(0, y, width, 1))
-
-    def _strip(self, row: Text, width: int) -> Strip:
-        return Strip(row.render(self.app.console)).adjust_cell_length(width)
+        elif changed := [y for y, row in enumerate(rows) if row != before[y]]:
+            self.refresh(*(Region(0, y, self.size.width, 1) for y in changed))
 
     def render_line(self, y: int) -> Strip:
         """One row, for Textual."""
-        return self._strips[y] if y < len(self._strips) else Strip.blank(self.size.width)
+        row = self._rows[y] if y < len(self._rows) else Text()
+        return Strip(row.render(self.app.console)).adjust_cell_length(self.size.width)
 
 
 class Monitor(App[None]):
@@ -116,7 +108,7 @@ class Monitor(App[None]):
         if self._look.paused and self._state is not None:
             state = replace(self._state, message=state.message)
         self._state = state
-        recording = f"REC {duration(self.recorder.seconds(now_s))}" if self.recorder.running else ""
+        recording = f"REC {duration(now_s - self.recorder.since_s)}" if self.recorder.running else ""
         self._view.show(render(state, replace(self._look, recording=recording), *self._view.size))
 
     def action_help_quit(self) -> None:

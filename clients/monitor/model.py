@@ -167,7 +167,7 @@ class State:
 
 
 class _Sensor:
-    """One sensor. It is judged whenever something comes, so that nothing is missed between two looks."""
+    """One sensor, judged whenever something arrives: no finding between two refreshes is missed."""
 
     def __init__(self, position: int, imu_units: ImuUnits) -> None:
         self.position = position

@@ -36,8 +36,7 @@ class Reader:
         self._model = model
         self._batch_s = batch_s
         self._closing = threading.Event()
-        self._tried = threading.Event()  # there was a reply to `status`, or a failed connection
-        self._answered = False
+        self.tried = threading.Event()  # there was a reply to `status`, or a failed connection
         self._thread = threading.Thread(target=self._run, name="reader", daemon=True)
 
     def start(self) -> None:
@@ -49,11 +48,6 @@ class Reader:
         self._closing.set()
         self._client.close()
         self._thread.join(timeout=2.0)
-
-    def wait_for_answer(self, timeout_s: float) -> bool:
-        """Wait for the first reply to `status` or failed connection; whether there was a reply."""
-        self._tried.wait(timeout_s)
-        return self._answered
 
     def _run(self) -> None:
         status_at_s = 0.0
@@ -98,7 +92,7 @@ class Reader:
             if not end.reachable:
                 reason = UnreachableError(end.reason).at(self._client.address)
             self._model.gone(reason, now_s)
-            self._tried.set()
+            self.tried.set()
 
     def _ask_status(self, client: Client) -> None:
         try:
@@ -107,5 +101,4 @@ class Reader:
             return  # an event says why
         except RefusedError:
             pass
-        self._answered = True
-        self._tried.set()
+        self.tried.set()

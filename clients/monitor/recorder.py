@@ -22,25 +22,18 @@ _STOP_TIMEOUT_S: Final = 20.0
 class Recorder:
     """At most one recording at a time."""
 
-    def __init__(
-        self, address: Address, directory: Path | None = None, command: Sequence[str] | None = None
-    ) -> None:
-        """Recordings go to `directory`, by default the current one; `command`: another program."""
+    def __init__(self, address: Address, command: Sequence[str] | None = None) -> None:
+        """`command`: another program than `ethercat-record`, with its first arguments."""
         self._address = address
-        self._directory = directory or Path.cwd()
         self._command = command
         self._process: subprocess.Popen[bytes] | None = None
         self._said: IO[bytes]  # what it prints
-        self._since_s = 0.0
+        self.since_s = 0.0
 
     @property
     def running(self) -> bool:
         """Whether a recording was started and has not been reported as ended."""
         return self._process is not None
-
-    def seconds(self, now_s: float) -> float:
-        """Duration of the recording."""
-        return now_s - self._since_s
 
     def start(self, now_s: float) -> tuple[str, bool]:
         """Start a recording; a message, and whether it is an error."""
@@ -54,7 +47,6 @@ class Recorder:
             # A session of its own: Ctrl-C is for the monitor, which then stops it.
             self._process = subprocess.Popen(
                 [*command, name, "--server", str(self._address), "--until-eof"],
-                cwd=self._directory,
                 stdin=subprocess.PIPE,  # closed when the monitor ends, however it ends
                 stdout=said,
                 stderr=said,
@@ -63,7 +55,7 @@ class Recorder:
         except OSError as error:
             said.close()
             return f"{PROGRAM} cannot be started: {error.strerror or error}", True
-        self._said, self._since_s = said, now_s
+        self._said, self.since_s = said, now_s
         return f"Recording to {name}", False
 
     def stop(self) -> None:

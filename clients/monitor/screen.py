@@ -53,12 +53,11 @@ NOTICE: Final = "bold reverse"
 _LEAST: Final = (24, 8)  # width and height
 _MESSAGE_ROWS_FROM: Final = 12
 _PANEL_ROWS: Final = 18
-_MOST_TALL: Final = 8  # rows of a trace; more show no more of it
 _TABLE_WIDTH: Final = 80
 _LEAST_SCALE: Final = {"N": 5.0, "Nm": 0.2, "counts": 1000.0}
 _VALUE_WIDTH: Final = 9
 _AXIS_WIDTH: Final = 4 + _VALUE_WIDTH + 1  # label, value, space
-_LEVELS: Final = "▁▂▃▄▅▆▇"  # of a trace; the highest leaves a gap to the row above
+_LEVELS: Final = "▁▂▃▄▅▆▇"  # of a trace
 _LEAST_TRACE: Final = 0.05  # of the bar's scale, so that noise does not look like a signal
 
 
@@ -116,7 +115,7 @@ def table(state: State) -> list[str]:
     if server.replay:
         lines.append(f"  REPLAY of {server.replay}")
     facts = [f"{name.lower()} {value}" for name, value in words.server_facts(server)]
-    lines += [f"  {wrong}"] if wrong else [f"  {'; '.join(row)}" for row in (facts[:5], facts[5:]) if row]
+    lines += [f"  {wrong}"] if wrong else [f"  {'; '.join(row)}" for row in (facts[:4], facts[4:]) if row]
     lines += [f"  client {words.client(client)}" for client in state.clients]
     for sensor in state.sensors:
         rows = [*_panel(sensor, (), _TABLE_WIDTH, trace=False), *_alerts(sensor, 1 << 16, 1 << 16)]
@@ -169,9 +168,7 @@ def _sensors(state: State, look: Look, width: int, height: int) -> list[Row]:
         rows += [Row(7, Text())] if number else []
         own = _panel(sensor, others, width)
         room = height // count - bool(number)
-        wrong = _alerts(sensor, width, max(2, room - len(own)))
-        tall = min(_MOST_TALL, 1 + (room - len(own) - len(wrong)) // len(AXES))
-        rows += [*(_panel(sensor, others, width, tall) if tall > 1 else own), *wrong]
+        rows += [*own, *_alerts(sensor, width, max(2, room - len(own)))]
     return rows
 
 
@@ -193,13 +190,8 @@ def _server(state: State) -> Text:
         return _field("Server", wrong, BAD)
     if server.uptime_s is None:
         return _field("Server", "waiting for its status")
-    text = (
-        f"up {numbers.duration(server.uptime_s)}  missed deadlines {words.count(server.missed_deadlines)}  "
-        f"lost frames {words.count(server.lost_frames)}"
-    )
-    if server.exchange_us is not None:
-        text += f"  exchange {numbers.milliseconds(server.exchange_us.worst)} ms p99"
-    return _field("Server", text)
+    facts = [f"{name.lower()} {value}" for name, value in words.server_facts(server)]
+    return _field("Server", "  ".join(facts[:4]))
 
 
 def _clients(state: State, width: int) -> Text:
@@ -249,9 +241,9 @@ def _warnings(sensor: SensorState, page: int, width: int, height: int) -> list[T
 
 
 def _panel(
-    sensor: SensorState, others: Iterable[SensorState], width: int, tall: int = 1, *, trace: bool = True
+    sensor: SensorState, others: Iterable[SensorState], width: int, *, trace: bool = True
 ) -> list[Row]:
-    """The rows of `sensor`, without its alerts. `tall`: rows of the trace of each axis, if there is one."""
+    """The rows of `sensor`, without its alerts."""
     stream = (
         f"{words.rate(sensor)}   age {words.times(sensor.age_us, 'worst')}   jitter {words.jitter(sensor)}"
     )
@@ -264,8 +256,8 @@ def _panel(
         clock.append(f"   age at hand-out {words.times(sensor.hand_out_us, 'p99')}")
     return [
         Row(2, _identity(sensor, others, width)),
-        *_axes(sensor, 0, width, tall, trace=trace),
-        *_axes(sensor, 1, width, tall, trace=trace),
+        *_axes(sensor, 0, width, trace=trace),
+        *_axes(sensor, 1, width, trace=trace),
         *_imu(sensor),
         Row(3, _field("Stream", stream)),
         Row(4, lost),
@@ -324,7 +316,7 @@ def _identity(sensor: SensorState, others: Iterable[SensorState], width: int) ->
     return row.append_text(rest)
 
 
-def _axes(sensor: SensorState, which: int, width: int, tall: int, *, trace: bool) -> list[Row]:
+def _axes(sensor: SensorState, which: int, width: int, *, trace: bool) -> list[Row]:
     """Force, or torque if `which` is 1: a heading and a row an axis."""
     unit, axes = sensor.units[which], range(3 * which, 3 * which + 3)
     shown = (80 if width >= 180 else 24 if width >= 110 else 16 if width >= 76 else 0) if trace else 0
@@ -355,10 +347,7 @@ def _axes(sensor: SensorState, which: int, width: int, tall: int, *, trace: bool
             for extreme in peak or ():
                 row.append(numbers.quantity(extreme, digits, _VALUE_WIDTH - 1).rjust(_VALUE_WIDTH), PEAK)
         if shown:
-            indent = " " * (row.cell_len + 1)
-            first, *more = traces(sensor.traces[axis], scale, shown, tall)
-            row.append(f" {first}", BAR)
-            rows += [Row(8, Text.assemble(indent, (line, BAR))) for line in more]
+            row.append(f" {trace_of(sensor.traces[axis], scale, shown)}", BAR)
     return rows
 
 
@@ -414,26 +403,22 @@ def bar(value: float, peak: Range | None, scale: float, width: int) -> Text:
     return text
 
 
-def traces(past: Sequence[Range | None], scale: float, width: int, height: int = 1) -> list[str]:
-    """The last `width` steps on `height` rows, the top first; of each the value furthest from the median."""
-    shown = list(past[-width:])
+def trace_of(past: Sequence[Range | None], scale: float, width: int) -> str:
+    """The last `width` steps in a row of characters: of each step the value furthest from the median."""
+    shown = past[-width:]
     known = [r for r in shown if r is not None]
     if not known:
-        return [" " * width] * height
+        return " " * width
     low, high = min(r.low for r in known), max(r.high for r in known)
     usual = statistics.median((r.low + r.high) / 2 for r in known)
     half = max((high - low) / 2, _LEAST_TRACE * scale / 2)
-    steps = len(_LEVELS)
-    columns = []
-    for piece in shown:
-        column = ""
-        if piece is not None:
-            value = piece.high if piece.high - usual >= usual - piece.low else piece.low
-            at = (value - (low + high) / 2 + half) / (2 * half)
-            full, rest = divmod(round(at * (height * steps - 1)), steps)
-            column = "█" * full + _LEVELS[rest]
-        columns.append(column.ljust(height))
-    return ["".join(column[row] for column in columns).rjust(width) for row in reversed(range(height))]
+
+    def level(step: Range) -> str:
+        value = step.high if step.high - usual >= usual - step.low else step.low
+        at = (value - (low + high) / 2 + half) / (2 * half)
+        return _LEVELS[round(at * (len(_LEVELS) - 1))]
+
+    return "".join(level(step) if step else " " for step in shown).rjust(width)
 
 
 def _fitted(row: Text, width: int, ascii_only: bool) -> Text:

@@ -11,8 +11,8 @@ from typing import Any, Final
 from protocol.address import Address
 from protocol.client import Client
 from protocol.control import six_numbers
-from protocol.errors import ConnectionFailedError, ProtocolError, RefusedError
-from protocol.program.tare_memory import Tared, recall, remember
+from protocol.errors import ConnectionFailedError, ProtocolError
+from protocol.program.tare_memory import former, remember
 from protocol.text.json_text import JsonObject
 from protocol.text.untrusted import number, rows, whole
 
@@ -22,105 +22,84 @@ _OFFSET: Final = 0x8000  # the sensor's force/torque offset, in sub-indices 1 to
 Say = Callable[[str, bool], None]  # takes a message, and whether it is an error
 
 WAYS: Final = {
-    "tare": "Taring sensor {}: keep it stationary",
-    "undo": "Undoing the tare of sensor {}",
-    "clear": "Clearing the offset of sensor {}",
-}  # what can be done, and what is said when it begins
+    "tare": ("Taring sensor {}: keep it stationary", "sensor {} was {}tared"),
+    "undo": ("Undoing the tare of sensor {}", "the tare of sensor {} was {}undone"),
+    "clear": ("Clearing the offset of sensor {}", "the offset of sensor {} was {}cleared"),
+}  # what can be done, what is said when it begins, and afterwards
 
 
 def start_tare(address: Address, position: int, say: Say, way: str = "tare") -> threading.Thread:
     """Do one of WAYS with the sensor at `position`; the thread, which is returned, says the result."""
-    say(WAYS[way].format(position), False)
-    do = {"tare": tare, "undo": undo, "clear": clear}[way]
-    thread = threading.Thread(target=lambda: say(*do(address, position)), name="tare", daemon=True)
+    say(WAYS[way][0].format(position), False)
+    thread = threading.Thread(target=lambda: say(*tare(address, position, way)), name="tare", daemon=True)
     thread.start()
     return thread
 
 
-def tare(address: Address, position: int) -> tuple[str, bool]:
-    """Tare the sensor; a message, and whether it is an error."""
+def tare(address: Address, position: int, way: str = "tare") -> tuple[str, bool]:
+    """Tare the sensor, undo this user's last tare, or clear the offset; a message, and whether it failed."""
+    done, failed = (WAYS[way][1].format(position, word) for word in ("", "not "))
+    before: Sequence[float]
+    after: Sequence[float]
+    residual = ""
     try:
         with Client(address.port, address.host, stream=False, reconnect=False).connect() as client:
+            serial = whole(_row(client.description, position).get("serial"))
             try:
-                reply = client.ask("tare", _TIMEOUT_S, sensor=position)
+                if way == "tare":
+                    reply = client.ask("tare", _TIMEOUT_S, sensor=position)
+                    before, after = six_numbers(reply.get("old_offset")), six_numbers(reply.get("new_offset"))
+                    residual = _residual(reply.get("residual"))
+                else:
+                    before = _offset(client.description, position)
+                    after = _former(serial, position, before) if way == "undo" else [0.0] * 6
+                    _replace(client, position, before, after)
             except ConnectionFailedError as error:
-                return f"It is unknown whether sensor {position} was tared: {error}", True
-            with contextlib.suppress(ValueError):
-                serial, _ = _found(client.description, position)
-                _remember(serial, six_numbers(reply.get("old_offset")), six_numbers(reply.get("new_offset")))
-    except RefusedError as error:
-        return f"Sensor {position} was not tared: {error}", True
-    except ProtocolError as error:
-        return f"Sensor {position} was not tared: no connection to the server ({error})", True
-    return f"Sensor {position} was tared{_residual(reply.get('residual'))}", False
-
-
-def undo(address: Address, position: int) -> tuple[str, bool]:
-    """Restore the offset of before the last tare by this user; as `tare`."""
-    return _set_offset(address, position, _former, f"tare of sensor {position} was {{}}undone")
-
-
-def clear(address: Address, position: int) -> tuple[str, bool]:
-    """Set the offset to zero; as `tare`."""
-    return _set_offset(
-        address, position, lambda *_: (0.0,) * 6, f"offset of sensor {position} was {{}}cleared"
-    )
-
-
-def _set_offset(
-    address: Address, position: int, wanted: Callable[[int, Sequence[float]], Sequence[float]], result: str
-) -> tuple[str, bool]:
-    try:
-        with Client(address.port, address.host, stream=False, reconnect=False).connect() as client:
-            serial, before = _found(client.description, position)
-            after = wanted(serial, before)
-            try:
-                _write(client, position, after)
-            except ConnectionFailedError as error:
-                return f"It is unknown whether the {result.format('')}: {error}", True
-            except (ProtocolError, ValueError):
-                _write(client, position, before)
-                raise
+                return f"It is unknown whether {done}: {error}", True
     except (ProtocolError, ValueError) as error:
-        return f"The {result.format('not ')}: {error}", True
-    _remember(serial, before, after)
-    return f"The {result.format('')}", False
-
-
-def _found(description: JsonObject, position: int) -> tuple[int, Sequence[float]]:
-    """Serial number and offset of the sensor; ValueError."""
-    for sensor in rows(description.get("sensors")):
-        serial, offset = whole(sensor.get("serial")), sensor.get("offset")
-        if sensor.get("sensor") == position and serial is not None and offset is not None:
-            return serial, six_numbers(offset)
-    raise ValueError("its offset is unknown to the server")
-
-
-def _former(serial: int, now: Sequence[float]) -> Sequence[float]:
-    last = recall(serial)
-    if last is None:
-        raise ValueError("no tare of it by this user is known; its offset can be cleared")
-    if _real32(last.after) != _real32(now):
-        raise ValueError("its offset has changed since the last tare by this user; it can be cleared")
-    return last.before
-
-
-def _write(client: Client, position: int, offset: Sequence[float]) -> None:
-    """Write the offset and verify it; ProtocolError, ValueError."""
-    for subindex, value in enumerate(offset, start=1):
-        client.ask("sdo_write", sensor=position, index=_OFFSET, subindex=subindex, type="f32", value=value)
-    if _real32(_found(client.ask("describe"), position)[1]) != _real32(offset):
-        raise ValueError("the sensor did not take the offset")
-
-
-def _real32(offset: Sequence[float]) -> bytes:
-    """As the sensor keeps it."""
-    return array("f", offset).tobytes()
-
-
-def _remember(serial: int, before: Sequence[float], after: Sequence[float]) -> None:
+        return f"{failed[0].upper()}{failed[1:]}: {error}", True
     with contextlib.suppress(OSError):  # then it cannot be undone
-        remember(serial, Tared(list(before), list(after)))
+        if serial is not None:
+            remember(serial, before, after)
+    return f"{done[0].upper()}{done[1:]}{residual}", False
+
+
+def _row(description: JsonObject, position: int) -> JsonObject:
+    return next((row for row in rows(description.get("sensors")) if row.get("sensor") == position), {})
+
+
+def _offset(description: JsonObject, position: int) -> Sequence[float]:
+    try:
+        return six_numbers(_row(description, position).get("offset"))
+    except ValueError:
+        raise ValueError("its offset is unknown to the server") from None
+
+
+def _former(serial: int | None, position: int, now: Sequence[float]) -> Sequence[float]:
+    try:
+        return former(serial, now, f"sensor {position}")
+    except ValueError as error:
+        raise ValueError(f"{error}; clear the offset, or tare again") from None
+
+
+def _replace(client: Client, position: int, before: Sequence[float], after: Sequence[float]) -> None:
+    """Write the offset and verify it; where it is refused, restore the old one. ProtocolError, ValueError."""
+
+    def write(offset: Sequence[float]) -> None:
+        for subindex, value in enumerate(offset, start=1):
+            client.ask(
+                "sdo_write", sensor=position, index=_OFFSET, subindex=subindex, type="f32", value=value
+            )
+        if array("f", _offset(client.ask("describe"), position)) != array("f", offset):
+            raise ValueError("the sensor did not take the offset")
+
+    try:
+        write(after)
+    except ConnectionFailedError:
+        raise
+    except (ProtocolError, ValueError):
+        write(before)
+        raise
 
 
 def _residual(values: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from clients.monitor.model import Client, Range, SensorState, ServerState, Spread, State
+from clients.monitor.model import Alert, Client, Range, SensorState, ServerState, Spread, State
 from clients.numbers import duration, milliseconds
 from protocol.health.verdict import Level
 from protocol.program.output import SPELLED
@@ -74,13 +74,13 @@ def server_facts(server: ServerState) -> list[tuple[str, str]]:
     if not server.connected or server.uptime_s is None:
         return []
     return [
-        ("Version", server.version or "?"),
         ("Up", duration(server.uptime_s)),
-        ("Cycles", count(server.cycles)),
         ("Missed deadlines", count(server.missed_deadlines)),
         ("Lost frames", count(server.lost_frames)),
-        ("Woke late by", times(server.wake_us, "p99")),
         ("Exchange", times(server.exchange_us, "p99")),
+        ("Woke late by", times(server.wake_us, "p99")),
+        ("Cycles", count(server.cycles)),
+        ("Version", server.version or "?"),
     ]
 
 
@@ -153,6 +153,11 @@ def seen(ago_s: float | None) -> str:
     return "now" if ago_s is None else f"{duration(ago_s)} ago"
 
 
+def alert(one: Alert) -> dict[str, str]:
+    """An alert for programs."""
+    return {"severity": one.level.key, "text": one.text, "remedy": one.remedy}
+
+
 def json_line(state: State, unix_s: float) -> str:
     """The state as one JSON object, for programs: docs/monitor.md has the keys. What is not known is null."""
     server = state.server
@@ -191,7 +196,7 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
         "orientation": sample and sample.orientation,
         "saturated": sorted(sensor.saturated),
         "verdict": sensor.verdict.level.key,
-        "alerts": [{"severity": a.level.key, "text": a.text, "remedy": a.remedy} for a in sensor.alerts],
+        "alerts": [alert(one) for one in sensor.alerts],
         **_plain(sensor, "samples rate_hz jitter_us jitter_worst_us missed gaps repeated invalid silent_s"),
         **_plain(sensor, "lost_on_bus recoveries"),
         "age_us": _spread(sensor.age_us, "worst"),

@@ -8,34 +8,31 @@ from __future__ import annotations
 import json
 import math
 import os
+from array import array
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 
-class Tared(NamedTuple):
-    """Force/torque offsets of a sensor, in N and Nm."""
-
-    before: list[float]
-    after: list[float]
-
-
-def remember(serial: int, tared: Tared) -> None:
-    """Keep it in place of an earlier one; OSError if it cannot be written."""
+def remember(serial: int, before: Sequence[float], after: Sequence[float]) -> None:
+    """Keep both offsets, in N and Nm, in place of earlier ones; OSError if they cannot be written."""
     path = _path()
     path.parent.mkdir(parents=True, exist_ok=True)
-    kept = {**_read(path), str(serial): tared._asdict()}
+    kept = {**_read(path), str(serial): {"before": list(before), "after": list(after)}}
     unfinished = path.with_suffix(f".{os.getpid()}")
     unfinished.write_text(json.dumps(kept), encoding="utf-8")
     unfinished.replace(path)
 
 
-def recall(serial: int) -> Tared | None:
-    """What was kept; None if there is nothing, or nothing that makes sense."""
+def former(serial: int | None, now: Sequence[float], sensor: str) -> list[float]:
+    """The offset of before the last tare of `sensor`; ValueError unless that tare made the offset `now`."""
     row = _read(_path()).get(str(serial))
     if not isinstance(row, dict) or not _are_offsets(row.get("before")) or not _are_offsets(row.get("after")):
-        return None
-    return Tared(row["before"], row["after"])
+        raise ValueError(f"no tare of {sensor} by this user is known")
+    if array("f", row["after"]) != array("f", now):  # as the sensor keeps it
+        raise ValueError(f"the offset of {sensor} has changed since its last tare here")
+    before: list[float] = row["before"]
+    return before
 
 
 def _path() -> Path:

@@ -50,8 +50,8 @@ class Stage:
         return self.shown()
 
 
-def play(scene: Callable[[Stage], Awaitable[None]], stage: Stage | None = None) -> Stage:
-    stage = stage or Stage()
+def play(scene: Callable[[Stage], Awaitable[None]]) -> Stage:
+    stage = Stage()
 
     async def run() -> None:
         async with stage.app.run_test(size=(80, 24)) as stage.pilot:
@@ -70,7 +70,7 @@ def test_tare_asks_first_and_only_y_does_it() -> None:
         assert "Sensor 0  BFT-SENS" in await stage.press("n")
         assert "Tare sensor 1?" in await stage.press("n", "t")
         await stage.press("y")
-        wait_until(lambda: "Sensor 1 was not tared: no connection to the server" in stage.shown(), "a word")
+        wait_until(lambda: "Sensor 1 was not tared: " in stage.shown(), "a word")
         await stage.press("t", "u")
         wait_until(lambda: "The tare of sensor 1 was not undone: " in stage.shown(), "another")
         await stage.press("t", "C")
@@ -90,41 +90,31 @@ def test_w_shows_all_warnings_and_any_other_key_leads_back() -> None:
     play(scene)
 
 
-def test_pause_holds_the_picture_and_counts_on() -> None:
+def test_pause_reset_and_help() -> None:
     async def scene(stage: Stage) -> None:
         assert "PAUSED" in await stage.press("p")
         stage.model.take([made.frame(6400, {"force.x": 77.0})], stage.now_s)
         assert "+77.00" not in stage.shown()
         text = await stage.press("p")
         assert "PAUSED" not in text
-        assert "+77.00" in text
-
-    play(scene)
-
-
-def test_reset_forgets_the_peaks() -> None:
-    async def scene(stage: Stage) -> None:
-        assert "-26.40" in stage.shown()
+        assert "+77.00" in text, "it counts on"
+        assert "-26.40" in text
         text = await stage.press("0")
         assert "-26.40" not in text
         assert "Peaks and past warnings are reset" in text
-
-    play(scene)
-
-
-def test_help_comes_and_goes_and_swallows_the_key() -> None:
-    async def scene(stage: Stage) -> None:
         assert "Press any key to return" in await stage.press("question_mark")
         text = await stage.press("t")
         assert "Press any key to return" not in text
-        assert "Tare sensor" not in text
+        assert "Tare sensor" not in text, "the key is not obeyed"
 
     play(scene)
 
 
-def test_record_starts_and_stops_a_recorder(tmp_path: Path) -> None:
+def test_record_starts_and_stops_a_recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
     async def scene(stage: Stage) -> None:
-        stage.app.recorder = Recorder(stage.address, tmp_path, [sys.executable, "-c", RECORDER])
+        stage.app.recorder = Recorder(stage.address, [sys.executable, "-c", RECORDER])
         assert "REC 0 s" in await stage.press("r")
         assert "Recording to recording-" in stage.shown()
         wait_until(lambda: bool(list(tmp_path.iterdir())), "the recording's file")
@@ -147,28 +137,21 @@ def test_keys_that_end_it(key: str) -> None:
     assert play(scene).app.return_code == 0
 
 
-def test_another_size_is_drawn_anew() -> None:
+def test_another_size_is_drawn_anew_and_then_only_rows_that_changed(monkeypatch: pytest.MonkeyPatch) -> None:
     async def scene(stage: Stage) -> None:
         await stage.pilot.resize_terminal(60, 15)
         await stage.pilot.pause()
         rows = stage.shown().splitlines()
-        assert len(rows) == 15
-        assert {len(row) for row in rows} == {60}
-
-    play(scene)
-
-
-def test_only_rows_that_changed_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def scene(stage: Stage) -> None:
-        view = stage.app.query_one("View")
-        stage.app.draw()
+        assert [len(row) for row in rows] == [60] * 15
         drawn: list[Any] = []
-        monkeypatch.setattr(view, "refresh", lambda *regions, **_: drawn.extend(regions))
+        monkeypatch.setattr(
+            stage.app.query_one("View"), "refresh", lambda *regions, **_: drawn.extend(regions)
+        )
         stage.app.draw()
         assert not drawn
         stage.model.say("something new")
         stage.app.draw()
-        assert [region.y for region in drawn] == [22]
+        assert [region.y for region in drawn] == [13]
 
     play(scene)
 
@@ -183,9 +166,9 @@ def test_only_rows_that_changed_are_drawn(monkeypatch: pytest.MonkeyPatch) -> No
         (["/nowhere/ethercat-record"], "ethercat-record cannot be started: No such file"),
     ],
 )
-def test_a_recorder_that_fails_says_why(tmp_path: Path, command: list[str], said: str) -> None:
+def test_a_recorder_that_fails_says_why(command: list[str], said: str) -> None:
     async def scene(stage: Stage) -> None:
-        stage.app.recorder = Recorder(stage.address, tmp_path, command)
+        stage.app.recorder = Recorder(stage.address, command)
         await stage.press("r")
         wait_until(lambda: said in stage.shown(), "the reason")
 

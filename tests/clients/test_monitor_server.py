@@ -20,17 +20,18 @@ from typing import Any
 
 import pytest
 
-from clients.monitor import cli, program
+from clients.monitor import cli
+from clients.monitor.cli import parse
 from clients.monitor.model import Model, State
-from clients.monitor.options import parse
 from clients.monitor.reader import Reader
-from clients.monitor.tare import clear, tare, undo
+from clients.monitor.tare import tare
 from clients.recording.reader import RecordingError, open_recording
 from ethercat_server.serving.transport.in_memory import ManualClock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from protocol.address import Address
 from protocol.client import Client
 from tests.bridge.scripted_server import ScriptedServer
+from tests.clients.captures import DOCS
 from tests.served_simulation import ServedSimulation, served
 from tests.server.as_another_user import NO_OTHER_USER
 from tests.server.running import PATIENCE_S, free_port, wait_until
@@ -70,11 +71,9 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
         code = cli.main(arguments)
         return code, *capsys.readouterr()
 
-    monkeypatch.setattr(program, "Model", model)
-    monkeypatch.setattr(
-        program, "time", SimpleNamespace(sleep=sleep, monotonic=time.monotonic, time=time.time)
-    )
-    monkeypatch.setattr(program, "_ANSWER_S", PATIENCE_S)
+    monkeypatch.setattr(cli, "Model", model)
+    monkeypatch.setattr(cli, "time", SimpleNamespace(sleep=sleep, monotonic=time.monotonic, time=time.time))
+    monkeypatch.setattr(cli, "_ANSWER_S", PATIENCE_S)
     yield running
     signal.signal(signal.SIGTERM, handler)
 
@@ -155,15 +154,8 @@ def test_once_without_a_server_is_exit_1_and_one_sentence(run: Run) -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        ["nonsense:port"],
-        ["localhost:0"],
-        ["::1"],
-        ["a", "b"],
-        ["--seconds", "0"],
-        ["--once", "--seconds", "3"],
-    ],
-)
+    [["nonsense:port"], ["localhost:0"], ["::1"], ["a", "b"], ["--seconds=0"], ["--once", "--seconds=3"]],
+)  # fmt: skip
 def test_wrong_usage_is_exit_2(arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         parse(arguments)
@@ -176,14 +168,11 @@ def test_a_line_a_second_until_the_limit(monkeypatch: pytest.MonkeyPatch) -> Non
     def monotonic() -> float:
         return clock.now_ns * 1e-9
 
-    monkeypatch.setattr(program, "time", SimpleNamespace(sleep=clock.sleep, monotonic=monotonic))
+    monkeypatch.setattr(cli, "time", SimpleNamespace(sleep=clock.sleep, monotonic=monotonic))
     times = []
-
-    def show() -> None:
+    for _ in cli.ticks(4.0):
         times.append(round(monotonic() - 1.0, 3))
         clock.sleep(1.8 if len(times) == 1 else 0.3)  # whoever is late does not hurry afterwards
-
-    program.every_second(4.0, show)
     assert times == [1.0, 2.8, 3.8]
 
 
@@ -200,11 +189,8 @@ def test_json_has_the_documented_keys(shared: ServedSimulation, run: Run) -> Non
     assert sensor["units"] == ["N", "Nm"]
     assert sensor["clock"]["mode"] in {"locked", "oversampling"}
     assert any(client["this"] for client in line["clients"])
-    assert documented_keys() == keys(line) | ALERT
-
-
-ALERT = {"severity", "text", "remedy"}
-"""Of which there are none on a machine that is not busy."""
+    alert = {"severity", "text", "remedy"}  # of which there are none on a machine that is not busy
+    assert documented_keys() == keys(line) | alert
 
 
 def keys(value: Any) -> set[str]:
@@ -214,8 +200,6 @@ def keys(value: Any) -> set[str]:
 
 
 def documented_keys() -> set[str]:
-    from tests.clients.captures import DOCS
-
     table = (DOCS / "monitor.md").read_text().split("## JSON")[1]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     return {key for row in rows for key in row.replace("`", "").replace(",", " ").split()}
@@ -315,13 +299,6 @@ def test_rate_jitter_age_and_the_own_row_among_the_clients_are_known(shared: Ser
         assert sensor.peaks is not None
 
 
-def test_tare_says_what_is_left() -> None:
-    with simulated_bus("--signal", "rest") as bus, simulated_server(bus):
-        text, bad = tare(Address("localhost", 1), 0)
-    assert not bad
-    assert re.fullmatch(r"Sensor 0 was tared; residual at most [0-9.]+ N and [0-9.]+ Nm", text)
-
-
 @pytest.fixture(autouse=True)
 def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where this user's last tares are kept."""
@@ -329,7 +306,7 @@ def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_tare_is_undone_and_cleared() -> None:
+def test_a_tare_says_what_is_left_and_is_undone_and_cleared() -> None:
     address = Address("localhost", 1)
 
     def offset() -> list[float]:
@@ -338,23 +315,25 @@ def test_a_tare_is_undone_and_cleared() -> None:
             return found
 
     with simulated_bus("--signal", "rest") as bus, simulated_server(bus):
-        assert undo(address, 0) == (
-            "The tare of sensor 0 was not undone: no tare of it by this user is known; its offset can be "
-            "cleared", True,
+        assert tare(address, 0, "undo") == (
+            "The tare of sensor 0 was not undone: no tare of sensor 0 by this user is known; clear the "
+            "offset, or tare again", True,
         )  # fmt: skip
-        tare(address, 0)
+        text, bad = tare(address, 0)
+        assert not bad
+        assert re.fullmatch(r"Sensor 0 was tared; residual at most [0-9.]+ N and [0-9.]+ Nm", text)
         tared = offset()
-        assert undo(address, 0) == ("The tare of sensor 0 was undone", False)
+        assert tare(address, 0, "undo") == ("The tare of sensor 0 was undone", False)
         assert offset() == [0.0] * 6
-        assert not undo(address, 0)[1], "of the undoing"
+        assert not tare(address, 0, "undo")[1], "of the undoing"
         assert offset() == tared
-        assert clear(address, 0) == ("The offset of sensor 0 was cleared", False)
+        assert tare(address, 0, "clear") == ("The offset of sensor 0 was cleared", False)
         assert offset() == [0.0] * 6
         with Client(address.port, stream=False).connect() as client:
             client.ask("sdo_write", sensor=0, index=0x8000, subindex=1, type="f32", value=1.0)
-        assert "its offset has changed since" in undo(address, 0)[0]
+        assert "the offset of sensor 0 has changed since" in tare(address, 0, "undo")[0]
         bus.command("on-write 0x8000 2 abort 0x8000 3 0x08000022")
-        text, bad = clear(address, 0)
+        text, bad = tare(address, 0, "clear")
         assert bad
         assert text.startswith("The offset of sensor 0 was not cleared: ")
         assert offset() == [1.0, *[0.0] * 5]
@@ -368,7 +347,7 @@ def test_tare_says_why_not() -> None:
         server.hangs = True
         text, bad = tare(Address("localhost", 1), 0)
         assert bad
-        assert re.match("Sensor 0 was not tared: no connection .*no reply to describe", text)
+        assert re.match("Sensor 0 was not tared: .*no reply to describe", text)
 
 
 @pytest.mark.parametrize("way", ["silent", "gone"])

@@ -44,7 +44,7 @@ for name, entry in CLIENTS.items():
         assert ended.code == 0, name
 
 import clients.export.program, clients.identify.program, clients.record.program, clients.replay.program
-from clients.monitor import options, program
+from clients.monitor import cli
 from clients.program import Signals, call_on
 from protocol.client import connect
 
@@ -62,8 +62,8 @@ while True:
     except Exception as error:
         assert "refused" in str(error), error
 assert clients.record.program.run([recorded, *where, "--seconds", "0.2"], recorder) == 0
-program._ONCE_S = 0.1
-assert program.run(options.parse(["--once", *where])) in (0, 1)
+cli._ONCE_S = 0.1
+assert cli.run(cli.parse(["--once", *where])) in (0, 1)
 replay._on_signal(0, None)
 thread.join()
 assert clients.export.program.run(clients.export.options.parse_options([recorded, table])) == 0

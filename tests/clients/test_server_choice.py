@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from clients.monitor import options as monitor
+from clients.monitor import cli as monitor
 from clients.record import options as record
 from clients.replay import options as replay
 from clients.report import options as report

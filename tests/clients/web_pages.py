@@ -53,7 +53,7 @@ class Web:
         ready, loop, stop = Future[int](), asyncio.new_event_loop(), asyncio.Event()
 
         async def serve() -> None:
-            async with serving(self.hub, self.model, "localhost", self.port, lambda: self.now_s) as at:
+            async with serving(self.hub, "localhost", self.port, lambda: self.now_s) as at:
                 ready.set_result(at)
                 await stop.wait()
 

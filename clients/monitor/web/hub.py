@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import hmac
+import ipaddress
 import json
 import secrets
 import threading
@@ -44,7 +45,6 @@ class WebModel(Model):
     def __init__(self, address: str, imu_units: ImuUnits = ImuUnits.G_DPS) -> None:
         super().__init__(address, imu_units)
         self.feed = Feed(imu_units)
-        self.on_points: Callable[[], None] = lambda: None  # called when there may be new points
 
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
         """See `Model`."""
@@ -55,7 +55,6 @@ class WebModel(Model):
         """See `Model`."""
         super().take(frames, now_s)
         self.feed.take(frames)
-        self.on_points()
 
 
 class Page:
@@ -124,7 +123,7 @@ class Hub:
                 page.send(texts[page.sensor])
 
     def send_points(self, now_s: float) -> None:
-        """Send the points that are due to the pages that keep up: whoever lags misses them and is told so."""
+        """Send new points to the pages that keep up; one that lags is told later that it has missed some."""
         silent = now_s - self._points_s > _SILENT_S
         for position, batch in self._model.feed.batches(silent=silent).items():
             self._points_s = now_s
@@ -191,6 +190,16 @@ class Hub:
         self._model.say(f"{clock_text()} {text}", bad)
 
 
+def is_loopback(host: str) -> bool:
+    """Whether a host, without port, is this machine."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
 def state_text(state: State, position: int, number: int) -> str:
     """State `number` for a page that shows the sensor at `position`, as JSON; unknown values are null."""
     trouble = words.trouble(state.server)
@@ -205,11 +214,11 @@ def state_text(state: State, position: int, number: int) -> str:
         "events": state.events,
         "sensors": [
             {
-                "position": sensor.position,
-                "name": sensor.name,
-                "ok": None if trouble else sensor.verdict.level is not Level.TROUBLE,
+                "position": s.position,
+                "name": s.name,
+                "ok": None if trouble else s.verdict.level < Level.TROUBLE,
             }
-            for sensor in state.sensors
+            for s in state.sensors
         ],
         "sensor": next((_sensor(sensor) for sensor in state.sensors if sensor.position == position), None),
     }
@@ -240,15 +249,8 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
         "peaks": sensor.peaks and dict(zip(AXES, sensor.peaks, strict=True)),
         "saturated": sorted(sensor.saturated),
         "alerts": [
-            {
-                "severity": alert.level.key,
-                "level": alert.level.words,
-                "text": alert.text,
-                "remedy": alert.remedy,
-                "when": words.seen(alert.ago_s),
-                "present": alert.ago_s is None,
-            }
-            for alert in sensor.alerts
+            words.alert(a) | {"level": a.level.words, "when": words.seen(a.ago_s), "present": a.ago_s is None}
+            for a in sensor.alerts
         ],
         "stream": list(stream.items()),
         "losses": words.losses(sensor),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import itertools
 import logging
 import socket
 import sys
@@ -26,15 +27,15 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from clients.monitor.options import Options, is_loopback
 from clients.monitor.reader import Reader
 from clients.monitor.tare import start_tare
-from clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, WebModel
+from clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, WebModel, is_loopback
 from clients.program import call_on, say
 from protocol.address import Address
+from protocol.pdo import ImuUnits
 
-STATE_S: Final = 0.2
 POINTS_S: Final = 1 / 30
+POINTS_A_STATE: Final = 6
 STREAM: Final = "/stream"  # where the page opens its WebSocket
 HEADERS: Final = {
     "Content-Security-Policy": (
@@ -58,17 +59,17 @@ _TRY_AGAIN_LATER: Final = 1013
 _WHY: Final = {
     errno.EADDRINUSE: "is in use",
     errno.EACCES: "is reserved for root",
-    errno.EADDRNOTAVAIL: "cannot be had: this machine has no such address",
+    errno.EADDRNOTAVAIL: "is no address of this machine",
 }
 
-# What a peer does wrong is no business of the terminal's, and requests are not logged.
+# Neither requests nor errors of clients are written to the terminal.
 _QUIET: Final = logging.Logger(__name__, logging.CRITICAL)
 
 
-def run_web(options: Options, where: Address) -> int:
-    """Serve the page until a signal or the time limit; returns the exit code."""
+def run_web(address: Address, where: Address, imu_units: ImuUnits, seconds: float | None) -> int:
+    """Serve the page of the server at `address` until a signal or for `seconds`; returns the exit code."""
     try:
-        asyncio.run(_run(options, where))
+        asyncio.run(_run(address, where, imu_units, seconds))
     except OSError as error:
         if error.errno not in _WHY:
             raise
@@ -77,13 +78,13 @@ def run_web(options: Options, where: Address) -> int:
     return 0
 
 
-async def _run(options: Options, where: Address) -> None:
+async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: float | None) -> None:
     stop = asyncio.Event()
     call_on(asyncio.get_running_loop(), stop.set, "SIGINT", "SIGTERM", "SIGHUP")
-    model = WebModel(str(options.address), options.imu_units)
-    hub = Hub(model, partial(start_tare, options.address))
-    reader = Reader(options.address, model, POINTS_S)
-    async with serving(hub, model, *where) as port:
+    model = WebModel(str(address), imu_units)
+    hub = Hub(model, partial(start_tare, address))
+    reader = Reader(address, model, POINTS_S)
+    async with serving(hub, *where) as port:
         sys.stdout.write(
             f"Open http://{Address(where.host, port)}/#token={hub.token}\n"
             "With this link the page can tare the sensor; without #token=... it only shows. Ctrl-C ends it.\n"
@@ -92,21 +93,18 @@ async def _run(options: Options, where: Address) -> None:
         reader.start()
         try:
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(stop.wait(), options.seconds)
+                await asyncio.wait_for(stop.wait(), seconds)
         finally:
             reader.close()
 
 
 @contextlib.asynccontextmanager
 async def serving(
-    hub: Hub, model: WebModel, host: str, port: int, clock: Callable[[], float] = time.monotonic
+    hub: Hub, host: str, port: int, clock: Callable[[], float] = time.monotonic
 ) -> AsyncIterator[int]:
-    """Serve on a loopback address, `localhost` on both; gives the port. OSError if it cannot be had."""
+    """Serve on a loopback address, `localhost` on both; yields the port. OSError if it cannot be bound."""
     listening = _listen(host, port)
-    loop, page_files = asyncio.get_running_loop(), read_page()
-
-    def respond(_: ServerConnection, request: Request) -> Response | None:
-        return answer(page_files, request)
+    page_files = read_page()
 
     async def converse(connection: ServerConnection) -> None:
         page = hub.join(partial(broadcast, [connection]), clock())
@@ -124,22 +122,19 @@ async def serving(
             hub.leave(page)
 
     async def send() -> None:
-        while True:
-            hub.send_states(clock())
+        for count in itertools.count():
+            if count % POINTS_A_STATE == 0:
+                hub.send_states(clock())
             hub.send_points(clock())
-            await asyncio.sleep(STATE_S)
+            await asyncio.sleep(POINTS_S)
 
-    def points_are_due() -> None:  # in the reader's thread
-        loop.call_soon_threadsafe(lambda: hub.send_points(clock()))
-
-    model.on_points = points_are_due
     async with contextlib.AsyncExitStack() as stack:
         for sock in listening:
             await stack.enter_async_context(
                 serve(
                     converse,
                     sock=sock,
-                    process_request=respond,
+                    process_request=lambda _, request: answer(page_files, request),
                     compression=None,
                     max_size=MOST_BYTES,
                     max_queue=4,
@@ -153,7 +148,6 @@ async def serving(
         try:
             yield listening[0].getsockname()[1]
         finally:
-            model.on_points = lambda: None
             sending.cancel()
 
 

@@ -16,7 +16,7 @@ from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
 from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, columns, report, sensors_of
 from ethercat_server.tool.commands.settings import UNSAVED
 from protocol.control import ACTIONS, MAX_TARE_SAMPLES
-from protocol.program.tare_memory import Tared, recall, remember
+from protocol.program.tare_memory import former, remember
 
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _UNSAVED: Final = UNSAVED.replace("--save, or the command save,", "the command save")
@@ -94,19 +94,15 @@ def _take_back(args: argparse.Namespace) -> int:
 
 def _former(found: Found, now: Sequence[float]) -> list[float]:
     """The offset of before the last tare; BusError unless what is in force is of that tare."""
-    last = recall(found.identity.serial)
-    if last is None:
-        raise BusError(f"no tare of {found} by this user is known: use --clear, or tare again")
-    if pack_offset(last.after) != pack_offset(now):
-        raise BusError(
-            f"the offset of {found} has changed since its last tare here: use --clear, or tare again"
-        )
-    return last.before
+    try:
+        return former(found.identity.serial, now, str(found))
+    except ValueError as error:
+        raise BusError(f"{error}: use --clear, or tare again") from None
 
 
 def _remember(found: Found, before: Sequence[float], after: Sequence[float]) -> None:
     try:
-        remember(found.identity.serial, Tared(list(before), list(after)))
+        remember(found.identity.serial, before, after)
     except OSError as error:
         note(f"--undo will not know this tare: {error.strerror or error}")
 

@@ -1,6 +1,6 @@
 // Puts the page together: what comes over the link goes into traces, readings, arrows and cards.
 
-import { byId, element, fill, setText } from "./dom.js";
+import { byId, dark, element, fill, setText } from "./dom.js";
 import { Link } from "./link.js";
 import { GROUPS, History, Trace } from "./traces.js";
 import { Wrench } from "./wrench.js";
@@ -8,7 +8,6 @@ import { Wrench } from "./wrench.js";
 const SPANS_S = [5, 10, 30, 60];
 const READ_MS = 200;
 const DRAW_MS = 40;
-const SAID_MS = 30000;
 
 const history = new History();
 const traces = GROUPS.map((group) => new Trace(group));
@@ -18,6 +17,7 @@ let span = 10;
 let newest = null;
 let sensor = null;
 let control = false;
+let refused = null;
 let troubles = { link: "not connected yet", server: null };
 let drawn = 0;
 let read = 0;
@@ -34,7 +34,8 @@ const link = new Link({
   state: showState,
   reply(message) {
     control = message.control;
-    if (message.refused) say(message.refused, true);
+    refused = message.refused;
+    showMessage(null);
     showControl();
   },
   trouble(text) {
@@ -66,7 +67,7 @@ function showState(state) {
   fill(byId("server").lastElementChild, rows, pairs);
   fill(byId("events").lastElementChild, state.events, (events) => events.map((text) => element("li", {}, text)).reverse());
   byId("events").hidden = !state.events.length;
-  if (message) say(message.text, message.bad);
+  showMessage(message);
   showControl();
   showTrouble();
 }
@@ -124,17 +125,12 @@ function showTrouble() {
   byId("link").className = text ? "bad" : old ? "warn" : "good";
 }
 
-let said = "";
-let saidTimer = 0;
-
-function say(text, bad) {
-  if (text === said) return;
-  said = text;
-  byId("message").hidden = false;
-  byId("message").classList.toggle("bad", bad);
-  clearTimeout(saidTimer);
-  saidTimer = setTimeout(() => { byId("message").hidden = true; }, SAID_MS);
-  setText(byId("message"), text);
+/** What the monitor last said; a token that it refused stays. */
+function showMessage(message) {
+  const said = refused ? { text: refused, bad: true } : message;
+  byId("message").hidden = !said;
+  byId("message").classList.toggle("bad", Boolean(said?.bad));
+  setText(byId("message"), said?.text ?? "");
 }
 
 // What people do.
@@ -225,7 +221,7 @@ function arrows() {
   });
 }
 
-document.addEventListener("theme", () => {
+dark.addEventListener("change", () => {
   drawn = 0;
   for (const trace of traces) trace.plot.redraw();
 });

@@ -24,8 +24,9 @@ export function fill(node, value, make) {
   node.replaceChildren(...make(value));
 }
 
-/** The colors of the style sheet as a canvas needs them; renewed when the theme changes. */
+/** The colors of the style sheet as a canvas needs them; renewed when the system turns light or dark. */
 export const colors = {};
+export const dark = matchMedia("(prefers-color-scheme: dark)");
 
 function renew() {
   const style = getComputedStyle(document.documentElement);
@@ -33,5 +34,5 @@ function renew() {
     colors[name] = style.getPropertyValue(`--${name}`).trim();
 }
 
-document.addEventListener("theme", renew);
+dark.addEventListener("change", renew);
 renew();

@@ -1,6 +1,6 @@
 // The connection to ethercat-monitor: comes back by itself, and notices silence.
 
-const RETRY_MS = [300, 700, 1500, 2000];
+const RETRY_MS = 1000;
 const SILENT_MS = 1500;
 const GIVEN_UP_MS = 5000;
 const HEADER_BYTES = 16;
@@ -28,17 +28,12 @@ export class Link {
     this.on = on;
     this.sensor = 0;
     this.token = null;
-    this.failures = 0;
-    this.heard = performance.now();
     setInterval(() => this.#watch(), 250);
-    const now = () => this.#again(0);
-    addEventListener("online", now);
-    document.addEventListener("visibilitychange", () => document.hidden || now());
     this.#open();
   }
 
   get connected() {
-    return this.socket?.readyState === WebSocket.OPEN;
+    return this.socket.readyState === WebSocket.OPEN;
   }
 
   send(message) {
@@ -58,19 +53,22 @@ export class Link {
   #open() {
     const socket = new WebSocket(`ws://${location.host}/stream`);
     this.socket = socket;
+    this.heard = performance.now();
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
-      this.heard = performance.now();
       this.send({ sensor: this.sensor });
       if (this.token) this.send({ token: this.token });
     };
     socket.onmessage = ({ data }) => this.socket === socket && this.#take(data);
-    socket.onclose = ({ reason }) => this.socket === socket && this.#lost(reason);
+    socket.onclose = ({ reason }) => {
+      if (this.socket !== socket) return;
+      this.on.trouble(reason || "ethercat-monitor does not answer: it has ended, or cannot be reached");
+      setTimeout(() => this.#open(), RETRY_MS);
+    };
   }
 
   #take(data) {
     this.heard = performance.now();
-    this.failures = 0;
     if (data instanceof ArrayBuffer) {
       this.on.points(decode(data));
       return;
@@ -83,28 +81,13 @@ export class Link {
     } else this.on.reply(message);
   }
 
-  #lost(reason) {
-    this.socket = null;
-    this.on.trouble(reason || "ethercat-monitor does not answer: it has ended, or cannot be reached");
-    this.#again(RETRY_MS[Math.min(this.failures++, RETRY_MS.length - 1)]);
-  }
-
-  #again(after) {
-    if (this.socket) return;
-    clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.socket || this.#open(), after);
-  }
-
   #watch() {
-    if (!this.socket) return;
     const silent = performance.now() - this.heard;
-    if (silent < SILENT_MS) return;
+    if (!this.connected || silent < SILENT_MS) return;
     this.on.trouble(`nothing came from ethercat-monitor for ${Math.floor(silent / 1000)} s`);
-    if (silent > GIVEN_UP_MS) {
-      const socket = this.socket;
-      this.heard = performance.now();
-      this.#lost("nothing comes from ethercat-monitor");
-      socket.close();
-    }
+    if (silent < GIVEN_UP_MS) return;
+    const silentSocket = this.socket;
+    this.#open();
+    silentSocket.close();
   }
 }

@@ -6,7 +6,7 @@ import { colors, element } from "./dom.js";
 
 const KEPT_S = 62;
 const STEP_S = 0.01;
-const BEHIND_S = 0.05; // the right edge is where there are points already
+const BEHIND_S = 0.08; // the right edge is where there are points already
 const LEAK = 0.02;
 
 /** Times and values as uPlot wants them; a null is a gap. */

@@ -3,23 +3,13 @@
 import { colors } from "./dom.js";
 
 const LEAST = { N: 5, Nm: 0.2, counts: 1000 };
-const SHRINK_MS = 3000;
 
-/** The length that an arrow of full size stands for: 1, 2 or 5 times a power of ten. */
-class Scale {
-  constructor() {
-    this.full = 0;
-    this.small = 0;
-  }
-
-  fit(length, unit) {
-    const wanted = Math.max(length, LEAST[unit] ?? 1);
-    const power = 10 ** Math.floor(Math.log10(wanted));
-    const nice = [1, 2, 5, 10].find((step) => step * power >= wanted * 0.999) * power;
-    if (nice >= this.full) this.small = performance.now();
-    if (nice > this.full || performance.now() - this.small > SHRINK_MS) this.full = nice;
-    return this.full;
-  }
+/** The length that an arrow of full size stands for: 1, 2 or 5 times a power of ten. It shrinks late, so as not to flicker. */
+function fit(full, length, unit) {
+  const wanted = Math.max(length, LEAST[unit] ?? 1);
+  const power = 10 ** Math.floor(Math.log10(wanted));
+  const nice = [1, 2, 5, 10].find((step) => step * power >= wanted * 0.999) * power;
+  return nice > full || wanted < 0.15 * full ? nice : full;
 }
 
 export class Wrench {
@@ -27,7 +17,7 @@ export class Wrench {
     this.canvas = canvas;
     this.yaw = -0.62;
     this.pitch = 0.42;
-    this.scales = [new Scale(), new Scale()];
+    this.full = [0, 0];
     canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
     canvas.addEventListener("pointermove", (event) => {
       if (!event.buttons) return;
@@ -60,7 +50,8 @@ export class Wrench {
     this.#axes(pen);
     return [[force, colors.ink, 0], [torque, colors.torque, 1]].map(([vector, color, i]) => {
       const size = vector ? Math.hypot(...vector) : 0;
-      const full = this.scales[i].fit(Number.isFinite(size) ? size : 0, units[i]);
+      const full = fit(this.full[i], Number.isFinite(size) ? size : 0, units[i]);
+      this.full[i] = full;
       if (vector && Number.isFinite(size) && size > full * 0.01) this.#arrow(pen, vector.map((v) => v / full), color, i === 1);
       return full;
     });
