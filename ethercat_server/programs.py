@@ -3,7 +3,7 @@
 import sys
 from pathlib import PurePath
 
-from protocol.program import start
+from bota_ethercat.program import start
 
 _NEEDED = frozenset({"pysoem", "pyroute2", "fcntl", "grp", "pwd", "resource"})
 """What is missing after `pip install --no-deps .`, and on other systems."""

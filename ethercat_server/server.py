@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from bota_ethercat.control import Event, event
 from ethercat_server.acquisition.cycle import Cycle, Watchdog
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.jobs import Jobs
@@ -19,7 +20,6 @@ from ethercat_server.sensor.scan import OtherSlaves
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.sensor_actions import SensorActions
-from protocol.control import Event, event
 
 
 class NoWatchdog:

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from protocol.framing import DataMessage
-from protocol.pdo import Sample
-from protocol.text.json_text import JsonObject
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import Sample
+from bota_ethercat.text.json_text import JsonObject
 
 _FOLDER: Final = Path(__file__).parent / "protocol" / "golden"
 
@@ -74,7 +74,7 @@ STREAMS: Final = {
 
 
 class AccountedStream(NamedTuple):
-    """Frames of one sensor, and what `protocol.accounting` makes of them."""
+    """Frames of one sensor, and what `bota_ethercat.accounting` makes of them."""
 
     name: str
     every: int

@@ -16,6 +16,8 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 
+from bota_ethercat.control import Event, event
+from bota_ethercat.settings import SettingValue
 from ethercat_server.acquisition.stream import Made
 from ethercat_server.serving.transport.base import Transport
 from ethercat_server.serving.transport.sockets import SocketTransport
@@ -23,8 +25,6 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 from ethercat_server.virtual_sensor import bus as virtual
 from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
-from protocol.control import Event, event
-from protocol.settings import SettingValue
 from tests.server.running import PATIENCE_S, Client, free_port
 from tests.simulation import Simulation
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from bota_ethercat.client import Client, client
 from ethercat_server.access import private_server, raw, sensors
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.acquisition.start_up import AsFound, Wanted
@@ -32,7 +33,6 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
-from protocol.client import Client, client
 from tests.simulation import MemoryChannel, SimulatedBus, Simulation
 
 SINC_LENGTH, RATE_HZ = 512, 100

@@ -22,6 +22,12 @@ from typing import Any
 
 import pytest
 
+from bota_ethercat.control import request
+from bota_ethercat.errors import ConnectionFailedError, UnreachableError
+from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
+from bota_ethercat.pdo import LAYOUTS
+from bota_ethercat.settings import SettingValue, start_up_defaults
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.start_up import Wanted
 from ethercat_server.acquisition.stream import Made
 from ethercat_server.ethercat.bus import Bus
@@ -34,12 +40,6 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.measurement.signals import ClockReading, decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.control import request
-from protocol.errors import ConnectionFailedError, UnreachableError
-from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_json
-from protocol.pdo import LAYOUTS
-from protocol.settings import SettingValue, start_up_defaults
-from protocol.text.json_text import JsonObject
 
 PATIENCE_S = 60.0
 """Simulated time that anything may take."""

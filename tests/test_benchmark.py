@@ -26,10 +26,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bota_ethercat.framing import DataMessage, FrameDecoder
+from bota_ethercat.pdo import SampleDecoder, encode
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.framing import DataMessage, FrameDecoder
-from protocol.pdo import SampleDecoder, encode
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import ScriptError, Setup

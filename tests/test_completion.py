@@ -82,6 +82,6 @@ def test_zsh_has_interfaces_settings_and_files() -> None:
 
 def test_without_shtab_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "shtab", None)
-    ended = run_here(importlib.import_module("clients.monitor.cli").main, "--print-completion", "bash")
+    ended = run_here(importlib.import_module("bota_clients.monitor.cli").main, "--print-completion", "bash")
     assert ended.code == 1
     assert ended.err.endswith(f"shtab is not installed: {sys.executable} -m pip install shtab\n")

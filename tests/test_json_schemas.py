@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from clients.identify.program import run as identify
-from clients.monitor.model import State
-from clients.monitor.words import json_line
-from clients.report.cli import main as report
+from bota_clients.identify.program import run as identify
+from bota_clients.monitor.model import State
+from bota_clients.monitor.words import json_line
+from bota_clients.report.cli import main as report
 from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.tool.cli import COMMANDS
 from tests.clients.monitor_states import gone, healthy, troubled

@@ -8,8 +8,8 @@ import re
 import numpy as np
 import pytest
 
-from protocol.framing import DataFlag, DataMessage
-from protocol.pdo import SampleDecoder, encode
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.pdo import SampleDecoder, encode
 from scripts.demonstration import program
 from scripts.demonstration.measure import Measurement, explanation, verdict
 from scripts.demonstration.program import Screen, print_summary

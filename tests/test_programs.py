@@ -16,10 +16,10 @@ from typing import Final
 
 import pytest
 
-from clients import program
+from bota_clients import program
+from bota_ethercat.program.output import never_fail
 from ethercat_server import programs
 from ethercat_server.virtual_sensor.cli import main as virtual_sensor
-from protocol.program.output import never_fail
 from tests.ended import run_here
 
 ROOT: Final = Path(__file__).parent.parent
@@ -60,7 +60,7 @@ def interrupted(name: str, number: int, at: str, arguments: str) -> tuple[int, s
         ("ethercat-sensor", "argparse", "--help"),
         ("ethercat-doctor", "ethercat_server.daemon.options", "--help"),
         ("ethercat-report", "jinja2", "--seconds 1"),
-        ("ethercat-monitor", "clients.monitor.screen", "--once"),
+        ("ethercat-monitor", "bota_clients.monitor.screen", "--once"),
         ("ethercat-monitor", "textual.app", ""),
         ("ethercat-server", "ethercat_server.process.signals", "--help"),
     ],
@@ -99,7 +99,7 @@ def test_the_server_says_what_it_needs(
     def start(_: str) -> int:
         raise ModuleNotFoundError("No module named 'pysoem'", name="pysoem")
 
-    monkeypatch.setattr("protocol.program.start.run", start)
+    monkeypatch.setattr("bota_ethercat.program.start.run", start)
     monkeypatch.setattr(sys, "argv", ["/opt/bin/ethercat-server"])
     assert programs.server() == 1
     sentence = "ethercat-server: pysoem is missing: this needs Linux and 'pip install .' there\n"

@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from bota_ethercat.address import Address
+from bota_ethercat.client import Client
+from bota_ethercat.errors import ProtocolError
+from bota_ethercat.program.server_choice import default_server
 from ethercat_server.ethercat.nic.packet_sockets import master_sockets, table, users_of
-from protocol.address import Address
-from protocol.client import Client
-from protocol.errors import ProtocolError
-from protocol.program.server_choice import default_server
 
 _LISTEN: Final = 0x0A
 

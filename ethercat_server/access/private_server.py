@@ -15,6 +15,8 @@ import threading
 from collections.abc import Sequence
 from typing import Final
 
+from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
+from bota_ethercat.errors import UnreachableError
 from ethercat_server.access.raw import open_interface
 from ethercat_server.acquisition.start_up import AsFound
 from ethercat_server.errors import BusError
@@ -22,8 +24,6 @@ from ethercat_server.process import realtime
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.transport.sockets import SocketStream, SocketTransport
-from protocol.client.channel import RECEIVE_BUFFER, TcpChannel
-from protocol.errors import UnreachableError
 
 STOPPED: Final = BusError("stopped before it was done")
 _ENDED: Final = "it has ended"

@@ -6,6 +6,22 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+from bota_ethercat.accounting import NOT_NEW
+from bota_ethercat.address import Address
+from bota_ethercat.client import Client
+from bota_ethercat.control import ErrorCode, Event
+from bota_ethercat.errors import (
+    ConnectionFailedError,
+    NoReplyError,
+    ProtocolError,
+    RefusedError,
+    UnreachableError,
+)
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.program.server_choice import default_server, is_address
+from bota_ethercat.sensor_choice import SensorChoice
+from bota_ethercat.settings import SettingValue
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.access.holder import find_holder
 from ethercat_server.access.private_server import PrivateServer
 from ethercat_server.errors import BusError, InterfaceError, SdoAbortError, ServerError, UsageError
@@ -16,22 +32,6 @@ from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.sensor import Found, Identity, Sensor
 from ethercat_server.sensor.set_up import NO_SETTINGS, read_in_force
 from ethercat_server.sensor.tare import LATER
-from protocol.accounting import NOT_NEW
-from protocol.address import Address
-from protocol.client import Client
-from protocol.control import ErrorCode, Event
-from protocol.errors import (
-    ConnectionFailedError,
-    NoReplyError,
-    ProtocolError,
-    RefusedError,
-    UnreachableError,
-)
-from protocol.framing import DataFlag, DataMessage
-from protocol.program.server_choice import default_server, is_address
-from protocol.sensor_choice import SensorChoice
-from protocol.settings import SettingValue
-from protocol.text.json_text import JsonObject
 
 _ANSWER_TIMEOUT_S: Final = 30.0
 _SLOWEST_SAMPLE_S: Final = 1.0

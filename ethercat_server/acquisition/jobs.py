@@ -11,12 +11,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.control import ErrorCode
+from bota_ethercat.errors import RequestError
 from ethercat_server.errors import BusError, CutOffError, SdoAbortError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.sensor.sensor import Sensor
-from protocol.control import ErrorCode
-from protocol.errors import RequestError
 
 _STEP_NS: Final = 300_000  # a step is begun only with this much time left: an exchange and a margin
 # A step is taken at least this often, even on a bus that leaves no time.

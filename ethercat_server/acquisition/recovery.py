@@ -10,6 +10,9 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
+from bota_ethercat.control import Event, event
+from bota_ethercat.settings import SettingValue
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.health.causes import Causes
 from ethercat_server.acquisition.health.mailboxes import Mailboxes
 from ethercat_server.acquisition.stream import SensorStream
@@ -29,9 +32,6 @@ from ethercat_server.sensor.objects.dictionary import is_sensor
 from ethercat_server.sensor.scan import OtherSlaves
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
 from ethercat_server.sensor.set_up import identify, set_up, set_up_in_op
-from protocol.control import Event, event
-from protocol.settings import SettingValue
-from protocol.text.json_text import JsonObject
 
 _SHORT_EXCHANGES: Final = 2  # short working counters, almost in a row, before the sensors' states are read
 # Time without a frame coming back after which all sensors are lost; a single lost frame never suffices.

@@ -9,6 +9,9 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple, Protocol, TypeVar
 
+from bota_ethercat.errors import PdoSizeError, SettingError
+from bota_ethercat.pdo import layout_for
+from bota_ethercat.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
 from ethercat_server.errors import BusError, SdoAbortError, SetUpError, UsageError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
@@ -18,9 +21,6 @@ from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.scan import Slave, look_safely
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState, is_known_model
 from ethercat_server.sensor.set_up import identify, read_in_force, read_offset, set_up
-from protocol.errors import PdoSizeError, SettingError
-from protocol.pdo import layout_for
-from protocol.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
 
 T = TypeVar("T")
 _ATTEMPTS: Final = 3

@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
+from bota_ethercat.framing import DataFlag, encode_data
+from bota_ethercat.pdo import is_finite
 from ethercat_server.acquisition.clock import SILENT_PERIODS, SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.health.samples import SampleHealth
@@ -22,8 +24,6 @@ from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock
 from ethercat_server.ethercat.exchange.process_data import DUPLICATE, Exchange
 from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.sensor.sensor import Sensor
-from protocol.framing import DataFlag, encode_data
-from protocol.pdo import is_finite
 
 # Bota's own driver discards the first three frames after entering OP.
 DISCARDED_AT_START: Final = 3

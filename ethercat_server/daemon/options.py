@@ -14,15 +14,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from bota_ethercat.errors import SettingError
+from bota_ethercat.program.completion import add_completion
+from bota_ethercat.sensor_choice import SensorChoice
+from bota_ethercat.settings import (
+    SETTINGS,
+    SettingValue,
+    check_combination,
+    check_settings,
+    start_up_defaults,
+)
+from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server import __version__
 from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.nic.interface import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import realtime
-from protocol.errors import SettingError
-from protocol.program.completion import add_completion
-from protocol.sensor_choice import SensorChoice
-from protocol.settings import SETTINGS, SettingValue, check_combination, check_settings, start_up_defaults
-from protocol.text.did_you_mean import did_you_mean
 
 DEFAULTS: Final = "defaults"
 KEEP: Final = "keep"

@@ -12,6 +12,8 @@ import threading
 from collections.abc import Sequence
 from typing import Final
 
+from bota_ethercat.errors import RequestError
+from bota_ethercat.settings import SettingValue
 from ethercat_server.daemon.options import SERVER_SETTINGS, ServerOptions, parse_options
 from ethercat_server.errors import UsageError
 from ethercat_server.process import realtime
@@ -21,8 +23,6 @@ from ethercat_server.server import Server
 from ethercat_server.serving.connection import Limits
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.permissions import controlling_uids, local_names
-from protocol.errors import RequestError
-from protocol.settings import SettingValue
 
 log = logging.getLogger(__name__)
 

@@ -16,6 +16,14 @@ from itertools import groupby
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from bota_ethercat.address import Address
+from bota_ethercat.control import Event
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.health import verdict as health
+from bota_ethercat.health.judge import Observation, emergency, judge
+from bota_ethercat.health.observer import StreamObserver
+from bota_ethercat.health.verdict import LIMITS, Level
+from bota_ethercat.text.untrusted import number
 from ethercat_server.access.adapters import promiscuity_kept
 from ethercat_server.access.holder import Holder, find_holder
 from ethercat_server.access.sensors import Sensors
@@ -49,14 +57,6 @@ from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.objects.dictionary import is_sensor
 from ethercat_server.sensor.scan import look_at, with_sii
 from ethercat_server.sensor.sensor import is_known_model
-from protocol.address import Address
-from protocol.control import Event
-from protocol.framing import DataMessage
-from protocol.health import verdict as health
-from protocol.health.judge import Observation, emergency, judge
-from protocol.health.observer import StreamObserver
-from protocol.health.verdict import LIMITS, Level
-from protocol.text.untrusted import number
 
 MOST_PORTS: Final = 4
 _ATTEMPTS: Final = 10

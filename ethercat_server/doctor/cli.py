@@ -11,13 +11,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
+from bota_ethercat.program.completion import add_completion
 from ethercat_server import __version__
 from ethercat_server.daemon.options import SERVER_SETTINGS, VIRTUAL_INTERFACE
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.nic.claim import MAX_NAME_LENGTH
 from ethercat_server.ethercat.nic.interface import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import command_line
-from protocol.program.completion import add_completion
 
 if TYPE_CHECKING:
     from ethercat_server.doctor.finding import Finding

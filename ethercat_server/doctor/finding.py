@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Final, NoReturn
 
-from protocol.health.verdict import Level
+from bota_ethercat.health.verdict import Level
 
 # As the doctor calls the levels.
 NAMES: Final = {

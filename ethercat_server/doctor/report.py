@@ -10,9 +10,9 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, TextIO
 
+from bota_ethercat.health.verdict import Level
+from bota_ethercat.text.untrusted import visible
 from ethercat_server.doctor.finding import NAMES, Finding
-from protocol.health.verdict import Level
-from protocol.text.untrusted import visible
 
 _COLORS: Final = {
     Level.GOOD: "\x1b[32m", Level.NOT_POSSIBLE: "\x1b[2m", Level.NOTE: "\x1b[36m", Level.LOOK: "\x1b[33m",

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Final
 
+from bota_ethercat.errors import ProtocolError
 from ethercat_server.errors import ServerError
 from ethercat_server.process.logs import PlainFormatter
-from protocol.errors import ProtocolError
 
 FAILED: Final = 1
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
+from bota_ethercat.settings import SETTINGS, SettingValue, check_combination
 from ethercat_server.errors import BusError, CutOffError, SdoAbortError, extended
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.sensor import Sensor
 from ethercat_server.sensor.set_up import read_settings, write_setting
-from protocol.settings import SETTINGS, SettingValue, check_combination
 
 _SAVE_TIMEOUT_S: Final = 5.0
 

@@ -12,6 +12,7 @@ import struct
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.pdo import LAYOUTS
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
@@ -23,7 +24,6 @@ from ethercat_server.ethercat.slave.al import STATE_S, AlState, AlStatus
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import read_sii
 from ethercat_server.sensor.objects.dictionary import is_sensor
-from protocol.pdo import LAYOUTS
 
 _LISTEN_S: Final = 0.1
 # Frames in this time that are a master's cycle; fewer may be the last ones of a server that was killed.

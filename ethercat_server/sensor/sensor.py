@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.sensor.meaning import value_meaning
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
 from ethercat_server.ethercat.clock import Clock, Deadline
-from protocol.sensor.meaning import value_meaning
-from protocol.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
 
 # How long Bota's own driver lets a sensor settle: new filter settings, and the data after entering OP.
 SETTLING_S: Final = 0.5

@@ -11,13 +11,13 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor, sinc_length_of
+from bota_ethercat.text.untrusted import visible
 from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.sensor import SETTLING_S, Identity, Sensor
-from protocol.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor, sinc_length_of
-from protocol.text.untrusted import visible
 
 _LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]  # sinc_length
 _OFFSETS: Final = tuple((dictionary.FORCE_TORQUE_OFFSET, sub) for sub in range(1, 7))

@@ -18,14 +18,14 @@ import statistics
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
+from bota_ethercat.control import ErrorCode
+from bota_ethercat.errors import RequestError
+from bota_ethercat.pdo import layout_for
 from ethercat_server.errors import BusError, CutOffError, extended
 from ethercat_server.ethercat.clock import Clock, Deadline
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
 from ethercat_server.sensor.sensor import SETTLING_SAMPLES, Sensor
 from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
-from protocol.control import ErrorCode
-from protocol.errors import RequestError
-from protocol.pdo import layout_for
 
 LATER: Final = "; it gets its old offset when it is back"
 _NAMES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz", "Rx", "Ry", "Rz")

@@ -10,13 +10,13 @@ import logging
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any, Final, Protocol
 
+from bota_ethercat.address import boot_id
+from bota_ethercat.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
+from bota_ethercat.errors import RequestError
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server import __version__
 from ethercat_server.serving.connection import Connection, Subscription
 from ethercat_server.serving.hub import Hub
-from protocol.address import boot_id
-from protocol.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
-from protocol.errors import RequestError
-from protocol.text.json_text import JsonObject
 
 # With more sensors `describe` omits the meaning of their settings: a reply has at most 65536 bytes.
 _MOST_EXPLAINED: Final = 32

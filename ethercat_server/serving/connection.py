@@ -22,12 +22,12 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
+from bota_ethercat.errors import BadMessageError, RemoteProtocolError
+from bota_ethercat.framing import DATA_FLAGS_OFFSET, DataFlag, FrameDecoder, encode_json
+from bota_ethercat.text.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import Made
 from ethercat_server.serving.transport.base import Stream
-from protocol.errors import BadMessageError, RemoteProtocolError
-from protocol.framing import DATA_FLAGS_OFFSET, DataFlag, FrameDecoder, encode_json
-from protocol.text.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
-from protocol.text.json_text import JsonObject
 
 MAX_REQUEST_LENGTH: Final = 4096
 MAX_QUEUED_DATA: Final = 256

@@ -15,13 +15,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from bota_ethercat.control import ErrorCode, error_reply
+from bota_ethercat.errors import RequestError
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import Made
 from ethercat_server.serving.connection import Connection, Limits, State, Unreadable, Watched
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport.base import Transport
-from protocol.control import ErrorCode, error_reply
-from protocol.errors import RequestError
-from protocol.text.json_text import JsonObject
 
 # Clients get at most a tenth of this thread's time, however much they ask.
 _PAUSE_RATIO: Final = 9

@@ -5,6 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+from bota_ethercat.control import ErrorCode, Event, Request, error_reply, event, reply
+from bota_ethercat.errors import RequestError, SettingError
+from bota_ethercat.sensor_choice import SensorChoice
+from bota_ethercat.settings import SettingValue
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.jobs import Done, Jobs, refusal
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import SensorStream
@@ -19,11 +24,6 @@ from ethercat_server.sensor.sensor import Sensor
 from ethercat_server.sensor.tare import tare
 from ethercat_server.serving.connection import Connection
 from ethercat_server.serving.hub import Hub
-from protocol.control import ErrorCode, Event, Request, error_reply, event, reply
-from protocol.errors import RequestError, SettingError
-from protocol.sensor_choice import SensorChoice
-from protocol.settings import SettingValue
-from protocol.text.json_text import JsonObject
 
 # Reads that may wait for one sensor: everyone may read, and changes must still get their turn.
 _MOST_READS: Final = 8

@@ -8,12 +8,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NoReturn
 
+from bota_ethercat.program.completion import OPTION, add_completion
+from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server import __version__
 from ethercat_server.process import command_line
 from ethercat_server.tool.command import Command, say_json
 from ethercat_server.tool.commands import bus, find, objects, settings, snapshot, tare, watch
-from protocol.program.completion import OPTION, add_completion
-from protocol.text.did_you_mean import did_you_mean
 
 _PROGRAM: Final = "ethercat-sensor"
 _EXIT_CODES: Final = (

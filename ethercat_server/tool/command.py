@@ -9,11 +9,11 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.program.server_choice import HELP
+from bota_ethercat.text.json_text import finite
 from ethercat_server.access.sensors import Sensors, open_sensors
 from ethercat_server.ethercat.nic.interface import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.sensor.sensor import Found
-from protocol.program.server_choice import HELP
-from protocol.text.json_text import finite
 
 
 def say(text: str) -> None:

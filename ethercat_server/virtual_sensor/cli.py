@@ -9,6 +9,9 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
+from bota_ethercat.pdo import LAYOUTS
+from bota_ethercat.program.completion import add_completion
+from bota_ethercat.settings import SETTINGS
 from ethercat_server import __version__
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic.interface import look_up
@@ -35,9 +38,6 @@ from ethercat_server.virtual_sensor.options import (
     ForeignOptions,
     SensorOptions,
 )
-from protocol.pdo import LAYOUTS
-from protocol.program.completion import add_completion
-from protocol.settings import SETTINGS
 
 _SERIAL_NUMBERS: Final = 100
 """For each bus: more than it has slaves."""

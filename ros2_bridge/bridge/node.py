@@ -20,6 +20,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
+from bota_ethercat.client.channel import Channel
 from bridge import real_time
 from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.compensating.control import CompensationControl
@@ -47,7 +48,6 @@ from bridge.signals import call_on_stop_signal
 from bridge.spinning import OrdinaryExecutor, PromptExecutor, Spinner
 from bridge.stream.link import RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Reader
-from protocol.client.channel import Channel
 
 SUPERVISOR_TOPIC = "/supervisor_status_data"
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"

@@ -17,8 +17,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
+from bota_ethercat.client.real_time import make_real_time
 from bridge.parameters.table import Parameters
-from protocol.client.real_time import make_real_time
 
 STREAM: Final = "reader"
 BESIDE: Final = ("monitor", "listening")

@@ -8,9 +8,9 @@ from typing import Any, Final, NamedTuple
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
+from bota_ethercat.pdo import Vector3
 from bridge.parameters.row import ParameterError
 from ft_compensation.quantities import Quaternion, unit_quaternion
-from protocol.pdo import Vector3
 
 TF_PERIOD_S: Final = 0.005
 _NS_PER_S: Final = 1_000_000_000

@@ -11,6 +11,7 @@ import math
 import threading
 from typing import Final, NamedTuple
 
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import (
     NO_PAYLOAD,
@@ -25,7 +26,6 @@ from ft_compensation.quantities import (
     wrench_text,
 )
 from ft_compensation.stationary import StationaryMeans
-from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 GRAVITY_TOLERANCE: Final = 0.5
 """m/s²: how much a stationary accelerometer may differ from g."""

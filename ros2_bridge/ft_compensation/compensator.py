@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from bota_ethercat.pdo import Vector3
 from ft_compensation.quantities import NO_PAYLOAD, NO_WRENCH, Payload, Wrench
-from protocol.pdo import Vector3
 
 
 class Stages(NamedTuple):

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
+from bota_ethercat.pdo import Vector3
 from ft_compensation.quantities import DEFAULT_GRAVITY
-from protocol.pdo import Vector3
 
 _MOST_RATES: Final = 4096
 """Remembered for orientations that come late: 2.5 s at 1600 Hz."""

@@ -12,9 +12,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from bota_ethercat.pdo import Vector3
 from ft_compensation.quantities import Payload, length
 from ft_compensation.stationary_limits import StationaryLimits
-from protocol.pdo import Vector3
 
 _LOOK_S: Final = 0.05
 """Between two samples that are looked at."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple, Self
 
-from protocol.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 
 Quaternion = tuple[float, float, float, float]
 """x, y, z, w"""

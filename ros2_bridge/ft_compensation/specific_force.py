@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
+from bota_ethercat.pdo import Vector3
 from ft_compensation.quantities import EXACT, ZERO, Accelerometer
-from protocol.pdo import Vector3
 
 _SLOPE_S: Final = 0.005
 """Angular acceleration is the slope of the angular rate over this time, and so half of it late."""

@@ -19,10 +19,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bota_ethercat.pdo import Sample, Vector3
+from bota_ethercat.sensor.warnings_register import WarningFlag
 from ft_compensation.quantities import ZERO, CompensationError, Wrench
 from ft_compensation.stationary_limits import StationaryLimits
-from protocol.pdo import Sample, Vector3
-from protocol.sensor.warnings_register import WarningFlag
 
 _MOST_SAMPLES: Final = 200_000
 _BLOCKS: Final = 4

@@ -12,10 +12,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.errors import FileError
+from bota_ethercat.pdo import Vector3
+from bota_ethercat.program.new_file import NewFile
 from ft_compensation.quantities import CompensationError, Payload, Wrench, vector
-from protocol.errors import FileError
-from protocol.pdo import Vector3
-from protocol.program.new_file import NewFile
 
 _FORMAT: Final = "bota-ethercat-bridge compensation"
 _VERSION: Final = 1

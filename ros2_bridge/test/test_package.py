@@ -9,7 +9,7 @@ import pytest
 
 
 @pytest.mark.parametrize(
-    "name", ["bridge.client", "bridge.stream.link", "bridge.stream.frame_selector", "protocol.framing"]
+    "name", ["bridge.client", "bridge.stream.link", "bridge.stream.frame_selector", "bota_ethercat.framing"]
 )
 def test_it_imports_without_ros(name: str) -> None:
     assert importlib.import_module(name)

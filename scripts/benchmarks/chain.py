@@ -21,10 +21,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from bota_ethercat.client import Client
+from bota_ethercat.errors import ProtocolError
 from ethercat_server.errors import ServerError
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
-from protocol.client import Client
-from protocol.errors import ProtocolError
 from scripts.benchmarks import statistics
 from scripts.benchmarks.records import PORT, began
 from scripts.benchmarks.statistics import Floats, Ints

@@ -1,6 +1,6 @@
 """What follows from the records: missing and repeated samples, which of them the machine lost, ages.
 
-The virtual sensor numbers its samples, so this is the truth that `protocol.accounting` can only infer: a
+The virtual sensor numbers its samples, so this is the truth that `bota_ethercat.accounting` can only infer: a
 sample is lost if its number is missing between two that arrived, whoever lost it. It is lost to a stop of the
 machine if a canary slept longer than a sample period (`stops`) and that covers at least half of the time for
 which the sample was the sensor's newest. Pure functions of arrays; times are CLOCK_MONOTONIC ns.

@@ -16,9 +16,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from protocol.accounting import FrameKind, StreamAccounting
-from protocol.framing import DataMessage
-from protocol.pdo import Sample, SampleDecoder
+from bota_ethercat.accounting import FrameKind, StreamAccounting
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import Sample, SampleDecoder
 from scripts.benchmarks.statistics import Ints, in_stops
 
 _REMEMBERED: Final = 8192  # samples: some seconds' worth

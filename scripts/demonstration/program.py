@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from bota_ethercat.client import Client
 from ethercat_server.process.realtime import DEFAULT_PRIORITY
-from protocol.client import Client
 from scripts.benchmarks.chain import (
     Chain,
     ScriptError,

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from bota_ethercat.pdo import encode
 from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
-from protocol.pdo import encode
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.compensation.making import TOOL, load
 

@@ -13,11 +13,11 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from protocol.control import PROTOCOL_VERSION
-from protocol.errors import ProtocolError
-from protocol.framing import DataMessage, FrameDecoder, encode_data, encode_json
-from protocol.pdo import encode
-from protocol.text.json_text import JsonObject
+from bota_ethercat.control import PROTOCOL_VERSION
+from bota_ethercat.errors import ProtocolError
+from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data, encode_json
+from bota_ethercat.pdo import encode
+from bota_ethercat.text.json_text import JsonObject
 
 Answer = Callable[[JsonObject], JsonObject | None]
 

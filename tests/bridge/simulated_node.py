@@ -25,10 +25,10 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
+from bota_ethercat.errors import ConnectionFailedError, UnreachableError
+from bota_ethercat.framing import FrameDecoder
 from bridge.diagnostics.monitor import TICK_S
 from bridge.node import BridgeNode
-from protocol.errors import ConnectionFailedError, UnreachableError
-from protocol.framing import FrameDecoder
 from tests.bridge.conftest import PATIENCE_S, Log, retire
 from tests.bridge.scripted_server import Script
 from tests.bridge.streaming import status, streaming_description

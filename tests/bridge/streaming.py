@@ -6,7 +6,7 @@ import queue
 import time
 from typing import Any
 
-from protocol.text.json_text import JsonObject
+from bota_ethercat.text.json_text import JsonObject
 from tests.bridge.conftest import PATIENCE_S, Listener
 from tests.bridge.scripted_server import description
 

@@ -10,7 +10,7 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Temperature
 
-from protocol.cdr import StampedNumbers
+from bota_ethercat.cdr import StampedNumbers
 
 
 @pytest.mark.parametrize("frame_id", ["", "a", "ft", "fts", "arm", "ft_sensor", "ü" * 37])

@@ -15,10 +15,10 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 
+from bota_ethercat.control import Event, event
+from bota_ethercat.framing import DataFlag
+from bota_ethercat.pdo import STANDARD_GRAVITY
 from ft_compensation.quantities import Payload
-from protocol.control import Event, event
-from protocol.framing import DataFlag
-from protocol.pdo import STANDARD_GRAVITY
 from tests.bridge.compensating import (
     OVER,
     QUICK,

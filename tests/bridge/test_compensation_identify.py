@@ -11,8 +11,8 @@ pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ro
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from bota_ethercat.pdo import STANDARD_GRAVITY
 from ft_compensation.quantities import NO_PAYLOAD
-from protocol.pdo import STANDARD_GRAVITY
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, sensed
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.compensation.making import AXES, BIAS, TOOL, written_parameters

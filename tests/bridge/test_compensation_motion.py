@@ -11,11 +11,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
+from bota_ethercat.pdo import STANDARD_GRAVITY, encode
 from bridge.compensating.tool_sources import ListenerSource, Oriented
 from bridge.parameters.compensation import DEFAULTS
 from ft_compensation.bias import force_bound_95
 from ft_compensation.quantities import Accelerometer, Payload
-from protocol.pdo import STANDARD_GRAVITY, encode
 from tests.bridge.compensating import UP, Stages, hold, six, weight
 from tests.bridge.simulated_node import STEP_S, SimulatedNode, SimulatedServer
 from tests.bridge.streaming import values

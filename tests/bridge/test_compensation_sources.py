@@ -22,6 +22,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
 
+from bota_ethercat.text.json_text import JsonObject
 from bridge.compensating.orientations import OrientationListener, multiply
 from bridge.compensating.tool_sources import ListenerSource, Oriented
 from bridge.node import StartError
@@ -29,7 +30,6 @@ from bridge.parameters.compensation import DEFAULTS
 from bridge.parameters.row import ParameterError
 from bridge.transforms import check_tf
 from ft_compensation.quantities import length, unit_quaternion
-from protocol.text.json_text import JsonObject
 from tests.bridge.compensating import OVER, QUICK, SIDE, UP, ZERO6, Stages, hold, is_near, weight
 from tests.bridge.conftest import listening, retire
 from tests.bridge.fake_tf import FakeTf

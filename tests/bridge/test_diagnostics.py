@@ -10,9 +10,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
-from protocol.framing import DataFlag
-from protocol.pdo import encode
-from protocol.sensor.warnings_register import WARNINGS
+from bota_ethercat.framing import DataFlag
+from bota_ethercat.pdo import encode
+from bota_ethercat.sensor.warnings_register import WARNINGS
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.bridge.streaming import SETTINGS, status, values
 

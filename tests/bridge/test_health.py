@@ -8,14 +8,14 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.health.verdict import LIMITS, Level
+from bota_ethercat.pdo import encode
+from bota_ethercat.sensor.warnings_register import WARNINGS, Severity
 from bridge.diagnostics.health import Status, judge, text_of
 from bridge.diagnostics.observer import CompensationState, Counts, Snapshot
 from bridge.stream.link import SensorInfo
 from bridge.stream.watch import Flags, Watch
-from protocol.framing import DataMessage
-from protocol.health.verdict import LIMITS, Level
-from protocol.pdo import encode
-from protocol.sensor.warnings_register import WARNINGS, Severity
 from tests.compensation.making import BIAS, TOOL
 
 pytestmark = pytest.mark.ros

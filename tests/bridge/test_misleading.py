@@ -12,9 +12,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
+from bota_ethercat.control import Event, event
+from bota_ethercat.pdo import encode, layout_for
 from bridge.node import StartError
-from protocol.control import Event, event
-from protocol.pdo import encode, layout_for
 from tests.bridge.compensating import QUICK, UP, ZERO6, Stages, hold, sensed
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
 from tests.bridge.streaming import SETTINGS, values

@@ -15,15 +15,15 @@ import rclpy
 from geometry_msgs.msg import WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 
+from bota_ethercat.control import Event, event
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import encode
 from bridge.node import StartError
 from bridge.parameters.row import ParameterError
 from bridge.parameters.table import PARAMETERS, gather_all
 from bridge.parameters.wrench_frames import parse
 from bridge.publishing.wrench_frames import make_frames
 from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
-from protocol.control import Event, event
-from protocol.framing import DataMessage
-from protocol.pdo import encode
 from tests.bridge.compensating import six, stamp_ns
 from tests.bridge.conftest import retire
 from tests.bridge.fake_tf import FakeTf

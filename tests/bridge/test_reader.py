@@ -9,13 +9,13 @@ from typing import Any, cast
 
 import pytest
 
+from bota_ethercat.errors import ConnectionFailedError, UnreachableError
+from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data, encode_json
+from bota_ethercat.pdo import Sample, encode
+from bota_ethercat.text.json_text import JsonObject
 from bridge.parameters.table import DEFAULTS
 from bridge.stream.link import sentence
 from bridge.stream.reader import Reader
-from protocol.errors import ConnectionFailedError, UnreachableError
-from protocol.framing import DataMessage, FrameDecoder, encode_data, encode_json
-from protocol.pdo import Sample, encode
-from protocol.text.json_text import JsonObject
 from tests.bridge.conftest import Log
 from tests.bridge.scripted_server import description, process_data
 from tests.server.running import wait_until

@@ -14,9 +14,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
+from bota_ethercat.client import Scheduling
 from bridge import real_time
 from bridge.parameters.table import DEFAULTS
-from protocol.client import Scheduling
 from tests.bridge.conftest import StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 from tests.limited import needs_root, skip_if_forbidden

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bota_ethercat.framing import DataMessage
 from bridge.stream.frame_selector import BACKLOG_NS, FRESH_NS, FrameCounts, FrameSelector, RateLimit
-from protocol.framing import DataMessage
 
 PERIOD_NS = 1_250_000
 

@@ -14,9 +14,9 @@ from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from protocol.control import ErrorCode, Event, event
-from protocol.settings import SETTINGS as TABLE
-from protocol.text.json_text import JsonObject
+from bota_ethercat.control import ErrorCode, Event, event
+from bota_ethercat.settings import SETTINGS as TABLE
+from bota_ethercat.text.json_text import JsonObject
 from tests.bridge.conftest import Listener, Start
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import SimulatedNode, SimulatedServer

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
 
-from protocol.pdo import encode
+from bota_ethercat.pdo import encode
 from tests.bridge.compensating import stamp_ns
 from tests.bridge.scripted_server import process_data
 from tests.bridge.simulated_node import STEP_S, SimulatedNode, SimulatedServer

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from bota_ethercat.errors import UnreachableError
 from ethercat_server.acquisition.stream import Made
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.errors import UnreachableError
 from tests.bridge.simulated_node import STEP_S, Wire
 from tests.simulation import Simulation
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from clients.monitor.model import State
-from clients.monitor.screen import Look, render
+from bota_clients.monitor.model import State
+from bota_clients.monitor.screen import Look, render
 from tests.clients import monitor_states as states
 
 DOCS = Path(__file__).parent.parent.parent / "docs"

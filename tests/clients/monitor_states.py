@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from clients.monitor.model import Model, State
-from protocol.control import Event
-from protocol.framing import DataFlag, DataMessage
-from protocol.pdo import encode
-from protocol.settings import start_up_defaults
+from bota_clients.monitor.model import Model, State
+from bota_ethercat.control import Event
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.pdo import encode
+from bota_ethercat.settings import start_up_defaults
 
 ADDRESS = "localhost:12001"
 OWN_PEER = "127.0.0.1:40000"

@@ -9,10 +9,10 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from protocol.control import Event, event
-from protocol.framing import FrameDecoder, encode_data, encode_json
-from protocol.pdo import encode
-from protocol.text.json_text import JsonObject
+from bota_ethercat.control import Event, event
+from bota_ethercat.framing import FrameDecoder, encode_data, encode_json
+from bota_ethercat.pdo import encode
+from bota_ethercat.text.json_text import JsonObject
 from tests.server.running import PATIENCE_S, wait_until
 
 SETTINGS = {

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from clients.recording.disk import DiskFile
-from clients.recording.file_format import FORMAT_VERSION
-from clients.recording.writer import RecordingWriter
-from protocol import pdo
-from protocol.framing import DataMessage
-from protocol.text.json_text import JsonObject
+from bota_clients.recording.disk import DiskFile
+from bota_clients.recording.file_format import FORMAT_VERSION
+from bota_clients.recording.writer import RecordingWriter
+from bota_ethercat import pdo
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.text.json_text import JsonObject
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 1_250_000

@@ -21,9 +21,9 @@ from unittest import mock
 
 from PIL import Image, PngImagePlugin
 
-from clients.report import plots
-from clients.report.checks import examine
-from clients.report.page import render
+from bota_clients.report import plots
+from bota_clients.report.checks import examine
+from bota_clients.report.page import render
 from tests.clients import chromium
 from tests.clients.simulated import sensor
 

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from clients.program import Signals
-from clients.record import program as record
-from clients.recording.reader import RecordingError, open_recording
-from clients.replay import program
-from protocol.client import Client as StreamClient
+from bota_clients.program import Signals
+from bota_clients.record import program as record
+from bota_clients.recording.reader import RecordingError, open_recording
+from bota_clients.replay import program
+from bota_ethercat.client import Client as StreamClient
 from tests.server.running import PATIENCE_S, Program, free_port, wait_until
 
 
@@ -158,4 +158,4 @@ class RecorderProcess(Program):
     """`ethercat-record` of what is on `port`, as a process."""
 
     def __init__(self, path: Path, port: int, *arguments: str) -> None:
-        super().__init__("clients.record.cli", [*arguments, str(path), str(port)])
+        super().__init__("bota_clients.record.cli", [*arguments, str(path), str(port)])

@@ -14,8 +14,11 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, cast
 
-from clients.recording.columns import Columns, columns
-from clients.report.series import Subject, subject
+from bota_clients.recording.columns import Columns, columns
+from bota_clients.report.series import Subject, subject
+from bota_ethercat.framing import DataMessage, FrameDecoder
+from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.settings import sampling_rate_hz, start_up_defaults
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.ethercat.clock import Clock
@@ -23,9 +26,6 @@ from ethercat_server.ethercat.exchange.process_data import Exchange
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults.table import obey
 from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
-from protocol.framing import DataMessage, FrameDecoder
-from protocol.pdo import ImuUnits
-from protocol.settings import sampling_rate_hz, start_up_defaults
 
 START_NS = 3_600 * 10**9
 STARTED_AT_NS = 1_767_225_600 * 10**9

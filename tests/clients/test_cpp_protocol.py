@@ -13,11 +13,11 @@ from itertools import pairwise
 
 import pytest
 
-from protocol.accounting import StreamAccounting, StreamCounts
-from protocol.errors import BadMessageError, RemoteProtocolError
-from protocol.framing import DataMessage, FrameDecoder
-from protocol.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder, layout_for
-from protocol.sensor.warnings_register import WarningFlag
+from bota_ethercat.accounting import StreamAccounting, StreamCounts
+from bota_ethercat.errors import BadMessageError, RemoteProtocolError
+from bota_ethercat.framing import DataMessage, FrameDecoder
+from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder, layout_for
+from bota_ethercat.sensor.warnings_register import WarningFlag
 from tests.clients.cpp_programs import INCLUDE, driver_program, needs_gxx, patient
 from tests.golden_vectors import (
     ACCOUNTED,

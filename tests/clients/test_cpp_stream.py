@@ -18,11 +18,11 @@ from typing import Any
 
 import pytest
 
-from protocol.address import boot_id
-from protocol.control import request
-from protocol.framing import DataFlag, FrameDecoder, encode_data, encode_json
-from protocol.pdo import encode
-from protocol.text.json_text import JsonObject
+from bota_ethercat.address import boot_id
+from bota_ethercat.control import request
+from bota_ethercat.framing import DataFlag, FrameDecoder, encode_data, encode_json
+from bota_ethercat.pdo import encode
+from bota_ethercat.text.json_text import JsonObject
 from tests.clients.cpp_programs import (
     ROOT,
     Driver,
@@ -248,7 +248,7 @@ def test_a_clock_that_is_shifted_is_another_one(server: PlayedServer) -> None:
             assert picked(running.latest(), "age_is_lower_bound") == (far,)
     finally:
         assert end_driver(process) == 0
-    name = "from protocol.address import boot_id; print(boot_id())"
+    name = "from bota_ethercat.address import boot_id; print(boot_id())"
     done = subprocess.run(
         [*shifted, sys.executable, "-c", name], check=True, capture_output=True, text=True, cwd=ROOT
     )

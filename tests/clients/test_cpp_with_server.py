@@ -9,11 +9,11 @@ from itertools import pairwise
 
 import pytest
 
+from bota_ethercat.address import Address
+from bota_ethercat.client import connect
+from bota_ethercat.framing import DataFlag
+from bota_ethercat.pdo import SampleDecoder
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.address import Address
-from protocol.client import connect
-from protocol.framing import DataFlag
-from protocol.pdo import SampleDecoder
 from tests.clients.cpp_programs import (
     SOURCES,
     Driver,

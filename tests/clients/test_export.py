@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from clients.export.cli import main
-from clients.export.program import COLUMNS
-from clients.record.options import parse_options as record_options
-from clients.record.program import Progress
-from protocol.framing import DataFlag
+from bota_clients.export.cli import main
+from bota_clients.export.program import COLUMNS
+from bota_clients.record.options import parse_options as record_options
+from bota_clients.record.program import Progress
+from bota_ethercat.framing import DataFlag
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
 from tests.ended import Result, run_here
 
@@ -107,7 +107,7 @@ def test_what_cannot_be_done_is_said_and_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from clients.export import program
+    from bota_clients.export import program
 
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt

@@ -16,14 +16,14 @@ from typing import Any
 
 import pytest
 
-from clients.identify.program import run
-from clients.identify.stationary_periods import find_stationary_periods
-from clients.program import missing
-from clients.recording.columns import columns
-from clients.recording.reader import open_recording
+from bota_clients.identify.program import run
+from bota_clients.identify.stationary_periods import find_stationary_periods
+from bota_clients.program import missing
+from bota_clients.recording.columns import columns
+from bota_clients.recording.reader import open_recording
+from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.measurement import scene
 from ethercat_server.virtual_sensor.measurement.motion import POSE_LENGTH, POSES
-from protocol.framing import DataFlag, DataMessage
 from tests.clients.recordings import START_NS, describe, record, writer
 from tests.compensation.making import written_parameters
 from tests.compensation.streaming import CYCLE, OFFSET, POSES_TAKE, process_data
@@ -239,7 +239,7 @@ def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.Capture
 
 def start(path: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "clients.identify.cli", str(path), "--json"],
+        [sys.executable, "-m", "bota_clients.identify.cli", str(path), "--json"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 
@@ -268,7 +268,7 @@ def test_what_is_not_installed_is_said(tmp_path: Path) -> None:
     (tmp_path / "numpy.py").write_text("raise ModuleNotFoundError('no', name='numpy')")
     hidden = subprocess.run(
         [sys.executable, "-c", "import sys; sys.path.insert(0, sys.argv.pop(1)); "
-         "from clients.identify.cli import main; sys.exit(main(['x.mcap']))", str(tmp_path)],
+         "from bota_clients.identify.cli import main; sys.exit(main(['x.mcap']))", str(tmp_path)],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert hidden.returncode == 1

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from clients.monitor.app import Monitor
-from clients.monitor.model import Model
-from clients.monitor.recorder import Recorder
-from protocol.address import Address
+from bota_clients.monitor.app import Monitor
+from bota_clients.monitor.model import Model
+from bota_clients.monitor.recorder import Recorder
+from bota_ethercat.address import Address
 from tests.clients import monitor_states as made
 from tests.server.running import free_port, wait_until
 

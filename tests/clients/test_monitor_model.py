@@ -10,14 +10,14 @@ from unittest import mock
 
 import pytest
 
-from clients.monitor.model import Model, SensorState
-from clients.monitor.reader import Reader
-from clients.monitor.screen import Look, render
-from protocol.address import Address
-from protocol.client import Client
-from protocol.control import Event
-from protocol.framing import DataFlag, DataMessage
-from protocol.health.verdict import Level
+from bota_clients.monitor.model import Model, SensorState
+from bota_clients.monitor.reader import Reader
+from bota_clients.monitor.screen import Look, render
+from bota_ethercat.address import Address
+from bota_ethercat.client import Client
+from bota_ethercat.control import Event
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.health.verdict import Level
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S, description, frame, now, status
 

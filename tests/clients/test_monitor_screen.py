@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import pytest
 
-from clients.monitor.model import Client, Model, Range, State
-from clients.monitor.screen import KEYS, Look, bar, render, scale_for, table, trace_of
-from clients.monitor.words import json_line
-from protocol.framing import DataMessage
+from bota_clients.monitor.model import Client, Model, Range, State
+from bota_clients.monitor.screen import KEYS, Look, bar, render, scale_for, table, trace_of
+from bota_clients.monitor.words import json_line
+from bota_ethercat.framing import DataMessage
 from tests.clients import monitor_states as made
 from tests.clients.captures import DOCS, captures
 

@@ -20,16 +20,16 @@ from typing import Any
 
 import pytest
 
-from clients.monitor import cli
-from clients.monitor.cli import parse
-from clients.monitor.model import Model, State
-from clients.monitor.reader import Reader
-from clients.monitor.tare import tare
-from clients.recording.reader import RecordingError, open_recording
+from bota_clients.monitor import cli
+from bota_clients.monitor.cli import parse
+from bota_clients.monitor.model import Model, State
+from bota_clients.monitor.reader import Reader
+from bota_clients.monitor.tare import tare
+from bota_clients.recording.reader import RecordingError, open_recording
+from bota_ethercat.address import Address
+from bota_ethercat.client import Client
 from ethercat_server.serving.transport.in_memory import ManualClock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.address import Address
-from protocol.client import Client
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.captures import DOCS
 from tests.served_simulation import ServedSimulation, served
@@ -38,7 +38,7 @@ from tests.server.running import PATIENCE_S, free_port, wait_until
 from tests.simulated_links import simulated_bus, simulated_server
 
 SENSORS = [SensorOptions(model=model, pdo_size=77) for model in ("BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8")]
-COMMAND = (sys.executable, "-m", "clients.monitor.cli")
+COMMAND = (sys.executable, "-m", "bota_clients.monitor.cli")
 LEAVE_ALTERNATE_SCREEN = b"\x1b[?1049l"
 SHOW_CURSOR = b"\x1b[?25h"
 
@@ -352,7 +352,7 @@ def test_tare_says_why_not() -> None:
 
 @pytest.mark.parametrize("way", ["silent", "gone"])
 def test_a_tare_without_an_answer_is_not_known(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("clients.monitor.tare._TIMEOUT_S", 0.05 if way == "silent" else PATIENCE_S)
+    monkeypatch.setattr("bota_clients.monitor.tare._TIMEOUT_S", 0.05 if way == "silent" else PATIENCE_S)
     with ScriptedServer() as server:
         server.answers["tare"] = lambda _: server.drop() if way == "gone" else None
         text, bad = tare(Address("localhost", server.port), 0)
@@ -364,7 +364,7 @@ def test_tare_of_another_user_says_the_servers_sentence(shared: ServedSimulation
     if NO_OTHER_USER is not None:
         pytest.skip(NO_OTHER_USER)
     code = (
-        "from protocol.address import Address; from clients.monitor.tare import tare;"
+        "from bota_ethercat.address import Address; from bota_clients.monitor.tare import tare;"
         "from tests.server.as_another_user import become_nobody; become_nobody();"
         f"print(*tare(Address('localhost', {shared.port}), 0))"
     )

@@ -43,14 +43,15 @@ for name, entry in CLIENTS.items():
     except SystemExit as ended:
         assert ended.code == 0, name
 
-import clients.export.program, clients.identify.program, clients.record.program, clients.replay.program
-from clients.monitor import cli
-from clients.program import Signals, call_on
-from protocol.client import connect
+import bota_clients.export.program, bota_clients.identify.program
+import bota_clients.record.program, bota_clients.replay.program
+from bota_clients.monitor import cli
+from bota_clients.program import Signals, call_on
+from bota_ethercat.client import connect
 
 replay, recorder = Signals(), Signals()
 where = "--server", f"localhost:{port}"
-run = lambda: clients.replay.program.run([played, *where, "--loop"], replay)
+run = lambda: bota_clients.replay.program.run([played, *where, "--loop"], replay)
 thread = threading.Thread(target=run, daemon=True)
 thread.start()
 while True:
@@ -61,12 +62,12 @@ while True:
         break
     except Exception as error:
         assert "refused" in str(error), error
-assert clients.record.program.run([recorded, *where, "--seconds", "0.2"], recorder) == 0
+assert bota_clients.record.program.run([recorded, *where, "--seconds", "0.2"], recorder) == 0
 cli._ONCE_S = 0.1
 assert cli.run(cli.parse(["--once", *where])) in (0, 1)
 replay._on_signal(0, None)
 thread.join()
-assert clients.export.program.run(clients.export.options.parse_options([recorded, table])) == 0
+assert bota_clients.export.program.run(bota_clients.export.options.parse_options([recorded, table])) == 0
 
 class Loop:
     def add_signal_handler(self, number, stop):

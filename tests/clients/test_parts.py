@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from clients.errors import DiskError
-from clients.record.recorder import Parts
-from clients.recording.disk import DiskFile
+from bota_clients.errors import DiskError
+from bota_clients.record.recorder import Parts
+from bota_clients.recording.disk import DiskFile
 
 
 def parts(

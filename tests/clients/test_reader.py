@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import zstandard
 
-from clients.recording.columns import columns
-from clients.recording.container import MAX_CHUNK, McapFile
-from clients.recording.file_format import DESCRIPTION_TOPIC, FORMAT_VERSION
-from clients.recording.reader import (
+from bota_clients.recording.columns import columns
+from bota_clients.recording.container import MAX_CHUNK, McapFile
+from bota_clients.recording.file_format import DESCRIPTION_TOPIC, FORMAT_VERSION
+from bota_clients.recording.reader import (
     DamagedError,
     Description,
     Event,
@@ -22,8 +22,8 @@ from clients.recording.reader import (
     RecordingError,
     open_recording,
 )
-from protocol.framing import DataFlag, DataMessage
-from protocol.pdo import SampleDecoder
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.pdo import SampleDecoder
 from tests.clients.recordings import START_NS, describe, frame, record, writer
 
 CHUNKS = 10

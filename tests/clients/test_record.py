@@ -23,15 +23,15 @@ import pytest
 from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
-from clients.record import cli, program, recorder
-from clients.record import recorder as record_parts
-from clients.record.recorder import FLUSH_S, Parts, Recorder
-from clients.record.source import BATCH_S, Batch, Source
-from clients.recording.file_format import FORMAT_VERSION, frame_topic
-from clients.recording.reader import open_recording
+from bota_clients.record import cli, program, recorder
+from bota_clients.record import recorder as record_parts
+from bota_clients.record.recorder import FLUSH_S, Parts, Recorder
+from bota_clients.record.source import BATCH_S, Batch, Source
+from bota_clients.recording.file_format import FORMAT_VERSION, frame_topic
+from bota_clients.recording.reader import open_recording
+from bota_ethercat.address import Address
+from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.address import Address
-from protocol.framing import DataFlag, DataMessage
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.recordings import frame, record
 from tests.clients.running import (

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from clients.record import options as record_options
-from clients.recording import file_format
-from clients.replay import options as replay_options
-from protocol.framing import DataMessage
+from bota_clients.record import options as record_options
+from bota_clients.recording import file_format
+from bota_clients.replay import options as replay_options
+from bota_ethercat.framing import DataMessage
 from tests.clients.recordings import frame
 
 DOCS = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()

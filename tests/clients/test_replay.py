@@ -18,14 +18,14 @@ from typing import Any
 
 import pytest
 
+from bota_clients.recording.reader import Description, Event, open_recording
+from bota_clients.replay import cli, program
+from bota_clients.replay.sensors import ReplayedSensors
+from bota_ethercat.client import Client, connect
+from bota_ethercat.control import ErrorCode
+from bota_ethercat.errors import RefusedError
+from bota_ethercat.framing import DataMessage
 from bridge.stream.link import find_sensor
-from clients.recording.reader import Description, Event, open_recording
-from clients.replay import cli, program
-from clients.replay.sensors import ReplayedSensors
-from protocol.client import Client, connect
-from protocol.control import ErrorCode
-from protocol.errors import RefusedError
-from protocol.framing import DataMessage
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
 from tests.clients.running import NoSignals, listen, replaying, signalled
 from tests.served_simulation import served
@@ -326,5 +326,6 @@ def test_a_damaged_recording_ends_it_with_a_sentence(path: Path, frames: list[Da
 
 
 def test_it_needs_no_bus() -> None:
-    code = "import sys, clients.replay.program, clients.record.program; sys.exit('pysoem' in sys.modules)"
+    code = "import sys; from bota_clients import replay, record; import bota_clients.replay.program, "
+    code += "bota_clients.record.program; sys.exit('pysoem' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

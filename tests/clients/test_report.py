@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clients.recording.columns import Columns
-from clients.report.checks import Examination, examine, longest_runs
-from clients.report.series import CHANNELS, FORCE, Subject, limit_origin, noise_limit, subject
-from clients.report.spectrum import welch
+from bota_clients.recording.columns import Columns
+from bota_clients.report.checks import Examination, examine, longest_runs
+from bota_clients.report.series import CHANNELS, FORCE, Subject, limit_origin, noise_limit, subject
+from bota_clients.report.spectrum import welch
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.health.verdict import Level
+from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
+from bota_ethercat.sensor.meaning import meaning
 from ethercat_server.virtual_sensor.measurement import scene
-from protocol.framing import DataFlag, DataMessage
-from protocol.health.verdict import Level
-from protocol.pdo import STANDARD_GRAVITY, ImuUnits
-from protocol.sensor.meaning import meaning
 from tests.clients.simulated import Script, decoded, described, sensor, simulate, subject_of
 
 SLOW = 512

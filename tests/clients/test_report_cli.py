@@ -13,10 +13,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from clients.program import missing
-from clients.report import cli, program, subjects
-from clients.report.subjects import Received
-from protocol.framing import DataFlag, DataMessage
+from bota_clients.program import missing
+from bota_clients.report import cli, program, subjects
+from bota_clients.report.subjects import Received
+from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.recordings import writer
 from tests.clients.report_capture import undrawn
 from tests.clients.simulated import STARTED_AT_NS, described, simulate
@@ -82,10 +82,10 @@ def test_a_recording_becomes_a_page_beside_it(recording: Path, capsys: pytest.Ca
 
 
 MADE = """
-import sys, types, clients.report
+import sys, types, bota_clients.report
 outcome = types.SimpleNamespace(words="Healthy", exit_code=0)
-clients.report.program = types.SimpleNamespace(make=lambda *_: outcome)
-from clients.report.cli import main
+bota_clients.report.program = types.SimpleNamespace(make=lambda *_: outcome)
+from bota_clients.report.cli import main
 sys.exit(main())
 """
 """The program, but what takes long has been done."""
@@ -303,7 +303,7 @@ def test_ctrl_c_leaves_nothing(
 def test_what_is_not_installed_is_said(recording: Path) -> None:
     script = (
         "import sys; sys.modules['matplotlib'] = None; "
-        "from clients.report.cli import main; "
+        "from bota_clients.report.cli import main; "
         f"sys.exit(main([{str(recording)!r}]))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)

@@ -15,14 +15,14 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from clients.numbers import figure, seconds
-from clients.recording.columns import Columns
-from clients.report import page as page_module
-from clients.report import plots
-from clients.report.checks import Examination, examine
-from clients.report.page import as_json, render
-from clients.report.plots import envelope, stretches
-from clients.report.series import FORCE, GROUPS, Floats, subject
+from bota_clients.numbers import figure, seconds
+from bota_clients.recording.columns import Columns
+from bota_clients.report import page as page_module
+from bota_clients.report import plots
+from bota_clients.report.checks import Examination, examine
+from bota_clients.report.page import as_json, render
+from bota_clients.report.plots import envelope, stretches
+from bota_clients.report.series import FORCE, GROUPS, Floats, subject
 from tests.clients import report_capture
 from tests.clients.chromium import DARK, needs_chromium, run, screenshot
 from tests.clients.report_capture import undrawn

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from protocol.control import Event, event
-from protocol.framing import DataFlag
+from bota_ethercat.control import Event, event
+from bota_ethercat.framing import DataFlag
 from tests.clients.cpp_programs import (
     ROOT,
     SANITIZED,

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from clients.monitor import cli as monitor
-from clients.record import options as record
-from clients.replay import options as replay
-from clients.report import options as report
+from bota_clients.monitor import cli as monitor
+from bota_clients.record import options as record
+from bota_clients.replay import options as replay
+from bota_clients.report import options as report
+from bota_ethercat.program.server_choice import default_server, is_address, own_server
 from ethercat_server.access import sensors
-from protocol.program.server_choice import default_server, is_address, own_server
 
 Read = Callable[[list[str]], tuple[str, str]]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from clients.record.recorder import Tally
-from protocol.framing import DataFlag, DataMessage
+from bota_clients.record.recorder import Tally
+from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.recordings import frame
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from clients.replay.player import Timeline
+from bota_clients.replay.player import Timeline
 from tests.clients.recordings import PERIOD_NS, START_NS, frame
 
 NOW_NS = 50 * 10**9

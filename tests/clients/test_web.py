@@ -19,19 +19,19 @@ import pytest
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from clients.monitor.cli import parse
-from clients.monitor.tare import Say
-from clients.monitor.web.hub import MOST_BEHIND, Hub, Page, WebModel, state_text
-from clients.monitor.web.points import CHANNELS, HEADER, STEP_NS, Feed
-from clients.monitor.web.server import HEADERS, STREAM, answer, read_page
-from protocol.framing import DataFlag, DataMessage
-from protocol.pdo import STANDARD_GRAVITY, ImuUnits
+from bota_clients.monitor.cli import parse
+from bota_clients.monitor.tare import Say
+from bota_clients.monitor.web.hub import MOST_BEHIND, Hub, Page, WebModel, state_text
+from bota_clients.monitor.web.points import CHANNELS, HEADER, STEP_NS, Feed
+from bota_clients.monitor.web.server import HEADERS, STREAM, answer, read_page
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.clients import monitor_states as made
 from tests.clients import web_capture
 from tests.clients.monitor_states import START_S, frame, moving
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "clients/monitor/web/page"
+PAGE = ROOT / "clients/bota_clients/monitor/web/page"
 PAGE_FILES = read_page()
 FX, FZ, AZ, WX = (CHANNELS.index(n) for n in ("force.x", "force.z", "acceleration.z", "angular_rate.x"))
 
@@ -393,8 +393,7 @@ def test_every_answer_has_the_headers_and_nothing_else_is_served() -> None:
 
 def test_every_file_is_in_the_package_and_the_library_with_its_license() -> None:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    assert "clients.monitor.web" in settings["packages"]
-    patterns = settings["package-data"]["clients.monitor.web"]
+    patterns = settings["package-data"]["bota_clients.monitor.web"]
     base = PAGE.parent
     packed = {path for pattern in patterns for path in base.glob(pattern) if path.is_file()}
     assert packed == {path for path in PAGE.rglob("*") if path.is_file()}

@@ -16,9 +16,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
-from clients.monitor import cli
-from clients.monitor.web.hub import MOST_PAGES, TOO_MANY
-from clients.monitor.web.server import HEADERS
+from bota_clients.monitor import cli
+from bota_clients.monitor.web.hub import MOST_PAGES, TOO_MANY
+from bota_clients.monitor.web.server import HEADERS
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.monitor_states import frame
 from tests.clients.web_pages import Web
@@ -134,7 +134,7 @@ def test_the_program_shows_tares_and_ends_with_ctrl_c() -> None:
     """With a real server: the link that it prints is enough to tare."""
     port = free_port()
     with served(SensorOptions(signal="rest")) as server:
-        program = Program("clients.monitor.cli", [f"localhost:{server.port}", "--web", str(port)])
+        program = Program("bota_clients.monitor.cli", [f"localhost:{server.port}", "--web", str(port)])
         try:
             program.wait_for("Ctrl-C ends it")
             link = re.search(rf"http://localhost:{port}/#token=(\S+)", program.said())

@@ -15,7 +15,7 @@ from typing import Final
 
 from PIL import Image, PngImagePlugin
 
-from clients.monitor.web.server import read_page
+from bota_clients.monitor.web.server import read_page
 from tests.clients import monitor_states as made
 from tests.clients.devtools import browser
 from tests.clients.monitor_states import RATE_HZ, frame, now

@@ -8,10 +8,10 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
 
-from clients.monitor.tare import Say
-from clients.monitor.web.hub import Hub, WebModel
-from clients.monitor.web.server import serving
-from protocol.framing import DataMessage
+from bota_clients.monitor.tare import Say
+from bota_clients.monitor.web.hub import Hub, WebModel
+from bota_clients.monitor.web.server import serving
+from bota_ethercat.framing import DataMessage
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S
 from tests.server.running import PATIENCE_S

@@ -14,12 +14,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bota_ethercat.pdo import STANDARD_GRAVITY
 from ethercat_server.virtual_sensor.measurement import scene
 from ethercat_server.virtual_sensor.measurement.motion import TURN_LENGTH, Turning
 from ft_compensation.compensator import Compensator
 from ft_compensation.orientation import QuaternionGravity
 from ft_compensation.quantities import Payload, Wrench
-from protocol.pdo import STANDARD_GRAVITY
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import yaml
 
+from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from ft_compensation.identification.poses import Pose
 from ft_compensation.quantities import Payload, Wrench
-from protocol.pdo import STANDARD_GRAVITY, Sample, Vector3
 
 TOOL = Payload(0.8, (0.004, -0.006, 0.055))
 BIAS = Wrench((3.0, -1.5, 7.25), (0.2, -0.05, 0.125))

@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from ft_compensation.quantities import Payload
-from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 Array = NDArray[np.float64]
 Path = Callable[[Array], tuple[Array, Array]]

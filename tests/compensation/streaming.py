@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator
 
+from bota_ethercat.pdo import Sample, SampleDecoder
 from ethercat_server.virtual_sensor.firmware.firmware import Firmware
 from ethercat_server.virtual_sensor.firmware.flash import Flash
 from ethercat_server.virtual_sensor.measurement import scene
@@ -12,7 +13,6 @@ from ethercat_server.virtual_sensor.measurement.motion import MOVE_LENGTH, POSE_
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ft_compensation.identification.poses import Pose, pose_of
 from ft_compensation.stationary import StationaryMeans, StationaryWindow
-from protocol.pdo import Sample, SampleDecoder
 
 Stream = Iterable[tuple[float, Sample]]
 """Samples with their times, s since the signal began."""

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bota_ethercat.pdo import Sample, SampleDecoder
 from ethercat_server.virtual_sensor.measurement import scene
 from ethercat_server.virtual_sensor.measurement.motion import TURN_LENGTH
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -21,7 +22,6 @@ from ft_compensation.identification.payload import Identified, identify
 from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.specific_force import ImuSpecificForce
 from ft_compensation.stationary import NotStationaryError, StationaryMeans, StationaryWindow
-from protocol.pdo import Sample, SampleDecoder
 from tests.compensation.streaming import (
     OFFSET,
     POSES_TAKE,

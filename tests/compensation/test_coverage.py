@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 import pytest
 
+from bota_ethercat.pdo import STANDARD_GRAVITY
 from ft_compensation.identification.estimation import Estimate, Value, estimate
 from ft_compensation.identification.weighted import Array
-from protocol.pdo import STANDARD_GRAVITY
 from tests.compensation.making import AXES, BIAS, TOOL
 
 NOISE: Final = np.array([0.02] * 3 + [0.0004] * 3)

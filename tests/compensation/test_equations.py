@@ -12,11 +12,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from bota_ethercat.pdo import STANDARD_GRAVITY
 from ethercat_server.virtual_sensor.measurement import scene
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import ZERO, Payload, Wrench
 from ft_compensation.specific_force import ImuSpecificForce
-from protocol.pdo import STANDARD_GRAVITY
 from tests.compensation import equations
 
 CASES = 10_000 if "TEST_SEED" in os.environ else 2_000

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bota_ethercat.pdo import Vector3
 from ft_compensation.outputs.frames import WrenchTransform
 from ft_compensation.quantities import ZERO, Quaternion
-from protocol.pdo import Vector3
 from tests.compensation.equations import matrix_from_quaternion
 
 HALF = math.sqrt(0.5)

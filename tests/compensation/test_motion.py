@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from bota_ethercat.pdo import STANDARD_GRAVITY
 from ft_compensation.bias import force_bound_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import EXACT, Accelerometer, Payload
 from ft_compensation.specific_force import ImuSpecificForce
-from protocol.pdo import STANDARD_GRAVITY
 from tests.compensation import motion
 from tests.compensation.motion import IMU, Array, Felt, Imperfection
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from ft_compensation.orientation import QuaternionGravity
 from ft_compensation.quantities import DEFAULT_GRAVITY
-from protocol.pdo import STANDARD_GRAVITY, Vector3
 from tests.compensation import equations
 
 G = STANDARD_GRAVITY

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import pytest
 
+from bota_ethercat.pdo import Vector3
 from ft_compensation.compensator import Compensator
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import NO_PAYLOAD, Payload, Wrench
-from protocol.pdo import Vector3
 from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load
 
 TILTED = ((1, 1, 1), (-1, 1, 0.5), (0.3, -1, 0.2), (0, 0, -1))

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.bus_checks import Request, examine_bus
 from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.finding import NAMES, Finding
 from ethercat_server.doctor.machine import InterfaceFacts
 from ethercat_server.doctor.report import worst
-from protocol.health.verdict import Level
 from tests.doctor.made_up import FACTS, Files, machine
 from tests.ended import Result, run, run_here
 from tests.server import readable

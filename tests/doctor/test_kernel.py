@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.finding import CannotLookError
-from protocol.health.verdict import Level
 from tests.doctor.made_up import Files, machine, only
 
 SWITCH = "/sys/kernel/debug/sched/preempt"

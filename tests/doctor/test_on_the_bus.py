@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from bota_ethercat.health.verdict import Level
 from ethercat_server.access.holder import Holder
 from ethercat_server.doctor import bus_checks
 from ethercat_server.ethercat.nic.interface import Routes
-from protocol.health.verdict import Level
 from tests.doctor.made_up import but
 from tests.doctor.running import examined
 from tests.simulated_links import registers, simulated_bus, simulated_server

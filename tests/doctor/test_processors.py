@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.finding import CannotLookError
 from ethercat_server.doctor.machine import as_list, processor_list
-from protocol.health.verdict import Level
 from tests.doctor.made_up import CPUS, Files, looks, machine, only
 
 NO_RIGHTS = {"/proc/self/status": "CapEff:\t0000000000000000\n"}

@@ -7,9 +7,9 @@ import json
 
 import pytest
 
+from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.finding import Finding, bad, note, ok, skipped, warning
 from ethercat_server.doctor.report import EXIT_CODES, Report, as_json, printable, wants_color, worst
-from protocol.health.verdict import Level
 
 
 class Terminal(io.StringIO):

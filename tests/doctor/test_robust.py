@@ -10,11 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.finding import CannotLookError, Finding, ok
 from ethercat_server.doctor.machine import InterfaceFacts, Link, Machine
 from ethercat_server.doctor.machine_checks import CHECKS, examine, examine_machine
 from ethercat_server.errors import BusError
-from protocol.health.verdict import Level
 from tests.doctor.made_up import CARD, GOOD, but, machine
 
 GARBAGE = ("", "\0\0", "-", "99999999999999999999", "x" * 5000, "1 2 3\n" * 50, b"\xff\xfe\x80", "(", "0-")

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor import bus_checks
 from ethercat_server.doctor.bus_checks import ErrorCounters, Slave
 from ethercat_server.doctor.finding import Finding
 from ethercat_server.ethercat.slave.al import AlStatus
-from protocol.health.verdict import Level
 
 INIT = AlStatus.of(1, 0)
 

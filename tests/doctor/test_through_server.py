@@ -10,12 +10,12 @@ from typing import Any, cast
 
 import pytest
 
+from bota_ethercat.address import Address
+from bota_ethercat.health.verdict import Level
 from ethercat_server.access.holder import Holder
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor import bus_checks
 from ethercat_server.doctor.bus_checks import ServerView
-from protocol.address import Address
-from protocol.health.verdict import Level
 from tests.doctor.running import examined
 from tests.simulated_links import SINC_LENGTH, SimulatedServer, simulated_bus, simulated_server
 from tests.simulation import SimulatedBus

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor import bus_checks
 from ethercat_server.doctor.finding import Finding
-from protocol.health.verdict import Level
 
 
 def summary(p99_us: float, p50_us: float = 20.0, max_us: float | None = None) -> dict[str, float]:

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.errors import BadMessageError, ProtocolError, RemoteProtocolError
-from protocol.text.bare_json import BareJsonDecoder, encode_bare_json
+from bota_ethercat.errors import BadMessageError, ProtocolError, RemoteProtocolError
+from bota_ethercat.text.bare_json import BareJsonDecoder, encode_bare_json
 
 OBJECT: dict[str, Any] = {"action": "shutdown", "id": 'a "quoted" \\ } { text'}
 LINE = encode_bare_json(OBJECT)

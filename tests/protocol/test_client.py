@@ -16,13 +16,13 @@ from typing import Any
 
 import pytest
 
-from protocol import address
-from protocol.address import boot_id
-from protocol.client import Client, Condition, Connected, Disconnected, NoSampleError, connect
-from protocol.client.channel import TcpChannel
-from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
-from protocol.framing import DataFlag
-from protocol.pdo import STANDARD_GRAVITY, ImuUnits
+from bota_ethercat import address
+from bota_ethercat.address import boot_id
+from bota_ethercat.client import Client, Condition, Connected, Disconnected, NoSampleError, connect
+from bota_ethercat.client.channel import TcpChannel
+from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
+from bota_ethercat.framing import DataFlag
+from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.bridge.scripted_server import ScriptedServer, description, process_data
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port

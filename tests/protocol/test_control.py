@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.control import (
+from bota_ethercat.control import (
     ACTIONS,
     ErrorCode,
     Event,
@@ -21,7 +21,7 @@ from protocol.control import (
     six_numbers,
     whole_number,
 )
-from protocol.errors import RequestError
+from bota_ethercat.errors import RequestError
 
 scalars: st.SearchStrategy[Any] = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS, FORCE_TORQUE_FILTERS
-from protocol.sensor.meaning import NOT_IN_TABLE, meaning, value_meaning
-from protocol.settings import SETTINGS, sampling_rate_hz, start_up_defaults
+from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS, FORCE_TORQUE_FILTERS
+from bota_ethercat.sensor.meaning import NOT_IN_TABLE, meaning, value_meaning
+from bota_ethercat.settings import SETTINGS, sampling_rate_hz, start_up_defaults
 
 # As printed in the note.
 TABLE_III_4 = """

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.errors import BadMessageError, ProtocolError, RemoteProtocolError
-from protocol.framing import (
+from bota_ethercat.errors import BadMessageError, ProtocolError, RemoteProtocolError
+from bota_ethercat.framing import (
     DATA_FLAGS_OFFSET,
     MAX_DATA_MESSAGE_SIZE,
     DataFlag,
@@ -19,7 +19,7 @@ from protocol.framing import (
     encode_data,
     encode_json,
 )
-from protocol.text.json_text import MAX_JSON_LENGTH
+from bota_ethercat.text.json_text import MAX_JSON_LENGTH
 
 SAMPLE = DataMessage(7, 1_700_000_000_000_000_000, 123_456_789, 3, int(DataFlag.GAP), 3, bytes(range(61)))
 WITH_ORIENTATION = SAMPLE._replace(sequence=8, process_data=bytes(range(77)))

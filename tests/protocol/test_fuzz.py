@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.control import ACTIONS, ErrorCode, error_reply, parse_request, reply
-from protocol.errors import BadMessageError, ProtocolError, RemoteProtocolError, RequestError
-from protocol.framing import DataMessage, FrameDecoder, encode_json
-from protocol.text.bare_json import BareJsonDecoder, encode_bare_json
-from protocol.text.json_text import JsonObject, parse_json_object
+from bota_ethercat.control import ACTIONS, ErrorCode, error_reply, parse_request, reply
+from bota_ethercat.errors import BadMessageError, ProtocolError, RemoteProtocolError, RequestError
+from bota_ethercat.framing import DataMessage, FrameDecoder, encode_json
+from bota_ethercat.text.bare_json import BareJsonDecoder, encode_bare_json
+from bota_ethercat.text.json_text import JsonObject, parse_json_object
 from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, in_chunks, mutate
 
 SEED: Final = int(os.environ.get("FUZZ_SEED", "20261121"))

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-import protocol.accounting
-from protocol.accounting import StreamAccounting, StreamCounts
-from protocol.errors import BadMessageError, RemoteProtocolError
-from protocol.framing import DataMessage, FrameDecoder, encode_data
-from protocol.pdo import ImuUnits, SampleDecoder
+import bota_ethercat.accounting
+from bota_ethercat.accounting import StreamAccounting, StreamCounts
+from bota_ethercat.errors import BadMessageError, RemoteProtocolError
+from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data
+from bota_ethercat.pdo import ImuUnits, SampleDecoder
 from tests.golden_vectors import (
     ACCOUNTED,
     BROKEN,
@@ -97,7 +97,7 @@ def test_accounting() -> None:
 
 def test_the_words_are_those_of_the_documentation() -> None:
     page = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
-    words = re.findall(r"^(\w+): (.*(?:\n    .*)*)", protocol.accounting.__doc__ or "", re.MULTILINE)
+    words = re.findall(r"^(\w+): (.*(?:\n    .*)*)", bota_ethercat.accounting.__doc__ or "", re.MULTILINE)
     assert {word for word, _ in words} == set(StreamCounts.__slots__)
     for word, meaning in words:
         assert f"| `{word}` | {' '.join(meaning.split())} |" in page, word

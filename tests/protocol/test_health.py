@@ -9,11 +9,11 @@ from typing import Any, NamedTuple, cast
 
 import pytest
 
-from protocol.framing import DataFlag, DataMessage
-from protocol.health.judge import Observation, judge
-from protocol.health.observer import StreamObserver
-from protocol.health.verdict import LIMITS, Level, Verdict
-from protocol.pdo import encode
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.health.judge import Observation, judge
+from bota_ethercat.health.observer import StreamObserver
+from bota_ethercat.health.verdict import LIMITS, Level, Verdict
+from bota_ethercat.pdo import encode
 from tests.clients.simulated import simulate
 
 PERIOD_NS = 1_250_000

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.errors import PdoSizeError
-from protocol.pdo import LAYOUTS, PDO_FIELDS, ImuUnits, SampleDecoder, encode, layout_for
+from bota_ethercat.errors import PdoSizeError
+from bota_ethercat.pdo import LAYOUTS, PDO_FIELDS, ImuUnits, SampleDecoder, encode, layout_for
 
 # Name, offset, struct code, sub-index.
 TABLE = [

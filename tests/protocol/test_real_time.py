@@ -14,7 +14,7 @@ from tests.limited import IPC_LOCK, SYS_RESOURCE, limited, needs_limits, needs_r
 
 PROBE = """
 import json, os, sys, threading
-from protocol.client import make_real_time
+from bota_ethercat.client import make_real_time
 stop = threading.Event()
 other = threading.Thread(target=stop.wait)
 other.start()

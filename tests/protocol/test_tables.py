@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.errors import SettingError
-from protocol.sensor.warnings_register import WARNINGS, Severity, explain
-from protocol.settings import (
+from bota_ethercat.errors import SettingError
+from bota_ethercat.sensor.warnings_register import WARNINGS, Severity, explain
+from bota_ethercat.settings import (
     SETTINGS,
     check_combination,
     check_settings,

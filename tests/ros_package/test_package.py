@@ -46,7 +46,7 @@ def test_catkin_pkg_finds_nothing_wrong_in_the_manifest() -> None:
 
 
 def test_everything_that_is_imported_is_a_dependency_once() -> None:
-    ours = {"bridge", "ft_compensation", "protocol", "__future__", *sys.stdlib_module_names}
+    ours = {"bridge", "ft_compensation", "bota_ethercat", "__future__", *sys.stdlib_module_names}
     # Packages that are not named as their modules; the package tf2_ros is C++.
     packages = {"tf2_ros": "tf2_ros_py", "numpy": "python3-numpy"}
     needed = {
@@ -67,12 +67,13 @@ def test_one_version() -> None:
 
 
 def test_every_package_of_python_files_is_installed() -> None:
-    listed = set(PROJECT["tool"]["setuptools"]["packages"])
-    folders = ("protocol", "ethercat_server", "clients", "ros2_bridge/bridge", "ros2_bridge/ft_compensation")
-    for path in [path for folder in folders for path in (ROOT / folder).rglob("*.py")]:
-        package = ".".join(path.relative_to(ROOT).parent.parts).removeprefix("ros2_bridge.")
-        assert package in listed or "ros2_control" in path.parts, path  # a ROS package in C++
-    assert (PACKAGE / "protocol" / "framing.py").samefile(ROOT / "protocol" / "framing.py")
+    find = PROJECT["tool"]["setuptools"]["packages"]["find"]
+    tops = [ROOT / where / name.strip("*") for where in find["where"] for name in find["include"]]
+    for top in filter(Path.is_dir, tops):
+        for path in top.rglob("*.py"):
+            assert (path.parent / "__init__.py").exists(), path
+    assert {top.name for top in tops if top.is_dir()} == {name.strip("*") for name in find["include"]}
+    assert (PACKAGE / "bota_ethercat").samefile(ROOT / "protocol" / "bota_ethercat")
     assert (PACKAGE / "resource" / "client").stat().st_mode & 0o111
 
 
@@ -107,7 +108,7 @@ def test_both_install_the_same_everything_in_the_shared_folders(monkeypatch: pyt
         assert pip[f"share/bridge/{folder}"] == files != set()
     # A new folder has to be named in both, or it is installed by neither.
     folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] not in "._"}
-    code = {"bridge", "ft_compensation", "protocol", "resource", "test"}
+    code = {"bridge", "ft_compensation", "bota_ethercat", "resource", "test"}
     assert folders - {"bridge.egg-info"} == {*SHARED_FOLDERS, *code}
 
 

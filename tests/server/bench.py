@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.text.json_text import JsonObject
 from tests.simulation import Simulation
 
 AT_REST = SensorOptions(signal="rest")

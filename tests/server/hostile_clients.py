@@ -14,10 +14,10 @@ import struct
 from collections.abc import Callable, Generator, Iterable
 from typing import Protocol
 
+from bota_ethercat.control import request
+from bota_ethercat.framing import encode_json
+from bota_ethercat.text.bare_json import encode_bare_json
 from ethercat_server.serving.connection import MAX_REQUEST_LENGTH
-from protocol.control import request
-from protocol.framing import encode_json
-from protocol.text.bare_json import encode_bare_json
 from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, mutate
 
 AT_ONCE, MOST_HELD = 10, 8

@@ -16,7 +16,7 @@ import pytest
 
 from tests.server.as_another_user import NO_OTHER_USER
 
-_PACKAGES: Final = ("ethercat_server", "protocol", "pyroute2", "pysoem")
+_PACKAGES: Final = ("ethercat_server", "bota_ethercat", "pyroute2", "pysoem")
 """The server and all that it needs."""
 
 PYTHON: Final = Path(sys.executable).resolve()

@@ -17,10 +17,10 @@ from typing import Any
 
 import pytest
 
-from protocol.control import request
-from protocol.errors import ConnectionFailedError
-from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_json
-from protocol.text.json_text import JsonObject
+from bota_ethercat.control import request
+from bota_ethercat.errors import ConnectionFailedError
+from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
+from bota_ethercat.text.json_text import JsonObject
 
 START_TIMEOUT_S = 40.0
 PATIENCE_S = 30.0

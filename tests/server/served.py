@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 
+from bota_ethercat.control import parse_request, reply
+from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data, encode_json
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.serving.connection import Connection, Subscription
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.transport.in_memory import InMemoryStream, InMemoryTransport, ManualClock
-from protocol.control import parse_request, reply
-from protocol.framing import DataMessage, FrameDecoder, encode_data, encode_json
-from protocol.text.json_text import JsonObject
 
 TURN_NS = 1_250_000
 """Time between two deadlines: the acquisition loop's at 800 Hz."""

@@ -15,9 +15,9 @@ import struct
 import sys
 from collections.abc import Callable, Sequence
 
-from protocol.control import request
-from protocol.framing import DataMessage, FrameDecoder, encode_json
-from protocol.text.bare_json import encode_bare_json
+from bota_ethercat.control import request
+from bota_ethercat.framing import DataMessage, FrameDecoder, encode_json
+from bota_ethercat.text.bare_json import encode_bare_json
 from tests.server.as_another_user import become_nobody
 
 HITS = 6

@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import pytest
 
+from bota_ethercat.pdo import LAYOUTS
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.bus import Bus
@@ -18,7 +19,6 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.pdo import LAYOUTS
 from tests.exchanging import Exchange
 from tests.simulation import Asked
 

@@ -6,8 +6,8 @@ import logging
 
 import pytest
 
+from bota_ethercat.settings import rate_divisor, sampling_rate_hz
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.settings import rate_divisor, sampling_rate_hz
 from tests.server.bench import Bench, error
 from tests.simulation import Simulation, check_frames, fresh, reading
 

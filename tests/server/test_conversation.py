@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import pytest
 
+from bota_ethercat.pdo import LAYOUTS
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.pdo import LAYOUTS
 from tests.server.bench import error
 from tests.simulation import Client, Simulation, check_frames
 

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 
 import pytest
 
+from bota_ethercat.framing import DataFlag
 from ethercat_server.acquisition.stream import Made
 from ethercat_server.simulation.machine import REALTIME_START_NS, START_NS, Machine, SimulatedClock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.framing import DataFlag
 from tests.simulation import OLD, Simulation, check_frames, fresh, more_if_long, reading
 
 PERIOD_NS = 1_250_000

@@ -6,17 +6,17 @@ from typing import cast
 
 import pytest
 
+from bota_ethercat.address import boot_id
+from bota_ethercat.framing import encode_json
+from bota_ethercat.sensor.meaning import value_meaning
+from bota_ethercat.settings import SETTINGS, SettingValue, start_up_defaults
+from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject
 from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.connection import Connection
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.sensor_actions import SensorActions
-from protocol.address import boot_id
-from protocol.framing import encode_json
-from protocol.sensor.meaning import value_meaning
-from protocol.settings import SETTINGS, SettingValue, start_up_defaults
-from protocol.text.json_text import MAX_JSON_LENGTH, JsonObject
 
 
 def wordiest() -> dict[str, SettingValue]:

@@ -10,8 +10,8 @@ from itertools import pairwise
 
 import pytest
 
+from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.framing import DataFlag, DataMessage
 from tests.simulation import OLD, Client, Simulation, check_frames, reading
 
 ALL_FOR_S = 2.0

@@ -6,11 +6,11 @@ import struct
 
 import pytest
 
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.ethercat.slave.emergencies import Emergency
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.text.json_text import JsonObject
 from tests.simulation import Simulation, check_frames
 
 HOT = "emergency 0x4210 0x09 0102030405"

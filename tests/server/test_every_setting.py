@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from protocol.sensor.filters import FORCE_TORQUE_FILTERS
-from protocol.sensor.meaning import value_meaning
-from protocol.settings import SETTINGS
+from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS
+from bota_ethercat.sensor.meaning import value_meaning
+from bota_ethercat.settings import SETTINGS
 from tests.server.bench import Bench
 
 IMU = ("acceleration_filter", "angular_rate_filter", "acceleration_range_g", "angular_rate_range_dps")

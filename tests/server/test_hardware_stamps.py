@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import pytest
 
+from bota_ethercat.framing import DataFlag
 from ethercat_server.errors import SetUpError
 from ethercat_server.ethercat.exchange.distributed_clock import LATCHED, latched_datagrams
 from ethercat_server.ethercat.exchange.frames import Area, fit_a_frame, make_frames
@@ -19,7 +20,6 @@ from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import Command, Datagram, parse
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.framing import DataFlag
 from tests.simulation import Simulation, fresh, reading
 
 SETTLED_S = 3.0

@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import pytest
 
+from bota_ethercat.framing import DataFlag
 from ethercat_server.ethercat.exchange.process_data import FIRST_INDEX
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, parse
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.framing import DataFlag
 from tests.simulation import Simulation, check_frames, fresh, more_if_long
 
 Change = Callable[[bytes], list[bytes]]

@@ -10,6 +10,8 @@ from itertools import pairwise
 
 import pytest
 
+from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.serving import permissions
 from ethercat_server.serving.connection import (
     MAX_QUEUED_DATA,
@@ -20,8 +22,6 @@ from ethercat_server.serving.connection import (
     Subscription,
 )
 from ethercat_server.serving.transport.in_memory import InMemoryStream
-from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
-from protocol.text.json_text import JsonObject
 from tests.server.served import TURN_NS, Served
 
 DESCRIBE = encode_json({"action": "describe"})

@@ -12,6 +12,9 @@ from typing import Any, cast
 
 import pytest
 
+from bota_ethercat.control import ErrorCode
+from bota_ethercat.errors import RequestError
+from bota_ethercat.pdo import LAYOUTS
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.stream import SensorStream
@@ -24,9 +27,6 @@ from ethercat_server.sensor.objects.dictionary import BY_SETTING
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
 from ethercat_server.sensor.set_up import read_offset, read_settings, write_offset
 from ethercat_server.sensor.tare import tare
-from protocol.control import ErrorCode
-from protocol.errors import RequestError
-from protocol.pdo import LAYOUTS
 
 IMU = BY_SETTING["imu_active"].address
 

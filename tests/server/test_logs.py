@@ -15,6 +15,7 @@ from typing import cast
 
 import pytest
 
+from bota_ethercat.errors import ConnectionFailedError
 from ethercat_server.process import logs
 from ethercat_server.process.logs import (
     MOST_LINES,
@@ -24,7 +25,6 @@ from ethercat_server.process.logs import (
     Repetitions,
     goes_to_journal,
 )
-from protocol.errors import ConnectionFailedError
 from tests.server.running import ATTEMPTS, PATIENCE_S, Client, free_port, needs_bus, wait_until
 
 

@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from bota_ethercat.sensor.sdo_types import SDO_TYPE_NAMES
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
-from protocol.sensor.sdo_types import SDO_TYPE_NAMES
 from tests.server.bench import Bench
 from tests.simulated_links import SimulatedServer, simulated_bus, simulated_server
 from tests.simulation import Client

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bota_ethercat.settings import SETTINGS
 from ethercat_server.sensor.objects.dictionary import (
     BY_SETTING,
     FACTORY_CALIBRATION,
@@ -17,7 +18,6 @@ from ethercat_server.sensor.objects.search import (
     full_name,
     similar_names,
 )
-from protocol.settings import SETTINGS
 
 TABLE_III_1 = (
     (0x2000, 0), (0x6000, 0), (0x8000, 0), (0x8001, 0), (0x8002, 0), (0x8003, 0), (0x8004, 0), (0x8005, 0),

@@ -20,13 +20,13 @@ from unittest.mock import MagicMock
 
 import pytest
 
+from bota_ethercat.control import request
 from ethercat_server import server as assembly
 from ethercat_server.daemon import server as daemon
 from ethercat_server.errors import ServerError, StopRequestedError, UsageError
 from ethercat_server.process import privileges, realtime
 from ethercat_server.process.privileges import User, user_to_become
 from ethercat_server.process.signals import Signals
-from protocol.control import request
 from tests.server.as_another_user import NO_OTHER_USER, NOBODY
 from tests.server.commands import command
 from tests.server.running import (

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
+from bota_ethercat.framing import DataFlag
+from bota_ethercat.settings import sampling_rate_hz
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import PROCESSED_BIT, SHORTEST_FRAME, SOURCE_ADDRESS, Command, build
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.firmware import firmware
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.framing import DataFlag
-from protocol.settings import sampling_rate_hz
 from tests.simulation import OLD, Client, Simulation, check_frames, fresh, more_if_long, reading
 
 CLOCK = SensorOptions(signal="clock", ppm=150.0)

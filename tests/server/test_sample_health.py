@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from bota_ethercat.pdo import LAYOUTS, encode
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.pdo import LAYOUTS, encode
 from tests.simulation import Simulation
 
 

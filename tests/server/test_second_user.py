@@ -17,8 +17,8 @@ from typing import Any
 
 import pytest
 
-from protocol.control import request
-from protocol.text.bare_json import encode_bare_json
+from bota_ethercat.control import request
+from bota_ethercat.text.bare_json import encode_bare_json
 from tests.server.as_another_user import NO_OTHER_USER, NOBODY
 from tests.server.running import Server, Veth, free_port, needs_bus, server, wait_until
 

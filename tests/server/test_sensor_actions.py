@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from bota_ethercat.framing import DataFlag, encode_json
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.framing import DataFlag, encode_json
 from tests.server.bench import AT_REST, Bench, error
 from tests.simulation import Client, check_frames, reading
 

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 
 import pytest
 
+from bota_ethercat.framing import DataMessage
 from ethercat_server.acquisition.health import round_trip
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.framing import DataMessage
 from tests.simulation import Simulation, check_frames, fresh, more_if_long, reading
 
 SETTLED_S = 3.0

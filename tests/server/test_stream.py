@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from bota_ethercat.framing import DataMessage, FrameDecoder
 from ethercat_server.acquisition.clock import SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.stream import DISCARDED_AT_START, GAP, INVALID, REPEATED, SensorStream
 from ethercat_server.ethercat.exchange.process_data import Exchange
 from ethercat_server.simulation.machine import Machine, SimulatedClock
-from protocol.framing import DataMessage, FrameDecoder
 
 PERIOD_NS = 1_250_000
 

@@ -14,6 +14,9 @@ from typing import Any, Protocol
 
 import pytest
 
+from bota_ethercat.control import parse_request, reply
+from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data, encode_json
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.serving.connection import Connection, Subscription
 from ethercat_server.serving.hub import Hub
@@ -21,9 +24,6 @@ from ethercat_server.serving.permissions import controlling_uids
 from ethercat_server.serving.transport.base import Stream, Transport
 from ethercat_server.serving.transport.in_memory import InMemoryTransport, ManualClock
 from ethercat_server.serving.transport.sockets import SocketTransport
-from protocol.control import parse_request, reply
-from protocol.framing import DataMessage, FrameDecoder, encode_data, encode_json
-from protocol.text.json_text import JsonObject
 from tests.server.running import free_port
 
 PATIENCE_S = 20.0

@@ -259,8 +259,7 @@ def test_without_a_staging_root_it_makes_users_and_cleans_up(tmp_path: Path) -> 
 
 def test_every_package_is_in_the_copy_that_is_built() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    tops = {name.split(".")[0] for name in project["packages"]}
-    folders = {project["package-dir"].get(top, top).split("/")[0] for top in tops}
+    folders = {"ethercat_server", *project["packages"]["find"]["where"]} - {"."}
     copied = re.search(r'"\$root"/\{(.*?)\}', (ROOT / "scripts" / "install-service").read_text())
     assert copied is not None
     assert folders <= set(copied[1].split(","))

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from bota_ethercat.settings import check_settings, start_up_defaults
 from bridge.parameters.table import PARAMETERS
 from ethercat_server.daemon.options import EMPTY, SERVER_SETTINGS, parse_options, read_config
 from ethercat_server.ethercat.nic import lock
 from ethercat_server.process import realtime
-from protocol.settings import check_settings, start_up_defaults
 from tests.systemd.staging import (
     BRIDGE_UNIT,
     CAPABILITIES,

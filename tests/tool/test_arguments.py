@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from bota_ethercat.settings import sinc_length_of
 from ethercat_server.access import holder
 from ethercat_server.access.holder import find_holder
 from ethercat_server.errors import ForbiddenWriteError
@@ -17,7 +18,6 @@ from ethercat_server.ethercat.slave.coe import Steps, finish
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
 from ethercat_server.tool.commands.snapshot import RESTORABLE
-from protocol.settings import sinc_length_of
 from tests.bridge.scripted_server import ScriptedServer, description
 from tests.server.running import needs_bus
 from tests.tool.running import one_sentence, tool_here

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bota_ethercat.settings import SETTINGS
 from ethercat_server.sensor.objects.dictionary import BY_SETTING
 from ethercat_server.tool.cli import COMMANDS
-from protocol.settings import SETTINGS
 
 DOCS = (Path(__file__).parents[2] / "docs" / "sensor-tool.md").read_text()
 

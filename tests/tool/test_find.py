@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from bota_ethercat.address import Address
 from ethercat_server.access import raw
 from ethercat_server.access.adapters import Adapter
 from ethercat_server.access.holder import Holder
@@ -15,7 +16,6 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.nic.interface import Routes
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.tool.commands import find
-from protocol.address import Address
 from tests.json_schema import problems
 from tests.simulated_links import chain, registers, simulated_bus, simulated_server
 from tests.simulation import SimulatedBus

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, SampleDecoder
+from bota_ethercat.sensor.warnings_register import WarningFlag
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.faults.table import COMMANDS, QuitCommand, obey
 from ethercat_server.virtual_sensor.measurement.signals import CONSTANT, decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.pdo import STANDARD_GRAVITY, Sample, SampleDecoder
-from protocol.sensor.warnings_register import WarningFlag
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, Abort, RawMaster, chain
 
 PERIOD = 1_250_000

@@ -6,6 +6,8 @@ import struct
 
 import pytest
 
+from bota_ethercat.pdo import STANDARD_GRAVITY, SampleDecoder, encode
+from bota_ethercat.sensor.warnings_register import WarningFlag
 from ethercat_server.virtual_sensor.measurement import scene
 from ethercat_server.virtual_sensor.measurement.clock import SampleClock
 from ethercat_server.virtual_sensor.measurement.motion import (
@@ -22,8 +24,6 @@ from ethercat_server.virtual_sensor.measurement.motion import (
 )
 from ethercat_server.virtual_sensor.measurement.signals import CONSTANT, decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.pdo import STANDARD_GRAVITY, SampleDecoder, encode
-from protocol.sensor.warnings_register import WarningFlag
 from tests.virtual_sensor.raw_master import OP, PREOP, RawMaster
 
 PERIOD = 1_250_000  # 64 / 51200 s in ns

@@ -16,12 +16,12 @@ from typing import Any, TypeVar
 import pysoem
 import pytest
 
+from bota_ethercat.pdo import encode
 from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.sensor.objects.dictionary import Access
 from ethercat_server.virtual_sensor.firmware.dictionary import entries_of
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
-from protocol.pdo import encode
 from tests.virtual_sensor.conftest import SensorProcess
 
 pytestmark = pytest.mark.bus

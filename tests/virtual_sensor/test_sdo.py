@@ -4,13 +4,13 @@ import struct
 
 import pytest
 
+from bota_ethercat.pdo import LAYOUTS
+from bota_ethercat.settings import SETTINGS, sampling_rate_hz
 from ethercat_server.sensor.objects.dictionary import BY_SETTING, OBJECTS, Access
 from ethercat_server.virtual_sensor.firmware.dictionary import entries_of
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.slave.coe import CoeServer
 from ethercat_server.virtual_sensor.slave.sdo_information import SdoInformation
-from protocol.pdo import LAYOUTS
-from protocol.settings import SETTINGS, sampling_rate_hz
 from tests.virtual_sensor.raw_master import OP, PREOP, SAFEOP, Abort, RawMaster
 
 STATES = [PREOP, SAFEOP, OP]

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from bota_ethercat.control import Event, event
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave.emergencies import Emergency
 from ethercat_server.sensor.sensor import Sensor
-from protocol.control import Event, event
-from protocol.text.json_text import JsonObject
 
 
 class Mailboxes:

@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+from bota_ethercat.control import MAX_SDO_BYTES, ErrorCode
+from bota_ethercat.errors import RequestError
+from bota_ethercat.sensor.sdo_types import SDO_TYPES, SdoType
+from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import CutOffError, extended
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
 from ethercat_server.sensor.objects import dictionary
@@ -12,10 +16,6 @@ from ethercat_server.sensor.objects.dictionary import ObjectEntry
 from ethercat_server.sensor.objects.search import find_objects, full_name
 from ethercat_server.sensor.sensor import Sensor
 from ethercat_server.sensor.set_up import read_offset
-from protocol.control import MAX_SDO_BYTES, ErrorCode
-from protocol.errors import RequestError
-from protocol.sensor.sdo_types import SDO_TYPES, SdoType
-from protocol.settings import SETTINGS
 
 _MOST_NAMES: Final = 8
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from protocol.pdo import INPUT_OBJECT, PDO_FIELDS, PdoType
-from protocol.sensor.meaning import value_meaning
-from protocol.settings import SETTINGS, SettingValue
+from bota_ethercat.pdo import INPUT_OBJECT, PDO_FIELDS, PdoType
+from bota_ethercat.sensor.meaning import value_meaning
+from bota_ethercat.settings import SETTINGS, SettingValue
 
 VENDOR_ID: Final = 0x0000B07A
 PRODUCT_CODE: Final = 1  # all Gen-0 EtherCAT models have product code 1; the name identifies the model
@@ -97,7 +97,7 @@ class ObjectEntry:
     access: Access
     default: float | str = 0  # factory default
     unit: str = ""
-    setting: str | None = None  # name of the setting in `protocol.settings`
+    setting: str | None = None  # name of the setting in `bota_ethercat.settings`
     codes: Mapping[SettingValue, int] | None = None  # wire value of each setting value, where they differ
     values: Mapping[int, str] | None = None  # wire values that mean something, for what is no setting
 

@@ -10,9 +10,9 @@ import socket
 from collections.abc import Callable, Collection, Sequence
 from typing import Final
 
+from bota_ethercat.address import Address
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.serving.transport.peer_uid import open_diagnostics, peer_uid
-from protocol.address import Address
 
 _BACKLOG: Final = 128
 _SEND_BUFFER: Final = 65536

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from protocol.framing import DataFlag, DataMessage
-from protocol.pdo import Sample, SampleDecoder
-from protocol.sensor.warnings_register import explain
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.pdo import Sample, SampleDecoder
+from bota_ethercat.sensor.warnings_register import explain
 
 _VECTORS: Final = ("force", "torque", "acceleration", "angular_rate")
 _LEAST_INTERVALS: Final = 10

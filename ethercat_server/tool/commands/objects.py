@@ -7,6 +7,8 @@ import struct
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.pdo import INPUT_OBJECT
+from bota_ethercat.sensor.meaning import value_meaning
 from ethercat_server.access.raw import open_interface, open_slave
 from ethercat_server.access.sensors import find_server, note
 from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError, UsageError
@@ -26,8 +28,6 @@ from ethercat_server.tool.command import (
     sensors_of,
     value_text,
 )
-from protocol.pdo import INPUT_OBJECT
-from protocol.sensor.meaning import value_meaning
 
 _MOST_SILENT: Final = 3
 """Number of consecutive timeouts after which the other objects are skipped."""

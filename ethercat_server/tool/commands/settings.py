@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from bota_ethercat.errors import SettingError
+from bota_ethercat.sensor.meaning import meaning, value_meaning
+from bota_ethercat.settings import SETTINGS, SettingValue
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.daemon.options import EMPTY, ServerOptions, parse_assignments, read_config
 from ethercat_server.errors import BusError, UsageError
@@ -25,9 +28,6 @@ from ethercat_server.tool.command import (
     sensors_of,
     value_text,
 )
-from protocol.errors import SettingError
-from protocol.sensor.meaning import meaning, value_meaning
-from protocol.settings import SETTINGS, SettingValue
 
 UNSAVED = "in force until the sensor is powered off: use --save, or the command save, to keep it"
 UNSAVED_IN_SERVER = (

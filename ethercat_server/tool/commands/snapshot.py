@@ -10,6 +10,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.errors import SettingError
+from bota_ethercat.program.new_file import NewFile
+from bota_ethercat.settings import SettingValue, check_settings
+from bota_ethercat.text.json_text import finite
 from ethercat_server.access.sensors import Sensors, failed_change, note
 from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
 from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
@@ -35,10 +39,6 @@ from ethercat_server.tool.commands.settings import (
     saving_lines,
     verify,
 )
-from protocol.errors import SettingError
-from protocol.program.new_file import NewFile
-from protocol.settings import SettingValue, check_settings
-from protocol.text.json_text import finite
 
 _FORMAT: Final = "ethercat-sensor snapshot"
 _VERSION: Final = 1

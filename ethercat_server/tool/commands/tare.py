@@ -7,6 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from bota_ethercat.control import ACTIONS, MAX_TARE_SAMPLES
+from bota_ethercat.program.tare_memory import former, remember
 from ethercat_server.access.sensors import Sensors, note
 from ethercat_server.errors import BusError, UsageError
 from ethercat_server.ethercat.slave.coe import finish
@@ -15,8 +17,6 @@ from ethercat_server.sensor.sensor import Found
 from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
 from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, columns, report, sensors_of
 from ethercat_server.tool.commands.settings import UNSAVED
-from protocol.control import ACTIONS, MAX_TARE_SAMPLES
-from protocol.program.tare_memory import former, remember
 
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _UNSAVED: Final = UNSAVED.replace("--save, or the command save,", "the command save")

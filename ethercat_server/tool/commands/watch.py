@@ -7,6 +7,9 @@ import sys
 from collections.abc import Sequence
 from typing import Any, Final
 
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.health.judge import Observation, judge
+from bota_ethercat.health.verdict import LIMITS
 from ethercat_server.access.sensors import note
 from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.clock import Clock, Deadline
@@ -22,9 +25,6 @@ from ethercat_server.tool.command import (
     sensors_of,
 )
 from ethercat_server.tool.commands.block import Block
-from protocol.framing import DataFlag, DataMessage
-from protocol.health.judge import Observation, judge
-from protocol.health.verdict import LIMITS
 
 _TERMINAL_INTERVAL_S: Final = 0.25
 _LINE_INTERVAL_S: Final = 1.0

@@ -9,6 +9,8 @@ import struct
 from collections.abc import Callable
 from typing import Final
 
+from bota_ethercat.pdo import INPUT_OBJECT, LAYOUTS
+from bota_ethercat.settings import SETTINGS, SettingValue, sampling_rate_hz
 from ethercat_server.ethercat.slave.abort_codes import AbortCode
 from ethercat_server.sensor.objects.dictionary import (
     BY_SETTING,
@@ -29,8 +31,6 @@ from ethercat_server.virtual_sensor.firmware.layout import RXPDO, sensor_device
 from ethercat_server.virtual_sensor.slave.al import AlState
 from ethercat_server.virtual_sensor.slave.device import MAPPING_NAMES, by_address, mapping_rows
 from ethercat_server.virtual_sensor.slave.objects import Address, ObjectTable, SdoAbortError
-from protocol.pdo import INPUT_OBJECT, LAYOUTS
-from protocol.settings import SETTINGS, SettingValue, sampling_rate_hz
 
 STRING_SIZES: Final = {0x1008: 20, 0x1009: 12, 0x100A: 13}
 """Declared length of each string; padded with NUL."""

@@ -1,12 +1,13 @@
 """Sync managers and PDO mapping of the sensor, derived from the tables of process data and objects.
 
-Source: the dump of a real Rokubi (see `protocol.pdo`).
+Source: the dump of a real Rokubi (see `bota_ethercat.pdo`).
 """
 
 from __future__ import annotations
 
 from typing import Final
 
+from bota_ethercat.pdo import INPUT_OBJECT, LAYOUTS
 from ethercat_server.ethercat.slave.sii_content import MailboxProtocol
 from ethercat_server.sensor.objects.dictionary import BY_ADDRESS, PRODUCT_CODE, REVISION, VENDOR_ID
 from ethercat_server.virtual_sensor.slave.device import (
@@ -18,7 +19,6 @@ from ethercat_server.virtual_sensor.slave.device import (
     Mapping,
     SyncManagerRow,
 )
-from protocol.pdo import INPUT_OBJECT, LAYOUTS
 
 RXPDO: Final = Mapping(0x1600, "Outputs", 2, (BY_ADDRESS[0x7000, 0],))
 TXPDO: Final = {

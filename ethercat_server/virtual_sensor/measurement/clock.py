@@ -6,7 +6,7 @@ In whole nanoseconds, without accumulating rounding errors.
 
 from __future__ import annotations
 
-from protocol.settings import BASE_SAMPLING_RATE_HZ
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
 
 _PPM_SCALE = 10**12  # ppm in steps of one millionth
 

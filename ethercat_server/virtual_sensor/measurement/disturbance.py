@@ -8,8 +8,8 @@ from __future__ import annotations
 import random
 from typing import Final, NamedTuple
 
+from bota_ethercat.sensor.warnings_register import WarningFlag
 from ethercat_server.virtual_sensor.measurement.signals import Reading
-from protocol.sensor.warnings_register import WarningFlag
 
 CHANNELS: Final[tuple[str, ...]] = tuple(
     f"{vector}.{axis}" for vector in ("force", "torque", "acceleration", "angular_rate") for axis in "xyz"

@@ -10,10 +10,10 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
+from bota_ethercat.pdo import PdoLayout
+from bota_ethercat.settings import SettingValue
 from ethercat_server.virtual_sensor.measurement.disturbance import NO_SATURATION, Saturation
 from ethercat_server.virtual_sensor.measurement.signals import Reading
-from protocol.pdo import PdoLayout
-from protocol.settings import SettingValue
 
 COUNTS_PER_NEWTON: Final = 10_000.0
 COUNTS_PER_NEWTON_METRE: Final = 500_000.0

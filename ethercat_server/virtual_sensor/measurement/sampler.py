@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from bota_ethercat.pdo import layout_for
 from ethercat_server.virtual_sensor.firmware.dictionary import Dictionary
 from ethercat_server.virtual_sensor.measurement.clock import SampleClock
 from ethercat_server.virtual_sensor.measurement.disturbance import NO_SATURATION, Disturbances
@@ -15,7 +16,6 @@ from ethercat_server.virtual_sensor.measurement.motion import MOTIONS
 from ethercat_server.virtual_sensor.measurement.scene import Scene
 from ethercat_server.virtual_sensor.measurement.signals import FORMULAS, Signal
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.pdo import layout_for
 
 
 def make_signal(options: SensorOptions) -> Signal:

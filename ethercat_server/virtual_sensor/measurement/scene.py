@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import random
 
+from bota_ethercat.pdo import STANDARD_GRAVITY
 from ethercat_server.virtual_sensor.measurement.motion import (
     Motion,
     Swaying,
@@ -19,7 +20,6 @@ from ethercat_server.virtual_sensor.measurement.motion import (
     to_sensor,
 )
 from ethercat_server.virtual_sensor.measurement.signals import Reading
-from protocol.pdo import STANDARD_GRAVITY
 
 TOOL_MASS = 0.8
 """kg"""

@@ -18,13 +18,13 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
+from bota_ethercat.pdo import Vector3
+from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bridge.compensating.tool_sources import ImuSource, ListenerSource, Oriented, Source
 from bridge.parameters.compensation import TOPIC_SOURCES, CompensationParameters, OrientationParameters
 from bridge.parameters.row import ParameterError
 from bridge.transforms import Tf, UnusableError, check_tf, follow_tf, look_up, stamp_ns
 from ft_compensation.quantities import Quaternion, unit_quaternion
-from protocol.pdo import Vector3
-from protocol.sensor.frames import IMU_HEIGHTS
 
 _LET_GO_S: Final = 1.0
 """How long an executor may take to release the previous subscription: DDS has one type per topic."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, Protocol
 
+from bota_ethercat.pdo import Sample, Vector3
 from bridge.parameters.compensation import CompensationParameters
 from ft_compensation.orientation import QuaternionGravity
 from ft_compensation.quantities import Quaternion
 from ft_compensation.specific_force import ImuSpecificForce
-from protocol.pdo import Sample, Vector3
 
 IMU_IS_OFF = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
 

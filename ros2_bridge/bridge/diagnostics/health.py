@@ -1,4 +1,4 @@
-"""What the diagnostics say: what is known, as `protocol.health` judges it. No ROS, no threads.
+"""What the diagnostics say: what is known, as `bota_ethercat.health` judges it. No ROS, no threads.
 
 Five statuses. A message says what is wrong and what to do; the values are for those who look closer.
 """
@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from bota_ethercat.health.judge import SATURATIONS
+from bota_ethercat.health.judge import judge as judge_stream
+from bota_ethercat.health.verdict import About, Level, Limits
+from bota_ethercat.text.untrusted import number, printable, whole
 from bridge.diagnostics.observer import SLOW_ANSWER_S, Snapshot, mapping, row_of
-from protocol.health.judge import SATURATIONS
-from protocol.health.judge import judge as judge_stream
-from protocol.health.verdict import About, Level, Limits
-from protocol.text.untrusted import number, printable, whole
 
 Values = dict[str, object]
 

@@ -14,11 +14,11 @@ from typing import Final
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from bota_ethercat.health.verdict import Level, Limits
 from bridge.diagnostics.health import Status, judge, text_of
 from bridge.diagnostics.observer import CompensationState, Observer, Snapshot
 from bridge.publishing.messages import Outputs, create_publisher
 from bridge.stream.reader import Reader
-from protocol.health.verdict import Level, Limits
 
 TICK_S: Final = 0.1
 REPORT_S: Final = 1.0

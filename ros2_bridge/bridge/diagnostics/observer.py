@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.errors import ConnectionFailedError
+from bota_ethercat.health.judge import Observation, emergency
+from bota_ethercat.health.observer import p99
+from bota_ethercat.text.json_text import JsonObject
 from bridge.stream.link import Link, SensorInfo
 from bridge.stream.reader import Reader
 from bridge.stream.watch import Flags
 from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
-from protocol.errors import ConnectionFailedError
-from protocol.health.judge import Observation, emergency
-from protocol.health.observer import p99
-from protocol.text.json_text import JsonObject
 
 _SHORTEST_RATE_S: Final = 0.8
 """A rate measured over less time than this says little."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.pdo import Vector3
 from bridge.parameters.row import ParameterError, Row
 from ft_compensation.outputs.filter import LEAST_CUTOFF_HZ, LEAST_NOTCH_HZ, FilterSettings
 from ft_compensation.quantities import (
@@ -22,7 +23,6 @@ from ft_compensation.quantities import (
     unit_quaternion,
 )
 from ft_compensation.stationary_limits import StationaryLimits
-from protocol.pdo import Vector3
 
 AUTO: Final = "auto"
 """The value of a path that is for the node to choose."""

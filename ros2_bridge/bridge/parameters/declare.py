@@ -13,10 +13,10 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from bota_ethercat.settings import SETTINGS
+from bota_ethercat.text.did_you_mean import did_you_mean
 from bridge.parameters.row import ParameterError, ParameterValue, Row
 from bridge.parameters.table import PARAMETERS, Parameters, gather_all
-from protocol.settings import SETTINGS
-from protocol.text.did_you_mean import did_you_mean
 
 SETTINGS_PREFIX: Final = "settings."
 _OF_OTHERS: Final = ("qos_overrides.", "use_sim_time", "start_type_description_service")

@@ -15,11 +15,11 @@ from rcl_interfaces.msg import IntegerRange, ParameterDescriptor, SetParametersR
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from bota_ethercat.errors import SettingError
+from bota_ethercat.settings import SETTINGS, Setting, SettingValue, check_settings
 from bridge.parameters.declare import SETTINGS_PREFIX as PREFIX
 from bridge.parameters.row import ParameterError
 from bridge.stream.link import CONFIGURE_TIMEOUT_S, Link, RequestFailedError
-from protocol.errors import SettingError
-from protocol.settings import SETTINGS, Setting, SettingValue, check_settings
 
 
 class SettingsParameters:

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.client.real_time import HIGHEST_PRIORITY
+from bota_ethercat.health.verdict import LIMITS, Limits
+from bota_ethercat.pdo import ImuUnits
 from bridge.parameters.compensation import ROWS as COMPENSATION_ROWS
 from bridge.parameters.compensation import CompensationParameters, gather
 from bridge.parameters.row import NO_TEXTS, Numbers, ParameterError, Row
 from bridge.parameters.wrench_frames import WrenchFrame, parse
-from protocol.client.real_time import HIGHEST_PRIORITY
-from protocol.health.verdict import LIMITS, Limits
-from protocol.pdo import ImuUnits
 
 _UNKNOWN: Final = (0.0, 0.0, 0.0)
 _COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"

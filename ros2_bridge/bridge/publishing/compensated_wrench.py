@@ -10,6 +10,8 @@ import threading
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import Sample, Vector3
 from bridge.compensating.tool_sources import Source
 from bridge.parameters.compensation import CompensationParameters
 from bridge.publishing.filtered_wrench import FilteredTopic
@@ -20,8 +22,6 @@ from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
 from ft_compensation.stationary import StationaryWindow
 from ft_compensation.stationary_limits import StationaryLimits
-from protocol.framing import DataMessage
-from protocol.pdo import Sample, Vector3
 
 
 class Plan(NamedTuple):

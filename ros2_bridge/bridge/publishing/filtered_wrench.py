@@ -6,14 +6,14 @@ from collections.abc import Callable
 
 from rclpy.node import Node
 
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import Vector3
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.table import Parameters
 from bridge.publishing.messages import WrenchTopic
 from ft_compensation.compensator import Stages
 from ft_compensation.outputs.filter import FilterSettings, WrenchFilter
 from ft_compensation.quantities import CompensationError
-from protocol.framing import DataMessage
-from protocol.pdo import Vector3
 
 
 class FilteredTopic:

@@ -20,13 +20,13 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
+from bota_ethercat.cdr import StampedNumbers
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import Sample, Vector3
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.row import Numbers
 from bridge.parameters.table import Parameters
 from ft_compensation.compensator import Stages
-from protocol.cdr import StampedNumbers
-from protocol.framing import DataMessage
-from protocol.pdo import Sample, Vector3
 
 ARRAY_LABEL: Final = "Fx Fy Fz Mx My Mz Ax Ay Az Rx Ry Rz"
 """The label of the array's one dimension: what its values are, in order."""

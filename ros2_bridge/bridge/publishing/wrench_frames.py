@@ -12,13 +12,13 @@ from typing import Final
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import Vector3
 from bridge.parameters.compensation import CompensationParameters
 from bridge.parameters.table import Parameters
 from bridge.publishing.messages import StageTopic
 from bridge.transforms import Tf, UnusableError, check_tf, follow_tf, look_up
 from ft_compensation.outputs.frames import WrenchTransform
-from protocol.framing import DataMessage
-from protocol.pdo import Vector3
 
 _PATIENCE: Final = 200
 """Failed lookups after the first subscription before it is a problem: TF has to arrive first."""

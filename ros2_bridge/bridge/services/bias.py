@@ -7,13 +7,13 @@ from typing import Final
 
 from rclpy.node import Node
 
+from bota_ethercat.pdo import Vector3
 from bridge.compensating.control import CompensationControl
 from bridge.publishing.compensated_wrench import RestWindow
 from bridge.services.sensor import create_triggers
 from bridge.stream.link import DESCRIBE_TIMEOUT_S, Link, RequestFailedError, find_sensor
 from ft_compensation.bias import Taken, check_at_rest, estimate_bias
 from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, length, wrench_text
-from protocol.pdo import Vector3
 
 _PATIENCE_S: Final = 2.0
 """A window may take this much longer than half as long again as it lasts."""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rclpy.node import Node
 
+from bota_ethercat.errors import FileError
 from bridge.compensating.bias_keeper import directory_of, expand
 from bridge.compensating.control import CompensationControl
 from bridge.parameters.compensation import AUTO
@@ -15,7 +16,6 @@ from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
 from ft_compensation.identification.poses import Pose, coverage, pose_of
 from ft_compensation.quantities import CompensationError, length, wrench_text
-from protocol.errors import FileError
 
 
 class IdentifyServices:

@@ -2,7 +2,7 @@
 
 The rules it keeps:
 
-- Only new frames come here, each once: `protocol.accounting` has left out the others.
+- Only new frames come here, each once: `bota_ethercat.accounting` has left out the others.
 - Age is CLOCK_MONOTONIC now minus the frame's, compared with what is usual on this connection: where the
   server's clock is another machine's, only differences mean anything.
 - When a queued frame is older than usual by BACKLOG_NS (this process was stopped, or is slower than the
@@ -18,8 +18,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.accounting import StreamCounts
-from protocol.framing import DataMessage
+from bota_ethercat.accounting import StreamCounts
+from bota_ethercat.framing import DataMessage
 
 BACKLOG_NS: Final = 50_000_000
 FRESH_NS: Final = 4_000_000

@@ -10,15 +10,15 @@ import contextlib
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.client.client import Client
+from bota_ethercat.client.session import Disconnected
+from bota_ethercat.control import Event, six_numbers
+from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError, SettingError
+from bota_ethercat.settings import SETTINGS, SettingValue
+from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import number, printable, rows
 from bridge.clock import Clock
 from ft_compensation.quantities import Wrench, wrench_text
-from protocol.client.client import Client
-from protocol.client.session import Disconnected
-from protocol.control import Event, six_numbers
-from protocol.errors import ConnectionFailedError, NoReplyError, RefusedError, SettingError
-from protocol.settings import SETTINGS, SettingValue
-from protocol.text.json_text import JsonObject
-from protocol.text.untrusted import number, printable, rows
 
 CONFIGURE_TIMEOUT_S: Final = 10.0
 DESCRIBE_TIMEOUT_S: Final = 3.0

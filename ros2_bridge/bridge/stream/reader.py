@@ -11,19 +11,19 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Final, Protocol
 
+from bota_ethercat.client.channel import Channel
+from bota_ethercat.client.client import Client
+from bota_ethercat.client.reading import Condition
+from bota_ethercat.client.session import ClientEvent, Connected, Disconnected
+from bota_ethercat.control import Event
+from bota_ethercat.errors import ConnectionFailedError
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import LAYOUTS, Sample, SampleDecoder
 from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.parameters.table import Parameters
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
 from bridge.stream.link import Link, sentence
 from bridge.stream.watch import Watch
-from protocol.client.channel import Channel
-from protocol.client.client import Client
-from protocol.client.reading import Condition
-from protocol.client.session import ClientEvent, Connected, Disconnected
-from protocol.control import Event
-from protocol.errors import ConnectionFailedError
-from protocol.framing import DataMessage
-from protocol.pdo import LAYOUTS, Sample, SampleDecoder
 
 SILENCE_S: Final = 1.0
 _SILENCE_NS: Final = round(0.99e9 * SILENCE_S)  # a wait may end some microseconds early

@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from protocol.framing import DataMessage
-from protocol.pdo import LAYOUTS, Sample
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import LAYOUTS, Sample
 
 _MOST_AGES: Final = 8192
 _MOST_CHANGES: Final = 8192

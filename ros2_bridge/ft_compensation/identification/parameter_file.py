@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from bota_ethercat.pdo import Vector3
+from bota_ethercat.program.new_file import NewFile
 from ft_compensation.identification.payload import Identified
 from ft_compensation.quantities import Accelerometer, Payload, Wrench
-from protocol.pdo import Vector3
-from protocol.program.new_file import NewFile
 
 
 def to_yaml(

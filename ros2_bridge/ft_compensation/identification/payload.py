@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from bota_ethercat.pdo import Vector3
 from ft_compensation.identification.estimation import Value, estimate
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
 from ft_compensation.identification.weighted import Array
@@ -24,7 +25,6 @@ from ft_compensation.quantities import (
     length,
 )
 from ft_compensation.stationary import triple
-from protocol.pdo import Vector3
 
 LARGEST_MASS: Final = 500.0
 """kg: no sensor of the family carries more."""

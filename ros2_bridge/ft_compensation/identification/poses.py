@@ -12,10 +12,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from ft_compensation.bias import gravity_of
 from ft_compensation.quantities import ZERO, CompensationError, Wrench, length
 from ft_compensation.stationary import StationaryMeans, triple
-from protocol.pdo import STANDARD_GRAVITY, Vector3
 
 LEAST_POSES: Final = 4
 MOST_POSES: Final = 1000

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
+from bota_ethercat.pdo import Vector3
 from ft_compensation.quantities import CompensationError, Wrench
-from protocol.pdo import Vector3
 
 LEAST_CUTOFF_HZ: Final = 0.05
 LEAST_NOTCH_HZ: Final = 1.0

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, Self
 
+from bota_ethercat.pdo import Vector3
 from ft_compensation.quantities import ZERO, Quaternion, Wrench, unit_quaternion
-from protocol.pdo import Vector3
 
 Rotation = tuple[Vector3, Vector3, Vector3]
 """A rotation matrix, row by row."""

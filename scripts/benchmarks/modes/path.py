@@ -14,6 +14,8 @@ from statistics import mean, median
 from types import FrameType
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.control import request
+from bota_ethercat.framing import encode_json
 from ethercat_server.acquisition.start_up import AsFound
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.server import Server
@@ -21,8 +23,6 @@ from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.transport.in_memory import InMemoryStream, InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
-from protocol.control import request
-from protocol.framing import encode_json
 from scripts.benchmarks.chain import Figures, Setup
 from scripts.benchmarks.modes.mode import Mode
 

@@ -13,11 +13,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+from bota_ethercat.client import make_real_time
+from bota_ethercat.control import request
+from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
+from bota_ethercat.pdo import SampleDecoder
 from ethercat_server.virtual_sensor.measurement.signals import decode_clock
-from protocol.client import make_real_time
-from protocol.control import request
-from protocol.framing import DataFlag, DataMessage, FrameDecoder, encode_json
-from protocol.pdo import SampleDecoder
 from scripts.benchmarks.records import PORT, Recording, connect, sleep_until
 
 SIZE: Final = 61

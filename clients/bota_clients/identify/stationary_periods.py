@@ -1,0 +1,140 @@
+"""Finds the periods of a recording in which the sensor was stationary.
+
+The recording is divided into short blocks. Quiet blocks in a row with the same pose make a period. Its first
+and last block, in which a hand may have touched it or the robot may have swung, are excluded; the remainder
+must pass the same test as a pose that is taken live.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from bota_clients.recording.columns import Columns
+from ft_compensation.stationary import (
+    BAD_WRENCH,
+    CHANCE,
+    NotStationaryError,
+    StationaryMeans,
+    stationary_means,
+)
+from ft_compensation.stationary_limits import StationaryLimits
+
+_BLOCK_S: Final = 0.1
+_BLOCK_SAMPLES: Final = 8
+"""Minimum number of samples in a block, however slow the sensor is."""
+_LONGEST_GAP_S: Final = 0.5
+_SAME_POSE: Final = math.cos(math.radians(1.5))
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+
+class StationaryPeriod(NamedTuple):
+    """A stationary period."""
+
+    begin_s: float
+    """s from the beginning of the recording."""
+    seconds: float
+    means: StationaryMeans
+
+
+class StationaryPeriods(NamedTuple):
+    """The stationary periods of a recording."""
+
+    periods: tuple[StationaryPeriod, ...]
+    rejected: tuple[str, ...]
+    """Sentences about periods that were nearly stationary, and why they were rejected."""
+
+
+def find_stationary_periods(
+    columns: Columns, least_seconds: float = 1.0, limits: StationaryLimits | None = None
+) -> StationaryPeriods:
+    """The stationary periods of at least `least_seconds`, in order."""
+    limits = limits or StationaryLimits()
+    fresh = columns.where(columns.fresh)
+    if len(fresh) < _BLOCK_SAMPLES:
+        return StationaryPeriods((), ())
+    rows = np.hstack([fresh.force, fresh.torque, fresh.acceleration, fresh.angular_rate])
+    good = _good(fresh, rows)
+    times = (fresh.monotonic_ns - fresh.monotonic_ns[0]) * 1e-9
+    rows = np.where(good[:, np.newaxis], rows, 0.0)
+    periods, rejected = [], []
+    for part in _parts(times):
+        for begin, end in _stretches(times[part], rows[part], good[part], limits):
+            first, last = part.start + begin, part.start + end
+            seconds = float(times[last - 1] - times[first])
+            if seconds < least_seconds:
+                continue
+            try:
+                means = stationary_means(rows[first:last], seconds, limits)
+            except NotStationaryError as error:
+                rejected.append(f"{times[first]:.1f} s to {times[last - 1]:.1f} s: {error}")
+            else:
+                periods.append(StationaryPeriod(float(times[first]), seconds, means))
+    return StationaryPeriods(tuple(periods), tuple(rejected))
+
+
+def _good(columns: Columns, rows: Floats) -> Bools:
+    """Samples that can be used: finite and not saturated."""
+    saturated = columns.force_torque_saturated | columns.acceleration_saturated
+    saturated = saturated | columns.angular_rate_saturated | (columns.warnings & int(BAD_WRENCH))
+    good: Bools = np.isfinite(rows).all(axis=1) & (saturated == 0)
+    return good
+
+
+def _parts(times: Floats) -> Iterator[slice]:
+    """The parts without a gap; a server on a restarted machine has another monotonic clock."""
+    steps = np.diff(times)
+    breaks = np.flatnonzero((steps < -_BLOCK_S) | (steps > _LONGEST_GAP_S)) + 1
+    bounds = [0, *breaks.tolist(), len(times)]
+    for begin, end in itertools.pairwise(bounds):
+        if end - begin >= 3 * _BLOCK_SAMPLES:
+            yield slice(begin, end)
+
+
+def _stretches(
+    times: Floats, rows: Floats, good: Bools, limits: StationaryLimits
+) -> Iterator[tuple[int, int]]:
+    """First row and the row after the last one of every period, without its first and last block."""
+    period = float(times[-1] - times[0]) / (len(times) - 1)
+    size = max(_BLOCK_SAMPLES, round(_BLOCK_S / period))
+    count = len(rows) // size
+    blocks = rows[: count * size].reshape(count, size, rows.shape[1])
+    mean, deviation = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
+    quiet = good[: count * size].reshape(count, size).all(axis=1)
+    quiet &= (deviation <= limits.spreads).all(axis=1)
+    quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= limits.angular_rate
+    start = 0
+    for number in range(1, count + 1):
+        if number < count and _goes_on(mean, deviation, quiet, start, number, size, limits):
+            continue
+        if quiet[start] and number - start >= 3:
+            yield (start + 1) * size, (number - 1) * size
+        start = number
+
+
+def _goes_on(
+    mean: Floats,
+    deviation: Floats,
+    quiet: Bools,
+    start: int,
+    number: int,
+    size: int,
+    limits: StationaryLimits,
+) -> bool:
+    """Whether block `number` belongs to the period that began with block `start`."""
+    if not (quiet[start] and quiet[number]):
+        return False
+    a, b = mean[start], mean[number]
+    sizes = float(np.linalg.norm(a[6:9]) * np.linalg.norm(b[6:9]))
+    if float(a[6:9] @ b[6:9]) < _SAME_POSE * sizes:
+        return False
+    by_chance = CHANCE * (deviation[start] + deviation[number]) / math.sqrt(size)
+    moved = np.abs(b - a) - by_chance
+    return bool((moved[:6] <= limits.wanders[:6]).all())  # of the acceleration the pose was compared

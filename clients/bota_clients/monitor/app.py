@@ -1,0 +1,180 @@
+"""The live view: terminal, keys and clock. The only file that uses Textual.
+
+Ten times a second the state is rendered as rows of text, and only rows that changed are drawn.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import ClassVar, Final
+
+from rich.text import Text
+from textual import events
+from textual.app import App, ComposeResult
+from textual.geometry import Region
+from textual.strip import Strip
+from textual.widget import Widget
+
+from bota_clients.monitor.model import Model, State, clock_text
+from bota_clients.monitor.recorder import Recorder
+from bota_clients.monitor.screen import Look, render
+from bota_clients.monitor.tare import start_tare
+from bota_clients.numbers import duration
+from bota_clients.program import call_on
+from bota_ethercat.address import Address
+
+REFRESH_S: Final = 0.1
+_ANSWERS: Final = {"y": "tare", "u": "undo", "c": "clear"}  # to the question whether to tare
+
+
+class View(Widget):
+    """Rows of text, of which only those that change are drawn."""
+
+    can_focus = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._rows: list[Text] = []
+
+    def show(self, rows: list[Text]) -> None:
+        """Show these rows."""
+        before, self._rows = self._rows, rows
+        if len(rows) != len(before):
+            self.refresh()
+        elif changed := [y for y, row in enumerate(rows) if row != before[y]]:
+            self.refresh(*(Region(0, y, self.size.width, 1) for y in changed))
+
+    def render_line(self, y: int) -> Strip:
+        """One row, for Textual."""
+        row = self._rows[y] if y < len(self._rows) else Text()
+        return Strip(row.render(self.app.console)).adjust_cell_length(self.size.width)
+
+
+class Monitor(App[None]):
+    """Connects keys, model and view. The caller closes `recorder` once the terminal is restored."""
+
+    TITLE = "ethercat-monitor"
+    CSS = "Screen, View { background: ansi_default; color: ansi_default; width: 100%; height: 100%; }"
+    ENABLE_COMMAND_PALETTE = False
+    BINDINGS: ClassVar = [("ctrl+z", "suspend_process", "suspend")]
+
+    def __init__(
+        self,
+        model: Model,
+        address: Address,
+        *,
+        ascii_only: bool = False,
+        seconds: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`seconds`: exit after this time."""
+        # The terminal's own background; Textual obeys NO_COLOR.
+        super().__init__(ansi_color=True)
+        self._model = model
+        self._address = address
+        self._clock = clock
+        self._look = Look(ascii=ascii_only)
+        self._view = View()
+        self._seconds = seconds
+        self.recorder = Recorder(address)
+        self._state: State | None = None
+        self._to_tare = 0  # the position that the question is about
+
+    def compose(self) -> ComposeResult:
+        """The only widget."""
+        yield self._view
+
+    def on_mount(self) -> None:
+        """Start the timers and the signal handlers."""
+        call_on(asyncio.get_running_loop(), self.exit, "SIGTERM", "SIGHUP")
+        self.app_resume_signal.subscribe(self, lambda _: self._view.refresh())
+        self.set_interval(REFRESH_S, self.draw)
+        if self._seconds is not None:
+            self.set_timer(self._seconds, self.exit)
+
+    def on_resize(self) -> None:
+        """Draw for the new size."""
+        self.call_after_refresh(self.draw)
+
+    def draw(self) -> None:
+        """Show the current state, or that of the time of the pause."""
+        now_s = self._clock()
+        if ended := self.recorder.ended():
+            self._say(*ended)
+        state = self._model.state(now_s)
+        if self._look.paused and self._state is not None:
+            state = replace(self._state, message=state.message)
+        self._state = state
+        recording = f"REC {duration(now_s - self.recorder.since_s)}" if self.recorder.running else ""
+        self._view.show(render(state, replace(self._look, recording=recording), *self._view.size))
+
+    def action_help_quit(self) -> None:
+        """Ctrl-C quits, instead of Textual's hint at another key."""
+        self.exit()
+
+    def on_key(self, event: events.Key) -> None:
+        """Handle a key."""
+        if event.key in {"ctrl+c", "ctrl+q", "ctrl+z"}:
+            return
+        event.stop()
+        look, key = self._look, (event.character or "").lower()
+        if event.key == "ctrl+l":
+            self._view.refresh()
+        elif look.question:
+            self._answer(key)
+        elif look.help or (look.warnings and key != "w"):
+            self._look = replace(look, help=False, warnings=0)
+        elif key == "t":
+            self._ask_tare()
+        elif key == "r":
+            self._record()
+        elif key in {"p", " "}:
+            self._look = replace(look, paused="" if look.paused else clock_text())
+        elif key == "0":
+            self._model.reset()
+            self._say("Peaks and past warnings are reset")
+        elif key == "n":
+            self._next()
+        elif key == "w":
+            self._look = replace(look, warnings=look.warnings + 1)
+        elif key in {"?", "h"}:
+            self._look = replace(look, help=True)
+        elif key == "q":
+            self.exit()
+        self.draw()
+
+    def _say(self, text: str, bad: bool = False) -> None:
+        self._model.say(f"{clock_text()} {text}", bad)
+
+    def _ask_tare(self) -> None:
+        state = self._state
+        if state is None or not state.sensors or not state.server.connected:
+            self._say("No sensor to tare: not connected to the server", True)
+            return
+        self._to_tare = state.sensors[self._look.selected % len(state.sensors)].position
+        answers = "y: yes, u: undo the last tare, c: clear it, any other key: no"
+        self._look = replace(self._look, question=f"Tare sensor {self._to_tare}? {answers}")
+
+    def _answer(self, key: str) -> None:
+        self._look = replace(self._look, question="")
+        if key in _ANSWERS:
+            start_tare(self._address, self._to_tare, self._say, _ANSWERS[key])
+        else:
+            self._say("Not tared")
+
+    def _record(self) -> None:
+        if self.recorder.running:
+            self.recorder.stop()
+            self._say("Stopping the recording")
+        else:
+            self._say(*self.recorder.start(self._clock()))
+
+    def _next(self) -> None:
+        count = len(self._state.sensors) if self._state else 0
+        if count < 2:
+            self._say("There is only one sensor" if count else "There is no sensor")
+        else:
+            self._look = replace(self._look, selected=(self._look.selected + 1) % count)

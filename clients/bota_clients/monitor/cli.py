@@ -1,0 +1,196 @@
+"""`ethercat-monitor`: command line, and the view that it asks for: live, lines, once, JSON, or a page.
+
+Exit codes: 0 fine, 1 not, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from bota_clients.arguments import add_imu_units, add_server, address, parser, seconds, server_of
+from bota_clients.monitor.model import Model, clock_text
+from bota_clients.monitor.reader import Reader
+from bota_clients.monitor.web.hub import is_loopback
+from bota_clients.monitor.words import can_show, json_line, to_ascii, trouble, verdict
+from bota_clients.program import discard_output, interrupt_on_signals, not_installed
+from bota_ethercat.address import DEFAULT_HOST, Address
+from bota_ethercat.health.verdict import Level
+from bota_ethercat.pdo import ImuUnits
+
+DEFAULT_WEB: Final = Address(DEFAULT_HOST, 12080)
+_PERIOD_S: Final = 1.0
+_ONCE_S: Final = 1.0
+_ANSWER_S: Final = 6.0
+
+
+class Options(argparse.Namespace):
+    """What to show, and how."""
+
+    address: Address
+    once: bool
+    json: bool
+    seconds: float | None
+    imu_units: ImuUnits
+    ascii: bool
+    web: Address | None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the monitor; returns its exit code."""
+    options = parse(argv)
+    try:
+        return run(options)
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.EIO):  # the reader or the terminal was closed
+            raise
+        discard_output()
+        return 0
+    except KeyboardInterrupt:
+        return 1 if options.once else 0
+    except ImportError as error:  # of rich, textual, websockets, which are imported where they are used
+        return not_installed("ethercat-monitor", error)
+
+
+def parse(argv: Sequence[str] | None) -> Options:
+    """Read the command line; argparse exits with 2 if it is wrong."""
+    made = parser(
+        "ethercat-monitor",
+        "Shows the stream of ethercat-server live in the terminal. Press ? for the keys.",
+        "With --once: exit code 0 if all is good or worth a look, 1 if there is trouble, or no server.",
+    )
+    add_server(made)
+    add = made.add_argument
+    add("old", nargs="?", help=argparse.SUPPRESS)  # HOST:PORT without --server
+    add("--once", action="store_true", help="observe for a second, print a table and exit")
+    add("--json", action="store_true", help="print one JSON object per second; with --once, just one")
+    add("--seconds", type=seconds, metavar="S", help="exit after S seconds")
+    add_imu_units(made)
+    add("--ascii", action="store_true", help="use ASCII characters only")
+    add(
+        "--web", type=_loopback, nargs="?", const=DEFAULT_WEB, metavar="PORT",
+        help=f"show it in a browser instead, on this port of this machine (default {DEFAULT_WEB.port})",
+    )  # fmt: skip
+    options = made.parse_args(argv, Options())
+    options.address = server_of(made, options.server, options.old)
+    if options.once and options.seconds is not None:
+        made.error("--seconds cannot be combined with --once")
+    if options.web is not None and (options.once or options.json):
+        made.error("--web cannot be combined with --once or --json")
+    return options
+
+
+def _loopback(text: str) -> Address:
+    where = address(text)
+    if is_loopback(where.host):
+        return where
+    raise argparse.ArgumentTypeError(
+        f"{text!r}: the page is for this machine only: give a port, and reach it from elsewhere over ssh -L"
+    )
+
+
+def run(options: Options) -> int:
+    """Run the monitor; returns the exit code."""
+    if options.web is not None:
+        from bota_clients.monitor.web.server import run_web  # noqa: PLC0415
+
+        return run_web(options.address, options.web, options.imu_units, options.seconds)
+    terminal = (
+        sys.stdin.isatty() and sys.stdout.isatty() and os.environ.get("TERM", "dumb") not in {"", "dumb"}
+    )
+    live = terminal and not options.once and not options.json
+    if live:
+        import bota_clients.monitor.app  # noqa: PLC0415
+    else:
+        import bota_clients.monitor.screen  # noqa: F401, PLC0415
+    interrupt_on_signals()  # the live view replaces the handler of SIGTERM
+    options.ascii = options.ascii or not can_show(sys.stdout.encoding)
+    model = Model(str(options.address), options.imu_units)
+    reader = Reader(options.address, model)
+    reader.start()
+    try:
+        if live:
+            return _live(options, model)
+        answered = reader.tried.wait(_ANSWER_S) and model.state(time.monotonic()).server.connected
+        if options.once:
+            return _once(options, model, answered=answered)
+        return _each_second(options, model)
+    finally:
+        reader.close()
+
+
+def _once(options: Options, model: Model, *, answered: bool) -> int:
+    from bota_clients.monitor.screen import table  # noqa: PLC0415
+
+    if answered:
+        time.sleep(_ONCE_S)
+    state = model.state(time.monotonic())
+    if options.json:
+        _say(json_line(state, time.time()))
+    if not answered:
+        reason = state.server.reason or f"the server at {options.address} does not answer"
+        sys.stderr.write(f"ethercat-monitor: {reason}, or give its HOST:PORT\n")
+        return 1
+    if not options.json:
+        _say(*table(state), ascii_only=options.ascii)
+    return 1 if verdict(state)[0] is Level.TROUBLE else 0
+
+
+def _live(options: Options, model: Model) -> int:
+    from bota_clients.monitor.app import Monitor  # noqa: PLC0415
+
+    app = Monitor(model, options.address, ascii_only=options.ascii, seconds=options.seconds)
+    try:
+        app.run(mouse=False)
+        if app.recorder.running:
+            _say("Finishing the recording")
+    finally:
+        ended = app.recorder.close()
+    if ended:
+        _say(ended)
+    return app.return_code or 0
+
+
+def _each_second(options: Options, model: Model) -> int:
+    """An object, or a line per sensor; trouble with the server is reported once."""
+    from bota_clients.monitor.screen import line  # noqa: PLC0415
+
+    was_wrong = False
+    for _ in ticks(options.seconds):
+        state, now = model.state(time.monotonic()), clock_text()
+        wrong = trouble(state.server)
+        if options.json:
+            _say(json_line(state, time.time()))
+            model.reset()  # peaks and warnings of the next line are those of its own second
+        elif wrong is None:
+            _say(*(line(sensor, now) for sensor in state.sensors), ascii_only=options.ascii)
+        elif not was_wrong:
+            _say(f"{now}  server {wrong}", ascii_only=options.ascii)
+        was_wrong = wrong is not None
+    return 0
+
+
+def ticks(limit_s: float | None) -> Iterator[None]:
+    """Once a second, until the limit; whoever is late does not hurry afterwards."""
+    start_s = due_s = time.monotonic()
+    while True:
+        due_s = max(due_s + _PERIOD_S, time.monotonic())
+        if limit_s is not None and due_s > start_s + limit_s + 0.5 * _PERIOD_S:
+            return
+        time.sleep(max(0.0, due_s - time.monotonic()))
+        yield
+
+
+def _say(*lines: str, ascii_only: bool = False) -> None:
+    text = "".join(f"{line}\n" for line in lines)
+    sys.stdout.write(to_ascii(text) if ascii_only else text)
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""The thread that feeds the model from the server.
+
+It wakes some twenty times a second instead of for every sample: it takes all that is queued, then waits for
+one more sample. As it was awake for that one, its arrival time gives the age of a sample on arrival.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from bota_clients.monitor.model import Model
+from bota_ethercat.address import Address
+from bota_ethercat.client import Client, ClientEvent, Connected, Disconnected
+from bota_ethercat.control import Event
+from bota_ethercat.errors import ConnectionFailedError, RefusedError, UnreachableError
+from bota_ethercat.framing import DataMessage
+
+BATCH_S: Final = 0.05
+_STATUS_EVERY_S: Final = 1.0
+_NEXT_SAMPLE_S: Final = 0.1
+_MOST_PILED: Final = 1000  # more were not read in time: what comes next has waited, too
+_ANSWER_TIMEOUT_S: Final = 10.0  # timeout for a reply of the server
+
+
+class Reader:
+    """Reads until closed."""
+
+    def __init__(self, address: Address, model: Model, batch_s: float = BATCH_S) -> None:
+        """`batch_s`: how long samples queue before they are taken."""
+        # REPEATED frames too: then a jump of the sequence is a loss and nothing else.
+        self._client = Client(address.port, address.host, fresh_only=False, raw=True)
+        self._model = model
+        self._batch_s = batch_s
+        self._closing = threading.Event()
+        self.tried = threading.Event()  # there was a reply to `status`, or a failed connection
+        self._thread = threading.Thread(target=self._run, name="reader", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the connection and the thread."""
+        self._closing.set()
+        self._client.close()
+        self._thread.join(timeout=2.0)
+
+    def _run(self) -> None:
+        status_at_s = 0.0
+        with self._client as client, contextlib.suppress(ConnectionFailedError):
+            while not self._closing.wait(self._batch_s):
+                self._take(client)
+                if client.session.connected and time.monotonic() >= status_at_s:
+                    status_at_s = time.monotonic() + _STATUS_EVERY_S
+                    self._ask_status(client)
+
+    def _take(self, client: Client) -> None:
+        piled_up = self._sort(client, client.poll_all())
+        fresh = self._sort(client, client.poll_all(_NEXT_SAMPLE_S))
+        now_ns = time.monotonic_ns()
+        self._model.take(piled_up + fresh, now_ns * 1e-9)
+        # What arrived while this thread decoded waited for it: its age is not that of the server.
+        if len(piled_up) < _MOST_PILED and client.session.same_machine:
+            first = {frame.sensor: frame for frame in reversed(fresh)}
+            for frame in first.values():
+                self._model.note_age(frame, now_ns)
+
+    def _sort(self, client: Client, items: Sequence[DataMessage | ClientEvent]) -> list[DataMessage]:
+        """The frames; the model gets the events."""
+        frames, now_s = [], time.monotonic()
+        for item in items:
+            if isinstance(item, DataMessage):
+                frames.append(item)
+            elif isinstance(item, Connected):
+                self._model.connected(item.description, str(Address(*client.channel.own)), now_s)
+            elif isinstance(item, Disconnected):
+                self._failed(item, now_s)
+            else:
+                self._model.take_event(item, now_s)
+                if item.get("event") in {Event.SENSOR_BACK, Event.RECONFIGURED}:
+                    with contextlib.suppress(ConnectionFailedError):
+                        self._model.described(client.ask("describe", _ANSWER_TIMEOUT_S), time.monotonic())
+        return frames
+
+    def _failed(self, end: Disconnected, now_s: float) -> None:
+        if not self._closing.is_set():
+            reason = f"the connection ended: {end.reason}"
+            if not end.reachable:
+                reason = UnreachableError(end.reason).at(self._client.address)
+            self._model.gone(reason, now_s)
+            self.tried.set()
+
+    def _ask_status(self, client: Client) -> None:
+        try:
+            self._model.take_status(client.ask("status", _ANSWER_TIMEOUT_S), time.monotonic())
+        except ConnectionFailedError:
+            return  # an event says why
+        except RefusedError:
+            pass
+        self.tried.set()

@@ -1,0 +1,213 @@
+"""`ethercat-monitor --web`: serves page and stream on this machine. The only file that uses websockets.
+
+A page of another site can make a browser send requests here, even under a host name of its own that resolves
+to this machine (DNS rebinding). Then Host or Origin has that name. Requests are answered only under a name of
+this machine, any port, because `ssh -L` may forward another one; the stream only to the page itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import itertools
+import logging
+import socket
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from functools import partial
+from http import HTTPStatus
+from importlib.resources import files
+from typing import Final
+from urllib.parse import urlsplit
+
+from websockets.asyncio.server import ServerConnection, broadcast, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from bota_clients.monitor.reader import Reader
+from bota_clients.monitor.tare import start_tare
+from bota_clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, WebModel, is_loopback
+from bota_clients.program import call_on, say
+from bota_ethercat.address import Address
+from bota_ethercat.pdo import ImuUnits
+
+POINTS_S: Final = 1 / 30
+POINTS_A_STATE: Final = 6
+STREAM: Final = "/stream"  # where the page opens its WebSocket
+HEADERS: Final = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}  # of every response
+_TYPES: Final = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+_FOREIGN_HOST: Final = (
+    "The page is for this machine only: open http://localhost:PORT/, from elsewhere over ssh -L."
+)
+_FOREIGN_ORIGIN: Final = "The stream is for the page that is served here, and not for others."
+_NO_IPV6: Final = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
+_POLICY_VIOLATION: Final = 1008
+_TRY_AGAIN_LATER: Final = 1013
+_WHY: Final = {
+    errno.EADDRINUSE: "is in use",
+    errno.EACCES: "is reserved for root",
+    errno.EADDRNOTAVAIL: "is no address of this machine",
+}
+
+# Neither requests nor errors of clients are written to the terminal.
+_QUIET: Final = logging.Logger(__name__, logging.CRITICAL)
+
+
+def run_web(address: Address, where: Address, imu_units: ImuUnits, seconds: float | None) -> int:
+    """Serve the page of the server at `address` until a signal or for `seconds`; returns the exit code."""
+    try:
+        asyncio.run(_run(address, where, imu_units, seconds))
+    except OSError as error:
+        if error.errno not in _WHY:
+            raise
+        say("ethercat-monitor", f"{where} {_WHY[error.errno]}: choose another port with --web PORT")
+        return 1
+    return 0
+
+
+async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: float | None) -> None:
+    stop = asyncio.Event()
+    call_on(asyncio.get_running_loop(), stop.set, "SIGINT", "SIGTERM", "SIGHUP")
+    model = WebModel(str(address), imu_units)
+    hub = Hub(model, partial(start_tare, address))
+    reader = Reader(address, model, POINTS_S)
+    async with serving(hub, *where) as port:
+        sys.stdout.write(
+            f"Open http://{Address(where.host, port)}/#token={hub.token}\n"
+            "With this link the page can tare the sensor; without #token=... it only shows. Ctrl-C ends it.\n"
+        )
+        sys.stdout.flush()
+        reader.start()
+        try:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), seconds)
+        finally:
+            reader.close()
+
+
+@contextlib.asynccontextmanager
+async def serving(
+    hub: Hub, host: str, port: int, clock: Callable[[], float] = time.monotonic
+) -> AsyncIterator[int]:
+    """Serve on a loopback address, `localhost` on both; yields the port. OSError if it cannot be bound."""
+    listening = _listen(host, port)
+    page_files = read_page()
+
+    async def converse(connection: ServerConnection) -> None:
+        page = hub.join(partial(broadcast, [connection]), clock())
+        if page is None:
+            await connection.close(_TRY_AGAIN_LATER, TOO_MANY)
+            return
+        try:
+            async for text in connection:
+                hub.take(page, text)
+                if page.end:
+                    await connection.close(_POLICY_VIOLATION, page.end)
+        except ConnectionClosed:
+            pass
+        finally:
+            hub.leave(page)
+
+    async def send() -> None:
+        for count in itertools.count():
+            if count % POINTS_A_STATE == 0:
+                hub.send_states(clock())
+            hub.send_points(clock())
+            await asyncio.sleep(POINTS_S)
+
+    async with contextlib.AsyncExitStack() as stack:
+        for sock in listening:
+            await stack.enter_async_context(
+                serve(
+                    converse,
+                    sock=sock,
+                    process_request=lambda _, request: answer(page_files, request),
+                    compression=None,
+                    max_size=MOST_BYTES,
+                    max_queue=4,
+                    open_timeout=5.0,
+                    close_timeout=0.5,
+                    server_header=None,
+                    logger=_QUIET,
+                )
+            )
+        sending = asyncio.create_task(send())
+        try:
+            yield listening[0].getsockname()[1]
+        finally:
+            sending.cancel()
+
+
+def read_page() -> dict[str, tuple[bytes, str]]:
+    """Body and type of each file of the page by its path."""
+    page = files("bota_clients.monitor.web") / "page"
+    found = {}
+    for folder, path in ((page, "/"), (page / "uplot", "/uplot/")):
+        for entry in folder.iterdir():
+            if kind := _TYPES.get(entry.name.rpartition(".")[2]):
+                text = "" if kind.startswith("image") else "; charset=utf-8"
+                found[path + entry.name] = entry.read_bytes(), kind + text
+    found["/"] = found.pop("/index.html")
+    return found
+
+
+def answer(page_files: dict[str, tuple[bytes, str]], request: Request) -> Response | None:
+    """The answer to a GET; None for a stream that may be opened."""
+    path = request.path.partition("?")[0]
+    host, origin = (_only(request.headers.get_all(name)) for name in ("Host", "Origin"))
+    status, kind = HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8"
+    if not _is_this_machine(host):
+        body = f"{_FOREIGN_HOST}\n".encode()
+    elif path == STREAM:
+        if origin.lower() == f"http://{host.lower()}":
+            return None
+        body = f"{_FOREIGN_ORIGIN}\n".encode()
+    elif path in page_files:
+        status, (body, kind) = HTTPStatus.OK, page_files[path]
+    else:
+        status, body = HTTPStatus.NOT_FOUND, b"There is no such file.\n"
+    headers = Headers({"Content-Type": kind, "Content-Length": str(len(body)), **HEADERS})
+    return Response(status.value, status.phrase, headers, body)
+
+
+def _only(values: list[str]) -> str:
+    return values[0] if len(values) == 1 else ""
+
+
+def _is_this_machine(host: str) -> bool:
+    try:
+        return is_loopback(urlsplit(f"//{host}").hostname or "")
+    except ValueError:
+        return False
+
+
+def _listen(host: str, port: int) -> list[socket.socket]:
+    """For `localhost` both addresses, so that no other program answers under one of them."""
+    if host != "localhost":
+        return [_bound(host, port)]
+    first = _bound("127.0.0.1", port)
+    try:
+        return [first, _bound("::1", first.getsockname()[1])]
+    except OSError as error:
+        if error.errno in _NO_IPV6:
+            return [first]
+        first.close()
+        raise
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    return socket.create_server((host, port), family=family)

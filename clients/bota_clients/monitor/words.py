@@ -1,0 +1,217 @@
+"""States in words and as JSON, the same for the terminal and the browser."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from bota_clients.monitor.model import Alert, Client, Range, SensorState, ServerState, Spread, State
+from bota_clients.numbers import duration, milliseconds
+from bota_ethercat.health.verdict import Level
+from bota_ethercat.program.output import SPELLED
+from bota_ethercat.text.json_text import finite
+
+DIGITS = {"N": 2, "Nm": 3, "counts": 0, "m/s²": 2, "rad/s": 3}  # decimals by unit
+_DRAWN = str.maketrans({**SPELLED, **dict(zip("█▌▐─┼├┤▁▂▃▄▅▆▇", "###-|[]_.,-=+*", strict=True))})
+
+
+def to_ascii(text: str) -> str:
+    """The text for an ASCII terminal."""
+    return text.translate(_DRAWN).encode("ascii", "replace").decode()
+
+
+def can_show(encoding: str | None) -> bool:
+    """Whether this encoding has the characters that the views draw with."""
+    try:
+        "".join(map(chr, _DRAWN)).encode(encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return True
+
+
+def link(server: ServerState) -> str:
+    """State of the connection, in a few words."""
+    if server.since_s is None:
+        return "connecting"
+    if not server.connected:
+        return f"SERVER GONE {duration(server.since_s)}"
+    if server.silent and server.heard_s is not None:
+        return f"SERVER SILENT {duration(server.heard_s)}"
+    return f"connected {duration(server.since_s)}"
+
+
+def trouble(server: ServerState) -> str | None:
+    """What is wrong with the server, one clause; None if nothing is."""
+    if server.since_s is None:
+        return None
+    if not server.connected:
+        return f"gone at {server.since_clock}: {server.reason}; reconnecting"
+    if server.silent and server.heard_s is not None:
+        return f"nothing came for {duration(server.heard_s)}: it may be stopped, or its machine too busy"
+    return None
+
+
+def verdict(state: State) -> tuple[Level, str]:
+    """How bad all that is there is, and what was found."""
+    if not state.server.connected or trouble(state.server):
+        wrong = trouble(state.server)
+        return Level.TROUBLE, f"there is no server: {wrong}" if wrong else "there is no server"
+    if not state.sensors:
+        return Level.TROUBLE, "the server has no sensor"
+    found = [
+        (finding.level, f"sensor {sensor.position}: {finding.sentence}")
+        for sensor in state.sensors
+        for finding in sensor.verdict.findings
+    ]
+    if not found:
+        return Level.GOOD, state.sensors[0].verdict.sentence
+    found.sort(key=lambda one: -one[0])
+    return found[0][0], "; ".join(sentence for _, sentence in found)
+
+
+def server_facts(server: ServerState) -> list[tuple[str, str]]:
+    """Name and value of what is known of the server."""
+    if not server.connected or server.uptime_s is None:
+        return []
+    return [
+        ("Up", duration(server.uptime_s)),
+        ("Missed deadlines", count(server.missed_deadlines)),
+        ("Lost frames", count(server.lost_frames)),
+        ("Exchange", times(server.exchange_us, "p99")),
+        ("Woke late by", times(server.wake_us, "p99")),
+        ("Cycles", count(server.cycles)),
+        ("Version", server.version or "?"),
+    ]
+
+
+def who(sensor: SensorState, *, firmware: bool = True) -> str:
+    """Position, name, serial number and firmware."""
+    parts = [f"Sensor {sensor.position}", sensor.name]
+    if sensor.serial is not None:
+        parts.append(f"serial {sensor.serial}")
+    if sensor.firmware and firmware:
+        parts.append(f"firmware {sensor.firmware}")
+    return "  ".join(part for part in parts if part)
+
+
+def rate(sensor: SensorState) -> str:
+    """Measured and nominal rate."""
+    found = "no samples" if sensor.rate_hz is None else f"{sensor.rate_hz:.1f}"
+    return f"{found} of {sensor.nominal_hz:g} Hz" if sensor.nominal_hz else f"{found} Hz"
+
+
+def jitter(sensor: SensorState) -> str:
+    """Standard deviation and worst interval."""
+    if sensor.jitter_us is None or sensor.jitter_worst_us is None:
+        return "not known"
+    return f"{sensor.jitter_us:.0f} µs, worst {sensor.jitter_worst_us:.0f}"
+
+
+def losses(sensor: SensorState) -> list[tuple[str, bool]]:
+    """Each kind of loss in words, and whether there was any."""
+    return [
+        (f"{count(sensor.lost_on_bus)} on the bus", bool(sensor.lost_on_bus)),
+        (f"{sensor.missed} on the way here", bool(sensor.missed)),
+        (f"repeated {sensor.repeated}", bool(sensor.repeated)),
+        (f"invalid {sensor.invalid}", bool(sensor.invalid)),
+    ]
+
+
+def clock(sensor: SensorState) -> str:
+    """How the server follows the sensor's clock."""
+    if sensor.clock is None:
+        return "not known"
+    text, offset_ppm, uncertainty_us = sensor.clock
+    if text == "locked":
+        text += "" if offset_ppm is None else f", {offset_ppm:+.1f} ppm"
+        text += "" if uncertainty_us is None else f", ±{uncertainty_us:.0f} µs"
+    return text
+
+
+def client(one: Client) -> str:
+    """One client of the server."""
+    text = "this one" if one.this else one.peer
+    if one.rate_hz is not None:
+        text += f" {one.rate_hz:.0f}/s"
+    return f"{text}, {one.withheld} withheld" if one.withheld else text
+
+
+def times(spread: Spread | None, worst: str) -> str:
+    """Median and worst of a distribution."""
+    if spread is None:
+        return "not known"
+    return f"{milliseconds(spread.p50)} ms, {worst} {milliseconds(spread.worst)}"
+
+
+def count(value: int | None) -> str:
+    """A count that may not be known."""
+    return "?" if value is None else str(value)
+
+
+def seen(ago_s: float | None) -> str:
+    """When something was last seen."""
+    return "now" if ago_s is None else f"{duration(ago_s)} ago"
+
+
+def alert(one: Alert) -> dict[str, str]:
+    """An alert for programs."""
+    return {"severity": one.level.key, "text": one.text, "remedy": one.remedy}
+
+
+def json_line(state: State, unix_s: float) -> str:
+    """The state as one JSON object, for programs: docs/monitor.md has the keys. What is not known is null."""
+    server = state.server
+    found = {
+        "time": unix_s,
+        **_plain(server, "address connected since_s heard_s"),
+        "reason": server.reason or None,
+        "replay": server.replay or None,
+        "server": {
+            **_plain(server, "version uptime_s cycles missed_deadlines lost_frames"),
+            "wake_us": _spread(server.wake_us, "p99"),
+            "exchange_us": _spread(server.exchange_us, "p99"),
+        }
+        if server.connected
+        else None,
+        "sensors": [_sensor(sensor) for sensor in state.sensors],
+        "clients": [client._asdict() for client in state.clients],
+    }
+    return json.dumps(finite(found), allow_nan=False, ensure_ascii=True)
+
+
+def _sensor(sensor: SensorState) -> dict[str, Any]:
+    sample, peaks = sensor.sample, sensor.peaks
+    imu = None if sensor.imu_off else sample
+    return {
+        "sensor": sensor.position,
+        "state": sensor.al_state,
+        **_plain(sensor, "name serial firmware nominal_hz units"),
+        "force": sample and sample.force,
+        "torque": sample and sample.torque,
+        "force_min_max": peaks and _ranges(peaks[:3]),
+        "torque_min_max": peaks and _ranges(peaks[3:]),
+        "acceleration": imu and imu.acceleration,
+        "angular_rate": imu and imu.angular_rate,
+        "temperature": sample and sample.temperature,
+        "orientation": sample and sample.orientation,
+        "saturated": sorted(sensor.saturated),
+        "verdict": sensor.verdict.level.key,
+        "alerts": [alert(one) for one in sensor.alerts],
+        **_plain(sensor, "samples rate_hz jitter_us jitter_worst_us missed gaps repeated invalid silent_s"),
+        **_plain(sensor, "lost_on_bus recoveries"),
+        "age_us": _spread(sensor.age_us, "worst"),
+        "clock": sensor.clock and sensor.clock._asdict(),
+        "hand_out_us": _spread(sensor.hand_out_us, "p99"),
+    }
+
+
+def _plain(thing: object, names: str) -> dict[str, Any]:
+    return {name: getattr(thing, name) for name in names.split()}
+
+
+def _ranges(ranges: tuple[Range, ...]) -> list[list[float]]:
+    return [[r.low, r.high] for r in ranges]
+
+
+def _spread(spread: Spread | None, worst: str) -> dict[str, float] | None:
+    return None if spread is None else {"p50": spread.p50, worst: spread.worst}

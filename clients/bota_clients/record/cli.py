@@ -1,0 +1,24 @@
+"""`ethercat-record`: entry point; catches signals while the rest is imported."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from bota_clients.program import Signals, not_installed
+from bota_clients.record.options import parse_options
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the program; returns its exit code."""
+    signals = Signals()
+    parse_options(argv)  # --help and wrong usage need nothing of the extra
+    try:
+        from bota_clients.record.program import run  # noqa: PLC0415 - after the signals
+    except ImportError as error:
+        return not_installed("ethercat-record", error)
+    return run(argv, signals)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,271 @@
+"""The sensors to report on, from a recording that `ethercat-record` made or from some seconds of a server's
+stream."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from bota_clients.errors import ReportError
+from bota_clients.numbers import count, listing, moment
+from bota_clients.recording.columns import Columns, columns
+from bota_clients.recording.reader import Identity, RecordedSensor, Recording, Settings, open_recording
+from bota_clients.recording.sensors import Histories
+from bota_clients.report.series import Bools, Subject, subject
+from bota_ethercat.accounting import NOT_NEW
+from bota_ethercat.address import Address
+from bota_ethercat.client import Client
+from bota_ethercat.errors import ConnectionFailedError
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.health.observer import p99
+from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.sensor_choice import MOST_PLACES, SensorChoice
+from bota_ethercat.text import untrusted
+from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import printable
+
+_MOST_EVENTS_NAMED = 10
+_MOST_SENSORS_NAMED = 4
+_LONGEST_CHANGE_NS = 2_000_000_000
+"""A change of settings takes the sensor out of operation for less than this."""
+
+
+def of_recording(path: Path, choice: SensorChoice | None, imu_units: ImuUnits) -> list[Subject]:
+    """The sensors of the recording at `path`, or those chosen, by position.
+
+    RecordingError if it cannot be read, ReportError if it has no such sensor.
+    """
+    with open_recording(path) as recording:
+        recorded = [sensor for sensor in recording.sensors if _recorded(recording, sensor)]
+        found = [sensor for sensor in recorded if _meant(sensor, choice)]
+        if not found:
+            there = [(s.sensor, who.name, who.serial) for s in recorded for *_, who in s.history]
+            raise no_sensor(str(path), choice, dict.fromkeys(there))
+        return [_subject(recording, sensor, choice, imu_units) for sensor in found]
+
+
+def _recorded(recording: Recording, sensor: RecordedSensor) -> bool:
+    """Whether it was chosen for the recording."""
+    return not recording.chosen or sensor.sensor in recording.chosen
+
+
+def no_sensor(
+    where: str, choice: SensorChoice | None, there: Iterable[tuple[object, object, object]]
+) -> ReportError:
+    """The error that the chosen sensor does not exist, with those that do."""
+    known = [printable(f"{position} ({name}, serial {serial})", 80) for position, name, serial in there]
+    if choice is None or not known:
+        return ReportError(f"{where} has no sensor")
+    return ReportError(f"{where} has no sensor {choice}: it has {', '.join(known[:16])}")
+
+
+def _meant(sensor: RecordedSensor, choice: SensorChoice | None) -> list[int]:
+    """Which entries of its history are of a chosen sensor; [0] if there is no history."""
+    told = [settings.identity for settings in sensor.history] or [Identity()]
+    return [
+        number
+        for number, who in enumerate(told)
+        if choice is None or choice.matches(sensor.sensor, who.name, who.serial)
+    ]
+
+
+class _Frames:
+    """The frames of one sensor, and how many of them came before each entry of its history."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self.before: list[int] = []
+
+    def frames(self, sensor: int | None = None) -> Iterator[DataMessage]:
+        """Its frames. The order in the file decides what came first, because clocks differ."""
+        assert sensor is not None
+        histories, so_far = Histories(), 0
+        for item in self._recording.everything(sensor):
+            if isinstance(item, DataMessage):
+                so_far += 1
+                yield item
+                continue
+            histories.take(item)
+            self.before += [so_far] * (len(histories.of(sensor)) - len(self.before))
+
+
+def _subject(
+    recording: Recording, sensor: RecordedSensor, choice: SensorChoice | None, imu_units: ImuUnits
+) -> Subject:
+    source = _Frames(recording)
+    every = columns(source, sensor.sensor, imu_units)
+    remarks: list[str] = []
+    row, settings = sensor._asdict(), None
+    if sensor.history:
+        # The first settings were in effect before they were received.
+        ends = [0, *source.before[1:], len(every)]
+        longest = max(_meant(sensor, choice), key=lambda number: ends[number + 1] - ends[number])
+        settings = sensor.history[longest]
+        row |= {**settings.identity._asdict(), "rate_hz": settings.rate_hz}
+        every = every.where(_between(len(every), ends[longest], ends[longest + 1]))
+        if longest + 1 < len(sensor.history):
+            every = _settled(every)
+        remarks = _remarks(sensor.history, settings, every)
+    made = subject(row, settings.values if settings else None, every, recording.path.name, sensor.sensor)
+    if recording.cut_off:
+        remarks.append(f"The recording was cut off: {recording.cut_off}.")
+    others = [str(s.sensor) for s in recording.sensors if not _recorded(recording, s)]
+    if others:
+        remarks.append(f"Not recorded, because others were chosen: sensor {listing(others)}.")
+    return made.with_remarks([*remarks, *event_remarks(event.name for event in recording.events)])
+
+
+def event_remarks(names: Iterable[str]) -> list[str]:
+    """A remark that says which events there were, if any."""
+    counts = Counter(printable(name, 40) for name in names)
+    counts.pop("connected", None)
+    if not counts:
+        return []
+    told = [f"{name} ({times})" for name, times in sorted(counts.items())[:_MOST_EVENTS_NAMED]]
+    more = f" and {len(counts) - _MOST_EVENTS_NAMED} other kinds" if len(counts) > _MOST_EVENTS_NAMED else ""
+    return [f"Events of the whole recording: {', '.join(told)}{more}."]
+
+
+def _between(total: int, begin: int, end: int) -> Bools:
+    """A mask of `total` rows that are those from `begin` to before `end`."""
+    rows = np.arange(total)
+    return (rows >= begin) & (rows < end)
+
+
+def _settled(frames: Columns) -> Columns:
+    """Without the end in which the change that follows was made already: the sensor gives nothing then."""
+    fresh = np.flatnonzero(frames.fresh)
+    last = int(fresh[-1]) if len(fresh) else -1
+    changing = frames.monotonic_ns > frames.monotonic_ns[-1:] - _LONGEST_CHANGE_NS
+    return frames.where(~changing | (np.arange(len(frames)) <= last))
+
+
+def _remarks(history: Sequence[Settings], kept: Settings, frames: Columns) -> list[str]:
+    """What was changed while it was recorded, and which part this is."""
+    if len(history) == 1:
+        return []
+    remarks = []
+    sensors = list(dict.fromkeys(settings.identity for settings in history))
+    if len(sensors) > 1:
+        there = [f"{who.name}, serial {who.serial}, firmware {who.firmware}" for who in sensors]
+        remarks.append(
+            f"The sensor was exchanged while it was recorded ({'; '.join(there[:_MOST_SENSORS_NAMED])}): "
+            f"this report is of serial {kept.identity.serial}; --sensor serial:N chooses."
+        )
+    changes = sum(new.identity == old.identity for old, new in pairwise(history))
+    if changes:
+        remarks.append(f"The settings were changed {count(changes, 'time')} while it was recorded.")
+    if len(frames):
+        first, last = (moment(int(frames.stamp_ns[row])) for row in (0, -1))
+        remarks.append(f"This report is of the longest stretch without a change, from {first} to {last}.")
+    return remarks
+
+
+_BATCH_S: Final = 0.05
+_MOST_AGES: Final = 1 << 16
+
+MOST_FRAMES: Final = 4_000_000
+"""About half an hour at 1600 Hz; more than that is what a recording is for."""
+
+
+class Received:
+    """Frames in order of arrival."""
+
+    def __init__(self) -> None:
+        self.all: deque[DataMessage] = deque(maxlen=MOST_FRAMES)
+        self.ages_us: dict[int, deque[float]] = {}
+        """By sensor, of the samples that were waited for."""
+
+    def take(self, frames: Sequence[DataMessage], now_ns: int | None) -> None:
+        """Add what came just now; `now_ns` is CLOCK_MONOTONIC if it is the server's too."""
+        self.all.extend(frames)
+        if frames and now_ns is not None and not frames[-1].flags & NOT_NEW:
+            ages_us = self.ages_us.setdefault(frames[-1].sensor, deque(maxlen=_MOST_AGES))
+            ages_us.append((now_ns - frames[-1].monotonic_ns) * 1e-3)
+
+    def frames(self, sensor: int | None = None) -> Iterable[DataMessage]:
+        """The frames of the sensor at this position, or of all."""
+        return (frame for frame in self.all if sensor in (None, frame.sensor))
+
+
+def of_server(
+    address: Address,
+    seconds: float,
+    choice: SensorChoice | None,
+    imu_units: ImuUnits,
+    progress: Callable[[float], None] = lambda _: None,
+) -> list[Subject]:
+    """The server's sensors, or those chosen, after `seconds`.
+
+    ConnectionFailedError or RefusedError if there is no stream; ReportError if there is no such sensor.
+    """
+    with Client(address.port, address.host, fresh_only=False, raw=True, reconnect=False).connect() as client:
+        rows = _chosen(client.description, address, choice)
+        received, ended = _listen(client, seconds, progress)
+        names = [str(event.get("event")) for event in client.events if isinstance(event, dict)]
+        changed = "" if ended else _changed(client, rows)
+    remarks = [*([ended] if ended else []), *([changed] if changed else []), *event_remarks(names)]
+    return [
+        replace(
+            subject(row, row.get("settings"), columns(received, position, imu_units), str(address), position),
+            age_p99_us=p99(received.ages_us.get(position, ())),
+        ).with_remarks(remarks)
+        for position, row in rows.items()
+    ]
+
+
+def _rows(description: JsonObject) -> dict[int, dict[str, Any]]:
+    return {
+        row["sensor"]: row
+        for row in untrusted.rows(description.get("sensors"))
+        if type(row.get("sensor")) is int and 0 <= row["sensor"] < MOST_PLACES
+    }
+
+
+def _chosen(
+    description: JsonObject, address: Address, choice: SensorChoice | None
+) -> dict[int, dict[str, Any]]:
+    rows = _rows(description)
+    found = {
+        position: row
+        for position, row in rows.items()
+        if choice is None or choice.matches(position, str(row.get("name")), row.get("serial", -1))
+    }
+    if not found:
+        there = [(position, row.get("name"), row.get("serial")) for position, row in rows.items()]
+        raise no_sensor(str(address), choice, there)
+    return found
+
+
+def _listen(client: Client, seconds: float, progress: Callable[[float], None]) -> tuple[Received, str]:
+    """The frames of `seconds`, and why they ended early, if they did."""
+    received = Received()
+    begin, same_clock = time.monotonic(), client.session.same_machine
+    while (passed := time.monotonic() - begin) < seconds:
+        progress(passed)
+        try:
+            frames = client.poll(min(_BATCH_S, seconds - passed))
+            received.take(frames, round(time.monotonic() * 1e9) if same_clock else None)
+        except ConnectionFailedError as error:
+            if not received.all:
+                raise
+            return received, f"The connection ended after {passed:.1f} s of {seconds:g}: {error}."
+    if not received.all:
+        raise ReportError(
+            f"nothing was received in {seconds:g} s: check ethercat-sensor watch and the server's log"
+        )
+    return received, ""
+
+
+def _changed(client: Client, rows: dict[int, dict[str, Any]]) -> str:
+    now = _rows(client.ask("describe"))
+    if any(now.get(position, {}).get("settings") != row.get("settings") for position, row in rows.items()):
+        return "The settings were changed while listening: limits and filters here are those of the start."
+    return ""

@@ -1,0 +1,143 @@
+"""One accounting of a stream: what each DATA frame is, and what is missing before it. No sockets, no clock.
+
+The words, as docs/protocol.md has them. The first four are kinds of frames, each frame is of one; the C++
+header counts the same, and tests/protocol/golden/accounting.json holds both to it.
+
+new: neither REPEATED nor INVALID: one new, valid sample
+repeated: REPEATED without INVALID: the sensor has nothing new
+invalid: INVALID: the working counter was short
+old: `sequence` and `monotonic_ns` are both no higher than those of the frame before: a duplicate, or out of
+    order. It changes no other count
+restarts: `sequence` is no higher but `monotonic_ns` is: the server's numbering began again. What is missing
+    before this frame is unknown
+gaps: frames with GAP
+withheld: sequence numbers missing before a frame with GAP, except `every` - 1 of them: the client did not
+    read in time. Under `fresh_only` REPEATED frames skipped in the same gap are included; without
+    `fresh_only` no GAP is needed
+lost: samples that the sensor produced and the server never had, so they have no number: at least one for a
+    GAP with nothing withheld, and, where the sensor's rate is known, as many as fit between this frame and
+    the last new one. GAP is also set when the server cannot rule a loss out; `lost_samples` in `status` says
+    how many there were
+skipped: other missing sequence numbers: the subscription left them out (`every`, `fresh_only`)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Final
+
+from bota_ethercat.framing import DataFlag
+
+NOT_NEW: Final = int(DataFlag.REPEATED | DataFlag.INVALID)
+"""Either of these flags says that a frame brings no new sample."""
+_INVALID: Final = int(DataFlag.INVALID)
+_GAP: Final = int(DataFlag.GAP)
+
+
+class FrameKind(Enum):
+    """What a frame is."""
+
+    NEW = auto()
+    REPEATED = auto()
+    INVALID = auto()
+    OLD = auto()
+
+
+@dataclass(slots=True)
+class StreamCounts:
+    """Counts of one sensor's frames and samples; the module's docstring defines each."""
+
+    new: int = 0
+    repeated: int = 0
+    invalid: int = 0
+    old: int = 0
+    restarts: int = 0
+    gaps: int = 0
+    withheld: int = 0
+    lost: int = 0
+    skipped: int = 0
+
+    @property
+    def frames(self) -> int:
+        """All frames received."""
+        return self.new + self.repeated + self.invalid + self.old
+
+    @property
+    def missing(self) -> int:
+        """Samples that this client should have and has not: lost and withheld."""
+        return self.lost + self.withheld
+
+
+class StreamAccounting:
+    """Classifies and counts the frames of one sensor."""
+
+    __slots__ = ("_every", "_fresh_only", "_monotonic_ns", "_sequence", "counts", "new_ns", "rate_hz")
+
+    def __init__(
+        self, counts: StreamCounts | None = None, *, every: int = 1, fresh_only: bool = True
+    ) -> None:
+        """`every` and `fresh_only` as subscribed; `counts` to add to, by default new ones."""
+        self.counts: StreamCounts = StreamCounts() if counts is None else counts
+        self.rate_hz = 0.0
+        """The sensor's sampling rate; 0 if it is unknown."""
+        self.new_ns = -1
+        """`monotonic_ns` of the newest new frame; -1: none since the subscription began."""
+        self._every = every
+        self._fresh_only = fresh_only
+        self.begin()
+
+    def begin(self) -> None:
+        """A new subscription begins: nothing before its first frame counts as missing, unless it has GAP."""
+        self._sequence = self._monotonic_ns = self.new_ns = -1
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether a frame has come since `begin`."""
+        return self._sequence >= 0
+
+    def take_next(self, sequence: int, monotonic_ns: int) -> bool:
+        """Count a frame without flags that is the one after the last, as nearly all are; False: not so."""
+        if sequence != self._sequence + 1:
+            return False
+        self._sequence = sequence
+        self._monotonic_ns = self.new_ns = monotonic_ns
+        self.counts.new += 1
+        return True
+
+    def take(self, sequence: int, monotonic_ns: int, flags: int) -> FrameKind:
+        """Count the next frame; what it is."""
+        counts, jump = self.counts, 0
+        if sequence > self._sequence:
+            jump = sequence - self._sequence - 1 if self._sequence >= 0 else 0
+        elif monotonic_ns > self._monotonic_ns:
+            counts.restarts += 1
+        else:
+            counts.old += 1
+            return FrameKind.OLD
+        if jump or flags & _GAP:
+            self._count_missing(jump, monotonic_ns, flags & _GAP)
+        self._sequence, self._monotonic_ns = sequence, monotonic_ns
+        if flags & NOT_NEW:
+            if flags & _INVALID:
+                counts.invalid += 1
+                return FrameKind.INVALID
+            counts.repeated += 1
+            return FrameKind.REPEATED
+        counts.new += 1
+        self.new_ns = monotonic_ns
+        return FrameKind.NEW
+
+    def _count_missing(self, jump: int, monotonic_ns: int, gap: int) -> None:
+        counts = self.counts
+        skipped = jump if self._fresh_only and not gap else min(jump, self._every - 1)
+        counts.skipped += skipped
+        counts.withheld += jump - skipped
+        if not gap:
+            return
+        counts.gaps += 1
+        lost = 0 if jump > skipped else 1
+        if self.new_ns >= 0 and self.rate_hz:
+            room = round((monotonic_ns - self.new_ns) * self.rate_hz / 1e9) - 1
+            lost = max(lost, room - jump)
+        counts.lost += lost

@@ -1,0 +1,11 @@
+"""The client: samples, conditions, requests and events over TCP, and real-time scheduling."""
+
+from bota_ethercat.client.client import Client, NoSampleError, connect
+from bota_ethercat.client.reading import Condition, Reading
+from bota_ethercat.client.real_time import Scheduling, make_real_time
+from bota_ethercat.client.session import ClientEvent, Connected, Disconnected
+
+__all__ = [
+    "Client", "ClientEvent", "Condition", "Connected", "Disconnected", "NoSampleError", "Reading",
+    "Scheduling", "connect", "make_real_time",
+]  # fmt: skip

@@ -1,0 +1,202 @@
+"""The TCP connection under a client, in steps that need not block; the only file here that opens a socket."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import socket
+import struct
+import threading
+import time
+from typing import Final, Protocol
+
+from bota_ethercat.errors import ConnectionFailedError, UnreachableError
+
+RECEIVE_BUFFER: Final = 65536
+"""Bytes that the kernel may keep, and so the age of what a client that has stalled gets: some 0.5 s."""
+CONNECT_TIMEOUT_S: Final = 2.0
+_SEND_TIMEOUT_S: Final = 1.0
+_KEEPALIVE: Final = tuple(
+    (getattr(socket, option), value)
+    for option, value in (("TCP_KEEPIDLE", 2), ("TCP_KEEPALIVE", 2), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3))
+    if hasattr(socket, option)  # the second is what macOS calls the first
+)
+_DONT_WAIT: Final = getattr(socket, "MSG_DONTWAIT", 0)
+"""0 on Windows, where a socket has no timeouts of the kernel's."""
+
+
+class Channel(Protocol):
+    """A stream of bytes to one server, which can be made again and again, and the time it is in."""
+
+    def monotonic_ns(self) -> int:
+        """CLOCK_MONOTONIC."""
+
+    def wait(self, event: threading.Event, seconds: float, /) -> bool:
+        """Wait until `event` is set, `seconds` at most; whether it is."""
+
+    def connect(self, timeout_s: float) -> bool:
+        """Begin or go on connecting, waiting at most `timeout_s`; whether it is done. UnreachableError."""
+
+    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+        """Receive what fits, waiting at most `timeout_s` for the first byte; 0: nothing came.
+
+        ConnectionFailedError at its end.
+        """
+
+    def send(self, data: bytes) -> None:
+        """Send all of it; ConnectionFailedError."""
+
+    def shutdown(self) -> None:
+        """End the connection; from any thread, which ends a `receive` in another."""
+
+    def close(self) -> None:
+        """Give the connection up, finished or not."""
+
+    @property
+    def is_near(self) -> bool:
+        """Whether both ends have one address, and so probably one machine."""
+
+    @property
+    def own(self) -> tuple[str, int]:
+        """The address of this end."""
+
+    def fileno(self) -> int:
+        """For `poll`: readable when something has arrived; -1 without a connection."""
+
+
+class TcpChannel:
+    """A `Channel` to `host`:`port`."""
+
+    monotonic_ns = staticmethod(time.monotonic_ns)
+    wait = staticmethod(threading.Event.wait)
+
+    def __init__(self, host: str, port: int, receive_buffer: int = RECEIVE_BUFFER) -> None:
+        """Nothing is sent yet. Each attempt looks the host's name up, which may wait for name servers."""
+        self._host, self._port, self._receive_buffer = host, port, receive_buffer
+        self._untried: list[tuple[socket.AddressFamily, tuple[object, ...]]] = []
+        self._sock: socket.socket | None = None
+        self._give_up_ns = 0
+        self._timeout_s = -1.0
+        self.own: tuple[str, int] = ("", 0)
+        self.is_near = False
+
+    def connect(self, timeout_s: float) -> bool:
+        """See `Channel`."""
+        try:
+            if self._sock is None:
+                if not 0 < self._port < 65536:
+                    raise UnreachableError(f"{self._port} is no port: it must be from 1 to 65535")
+                found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
+                self._untried = [(family, address) for family, _, _, _, address in found]
+                self._begin(*self._untried.pop(0))
+        except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot be one
+            raise UnreachableError(_reason(error)) from None
+        while True:
+            assert self._sock is not None
+            try:
+                if not _is_writable(self._sock, timeout_s):
+                    if self.monotonic_ns() < self._give_up_ns:
+                        return False
+                    raise OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
+                if (failed := self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) != 0:
+                    raise OSError(failed, os.strerror(failed))
+                self._prepare(self._sock)
+                return True
+            except OSError as error:  # "localhost" is ::1 and 127.0.0.1: the server may listen on one only
+                self.close()
+                if not self._untried:
+                    raise UnreachableError(_reason(error)) from None
+                self._begin(*self._untried.pop(0))
+
+    def _begin(self, family: socket.AddressFamily, address: tuple[object, ...]) -> None:
+        self._give_up_ns = self.monotonic_ns() + round(CONNECT_TIMEOUT_S * 1e9)
+        self._sock = socket.socket(family, socket.SOCK_STREAM)
+        # Before connecting: else the kernel lets it grow to megabytes, which hold a minute of samples.
+        self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._receive_buffer)
+        self._sock.setblocking(False)
+        self._sock.connect_ex(address)  # how it went, SO_ERROR tells
+
+    def _prepare(self, sock: socket.socket) -> None:
+        own, peer = sock.getsockname(), sock.getpeername()
+        if own == peer:  # a free ephemeral port can connect to itself
+            raise OSError("nothing listens there")
+        self.own, self.is_near = own[:2], own[0] == peer[0]
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # for a peer that was switched off
+        for option, value in _KEEPALIVE:
+            sock.setsockopt(socket.IPPROTO_TCP, option, value)
+        sock.settimeout(None if _DONT_WAIT else _SEND_TIMEOUT_S)
+        self._timeout_s = -1.0
+        if _DONT_WAIT:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _timeval(_SEND_TIMEOUT_S))
+
+    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+        """See `Channel`. The kernel's own timeout costs no system call, as long as it is the same."""
+        sock = self._sock
+        try:
+            if sock is None:
+                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+            if timeout_s > 0 and timeout_s != self._timeout_s:
+                if _DONT_WAIT:
+                    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(timeout_s))
+                self._timeout_s = timeout_s
+            if _DONT_WAIT:
+                count = sock.recv_into(buffer, 0, 0 if timeout_s > 0 else _DONT_WAIT)
+            else:
+                sock.settimeout(max(timeout_s, 0.0))
+                count = sock.recv_into(buffer)
+        except (BlockingIOError, TimeoutError):
+            return 0
+        except OSError as error:
+            raise ConnectionFailedError(error.strerror or str(error)) from None
+        if count == 0:
+            raise ConnectionFailedError("the server closed it")
+        return count
+
+    def send(self, data: bytes) -> None:
+        """See `Channel`."""
+        try:
+            if self._sock is None:
+                raise OSError(errno.EPIPE, os.strerror(errno.EPIPE))
+            self._sock.sendall(data)
+        except OSError as error:
+            raise ConnectionFailedError(f"cannot send: {error.strerror or error}") from None
+
+    def shutdown(self) -> None:
+        """See `Channel`."""
+        if (sock := self._sock) is not None:
+            with contextlib.suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """See `Channel`."""
+        self.shutdown()
+        if self._sock is not None:
+            self._sock.close()
+            self._sock = None
+
+    def fileno(self) -> int:
+        """See `Channel`."""
+        return -1 if self._sock is None else self._sock.fileno()
+
+
+def _is_writable(sock: socket.socket, timeout_s: float) -> bool:
+    if not hasattr(select, "poll"):  # on Windows, whose `select` knows no limit of 1,024 descriptors
+        return any(select.select((), (sock,), (sock,), timeout_s))
+    poll = select.poll()
+    poll.register(sock, select.POLLOUT)
+    return bool(poll.poll(timeout_s * 1e3))
+
+
+def _reason(error: OSError | UnicodeError) -> str:
+    """Why there is no connection, without numbers."""
+    if isinstance(error, socket.gaierror):  # has numbers of its own
+        return error.strerror or str(error)
+    return os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+
+
+def _timeval(seconds: float) -> bytes:
+    microseconds = max(1, round(seconds * 1e6))  # 0 would be no timeout
+    return struct.pack("@ll", *divmod(microseconds, 1_000_000))

@@ -1,0 +1,359 @@
+"""The client for programs that are not on ROS; the node, the recorder and the monitor are built on it, too.
+
+    from bota_ethercat import connect
+
+    with connect(12001) as sensor:
+        for sample in sensor:  # NoSampleError when there is none for some periods, and it says why
+            print(sample.force, sample.torque)
+
+No REPEATED or INVALID frame passes for a sample. A connection that ends is made anew while one of `latest`,
+`receive`, `poll` and the iteration is called; they are for one thread, `ask` is for any. If it is read more
+slowly than the sensor samples, the server withholds samples and sets GAP in `frame.flags`.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
+from types import TracebackType
+from typing import Final
+
+from bota_ethercat.address import Address
+from bota_ethercat.client.channel import RECEIVE_BUFFER, Channel, TcpChannel
+from bota_ethercat.client.reading import Condition, Reading
+from bota_ethercat.client.real_time import Scheduling, make_real_time
+from bota_ethercat.client.session import ClientEvent, Session
+from bota_ethercat.errors import (
+    ConnectionFailedError,
+    NoReplyError,
+    ProtocolError,
+    RefusedError,
+    UnreachableError,
+)
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
+from bota_ethercat.text.json_text import JsonObject
+
+ANSWER_TIMEOUT_S: Final = 5.0
+_MOST_EVENTS: Final = 1000
+_MOST_READS: Final = 64
+"""Reads in one call, so that it returns whatever arrives."""
+_BACKLOG: Final = 2048
+"""Bytes received at once that are more than any steady stream: more may be waiting."""
+_AGAIN_S: Final = 0.5
+_CLOSED: Final = "this client has been closed"
+
+
+class NoSampleError(ProtocolError):
+    """No new, valid sample came in time. `condition` says why; the client goes on, and so may its caller."""
+
+    def __init__(self, condition: Condition, text: str) -> None:
+        super().__init__(text)
+        self.condition = condition
+
+
+def connect(
+    port: int,
+    host: str = "localhost",
+    *,
+    sensors: Sequence[int] | None = None,
+    every: int = 1,
+    fresh_only: bool = True,
+    timeout_s: float | None = None,
+    imu_units: ImuUnits = ImuUnits.G_DPS,
+    rt_priority: int = 0,
+    cpu: int = -1,
+) -> Client:
+    """A `Client` that is connected; `rt_priority` and `cpu` are the calling thread's (`make_real_time`).
+
+    UnreachableError where there is no server, RefusedError if it does not grant the subscription.
+    """
+    client = Client(
+        port, host, sensors=sensors, every=every, fresh_only=fresh_only, timeout_s=timeout_s,
+        imu_units=imu_units,
+    )  # fmt: skip
+    try:
+        client.scheduling = make_real_time(rt_priority, cpu)
+        return client.connect()
+    except BaseException:
+        client.close()
+        raise
+
+
+class Client:
+    """The stream of a server, its requests and its events.
+
+    Attributes:
+        events: `Connected`, `Disconnected` and the server's events, oldest first, the last thousand; take
+            them out with `popleft`.
+        frame: the DATA message that the last sample came from: its sequence, stamps, sensor, flags.
+        scheduling: what `connect` was granted of `rt_priority` and `cpu`.
+        session: what is known of the server and its sensors.
+        address: of the server.
+    """
+
+    def __init__(
+        self,
+        port: int,
+        host: str = "localhost",
+        *,
+        sensors: Sequence[int] | None = None,
+        every: int = 1,
+        fresh_only: bool = True,
+        raw: bool = False,
+        stream: bool = True,
+        reconnect: bool = True,
+        timeout_s: float | None = None,
+        imu_units: ImuUnits = ImuUnits.G_DPS,
+        receive_buffer: int = RECEIVE_BUFFER,
+        channel: Channel | None = None,
+    ) -> None:
+        """Nothing is sent yet.
+
+        `sensors`: by position on the bus, of those that are there; None for all. `every`: one frame in so
+        many. `fresh_only`: REPEATED frames only every 10 ms. `raw`: REPEATED and INVALID frames come, too.
+        `stream` False: no frames, only requests and events. `reconnect` False: ConnectionFailedError tells
+        that the only connection has ended. `timeout_s`: how long `receive` waits for a sample; by default 5
+        periods, at least 20 ms. `channel`: another one than TCP.
+        """
+        self.address = Address(host, port)
+        self.events: deque[ClientEvent] = deque(maxlen=_MOST_EVENTS)
+        self.frame: DataMessage | None = None
+        self.scheduling = Scheduling()
+        self.session = Session(
+            sensors, every=every, fresh_only=fresh_only, raw=raw, stream=stream, imu_units=imu_units
+        )
+        self.channel: Channel = TcpChannel(host, port, receive_buffer) if channel is None else channel
+        self._decoders = {size: SampleDecoder(size, imu_units) for size in LAYOUTS}
+        self._reconnect, self._timeout_s = reconnect, timeout_s
+        self._open = False
+        self._failed: ProtocolError | None = None
+        self._reader: int | None = None
+        self._stepping = False
+        self._sending = threading.Lock()
+        self._closing = threading.Event()
+
+    def __enter__(self) -> Client:
+        """The client; `with` closes it."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def connect(self) -> Client:
+        """Wait for the connection; UnreachableError, RefusedError or ConnectionFailedError if it fails."""
+        while not self.session.connected:
+            self._failed = None
+            self._step(_AGAIN_S)
+            if self._failed is not None:
+                raise self._failed
+        return self
+
+    def close(self) -> None:
+        """End the connection for good. From any thread, which ends a wait and fails requests that wait."""
+        self._closing.set()
+        self.channel.shutdown()
+        if not self._stepping:  # else the thread that is there closes the socket, which it may be reading
+            self._end(ConnectionFailedError(_CLOSED))
+
+    def fileno(self) -> int:
+        """For `poll` or `epoll`; another one after a new connection, -1 without one."""
+        return self.channel.fileno()
+
+    @property
+    def description(self) -> JsonObject:
+        """The server's newest description; empty before the first connection."""
+        return self.session.description or {}
+
+    # -- samples
+
+    def latest(
+        self, sensor: int | None = None, *, max_age_s: float = 0.01, timeout_s: float = 0.0
+    ) -> Reading:
+        """The newest sample of a sensor, by default the first, and whether it may be used; for control loops.
+
+        Takes all that has arrived; with `timeout_s` waits at most so long for a sample that no reading had.
+        Tells by `condition` what is wrong, and does not raise.
+        """
+        session = self.session
+        state = session.state(session.first if sensor is None else sensor)
+        deadline_ns = self.channel.monotonic_ns() + round(timeout_s * 1e9)
+        left_s = 0.0
+        while not self._closing.is_set():
+            self._gather(left_s)
+            self._take_items()
+            left_s = (deadline_ns - self.channel.monotonic_ns()) * 1e-9
+            if state.unread or left_s <= 0:
+                break
+        return state.read(round(max_age_s * 1e9), self.channel.monotonic_ns(), connected=session.connected)
+
+    def receive(self, timeout_s: float | None = None) -> list[DataMessage]:
+        """New, valid samples in the order of arrival, at least one; NoSampleError if none comes in time.
+
+        `timeout_s` is by default that of the client. Of several sensors each must have one in it.
+        """
+        session = self.session
+        if timeout_s is None:
+            timeout_s = session.timeout_s if self._timeout_s is None else self._timeout_s
+        deadline_ns = self.channel.monotonic_ns() + round(timeout_s * 1e9)
+        left_s, frames = timeout_s, list[DataMessage]()
+        while not frames and left_s > 0:
+            self._gather(left_s)
+            frames = self._take_items()
+            left_s = (deadline_ns - self.channel.monotonic_ns()) * 1e-9
+        silent = session.find_silent(round(timeout_s * 1e9)) if frames else session.first
+        if silent is None:
+            return frames
+        session.items.extendleft(reversed(frames))
+        condition = session.state(silent).why_old(
+            round(timeout_s * 1e9), self.channel.monotonic_ns(), connected=session.connected
+        )
+        why = f"{condition} ({session.problem})" if session.problem else str(condition)
+        raise NoSampleError(condition, f"no new sample of sensor {silent} for {timeout_s * 1e3:g} ms: {why}")
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Every new and valid sample as it comes, decoded; as `receive`."""
+        while True:
+            for frame in self.receive():
+                self.frame = frame
+                yield self.decode(frame)
+
+    def poll(self, timeout_s: float = 0.0) -> list[DataMessage]:
+        """The frames that have arrived, if any, waiting at most `timeout_s` for the first, or an event."""
+        self._gather(timeout_s)
+        return self._take_items()
+
+    def poll_all(self, timeout_s: float = 0.0) -> list[DataMessage | ClientEvent]:
+        """As `poll`, with the events in their places between the frames."""
+        self._gather(timeout_s)
+        items = list(self.session.items)
+        self.session.items.clear()
+        return items
+
+    def frames(self) -> Iterator[DataMessage]:
+        """The frames as they come; without end, or with `reconnect` False until the connection ends."""
+        while True:
+            try:
+                frames = self.poll(_AGAIN_S)
+            except ConnectionFailedError:
+                return
+            yield from frames
+
+    def decode(self, frame: DataMessage) -> Sample:
+        """The sample in `frame`."""
+        return self._decoders[len(frame.process_data)].decode(frame.process_data)
+
+    # -- requests
+
+    def ask(self, action: str, timeout_s: float = ANSWER_TIMEOUT_S, **values: object) -> JsonObject:
+        """The reply that grants a request; what comes meanwhile is kept for later. From any thread.
+
+        RefusedError if it is refused, NoReplyError if no reply comes in `timeout_s`, ConnectionFailedError if
+        there is no connection or it ends.
+        """
+        future = self.request(action, **values)
+        try:
+            deadline_ns = self.channel.monotonic_ns() + round(timeout_s * 1e9)
+            over = threading.Event()
+            future.add_done_callback(lambda _: over.set())
+            while not over.is_set():
+                left_ns = deadline_ns - self.channel.monotonic_ns()
+                if left_ns <= 0:
+                    raise NoReplyError(f"no reply to {action} within {timeout_s:g} s")
+                if self._reader == threading.get_ident():
+                    self._step(left_ns * 1e-9)
+                else:
+                    self.channel.wait(over, left_ns * 1e-9)
+        finally:
+            self.session.forget(future)
+        reply = future.result()
+        if reply.get("ok") is not True:
+            raise RefusedError.of(reply)
+        return reply
+
+    def request(self, action: str, **values: object) -> Future[JsonObject]:
+        """Send a request; the future gets the reply, granted or not. From any thread.
+
+        ConnectionFailedError if there is no connection; also the future's, if it ends before the reply.
+        """
+        if not self.session.connected:
+            raise ConnectionFailedError(self.session.problem)
+        future, data = self.session.ask(action, **values)
+        try:
+            self._send(data)
+        except ConnectionFailedError:
+            self.session.forget(future)
+            raise
+        return future
+
+    # -- one step at a time
+
+    def _gather(self, timeout_s: float) -> None:
+        """Wait at most `timeout_s` until there is something in `session.items`; take all that has arrived."""
+        items, monotonic_ns = self.session.items, self.channel.monotonic_ns
+        left_s, begun_ns = 0.0 if items else timeout_s, monotonic_ns()
+        for _ in range(_MOST_READS):
+            count = self._step(left_s)
+            if count < _BACKLOG and (items or left_s <= 0):
+                return
+            left_s = 0.0 if items else timeout_s - (monotonic_ns() - begun_ns) * 1e-9
+
+    def _take_items(self) -> list[DataMessage]:
+        """The frames among the items; `events` gets the others."""
+        items, frames = self.session.items, list[DataMessage]()
+        while items:
+            item = items.popleft()
+            if isinstance(item, DataMessage):
+                frames.append(item)
+            else:
+                self.events.append(item)
+        return frames
+
+    def _step(self, timeout_s: float) -> int:
+        """Connect if that is due, or receive once, waiting at most `timeout_s`; the bytes received.
+
+        ConnectionFailedError where there is no connection and none is to be made.
+        """
+        session, channel = self.session, self.channel
+        self._reader, self._stepping = threading.get_ident(), True
+        try:
+            if self._closing.is_set():
+                raise ConnectionFailedError(_CLOSED)
+            if self._open:
+                with session.get_buffer() as buffer:
+                    count = channel.receive(buffer, timeout_s)
+                answer = session.received(count, channel.monotonic_ns())
+                if answer:
+                    self._send(answer)
+                return count
+            if self._failed and not self._reconnect:
+                raise self._failed
+            wait_s = (session.retry_at_ns - channel.monotonic_ns()) * 1e-9
+            if wait_s > 0:
+                channel.wait(self._closing, min(wait_s, timeout_s))
+            elif channel.connect(timeout_s):
+                self._open = True
+                self._send(session.opened(channel.monotonic_ns(), is_near=channel.is_near))
+        except ProtocolError as error:
+            if self._failed is error:
+                raise
+            self._end(error)
+            if self._closing.is_set():
+                raise
+        finally:
+            self._stepping = False
+        return 0
+
+    def _end(self, error: ProtocolError) -> None:
+        self._open, self._failed = False, error
+        self.channel.close()
+        reachable = not isinstance(error, UnreachableError)
+        self.session.ended(str(error), self.channel.monotonic_ns(), reachable=reachable)
+
+    def _send(self, data: bytes) -> None:
+        with self._sending:
+            self.channel.send(data)

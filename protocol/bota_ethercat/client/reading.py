@@ -1,0 +1,191 @@
+"""What a client knows of one sensor: its newest frame, its newest sample, and what that is worth now.
+
+Conditions, their numbers and the rules are those of the C++ header (`reading.hpp`, `sensor_state.hpp`).
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+from bota_ethercat.accounting import FrameKind, StreamAccounting
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
+from bota_ethercat.sensor.warnings_register import WarningFlag
+
+_REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
+_CLOCK_TOLERANCE_NS: Final = 1_000_000
+_LEAST_SILENCE_NS: Final = 30_000_000
+"""Three times the pace of REPEATED frames."""
+_SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
+_WARNINGS: Final = slice(
+    LAYOUTS[min(LAYOUTS)].offsets["warnings"], LAYOUTS[min(LAYOUTS)].offsets["warnings"] + 4
+)
+_NO_WARNINGS: Final = bytes(4)
+
+
+class Condition(IntEnum):
+    """Whether the newest sample may be used, and if not, why. A higher number takes precedence.
+
+    0 to 2: there is a sample no older than `max_age_s`, and they say what it is worth. Others: there is none.
+    """
+
+    FRESH = 0
+    SATURATED = 1
+    NOT_FINITE = 2
+    LATE = 3
+    BAD_CLOCK = 4
+    REPEATED = 5
+    INVALID = 6
+    SILENT = 7
+    SENSOR_LOST = 8
+    DISCONNECTED = 9
+
+    def __str__(self) -> str:
+        """What it means."""
+        return _MEANINGS[self]
+
+
+_MEANINGS: Final = {
+    Condition.FRESH: "fresh",
+    Condition.SATURATED: "saturated: the sensor is overloaded",
+    Condition.NOT_FINITE: "not finite: the sensor sends NaN or infinity",
+    Condition.LATE: "late: what arrives is too old",
+    Condition.BAD_CLOCK: "bad clock: the server's stamps are ahead of this machine's",
+    Condition.REPEATED: "repeated: the sensor gives nothing new",
+    Condition.INVALID: "invalid: the sensor does not answer on the bus",
+    Condition.SILENT: "silent: nothing arrives from the server",
+    Condition.SENSOR_LOST: "lost: the server says that the sensor is lost",
+    Condition.DISCONNECTED: "disconnected",
+}
+
+
+class Reading(NamedTuple):
+    """What is known of a sensor at the moment of a call."""
+
+    condition: Condition
+    sensor: int
+    sample: Sample | None
+    """The newest new and valid one; None before the first."""
+    frame: DataMessage | None
+    """What it came in: sequence, stamps, flags."""
+    is_new: bool
+    """No earlier reading had it."""
+    age_s: float
+    """Of the sample, now; infinity if unknown. From its arrival where the server's clock is not ours."""
+    gap: bool
+    """Samples were lost or withheld, or the connection was made anew, since the reading before."""
+    passed_over: int
+    """New samples since the reading before that came before this one."""
+    warnings_seen: int
+    """Warnings registers of all of them, joined by OR: a warning can last one sample."""
+
+    @property
+    def fresh(self) -> bool:
+        """The one thing to ask before a sample is used: it is recent, finite and not saturated."""
+        return self.condition is Condition.FRESH
+
+
+class SensorState:
+    """One sensor of a `Session`."""
+
+    def __init__(self, sensor: int, *, every: int, fresh_only: bool, imu_units: ImuUnits) -> None:
+        self.accounting = StreamAccounting(every=every, fresh_only=fresh_only)
+        self.lost = False
+        """The server says so."""
+        self.sensor = sensor
+        self.unread = 0
+        """New samples since the last reading."""
+        self.told_ns = -1
+        """Up to this instant, of the server's clock, it was told to be silent."""
+        self._decoders = {size: SampleDecoder(size, imu_units) for size in LAYOUTS}
+        self._flags = 0
+        self._received_ns = self._sampled_received_ns = 0
+        self._sampled: DataMessage | None = None
+        self._same_clock = self._anew = self._gap = False
+        self._carried = 0
+        self._warnings = 0
+
+    def begin(self) -> None:
+        """A new connection."""
+        self._anew = self.accounting.counts.frames > 0  # what was lost meanwhile is not known
+        self.accounting.begin()
+        self.lost = False
+
+    def take(self, frame: DataMessage, received_ns: int, same_clock: bool) -> DataMessage | None:
+        """A frame that arrived at `received_ns`; itself if it brings a new, valid sample.
+
+        GAP of a frame that brings none is carried to the next that does.
+        """
+        sequence, _, monotonic_ns, _, flags, _, process_data = frame
+        accounting = self.accounting
+        unusual = flags or self._anew or self._carried or self.lost
+        if unusual or not accounting.take_next(sequence, monotonic_ns):
+            restarts = accounting.counts.restarts
+            kind = accounting.take(sequence, monotonic_ns, flags)
+            if kind is FrameKind.OLD:
+                return None
+            if self._anew or accounting.counts.restarts > restarts:
+                self._anew, self._carried = False, _GAP
+            if kind is not FrameKind.NEW:
+                self._flags, self._received_ns = flags, received_ns
+                self._carried |= flags & _GAP
+                return None
+            if self._carried:
+                frame, self._carried = frame._replace(flags=flags | self._carried), 0
+            self._gap = self._gap or frame.flags & _GAP != 0
+            self.lost = False
+        self._flags, self._same_clock = flags, same_clock
+        self._sampled, self._received_ns, self._sampled_received_ns = frame, received_ns, received_ns
+        self.unread += 1
+        if (warnings := process_data[_WARNINGS]) != _NO_WARNINGS:
+            self._warnings |= int.from_bytes(warnings, "little")
+        return frame
+
+    def decode(self, frame: DataMessage) -> Sample:
+        """The sample in a frame."""
+        return self._decoders[len(frame.process_data)].decode(frame.process_data)
+
+    def read(self, max_age_ns: int, now_ns: int, *, connected: bool) -> Reading:
+        """What is known as of `now_ns`; the next reading begins."""
+        frame, sample, age_ns, ahead = self._sampled, None, math.inf, False
+        if frame is not None:
+            sample = self.decode(frame)
+            since_ns = now_ns - (frame.monotonic_ns if self._same_clock else self._sampled_received_ns)
+            ahead = since_ns < -_CLOCK_TOLERANCE_NS
+            age_ns = math.inf if ahead else max(0, since_ns)
+        if sample is not None and age_ns <= max_age_ns:
+            condition = _worth(sample)
+        else:
+            silence_ns = max(2 * max_age_ns, _LEAST_SILENCE_NS)
+            condition = self.why_old(silence_ns, now_ns, connected=connected, ahead=ahead)
+        reading = Reading(
+            condition, self.sensor, sample, frame, self.unread > 0, age_ns * 1e-9,
+            self._gap or self._carried != 0, max(0, self.unread - 1), self._warnings,
+        )  # fmt: skip
+        self.unread = self._warnings = 0
+        self._gap = False
+        return reading
+
+    def why_old(self, silence_ns: int, now_ns: int, *, connected: bool, ahead: bool = False) -> Condition:
+        """Why there is no recent sample; SILENT after `silence_ns` without any frame."""
+        if not connected:
+            return Condition.DISCONNECTED
+        if self.lost:
+            return Condition.SENSOR_LOST
+        if not self.accounting.has_begun or now_ns - self._received_ns >= silence_ns:
+            return Condition.SILENT
+        if self._flags & _INVALID:
+            return Condition.INVALID
+        if self._flags & _REPEATED:
+            return Condition.REPEATED
+        return Condition.BAD_CLOCK if ahead else Condition.LATE
+
+
+def _worth(sample: Sample) -> Condition:
+    """What a recent sample is worth: by force and torque."""
+    if not math.isfinite(sum(sample.force) + sum(sample.torque)):
+        return Condition.NOT_FINITE
+    saturated = sample.force_torque_saturated or sample.warnings & _SATURATED
+    return Condition.SATURATED if saturated else Condition.FRESH

@@ -1,0 +1,323 @@
+"""The client's side of the protocol without sockets: bytes in; samples, replies and events out.
+
+The rules it keeps:
+
+- A connection begins with `describe`: the version is checked, and of the sensors asked for, those that are
+  there are subscribed to. If none is there, or at first not all are, the connection has failed.
+- Whoever has the socket passes what arrives to `received` and sends what is returned.
+- After a connection that ended the next attempt is due at `retry_at_ns`: later each time, at once after one
+  that lasted.
+- What is known of a sensor is kept over connections; the first sample of a new one has GAP.
+- Frames that are no news are not handed out, unless `raw`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future
+from typing import Any, Final, NamedTuple
+
+from bota_ethercat.address import boot_id
+from bota_ethercat.client.reading import SensorState
+from bota_ethercat.control import Event, check_version, request
+from bota_ethercat.errors import (
+    BadMessageError,
+    ConnectionFailedError,
+    NoReplyError,
+    RefusedError,
+    RemoteProtocolError,
+)
+from bota_ethercat.framing import DataMessage, FrameDecoder, encode_json
+from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.sensor_choice import MOST_PLACES
+from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import printable, rows
+
+_FIRST_RETRY_NS: Final = 100_000_000
+_LONGEST_RETRY_NS: Final = 1_000_000_000
+_LASTED_NS: Final = 1_000_000_000
+"""A connection that lasted this long was a good one: the next attempt follows at once."""
+_MOST_HZ: Final = 1e6
+_MOST_ITEMS: Final = 65536
+"""Kept while nobody takes them; a tare of 20,000 samples needs fewer."""
+_HANDSHAKE_NS: Final = 5_000_000_000
+_LEAST_TIMEOUT_S: Final = 0.02
+_TIMEOUT_PERIODS: Final = 5
+
+
+class Connected(NamedTuple):
+    """A connection was made, and what was asked for is granted."""
+
+    description: JsonObject
+    again: bool
+    """It is not the first."""
+    missing: tuple[int, ...]
+    """Sensors that were asked for and are not there."""
+
+
+class Disconnected(NamedTuple):
+    """A connection has ended, or an attempt to make one has failed."""
+
+    reason: str
+    reachable: bool
+    """There is a server."""
+    was_connected: bool
+
+
+ClientEvent = Connected | Disconnected | JsonObject
+"""What the client tells of its connection, and the server's events as they came."""
+
+
+class Session:
+    """The conversation with one server, over any number of connections.
+
+    Attributes:
+        connected: whether there is a connection and its subscription is granted.
+        description: the server's newest description; None before the first connection.
+        items: what has arrived and was not taken yet, in order: new and valid frames, or all of them if
+            `raw`; the server's events; `Connected` and `Disconnected`.
+        same_machine: whether the server's CLOCK_MONOTONIC is this machine's.
+        sensors: by position on the bus.
+        connections: number of those that were made.
+        retry_at_ns: the next attempt is due at this CLOCK_MONOTONIC.
+        problem: why there is no connection; empty if there is one.
+    """
+
+    def __init__(
+        self,
+        sensors: Sequence[int] | None = None,
+        *,
+        every: int = 1,
+        fresh_only: bool = True,
+        raw: bool = False,
+        stream: bool = True,
+        imu_units: ImuUnits = ImuUnits.G_DPS,
+    ) -> None:
+        """What to subscribe to, `sensors` None for all; nothing unless `stream`."""
+        self.wanted = None if sensors is None else tuple(sensors)
+        self.connected = self.same_machine = False
+        self.description: JsonObject | None = None
+        self.items: deque[DataMessage | ClientEvent] = deque(maxlen=_MOST_ITEMS)
+        self.sensors: dict[int, SensorState] = {}
+        self.connections = 0
+        self.retry_at_ns = 0
+        self.problem = "no connection yet"
+        self._every, self._fresh_only, self._imu_units = every, fresh_only, imu_units
+        self._raw, self._stream = raw, stream
+        self._begun_ns = -1
+        for sensor in self.wanted or ():
+            self.state(sensor)
+        self._decoder = FrameDecoder()
+        self._batch: list[DataMessage] = []
+        self._ids = itertools.count(1)
+        self._replies: dict[int, Future[JsonObject]] = {}
+        self._describing: Future[JsonObject] | None = None
+        self._subscribing: Future[JsonObject] | None = None
+        self._missing: tuple[int, ...] = ()
+        self._retry_ns = _FIRST_RETRY_NS
+        self._opened_ns = 0
+        self._open = False
+
+    # -- the connection
+
+    def opened(self, now_ns: int, *, is_near: bool) -> bytes:
+        """There is a connection; what to send. `is_near`: to this machine, unless its server denies it."""
+        self._open, self._opened_ns = True, now_ns
+        self.same_machine = is_near
+        self._decoder = FrameDecoder()
+        self._describing, sent = self.ask("describe")
+        return sent
+
+    def ended(self, reason: str, now_ns: int, *, reachable: bool = True) -> None:
+        """The connection has ended, or none could be made."""
+        was_connected = self.connected
+        lasted = self._open and now_ns - self._opened_ns >= _LASTED_NS
+        self.connected = self._open = False
+        self._describing = self._subscribing = None
+        self._retry_ns = _FIRST_RETRY_NS if lasted else self._retry_ns
+        self.retry_at_ns = now_ns + self._retry_ns
+        self._retry_ns = min(self._retry_ns * 3 // 2, _LONGEST_RETRY_NS)
+        self.problem = reason
+        for identifier in list(self._replies):
+            if (future := self._replies.pop(identifier, None)) is not None:
+                future.set_exception(
+                    ConnectionFailedError(f"the connection ended before the reply: {reason}")
+                )
+        self.items.append(Disconnected(reason, reachable, was_connected))
+
+    def get_buffer(self) -> memoryview:
+        """Where to read into; then call `received`."""
+        return self._decoder.get_buffer()
+
+    def received(self, count: int, now_ns: int) -> bytes:
+        """`count` bytes were read into `get_buffer()`; what to send, almost always nothing.
+
+        ProtocolError if the connection is of no use, RefusedError if the server does not grant what was asked
+        for: close it and call `ended`.
+        """
+        if not count:
+            if not self.connected and now_ns - self._opened_ns > _HANDSHAKE_NS:
+                raise NoReplyError(f"no reply to describe within {_HANDSHAKE_NS / 1e9:g} s")
+            return b""
+        decoder, batch, answer = self._decoder, self._batch, b""
+        decoder.received(count)
+        try:
+            while True:
+                message = decoder.take_data(batch)
+                if batch:
+                    self._take(now_ns)
+                if message is None:
+                    return answer
+                answer += self._hear(message)
+        except (RemoteProtocolError, BadMessageError) as error:
+            raise ConnectionFailedError(f"what came is not this protocol: {printable(error)}") from None
+
+    def _take(self, now_ns: int) -> None:
+        sensors, items, batch, same = self.sensors, self.items, self._batch, self.same_machine
+        for frame in batch:
+            state = sensors.get(frame.sensor)
+            new = state.take(frame, now_ns, same) if state is not None else None
+            if self._raw:
+                items.append(frame)
+            elif new is not None:
+                items.append(new)
+        batch.clear()
+
+    # -- requests
+
+    def ask(self, action: str, **values: object) -> tuple[Future[JsonObject], bytes]:
+        """A request: the future that gets its reply, and what to send; from any thread."""
+        identifier = next(self._ids)
+        future = self._replies[identifier] = Future()
+        return future, encode_json(request(action, identifier, **values))
+
+    def forget(self, future: Future[JsonObject]) -> None:
+        """Nobody waits for this reply any more; from any thread."""
+        for identifier, waiting in list(self._replies.items()):
+            if waiting is future:
+                self._replies.pop(identifier, None)
+
+    def _hear(self, message: JsonObject) -> bytes:
+        """Take a JSON message; what to send."""
+        if "event" in message:
+            self._hear_event(message)
+            return b""
+        identifier = message.get("id")
+        future = self._replies.pop(identifier, None) if type(identifier) is int else None
+        if future is not None:
+            future.set_result(message)
+        if future is None:
+            return b""
+        if future is self._describing:
+            self._describing = None
+            return self._described(message)
+        if future is self._subscribing:
+            self._subscribing = None
+            self._granted(message)
+        return b""
+
+    def _described(self, reply: JsonObject) -> bytes:
+        _check_granted(reply)
+        check_version(reply)
+        theirs, ours = reply.get("boot_id"), boot_id()
+        if isinstance(theirs, str) and ours is not None:
+            self.same_machine = theirs == ours
+        self.describe(reply)
+        if not self._stream:
+            self._begin()
+            return b""
+        there = [position for row in rows(reply.get("sensors")) if (position := _position(row)) is not None]
+        values: dict[str, Any] = {"every": self._every, "fresh_only": self._fresh_only}
+        if self.wanted is not None:
+            found = [position for position in self.wanted if position in there]
+            self._missing = tuple(position for position in self.wanted if position not in there)
+            if self._missing and not (found and self.connections):
+                text = ", ".join(map(str, self._missing))
+                has = ", ".join(map(str, there[:16])) or "none"
+                raise ConnectionFailedError(f"the server has no sensor {text} (it has: {has})")
+            values["sensors"] = found
+        self._subscribing, sent = self.ask("subscribe", **values)
+        return sent
+
+    def _granted(self, reply: JsonObject) -> None:
+        _check_granted(reply)
+        self.describe(reply)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._begun_ns = -1
+        for state in self.sensors.values():
+            state.begin()
+        assert self.description is not None
+        self.connected, self.problem = True, ""
+        self.connections += 1
+        self.items.append(Connected(self.description, self.connections > 1, self._missing))
+
+    def describe(self, description: JsonObject) -> None:
+        """Take a description of the server, which may be newer than that of the connection."""
+        self.description = description
+        for row in rows(description.get("sensors")):
+            if (position := _position(row)) is not None:
+                self.state(position)
+            self._take_rate(row)
+
+    def _hear_event(self, message: JsonObject) -> None:
+        state = self.sensors.get(position) if (position := _position(message)) is not None else None
+        if state is not None and message["event"] == Event.SENSOR_LOST:
+            state.lost = True
+        elif state is not None and message["event"] in (Event.SENSOR_BACK, Event.RECONFIGURED):
+            state.lost = False
+            self._take_rate(message)
+        self.items.append(message)
+
+    def _take_rate(self, message: JsonObject) -> None:
+        position, rate_hz = _position(message), message.get("rate_hz")
+        if position in self.sensors and isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ:
+            self.sensors[position].accounting.rate_hz = float(rate_hz)
+
+    # -- what is known
+
+    @property
+    def timeout_s(self) -> float:
+        """After this time without a sample something is wrong: a few periods of the slowest sensor."""
+        rates = [state.accounting.rate_hz for state in self.sensors.values() if state.accounting.rate_hz]
+        return max(_LEAST_TIMEOUT_S, *(_TIMEOUT_PERIODS * self._every / rate for rate in rates))
+
+    def state(self, sensor: int) -> SensorState:
+        """What is known of a sensor, so far nothing of one that no description had."""
+        if sensor not in self.sensors:
+            self.sensors[sensor] = SensorState(
+                sensor, every=self._every, fresh_only=self._fresh_only, imu_units=self._imu_units
+            )
+        return self.sensors[sensor]
+
+    @property
+    def first(self) -> int:
+        """The sensor that is meant where none is named."""
+        return self.wanted[0] if self.wanted else min(self.sensors, default=0)
+
+    def find_silent(self, timeout_ns: int) -> int | None:
+        """A sensor without new samples for this time, in which another had some; told again after it."""
+        awaited = [self.sensors[position] for position in self.wanted or self.sensors]
+        if len(awaited) < 2:
+            return None
+        newest_ns = max(state.accounting.new_ns for state in awaited)
+        if self._begun_ns < 0:
+            self._begun_ns = newest_ns
+        for state in awaited:
+            if newest_ns - max(state.accounting.new_ns, state.told_ns, self._begun_ns) > timeout_ns:
+                state.told_ns = newest_ns
+                return state.sensor
+        return None
+
+
+def _check_granted(reply: JsonObject) -> None:
+    if reply.get("ok") is not True:
+        raise RefusedError.of(reply)
+
+
+def _position(row: JsonObject) -> int | None:
+    position = row.get("sensor")
+    return position if type(position) is int and 0 <= position < MOST_PLACES else None

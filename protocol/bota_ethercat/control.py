@@ -1,0 +1,300 @@
+"""Control messages: actions and their keys, error codes, events, replies.
+
+`ACTIONS` is the table of what a request may carry; `parse_request` checks a request against it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Mapping
+from enum import StrEnum
+from typing import Any, Final, NamedTuple
+
+from bota_ethercat.errors import ConnectionFailedError, RequestError, SettingError
+from bota_ethercat.sensor.sdo_types import sdo_type
+from bota_ethercat.sensor_choice import SensorChoice
+from bota_ethercat.settings import check_settings
+from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import printable
+
+PROTOCOL_VERSION: Final = 1
+MAX_SDO_BYTES: Final = 112
+"""Largest SDO that fits a mailbox of 128 bytes unsegmented."""
+MAX_TARE_SAMPLES: Final = 20_000
+_LONGEST_NAME: Final = 80
+MAX_SII_WORDS: Final = 128
+
+
+class ErrorCode(StrEnum):
+    """The `code` of an error reply."""
+
+    BAD_REQUEST = "bad_request"
+    UNKNOWN_ACTION = "unknown_action"
+    DENIED = "denied"
+    BUSY = "busy"
+    NOT_READY = "not_ready"
+    SENSOR = "sensor"
+    """The sensor refused: an SDO abort, with `abort_code`."""
+    INTERNAL = "internal"
+
+
+class Event(StrEnum):
+    """What the server sends to framed connections unasked."""
+
+    SENSOR_LOST = "sensor_lost"
+    SENSOR_BACK = "sensor_back"
+    RECONFIGURED = "reconfigured"
+    OFFSET_CHANGED = "offset_changed"
+    EMERGENCY = "emergency"
+    SHUTTING_DOWN = "shutting_down"
+
+
+Check = Callable[[object], Any]
+"""Returns the checked value; raises SettingError, or ValueError whose text is what is allowed."""
+
+
+class Parameter(NamedTuple):
+    """One key that a request may carry."""
+
+    check: Check
+    default: Any = None
+    required: bool = False
+
+
+class Action(NamedTuple):
+    """One action and its keys besides `action` and `id`."""
+
+    parameters: Mapping[str, Parameter]
+    controls: bool = False
+    """Changes something, so it needs control rights."""
+    framed_only: bool = False
+    """For framed connections only."""
+
+
+class Request(NamedTuple):
+    """A checked request. `values` has every key of the action, with defaults."""
+
+    action: str
+    id: object
+    has_id: bool
+    values: Mapping[str, Any]
+
+
+def _is_int(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def whole_number(low: int, high: int) -> Check:
+    """A check for a whole number from `low` to `high`."""
+
+    def check(value: object) -> int:
+        if isinstance(value, int) and _is_int(value) and low <= value <= high:
+            return value
+        raise ValueError(f"a whole number from {low} to {high}")
+
+    return check
+
+
+def _boolean(value: object) -> bool:
+    if isinstance(value, bool):
+        return value
+    raise ValueError("true or false")
+
+
+def _sensor_list(value: object) -> tuple[int, ...]:
+    if isinstance(value, list) and value and all(_is_int(item) and 0 <= item <= 255 for item in value):
+        return tuple(value)
+    raise ValueError("a list of sensor positions on the bus, such as [0]")
+
+
+def six_numbers(value: object) -> tuple[float, ...]:
+    """Check for a wrench: six finite numbers."""
+    if isinstance(value, list) and len(value) == 6:
+        numbers = [v for v in value if isinstance(v, int | float) and not isinstance(v, bool)]
+        with contextlib.suppress(OverflowError):  # JSON has whole numbers that no float can be
+            floats = tuple(float(v) for v in numbers)
+            if len(floats) == 6 and all(map(math.isfinite, floats)):
+                return floats
+    raise ValueError("a list of six finite numbers")
+
+
+def _settings(value: object) -> Mapping[str, Any]:
+    if not isinstance(value, dict) or not value:
+        raise ValueError('an object with settings by name, such as {"sinc_length": 64}')
+    return check_settings(value)
+
+
+def _anything(value: object) -> object:
+    return value
+
+
+def _object_number(high: int) -> Check:
+    """A check for an index or sub-index: a whole number, or a text such as "0x8010"."""
+
+    def check(value: object) -> int:
+        if isinstance(value, str):
+            with contextlib.suppress(ValueError):
+                value = int(value, 16) if value.lower().startswith("0x") else int(value)
+        if isinstance(value, int) and _is_int(value) and 0 <= value <= high:
+            return value
+        raise ValueError(f'a number from 0 to {high}, or a text such as "0x{high:X}"')
+
+    return check
+
+
+def _hex_bytes(value: object) -> bytes:
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            data = bytes.fromhex(value)
+            if 0 < len(data) <= MAX_SDO_BYTES:
+                return data
+    raise ValueError(f"1 to {MAX_SDO_BYTES} bytes as hexadecimal digits, two each")
+
+
+def _object_name(value: object) -> str:
+    if isinstance(value, str) and 0 < len(value) <= _LONGEST_NAME:
+        return value
+    raise ValueError(f"a text of 1 to {_LONGEST_NAME} characters, such as 'Sampling rate'")
+
+
+_SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(number=0))
+_INDEX: Final = _object_number(0xFFFF)
+_SUBINDEX: Final = _object_number(0xFF)
+_ENTRY: Final = {
+    "sensor": _SENSOR,
+    "index": Parameter(_INDEX, required=True),
+    "subindex": Parameter(_SUBINDEX, default=0),
+    "type": Parameter(sdo_type),
+}
+
+ACTIONS: Final[Mapping[str, Action]] = {
+    "describe": Action({}),
+    "subscribe": Action(
+        {
+            "sensors": Parameter(_sensor_list),
+            "every": Parameter(whole_number(1, 1_000_000), default=1),
+            "fresh_only": Parameter(_boolean, default=True),
+        },
+        framed_only=True,
+    ),
+    "unsubscribe": Action({}, framed_only=True),
+    "status": Action({}),
+    "configure": Action(
+        {
+            "sensor": _SENSOR,
+            "settings": Parameter(_settings, required=True),
+            "save": Parameter(_boolean, default=False),
+        },
+        controls=True,
+    ),
+    "tare": Action(
+        {
+            "sensor": _SENSOR,
+            "samples": Parameter(whole_number(1, MAX_TARE_SAMPLES), default=400),
+            "target": Parameter(six_numbers, default=(0.0,) * 6),
+        },
+        controls=True,
+    ),
+    "sdo_read": Action(
+        {
+            **_ENTRY,
+            "index": Parameter(_INDEX),
+            "subindex": Parameter(_SUBINDEX),
+            "name": Parameter(_object_name),
+        }
+    ),
+    "sdo_write": Action(
+        {**_ENTRY, "value": Parameter(_anything), "hex": Parameter(_hex_bytes)}, controls=True
+    ),
+    "sii_read": Action(
+        {
+            "sensor": _SENSOR,
+            "word": Parameter(_object_number(0xFFFF), required=True),
+            "words": Parameter(whole_number(1, MAX_SII_WORDS), default=2),
+        },
+        controls=True,
+    ),
+    "shutdown": Action({}, controls=True),
+}
+
+
+def parse_request(message: JsonObject) -> Request:
+    """Check a request against its action's table.
+
+    RequestError carries `bad_request`, naming the key that is wrong, or `unknown_action`.
+    """
+    name = message.get("action")
+    if name is None:
+        raise RequestError(ErrorCode.BAD_REQUEST, "the key 'action' is missing: say what to do")
+    if not isinstance(name, str):
+        raise RequestError(ErrorCode.BAD_REQUEST, "the key 'action' must be a string")
+    action = ACTIONS.get(name)
+    if action is None:
+        known = ", ".join(ACTIONS)
+        raise RequestError(ErrorCode.UNKNOWN_ACTION, f"no action {_short(name)}: the actions are {known}")
+    for key in message:
+        if key not in action.parameters and key not in {"action", "id"}:
+            known = ", ".join(("id", *action.parameters))
+            text = f"{name} takes no key {_short(key)}: it takes {known}"
+            raise RequestError(ErrorCode.BAD_REQUEST, text)
+    values: dict[str, Any] = {}
+    for key, parameter in action.parameters.items():
+        if key not in message:
+            if parameter.required:
+                raise RequestError(ErrorCode.BAD_REQUEST, f"{name} needs the key {key!r}")
+            values[key] = parameter.default
+            continue
+        try:
+            values[key] = parameter.check(message[key])
+        except ValueError as error:
+            raise RequestError(ErrorCode.BAD_REQUEST, f"the key {key!r} must be {error}") from None
+        except SettingError as error:
+            raise RequestError(ErrorCode.BAD_REQUEST, f"the key {key!r} is refused: {error}") from None
+    return Request(name, message.get("id"), "id" in message, values)
+
+
+def _short(text: str) -> str:
+    return repr(text if len(text) <= 40 else text[:37] + "...")
+
+
+def request(action: str, id: object = None, **values: object) -> JsonObject:  # noqa: A002 - the wire's name
+    """A request to send; `id` is left out if None."""
+    message: JsonObject = {"action": action}
+    if id is not None:
+        message["id"] = id
+    message.update(values)
+    return message
+
+
+def check_version(description: Mapping[str, Any]) -> None:
+    """ConnectionFailedError if the server that describes itself so speaks another version of the protocol."""
+    version = description.get("protocol")
+    if version != PROTOCOL_VERSION or isinstance(version, bool):
+        raise ConnectionFailedError(
+            f"the server speaks protocol {printable(version, 20)} and this client {PROTOCOL_VERSION}: "
+            "install the same version of both"
+        )
+
+
+def reply(message: Request, **values: object) -> JsonObject:
+    """The reply that grants `message`."""
+    head: JsonObject = {"reply": message.action}
+    if message.has_id:
+        head["id"] = message.id
+    return {**head, "ok": True, **values}
+
+
+def error_reply(message: JsonObject | None, code: str, text: str, **extra: object) -> JsonObject:
+    """The reply that refuses `message`; None if no message could be read."""
+    message = message or {}
+    action = message.get("action")
+    head: JsonObject = {"reply": action if isinstance(action, str) else None}
+    if "id" in message:
+        head["id"] = message["id"]
+    return {**head, "ok": False, "error": {"code": str(code), "message": text, **extra}}
+
+
+def event(name: Event, **values: object) -> JsonObject:
+    """An event to send."""
+    return {"event": str(name), **values}

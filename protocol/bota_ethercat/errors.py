@@ -1,0 +1,101 @@
+"""Every exception that `protocol` raises.
+
+ProtocolError
++-- PdoSizeError          process data of a size no sensor has
++-- RemoteProtocolError   the peer broke the framing: answer it, then close the connection
++-- BadMessageError       one message was no JSON object: answer it and carry on
++-- RequestError          one request cannot be granted: answer it and carry on
++-- SettingError          a setting's name or value is wrong
++-- ConnectionFailedError the connection cannot be made or has ended: close it
+|   +-- UnreachableError  there is no server at that address
+|   +-- NoReplyError      a request was not answered in time
++-- RefusedError          the server refused a request; the connection goes on
++-- NoSampleError         no new, valid sample came in time; the client goes on
++-- FileError             a file cannot be written, or would replace another
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bota_ethercat.text.untrusted import printable
+
+
+class ProtocolError(Exception):
+    """Base of all errors here; the text is one sentence for users."""
+
+
+class FileError(ProtocolError):
+    """A file cannot be written, or would replace another."""
+
+
+class PdoSizeError(ProtocolError):
+    """Process data of a size that no known sensor has."""
+
+    def __init__(self, size: int, known: Sequence[int]) -> None:
+        choices = " or ".join(str(n) for n in known)
+        super().__init__(f"process data of {size} bytes: a Bota Gen-0 sensor maps {choices}")
+        self.size = size
+
+
+class RemoteProtocolError(ProtocolError):
+    """The peer sent bytes that are not this protocol; nothing after them can be trusted."""
+
+
+class BadMessageError(ProtocolError):
+    """One message was not a JSON object; the framing is intact and the next message can be read."""
+
+
+class RequestError(ProtocolError):
+    """A request that is refused. `code` is one of `bota_ethercat.control.ErrorCode`."""
+
+    def __init__(self, code: str, message: str, **extra: object) -> None:
+        super().__init__(message)
+        self.code = code
+        self.extra = extra
+
+
+class SettingError(ProtocolError):
+    """A setting that does not exist, or a value that is not allowed."""
+
+
+class ConnectionFailedError(ProtocolError):
+    """The connection cannot be made or has ended; the text says why. Close it."""
+
+
+class UnreachableError(ConnectionFailedError):
+    """Nothing answers at that address."""
+
+    def at(self, address: object) -> str:
+        """The one sentence about it."""
+        return f"no server at {address} ({self}): start ethercat-server"
+
+
+class NoReplyError(ConnectionFailedError):
+    """A request was not answered in time; it may have been carried out."""
+
+
+class RefusedError(ProtocolError):
+    """The server refused a request; the text is its message, made safe to print.
+
+    `code` is one of `bota_ethercat.control.ErrorCode`, `abort_code` the SDO abort code behind it, if any.
+    """
+
+    def __init__(self, code: str, message: str, abort_code: int | None = None) -> None:
+        super().__init__(message)
+        self.code = code
+        self.abort_code = abort_code
+
+    @classmethod
+    def of(cls, reply: Mapping[str, Any]) -> RefusedError:
+        """The error of a `reply` that refuses a request."""
+        error = reply.get("error")
+        if not isinstance(error, dict):
+            return cls("internal", "the server gave no reason")
+        abort_code = error.get("abort_code")
+        return cls(
+            printable(error.get("code", "no code"), 40),
+            printable(error.get("message", "the server gave no reason"), 1000),
+            abort_code if isinstance(abort_code, int) and not isinstance(abort_code, bool) else None,
+        )

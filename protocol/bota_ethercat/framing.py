@@ -1,0 +1,205 @@
+"""Framing, without sockets: bytes in, messages out, and back.
+
+The rules it keeps:
+
+- A framed message is `length` u32 big-endian, `type` u8, body; length counts type and body.
+- An impossible length is refused as soon as it is received: nothing is buffered for it.
+- RemoteProtocolError is final: the decoder raises it again on every later call and buffers nothing.
+- BadMessageError concerns one message: it has been consumed, and the next call goes on after it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from enum import IntEnum, IntFlag
+from typing import Final, NamedTuple, NoReturn
+
+from bota_ethercat.errors import RemoteProtocolError
+from bota_ethercat.pdo import LAYOUTS
+from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject, encode_json_text, parse_json_object
+
+
+class MessageType(IntEnum):
+    """The `type` byte."""
+
+    DATA = 1
+    JSON = 2
+
+
+class DataFlag(IntFlag):
+    """The `flags` byte of a DATA message."""
+
+    REPEATED = 1
+    """Same process data as the frame before: nothing new from the sensor."""
+    INVALID = 2
+    """Working counter short; the process data is the last good one."""
+    GAP = 4
+    """Samples of this sensor were lost, or withheld from this client, since its previous frame."""
+
+
+class DataMessage(NamedTuple):
+    """One DATA message. Its fields are the wire's, in the wire's order."""
+
+    sequence: int
+    stamp_ns: int
+    monotonic_ns: int
+    sensor: int
+    flags: int
+    wkc: int
+    process_data: bytes
+
+
+_LENGTH: Final = struct.Struct(">I")
+_PREFIX: Final = struct.Struct(">IB")
+_DATA_HEADER: Final = struct.Struct(">QQQBBH")
+_DATA_MESSAGE: Final = struct.Struct(">IBQQQBBH")
+_DATA: Final = int(MessageType.DATA)
+_TYPE_SIZE: Final = 1
+_BODY_OFFSET: Final = _PREFIX.size
+DATA_FLAGS_OFFSET: Final = _PREFIX.size + struct.calcsize(">QQQB")
+"""Offset of the flags byte in an encoded DATA message."""
+_LENGTH_SIZE: Final = _LENGTH.size
+_UNPACK_DATA: Final = {
+    _TYPE_SIZE + _DATA_HEADER.size + size: struct.Struct(f">{_PREFIX.size}xQQQBBH{size}s").unpack_from
+    for size in LAYOUTS
+}
+"""The fields of a whole DATA message, by its length."""
+_DATA_LENGTHS: Final = frozenset(_UNPACK_DATA)
+MAX_DATA_MESSAGE_SIZE: Final = _LENGTH.size + max(_DATA_LENGTHS)
+
+
+def encode_data(
+    sequence: int, stamp_ns: int, monotonic_ns: int, sensor: int, flags: int, wkc: int, process_data: bytes
+) -> bytes:
+    """A whole DATA message, ready to send. struct.error if a number does not fit its field."""
+    length = _TYPE_SIZE + _DATA_HEADER.size + len(process_data)
+    head = _DATA_MESSAGE.pack(length, _DATA, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc)
+    return head + process_data
+
+
+def encode_json(message: JsonObject) -> bytes:
+    """A whole JSON message for a framed connection."""
+    text = encode_json_text(message)
+    return _PREFIX.pack(_TYPE_SIZE + len(text), MessageType.JSON) + text
+
+
+class FrameDecoder:
+    """Decodes a framed connection's bytes.
+
+    Pass bytes to `feed`, or avoid a copy by reading into `get_buffer()` and calling `received()`. Then call
+    `next_message()` until it returns None. The buffer never has more than one unfinished message and what was
+    last received.
+    """
+
+    def __init__(self, *, max_json_length: int = MAX_JSON_LENGTH, accept_data: bool = True) -> None:
+        """`accept_data=False`, for servers, makes DATA an unknown type."""
+        self._max_json_length = max_json_length
+        self._accept_data = accept_data
+        self._buffer = bytearray(65536)
+        self._start = 0
+        self._end = 0
+        self._broken: str | None = None
+
+    def get_buffer(self) -> memoryview:
+        """Writable free space to read into; never empty."""
+        if self._start == self._end:
+            self._start = self._end = 0
+        else:
+            self._make_room(4096)
+        return memoryview(self._buffer)[self._end :]
+
+    def received(self, count: int) -> None:
+        """`count` bytes were written to the start of `get_buffer()`."""
+        if self._broken is None:
+            self._end += count
+
+    def feed(self, data: bytes | bytearray | memoryview) -> None:
+        """Add received bytes."""
+        if self._broken is not None:
+            return
+        self._make_room(len(data))
+        self._buffer[self._end : self._end + len(data)] = data
+        self._end += len(data)
+
+    @property
+    def pending(self) -> int:
+        """Bytes buffered of an unfinished message."""
+        return self._end - self._start
+
+    def next_message(self) -> DataMessage | JsonObject | None:
+        """The next whole message, or None if more bytes are needed.
+
+        Raises RemoteProtocolError (answer it and close the connection) or BadMessageError (answer it and
+        carry on).
+        """
+        if self._broken is not None:
+            raise RemoteProtocolError(self._broken)
+        available = self._end - self._start
+        if available < _LENGTH.size:
+            return None
+        (length,) = _LENGTH.unpack_from(self._buffer, self._start)
+        if not _TYPE_SIZE <= length <= max(self._max_json_length + _TYPE_SIZE, MAX_DATA_MESSAGE_SIZE):
+            self._break(f"message length {length}: it must be from 1 to {self._max_json_length + _TYPE_SIZE}")
+        if available < _PREFIX.size:
+            return None
+        kind = self._buffer[self._start + _LENGTH.size]
+        if kind == MessageType.DATA and self._accept_data:
+            if length not in _DATA_LENGTHS:
+                self._break(f"DATA message of length {length}: it must be one of {sorted(_DATA_LENGTHS)}")
+        elif kind != MessageType.JSON:
+            self._break(f"message type {kind}: this side understands {self._types_text()}")
+        elif length > self._max_json_length + _TYPE_SIZE:
+            self._break(f"JSON message of length {length}: it must be at most {self._max_json_length + 1}")
+        if available < _LENGTH.size + length:
+            return None
+        body = self._start + _BODY_OFFSET
+        end = self._start + _LENGTH.size + length
+        self._start = end
+        if kind == MessageType.DATA:
+            return DataMessage._make(_UNPACK_DATA[length](self._buffer, body - _BODY_OFFSET))
+        return parse_json_object(bytes(self._buffer[body:end]))
+
+    def __iter__(self) -> Iterator[DataMessage | JsonObject]:
+        """The whole messages received so far."""
+        while (message := self.next_message()) is not None:
+            yield message
+
+    def take_data(self, into: list[DataMessage]) -> JsonObject | None:
+        """Append the DATA messages that are next and whole to `into`; returns the JSON message after them.
+
+        As `next_message` until it returns something else, but faster, for streams. None and errors as there.
+        """
+        buffer, start, end = self._buffer, self._start, self._end
+        if self._accept_data and self._broken is None:
+            while end - start >= _BODY_OFFSET:
+                length, kind = _PREFIX.unpack_from(buffer, start)
+                unpack, after = _UNPACK_DATA.get(length), start + _LENGTH_SIZE + length
+                if kind != _DATA or unpack is None or after > end:
+                    break
+                into.append(DataMessage._make(unpack(buffer, start)))
+                self._start = start = after
+            if start == end:
+                return None
+        message = self.next_message()
+        assert not isinstance(message, DataMessage)  # a whole one was taken above
+        return message
+
+    def _types_text(self) -> str:
+        return "1 (DATA) and 2 (JSON)" if self._accept_data else "2 (JSON)"
+
+    def _break(self, reason: str) -> NoReturn:
+        self._broken = reason
+        self._start = self._end = 0
+        raise RemoteProtocolError(reason)
+
+    def _make_room(self, count: int) -> None:
+        if self._start == self._end:
+            self._start = self._end = 0
+        if len(self._buffer) - self._end >= count:
+            return
+        pending = self._end - self._start
+        self._buffer[:pending] = self._buffer[self._start : self._end]
+        self._start, self._end = 0, pending
+        if len(self._buffer) - pending < count:
+            self._buffer.extend(bytes(pending + count - len(self._buffer)))

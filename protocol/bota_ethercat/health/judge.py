@@ -1,0 +1,246 @@
+"""Judges what was observed of a sensor's stream. Every sentence of a verdict is here, and nowhere else.
+
+Losses explain a low rate, and silence explains repeated and invalid frames: what is explained is not found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Final, NamedTuple
+
+from bota_ethercat.health.verdict import LIMITS, About, Finding, Level, Limits, Verdict, verdict
+from bota_ethercat.sensor.warnings_register import Severity, WarningFlag, explain
+from bota_ethercat.text.untrusted import number, printable, whole
+
+
+class Observation(NamedTuple):
+    """What was seen of one sensor's stream in some time. None and 0 where nothing is known."""
+
+    seconds: float = 0.0  # how long it was observed
+    samples: int = 0  # new ones
+    lost: int = 0  # samples that did not come: lost on the bus or in the server, or not read in time
+    repeated: int = 0
+    invalid: int = 0  # frames
+    silent_s: float = 0.0  # the longest time without a new sample, up to the end of the observation
+    rate_hz: float | None = None  # new samples a second, by their stamps
+    nominal_hz: float = 0.0
+    age_p99_us: float | None = None  # of the samples on arrival; None on another machine than the server's
+    not_finite: int = 0  # samples with values that are not finite
+    # The bits of the warnings register that were set in any sample; likewise of the saturation fields.
+    warnings: int = 0
+    force_torque_saturated: int = 0
+    acceleration_saturated: int = 0
+    angular_rate_saturated: int = 0
+    temperature: float | None = None
+    locked: bool | None = None  # whether the server follows the sensor's clock
+    recoveries: int = 0
+    missed_deadlines: int = 0  # by the server's loop, in sampling periods
+    reconnects: int = 0
+    is_lost: bool = False  # the server says that it has lost the sensor
+    state: str = "OP"  # the sensor's AL state
+    server_silent: bool = False  # the server itself owes an answer
+    emergency: str = ""  # what the sensor's newest emergency says, if it is new and not over
+    settings: Mapping[str, object] = {}
+
+
+class Saturation(NamedTuple):
+    """One saturation field of the process data."""
+
+    field: str
+    axes: tuple[str, ...]  # of its bits, lowest first
+    flag: WarningFlag
+
+
+SATURATIONS: Final = (
+    Saturation(
+        "force_torque_saturated", ("Fx", "Fy", "Fz", "Mx", "My", "Mz"), WarningFlag.FORCE_TORQUE_SATURATED
+    ),
+    Saturation("acceleration_saturated", ("ax", "ay", "az"), WarningFlag.ACCELERATION_SATURATED),
+    Saturation("angular_rate_saturated", ("ωx", "ωy", "ωz"), WarningFlag.ANGULAR_RATE_SATURATED),
+)
+# Bits of an emergency's code; none of them in one that says that an error is over.
+_ERROR_CLASS: Final = 0xFF00
+# AL states that are, or may be, those of a sensor that streams.
+_STREAMING: Final = frozenset({"OP", "?", ""})
+_CABLE: Final = "Check its cable and power"
+_STOOD_STILL: Final = "The server's computer stood still meanwhile, check it with ethercat-doctor"
+# Missed deadlines that amount to this time explain why a sensor did not answer, or left OP.
+_STANDSTILL_S: Final = 0.02
+
+
+def judge(seen: Observation, limits: Limits = LIMITS) -> Verdict:
+    """The verdict on a stream."""
+    silent = seen.silent_s > limits.stale_after
+    findings: list[Finding] = []
+    if silent:
+        findings.append(_silence(seen))
+    elif seen.is_lost:
+        findings.append(_trouble("silence", "The server has lost the sensor", _advice(seen)))
+    elif not seen.samples and seen.state not in _STREAMING:
+        findings.append(
+            _trouble("silence", f"The sensor is in state {seen.state}, not OP", "See the server's log")
+        )
+    findings += _values(seen, limits)
+    findings += _losses(seen, limits)
+    if not silent and not seen.is_lost:
+        findings += _arrival(seen, limits)
+    findings += _circumstances(seen)
+    return verdict(findings)
+
+
+def _trouble(key: str, found: str, remedy: str, about: About = About.STREAM, size: float = 0.0) -> Finding:
+    return Finding(Level.TROUBLE, about, key, found, remedy, size)
+
+
+def _look(key: str, found: str, remedy: str, about: About = About.STREAM, size: float = 0.0) -> Finding:
+    return Finding(Level.LOOK, about, key, found, remedy, size)
+
+
+def _advice(seen: Observation) -> str:
+    """Where to look for the reason why a sensor did not answer."""
+    stood_still = seen.missed_deadlines > _STANDSTILL_S * seen.nominal_hz > 0
+    return _STOOD_STILL if stood_still else _CABLE
+
+
+def _silence(seen: Observation) -> Finding:
+    if seen.is_lost or seen.invalid:
+        why, remedy = "the sensor does not answer the bus", _advice(seen)
+    elif seen.repeated:
+        why, remedy = "the sensor repeats the same sample again and again", "Power-cycle it"
+    elif seen.server_silent:
+        why, remedy = "the server does not answer", "It is stopped or overloaded"
+    elif seen.state not in _STREAMING:
+        why, remedy = f"the server has the sensor in state {seen.state}, not OP", "See its log"
+    else:
+        why, remedy = "the server sends none", "See its log"
+    return _trouble("silence", f"No new sample for {seen.silent_s:.1f} s, {why}", remedy, size=seen.silent_s)
+
+
+def _values(seen: Observation, limits: Limits) -> Iterator[Finding]:
+    """What is wrong with the samples themselves."""
+    if seen.not_finite:
+        yield _trouble(
+            "not_finite",
+            "Samples have values that are not finite",
+            "Power-cycle the sensor; if it persists, contact support",
+        )
+    if seen.settings.get("calibration_matrix") is False:
+        found = "settings.calibration_matrix is off, force and torque are counts and not N and Nm"
+        yield _trouble("calibration_matrix", found, "Switch it on", About.SENSOR)
+    axes = saturated_axes(seen)
+    register = seen.warnings
+    for flag in axes:
+        register |= flag
+    for row in explain(register):
+        level = Level.LOOK if row.severity is Severity.WARNING else Level.TROUBLE
+        where = f": {', '.join(axes[row.flag])}" if row.flag in axes else ""
+        yield Finding(level, About.SENSOR, f"warning {row.flag}", f"{row.meaning}{where}", row.remedy)
+    if seen.temperature is not None:
+        yield from _temperature(seen.temperature, limits)
+
+
+def _temperature(celsius: float, limits: Limits) -> Iterator[Finding]:
+    if celsius >= limits.temperature_warn:
+        make = _trouble if celsius >= limits.temperature_error else _look
+        yield make(
+            "temperature", f"The sensor has {celsius:.1f} °C", "Let it cool down", About.SENSOR, celsius
+        )
+    elif celsius < limits.coldest:
+        found = f"The sensor says {celsius:.1f} °C, which its electronics cannot have"
+        yield _look("temperature", found, "Do not use it; contact support", About.SENSOR)
+
+
+def saturated_axes(seen: Observation) -> dict[int, list[str]]:
+    """The saturated axes, by their flag in the warnings register."""
+    found = {}
+    for field, axes, flag in SATURATIONS:
+        bits = getattr(seen, field)
+        if bits:
+            names = [name for place, name in enumerate(axes) if bits >> place & 1]
+            found[int(flag)] = names or ["an undefined axis"]
+    return found
+
+
+def _losses(seen: Observation, limits: Limits) -> Iterator[Finding]:
+    if seen.lost >= limits.lost_warn:
+        total = seen.samples + seen.lost
+        found = f"{seen.lost} of {total} samples ({_percent(seen.lost, total)}) were lost"
+        remedy = "The machine is too busy or the cable is bad; ethercat-doctor tells which"
+        level = _many(seen.lost, total, seen, limits)
+        yield Finding(level, About.STREAM, "lost", found, remedy, seen.lost)
+    if seen.recoveries:
+        times = "once" if seen.recoveries == 1 else f"{seen.recoveries} times"
+        yield _look("recoveries", f"The server lost the sensor {times} and has it back", _advice(seen))
+
+
+def _many(count: int, total: int, seen: Observation, limits: Limits) -> Level:
+    period_s = 1 / seen.nominal_hz if seen.nominal_hz else seen.seconds / max(total, 1)
+    many = count > limits.lost_error * total and count * period_s >= limits.lost_error_s
+    return Level.TROUBLE if many else Level.LOOK
+
+
+def _percent(part: int, total: int) -> str:
+    percent = 100 * part / total
+    return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
+
+
+def _arrival(seen: Observation, limits: Limits) -> Iterator[Finding]:
+    """How the samples arrive, of a stream that is not silent."""
+    yield from _rate(seen, limits)
+    if seen.invalid >= limits.lost_warn:
+        total = seen.samples + seen.invalid
+        frames = "1 frame was" if seen.invalid == 1 else f"{seen.invalid} frames were"
+        found = f"{frames} invalid, the sensor did not answer the bus"
+        level = _many(seen.invalid, total, seen, limits)
+        yield Finding(level, About.STREAM, "invalid", found, _advice(seen), seen.invalid)
+    if seen.repeated >= limits.lost_warn:
+        frames = "1 frame was" if seen.repeated == 1 else f"{seen.repeated} frames were"
+        found = f"{frames} repeated, the sensor had nothing new"
+        yield _look("repeated", found, "If it goes on, power-cycle it", size=seen.repeated)
+    if seen.age_p99_us is not None and seen.age_p99_us >= limits.age_warn * 1e6:
+        make = _trouble if seen.age_p99_us >= limits.age_error * 1e6 else _look
+        found = f"Samples are {seen.age_p99_us / 1000:.1f} ms old on arrival (p99)"
+        remedy = "This machine, or the program that reads, is busy"
+        yield make("age", found, remedy, size=seen.age_p99_us)
+
+
+def _rate(seen: Observation, limits: Limits) -> Iterator[Finding]:
+    rate, nominal = seen.rate_hz, seen.nominal_hz
+    if rate is None or not nominal:
+        return
+    # One sample more or less at either end of a short observation is no deviation.
+    slack = 2.0 / seen.seconds if seen.seconds > 0 else 2.0
+    without = seen.lost + seen.invalid + seen.repeated  # periods without a sample that have a finding already
+    with_lost = min(rate * (1 + without / max(seen.samples, 1)), nominal) if rate < nominal else rate
+    off = max(abs(with_lost - nominal) - slack, 0.0) / nominal
+    if off > limits.rate_tolerance:
+        make = _trouble if off > limits.rate_error else _look
+        found = f"{rate:.0f} samples a second instead of {nominal:g}"
+        yield make("rate", found, "The filters in effect are not those of the settings: set them again")
+
+
+def _circumstances(seen: Observation) -> Iterator[Finding]:
+    if seen.emergency:
+        yield _look("emergency", seen.emergency, "If it comes again, contact support", About.SENSOR)
+    if seen.settings.get("coordinate_system") is True:
+        yield _look(
+            "coordinate_system",
+            "settings.coordinate_system is on, force and torque are in a frame configured in the sensor",
+            "Switch it off, or correct the URDF",
+            About.SENSOR,
+        )
+    if seen.locked is False:
+        found = "The server does not follow the sensor's clock (yet), stamps are less exact"
+        yield _look("clock", found, "If it goes on, the machine is too busy", About.CLOCK)
+    if seen.reconnects:
+        found = "The connection to the server was interrupted"
+        yield _look("reconnects", found, "If it happens again, see the server's log", About.LINK)
+
+
+def emergency(row: object, limits: Limits = LIMITS) -> str:
+    """In words, the `emergency` in a reply to `status`; empty if there is none, or none that matters now."""
+    last: Mapping[str, object] = row if isinstance(row, dict) else {}
+    code, ago_s = whole(last.get("code")), number(last.get("ago_s"))
+    if code is None or not code & _ERROR_CLASS or ago_s is None or not 0 <= ago_s < limits.emergency_s:
+        return ""
+    return f"Emergency 0x{code:04X} ({printable(last.get('text'), 80)})"

@@ -1,0 +1,27 @@
+"""Starts a program: Ctrl-C is never a traceback, whatever is being imported, and output never fails.
+
+Few imports, for Python's own handler raises KeyboardInterrupt in the middle of them. While a program loads,
+SIGINT and SIGTERM have their default action; what raises KeyboardInterrupt is installed when all is loaded.
+"""
+
+import signal
+
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # as early as can be: this is imported by entry points only
+
+from importlib import import_module  # noqa: E402
+
+from bota_ethercat.program.output import never_fail  # noqa: E402
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
+def run(module: str) -> int:
+    """The exit code of `main` of this module, which handles Ctrl-C itself once it can."""
+    never_fail()
+    try:
+        code: int = import_module(module).main()
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    return code

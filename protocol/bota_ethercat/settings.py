@@ -1,0 +1,161 @@
+"""The sensor's settings by name: type, allowed values, start-up default, meaning.
+
+One table for the command line, the configuration file, the control channel and the ROS parameters. Their
+objects are in `ethercat_server.sensor.objects.dictionary`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from bota_ethercat.errors import SettingError
+from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS
+from bota_ethercat.text.did_you_mean import did_you_mean
+
+SettingValue = bool | int
+
+
+class Setting(NamedTuple):
+    """One setting. `choices` are its allowed values, None for bool."""
+
+    name: str
+    default: SettingValue | None
+    """What the server writes at start-up unless configured otherwise; None = not written."""
+    choices: range | tuple[int, ...] | None
+    meaning: str
+    preop_only: bool
+    """Can be written in PREOP only."""
+
+    @property
+    def is_bool(self) -> bool:
+        """Whether the setting is on or off."""
+        return self.choices is None
+
+    def check(self, value: object) -> SettingValue:
+        """Return `value` if it is allowed, else raise SettingError with the choices."""
+        if self.is_bool:
+            if isinstance(value, bool):
+                return value
+            raise SettingError(f"{self.name} is {value!r}: it must be true or false")
+        if isinstance(value, bool) or not isinstance(value, int) or value not in (self.choices or ()):
+            raise SettingError(f"{self.name} is {value!r}: it must be {self._choices_text()}")
+        return value
+
+    def parse(self, text: str) -> SettingValue:
+        """The value of `text` from a command line; SettingError if it is not allowed."""
+        if self.is_bool:
+            word = text.strip().lower()
+            if word in {"true", "yes", "on", "1"}:
+                return True
+            if word in {"false", "no", "off", "0"}:
+                return False
+            raise SettingError(f"{self.name} is {text!r}: it must be true or false")
+        try:
+            return self.check(int(text, 0))
+        except ValueError:
+            raise SettingError(f"{self.name} is {text!r}: it must be {self._choices_text()}") from None
+
+    def _choices_text(self) -> str:
+        if isinstance(self.choices, range):
+            return f"a whole number from {self.choices[0]} to {self.choices[-1]}"
+        return "one of " + ", ".join(str(choice) for choice in self.choices or ())
+
+
+SETTINGS: Final[Mapping[str, Setting]] = {
+    row.name: row
+    for row in (
+        Setting("calibration_matrix", True, None, "force and torque in N and Nm, not raw counts", False),
+        Setting("temperature_compensation", False, None, "correct the force/torque for temperature", False),
+        Setting("imu_active", 1, range(0, 4), "IMU: 0 none, 1 internal, 2 external, 3 both", False),
+        Setting("coordinate_system", None, None, "use the configured coordinate system", False),
+        Setting(
+            "inertia_compensation", None, None, "the sensor's own inertia and gravity compensation", False
+        ),
+        Setting("orientation_estimation", None, None, "the sensor estimates its orientation", False),
+        Setting("acceleration_range_g", 2, (2, 4, 8, 16), "accelerometer full scale, g", True),
+        Setting("angular_rate_range_dps", 250, (250, 500, 1000, 2000), "gyroscope full scale, °/s", True),
+        Setting("acceleration_filter", 1, range(1, 9), "accelerometer filter profile", True),
+        Setting("angular_rate_filter", 3, range(3, 10), "gyroscope filter profile", True),
+        # The sensor accepts more lengths than its manual lists; which ones depends on the other filters.
+        Setting(
+            "sinc_length", 64, range(32, 2049), "SINC filter length; sampling rate = 51200 / length", True
+        ),
+        Setting("fir", False, None, "FIR filter: lower cut-off, more delay", True),
+        Setting("fast", False, None, "FAST filter: switches the FIR filter off on steps; needs fir", True),
+        Setting("chop", False, None, "CHOP filter: less drift, unpredictable latency", True),
+    )
+}
+
+BASE_SAMPLING_RATE_HZ: Final = 51200
+"""The ADC's rate: sampling rate = 51200 / SINC length."""
+
+_MOST_DIVIDED: Final = 8
+"""By how much CHOP may divide the sampling rate; no source says whether it does, so object 0x8011 decides."""
+
+PUBLISHED_RATES_HZ: Final[Mapping[int, int]] = {
+    length: row.rate_hz for length, row in FORCE_TORQUE_FILTERS.items()
+}
+"""Rate in object 0x8011 by SINC length, for the lengths of the manual (51 is rounded down, 205 up)."""
+
+
+def sampling_rate_hz(sinc_length: int) -> int:
+    """The rate in whole Hz that object 0x8011 gives for a SINC length."""
+    return PUBLISHED_RATES_HZ.get(sinc_length, round(BASE_SAMPLING_RATE_HZ / sinc_length))
+
+
+def rate_divisor(sinc_length: int, rate_hz: int, chop: SettingValue | None = False) -> int | None:
+    """By what the rate of a SINC length is divided if object 0x8011 gives `rate_hz`: 1, or with CHOP up to 8.
+
+    None if the length does not explain the rate. The object rounds up or down to whole Hz.
+    """
+    if sinc_length <= 0:
+        return None
+    nominal = BASE_SAMPLING_RATE_HZ / sinc_length
+    nearest = min(range(1, _MOST_DIVIDED + 1 if chop else 2), key=lambda by: abs(rate_hz - nominal / by))
+    return nearest if abs(rate_hz - nominal / nearest) < 1.0 else None
+
+
+def sinc_length_of(
+    read: int | None,
+    rate_hz: int | None,
+    chop: SettingValue | None = False,
+    asked: SettingValue | None = None,
+) -> int | None:
+    """The SINC length in force, from what object 0x8006:1 reads and the sampling rate in 0x8011.
+
+    The rate decides: real devices read back 768 after 128, and 2048 at 150 Hz. Of several lengths with this
+    rate it is the one read, else the one `asked` for, else the manual's.
+    """
+    if not rate_hz:
+        return read
+    allowed = SETTINGS["sinc_length"].choices or ()
+    for length in (read, asked):
+        if length is not None and length in allowed and rate_divisor(length, rate_hz, chop):
+            return length
+    published = [length for length, published in PUBLISHED_RATES_HZ.items() if published == rate_hz]
+    return published[0] if published else min(round(BASE_SAMPLING_RATE_HZ / rate_hz), allowed[-1])
+
+
+def check_settings(values: Mapping[str, object]) -> dict[str, SettingValue]:
+    """Return `values` if every name exists and every value is allowed; else raise SettingError."""
+    checked: dict[str, SettingValue] = {}
+    for name, value in values.items():
+        setting = SETTINGS.get(name)
+        if setting is None:
+            raise SettingError(
+                f"no setting {name!r}: the settings are {', '.join(SETTINGS)}{did_you_mean(name, SETTINGS)}"
+            )
+        checked[name] = setting.check(value)
+    return checked
+
+
+def check_combination(values: Mapping[str, SettingValue]) -> None:
+    """Raise SettingError if settings that are each allowed contradict one another."""
+    if values.get("fast") and values.get("fir") is False:
+        raise SettingError("fast is true but fir is false: the FAST filter works only with the FIR filter on")
+
+
+def start_up_defaults() -> dict[str, SettingValue]:
+    """The settings that the server writes at start-up unless configured otherwise."""
+    return {row.name: row.default for row in SETTINGS.values() if row.default is not None}
