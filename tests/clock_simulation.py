@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 from ethercat_server.acquisition.clock import SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.slave_clock import EventTimes
-from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
+from ethercat_server.ethercat.exchange import DistributedClock, Latched
 
 SECOND: Final = 1e9
 _SEND_NS: Final = 8_000.0

@@ -19,8 +19,7 @@ from concurrent.futures import Future
 from bota_ethercat.control import Event, event
 from bota_ethercat.settings import SettingValue
 from ethercat_server.acquisition.stream import Made
-from ethercat_server.serving.transport.base import Transport
-from ethercat_server.serving.transport.sockets import SocketTransport
+from ethercat_server.serving.transport import SocketTransport, Transport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 from ethercat_server.virtual_sensor import bus as virtual

@@ -34,8 +34,8 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.sensor import Identity
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.transport.base import Transport
-from ethercat_server.serving.transport.in_memory import InMemoryStream, InMemoryTransport
+from ethercat_server.serving.in_memory import InMemoryStream, InMemoryTransport
+from ethercat_server.serving.transport import Transport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.measurement.signals import ClockReading, decode_clock

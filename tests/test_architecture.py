@@ -76,7 +76,7 @@ ROOMS: Final[dict[str, set[str]]] = {
 """A room, and the rooms it may import. A room without a line of its own belongs to the one above it."""
 
 PACKAGES: Final[dict[str, set[str]]] = {
-    "pysoem": {f"{S}.ethercat.master.soem"},
+    "pysoem": {f"{S}.ethercat.soem"},
     "pyroute2": {S},
     "numpy": {"ft_compensation", "bridge", "bota_clients"},
     "matplotlib": {"bota_clients.report"},

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from ethercat_server.access.holder import Holder, find_holder
-from ethercat_server.ethercat.nic.interface import Routes, find_routes
+from ethercat_server.ethercat.nic import Routes, find_routes
 from ethercat_server.process.signals import signals_held_back
 
 _IFF_UP, _IFF_LOOPBACK, _IFF_PROMISC = 0x1, 0x8, 0x100

@@ -17,7 +17,7 @@ from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.errors import ProtocolError
 from bota_ethercat.program.server_choice import default_server
-from ethercat_server.ethercat.nic.packet_sockets import master_sockets, table, users_of
+from ethercat_server.ethercat.nic import master_sockets, table, users_of
 
 _LISTEN: Final = 0x0A
 

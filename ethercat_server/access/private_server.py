@@ -23,7 +23,7 @@ from ethercat_server.errors import BusError
 from ethercat_server.process import realtime
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.transport.sockets import SocketStream, SocketTransport
+from ethercat_server.serving.transport import SocketStream, SocketTransport
 
 STOPPED: Final = BusError("stopped before it was done")
 _ENDED: Final = "it has ended"

@@ -14,7 +14,7 @@ from typing import Final
 
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.slave_clock import EventTimes
-from ethercat_server.ethercat.exchange.distributed_clock import Latched
+from ethercat_server.ethercat.exchange import Latched
 
 # The estimate
 _ROOT_2_PI: Final = math.sqrt(2 * math.pi)

@@ -13,14 +13,13 @@ from itertools import cycle
 from typing import Any, Final, Protocol
 
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.health.round_trip import RoundTripHealth
+from ethercat_server.acquisition.health import RoundTripHealth
 from ethercat_server.acquisition.histogram import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import Made, SensorStream
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.exchange.distributed_clock import LATCHED
-from ethercat_server.ethercat.exchange.process_data import DUPLICATE, Exchange
+from ethercat_server.ethercat.exchange import DUPLICATE, LATCHED, Exchange
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
 # Sockets are served this often even if every deadline has passed,

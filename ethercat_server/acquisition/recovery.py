@@ -13,14 +13,13 @@ from typing import Final, NamedTuple
 from bota_ethercat.control import Event, event
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.acquisition.health.causes import Causes
-from ethercat_server.acquisition.health.mailboxes import Mailboxes
+from ethercat_server.acquisition.health import Causes, Mailboxes
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError, extended
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.datagrams import ByPosition
-from ethercat_server.ethercat.nic.interface import CHECK_CABLE
+from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import STATE_S, AlState, AlStatus
 from ethercat_server.ethercat.slave.coe import Steps

@@ -14,7 +14,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
-from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
+from ethercat_server.ethercat.exchange import DistributedClock, Latched
 
 # The local clock
 # Local times are given modulo this, in ns: 4.3 s.

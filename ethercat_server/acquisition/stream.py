@@ -15,13 +15,12 @@ from bota_ethercat.framing import DataFlag, encode_data
 from bota_ethercat.pdo import is_finite
 from ethercat_server.acquisition.clock import SILENT_PERIODS, SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.health.samples import SampleHealth
+from ethercat_server.acquisition.health import SampleHealth
 from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.slave_clock import EventTimes
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, RealtimeOffset
-from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, Latched
-from ethercat_server.ethercat.exchange.process_data import DUPLICATE, Exchange
+from ethercat_server.ethercat.exchange import DUPLICATE, DistributedClock, Exchange, Latched
 from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.sensor.sensor import Sensor
 

@@ -27,7 +27,7 @@ from bota_ethercat.settings import (
 from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server import __version__
 from ethercat_server.errors import UsageError
-from ethercat_server.ethercat.nic.interface import ALLOW_IP, ALLOW_IP_HELP
+from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import realtime
 
 DEFAULTS: Final = "defaults"

@@ -17,7 +17,7 @@ from ethercat_server.process.privileges import User, become, user_to_become
 from ethercat_server.process.signals import Signals
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.transport.sockets import SocketTransport
+from ethercat_server.serving.transport import SocketTransport
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 
 log = logging.getLogger(__name__)

@@ -27,7 +27,7 @@ from bota_ethercat.text.untrusted import number
 from ethercat_server.access.adapters import promiscuity_kept
 from ethercat_server.access.holder import Holder, find_holder
 from ethercat_server.access.sensors import Sensors
-from ethercat_server.acquisition.health.round_trip import SLOW_US, cost
+from ethercat_server.acquisition.health import SLOW_US, cost
 from ethercat_server.doctor.finding import (
     CannotLookError,
     Finding,
@@ -42,7 +42,7 @@ from ethercat_server.doctor.machine import Machine, read_counters
 from ethercat_server.doctor.machine_checks import examine, rising
 from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.nic.interface import network_trouble
+from ethercat_server.ethercat.nic import network_trouble
 from ethercat_server.ethercat.open_bus import open_bus
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
 from ethercat_server.ethercat.slave.registers import (

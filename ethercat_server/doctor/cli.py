@@ -15,8 +15,7 @@ from bota_ethercat.program.completion import add_completion
 from ethercat_server import __version__
 from ethercat_server.daemon.options import SERVER_SETTINGS, VIRTUAL_INTERFACE
 from ethercat_server.errors import ServerError, UsageError
-from ethercat_server.ethercat.nic.claim import MAX_NAME_LENGTH
-from ethercat_server.ethercat.nic.interface import ALLOW_IP, ALLOW_IP_HELP
+from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP, MAX_NAME_LENGTH
 from ethercat_server.process import command_line
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from typing import Any, Final
 
 from ethercat_server.access.adapters import is_local, kind, open_routes
 from ethercat_server.doctor.finding import cannot_look
-from ethercat_server.ethercat.nic.interface import Routes, find_routes
+from ethercat_server.ethercat.nic import Routes, find_routes
 
 _IFF_UP, _IFF_LOOPBACK = 0x1, 0x8
 _NO_SUPPORT: Final = "the driver does not support it"

@@ -27,8 +27,7 @@ from ethercat_server.doctor.finding import (
 )
 from ethercat_server.doctor.machine import Link, Machine, as_list, known, processor_list
 from ethercat_server.errors import ServerError
-from ethercat_server.ethercat.nic.interface import ALLOW_IP, network_trouble
-from ethercat_server.ethercat.nic.packet_sockets import Listener, packet_sockets
+from ethercat_server.ethercat.nic import ALLOW_IP, Listener, network_trouble, packet_sockets
 
 _SWITCH: Final = "/sys/kernel/debug/sched/preempt"
 _MOUNT: Final = "sudo mount -t debugfs none /sys/kernel/debug"

@@ -8,18 +8,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from ethercat_server.ethercat import mapping
 from ethercat_server.ethercat.backend import Backend, CheckInterrupt, Master
 from ethercat_server.ethercat.datagrams import Datagrams
-from ethercat_server.ethercat.exchange.distributed_clock import DistributedClock, read_clock
-from ethercat_server.ethercat.exchange.frames import fit_a_frame
-from ethercat_server.ethercat.exchange.process_data import ProcessData
-from ethercat_server.ethercat.master import mapping
+from ethercat_server.ethercat.exchange import DistributedClock, ProcessData, fit_a_frame, read_clock
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import Steps, finish
 from ethercat_server.ethercat.slave.controller import SlaveController
 from ethercat_server.ethercat.slave.emergencies import Emergencies
-from ethercat_server.ethercat.slave.sii_content import Sii
+from ethercat_server.ethercat.slave.sii import Sii
 
 _MOST_EMERGENCIES: Final = 16
 _PAUSE_S: Final = 0.001

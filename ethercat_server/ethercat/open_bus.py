@@ -6,8 +6,8 @@ import contextlib
 from collections.abc import Iterator
 
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.master.soem import SoemBackend
-from ethercat_server.ethercat.nic.claim import claimed
+from ethercat_server.ethercat.nic import claimed
+from ethercat_server.ethercat.soem import SoemBackend
 
 
 @contextlib.contextmanager

@@ -19,7 +19,7 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.datagrams import ByPosition
 from ethercat_server.ethercat.slave import registers as reg
-from ethercat_server.ethercat.slave import sii_content
+from ethercat_server.ethercat.slave import sii
 from ethercat_server.ethercat.slave.al import STATE_S, AlState, AlStatus
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import read_sii
@@ -56,7 +56,7 @@ class Slave(NamedTuple):
 
     position: int
     status: AlStatus
-    sii: sii_content.Sii | None  # None if it was not read
+    sii: sii.Sii | None  # None if it was not read
     problem: str = ""  # why its SII cannot be read
     at_work: bool = False  # it is no Bota sensor and in SAFEOP, OP or BOOT
 
@@ -134,7 +134,7 @@ def look_at(bus: Bus, position: int) -> Slave:
 def with_sii(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt = lambda: None) -> Slave:
     """The same slave with its SII; access to the SII returns to its owner afterwards."""
     try:
-        content = sii_content.decode(read_image(bus, slave.position, check_interrupt))
+        content = sii.decode(read_image(bus, slave.position, check_interrupt))
     except BusError as error:
         return slave._replace(problem=str(error))
     if not content["vendor"] and not content["product"]:
@@ -151,7 +151,7 @@ def read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda
         steps = read_sii(registers, position, word, words, owner)
         return finish(steps, pause_s=_SII_PAUSE_S, clock=bus.clock, check_interrupt=check_interrupt)
 
-    return sii_content.read_image(read)
+    return sii.read_image(read)
 
 
 class OtherSlaves:

@@ -27,7 +27,7 @@ from bota_ethercat.framing import DATA_FLAGS_OFFSET, DataFlag, FrameDecoder, enc
 from bota_ethercat.text.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import Made
-from ethercat_server.serving.transport.base import Stream
+from ethercat_server.serving.transport import Stream
 
 MAX_REQUEST_LENGTH: Final = 4096
 MAX_QUEUED_DATA: Final = 256

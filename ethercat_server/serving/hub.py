@@ -21,7 +21,7 @@ from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import Made
 from ethercat_server.serving.connection import Connection, Limits, State, Unreadable, Watched
 from ethercat_server.serving.permissions import Permissions
-from ethercat_server.serving.transport.base import Transport
+from ethercat_server.serving.transport import Transport
 
 # Clients get at most a tenth of this thread's time, however much they ask.
 _PAUSE_RATIO: Final = 9

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import heapq
 
-from ethercat_server.ethercat.nic.interface import CHECK_CABLE
+from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
 from ethercat_server.virtual_sensor import bus as virtual

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.program.server_choice import HELP
 from bota_ethercat.text.json_text import finite
 from ethercat_server.access.sensors import Sensors, open_sensors
-from ethercat_server.ethercat.nic.interface import ALLOW_IP, ALLOW_IP_HELP
+from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.sensor.sensor import Found
 
 

@@ -14,7 +14,7 @@ from bota_ethercat.program.completion import add_completion
 from bota_ethercat.settings import SETTINGS
 from ethercat_server import __version__
 from ethercat_server.errors import InterfaceError
-from ethercat_server.ethercat.nic.interface import look_up
+from ethercat_server.ethercat.nic import look_up
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor import link
 from ethercat_server.virtual_sensor.control import ControlError

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from typing import Final, TextIO
 
-from ethercat_server.ethercat.nic.interface import look_up
+from ethercat_server.ethercat.nic import look_up
 from ethercat_server.ethercat.raw_socket import arrived_ns
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus

@@ -22,7 +22,7 @@ from bota_ethercat.settings import sampling_rate_hz, start_up_defaults
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.ethercat.clock import Clock
-from ethercat_server.ethercat.exchange.process_data import Exchange
+from ethercat_server.ethercat.exchange import Exchange
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults.table import obey
 from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions

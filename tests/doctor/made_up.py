@@ -17,7 +17,7 @@ from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.finding import Finding
 from ethercat_server.doctor.machine import InterfaceFacts, Link, Machine
 from ethercat_server.doctor.machine_checks import CHECKS
-from ethercat_server.ethercat.nic.interface import Routes
+from ethercat_server.ethercat.nic import Routes
 
 CPUS = "/sys/devices/system/cpu"
 CARD = Link(index=7, parent="0000:00:1f.6", counters={"rx_packets": 100}, carrier_changes=2)

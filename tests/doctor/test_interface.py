@@ -12,7 +12,7 @@ from ethercat_server.doctor import machine_checks
 from ethercat_server.doctor.finding import CannotLookError
 from ethercat_server.doctor.machine import InterfaceFacts
 from ethercat_server.doctor.machine_checks import examine_machine
-from ethercat_server.ethercat.nic.interface import Routes
+from ethercat_server.ethercat.nic import Routes
 from tests.doctor.made_up import CPUS, but, machine, only
 
 NAMED = "ens5"

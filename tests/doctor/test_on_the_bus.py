@@ -11,7 +11,7 @@ import pytest
 from bota_ethercat.health.verdict import Level
 from ethercat_server.access.holder import Holder
 from ethercat_server.doctor import bus_checks
-from ethercat_server.ethercat.nic.interface import Routes
+from ethercat_server.ethercat.nic import Routes
 from tests.doctor.made_up import but
 from tests.doctor.running import examined
 from tests.simulated_links import registers, simulated_bus, simulated_server

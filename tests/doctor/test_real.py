@@ -17,7 +17,7 @@ import pytest
 
 from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.machine import Link, collect
-from ethercat_server.ethercat.nic.interface import Routes
+from ethercat_server.ethercat.nic import Routes
 from tests.doctor.running import ATTEMPTS, MODULE, STARVED, doctor, doctor_here, doctor_of_nobody, levels
 from tests.server import readable
 from tests.server.as_another_user import NOBODY

@@ -9,7 +9,7 @@ from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data, encode
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.serving.connection import Connection, Subscription
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.transport.in_memory import InMemoryStream, InMemoryTransport, ManualClock
+from ethercat_server.serving.in_memory import InMemoryStream, InMemoryTransport, ManualClock
 
 TURN_NS = 1_250_000
 """Time between two deadlines: the acquisition loop's at 800 Hz."""

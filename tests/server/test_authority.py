@@ -16,7 +16,7 @@ import pytest
 
 from ethercat_server.errors import UsageError
 from ethercat_server.serving.permissions import controlling_uids
-from ethercat_server.serving.transport.peer_uid import open_diagnostics, peer_uid
+from ethercat_server.serving.transport import open_diagnostics, peer_uid
 from tests.server.as_another_user import NO_OTHER_USER
 
 NOBODY = pwd.getpwnam("nobody")

@@ -11,8 +11,8 @@ from bota_ethercat.pdo import LAYOUTS
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.exchange.process_data import DUPLICATE, FIRST_INDEX
-from ethercat_server.ethercat.exchange.process_data import Exchange as Taken
+from ethercat_server.ethercat.exchange import DUPLICATE, FIRST_INDEX
+from ethercat_server.ethercat.exchange import Exchange as Taken
 from ethercat_server.ethercat.late_answers import LateAnswers
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build, parse, working_counter
 from ethercat_server.simulation.backend import MemoryBackend

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ethercat_server.serving.connection import TRANSITIONS, Connection, State
-from ethercat_server.serving.transport.in_memory import InMemoryTransport, ManualClock
+from ethercat_server.serving.in_memory import InMemoryTransport, ManualClock
 
 
 def test_the_table_has_a_row_for_every_state() -> None:

@@ -14,8 +14,7 @@ import pytest
 
 from bota_ethercat.framing import DataFlag
 from ethercat_server.errors import SetUpError
-from ethercat_server.ethercat.exchange.distributed_clock import LATCHED, latched_datagrams
-from ethercat_server.ethercat.exchange.frames import Area, fit_a_frame, make_frames
+from ethercat_server.ethercat.exchange import LATCHED, Area, fit_a_frame, latched_datagrams, make_frames
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import Command, Datagram, parse
 from ethercat_server.simulation.machine import Machine

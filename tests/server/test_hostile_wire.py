@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from bota_ethercat.framing import DataFlag
-from ethercat_server.ethercat.exchange.process_data import FIRST_INDEX
+from ethercat_server.ethercat.exchange import FIRST_INDEX
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, parse
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions

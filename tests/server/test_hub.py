@@ -21,7 +21,7 @@ from ethercat_server.serving.connection import (
     State,
     Subscription,
 )
-from ethercat_server.serving.transport.in_memory import InMemoryStream
+from ethercat_server.serving.in_memory import InMemoryStream
 from tests.server.served import TURN_NS, Served
 
 DESCRIBE = encode_json({"action": "describe"})

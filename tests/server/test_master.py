@@ -12,13 +12,13 @@ import pytest
 
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.errors import BusError, StopRequestedError
+from ethercat_server.ethercat import soem
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.master import soem
-from ethercat_server.ethercat.master.soem import SoemBackend
-from ethercat_server.ethercat.nic.claim import claimed
+from ethercat_server.ethercat.nic import claimed
 from ethercat_server.ethercat.raw_socket import packet_sockets
-from ethercat_server.ethercat.slave.sii_content import decode
+from ethercat_server.ethercat.slave.sii import decode
+from ethercat_server.ethercat.soem import SoemBackend
 from ethercat_server.sensor.sensor import Sensor
 from tests.server.commands import command, stats
 from tests.server.running import (

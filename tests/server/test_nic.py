@@ -17,9 +17,8 @@ import pytest
 
 from ethercat_server.daemon.server import serve
 from ethercat_server.errors import InterfaceError
-from ethercat_server.ethercat.nic import lock
-from ethercat_server.ethercat.nic.claim import claimed
-from ethercat_server.ethercat.nic.interface import Routes, look_up, network_trouble, why_silent
+from ethercat_server.ethercat import nic
+from ethercat_server.ethercat.nic import Routes, claimed, look_up, network_trouble, why_silent
 from ethercat_server.process.signals import Signals
 from tests.doctor.running import doctor_here
 from tests.server import readable
@@ -31,7 +30,7 @@ pytestmark = [pytest.mark.bus, needs_bus]
 AS_NOBODY = pytest.mark.skipif(NO_OTHER_USER is not None, reason=NO_OTHER_USER or "")
 CLAIM = """
 import sys
-from ethercat_server.ethercat.nic.claim import claimed
+from ethercat_server.ethercat.nic import claimed
 with claimed(sys.argv[1]):
     print("claimed", flush=True)
     sys.stdin.read()
@@ -48,7 +47,7 @@ def veth() -> Iterator[Veth]:
 def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """In place of the one in /run."""
     found = tmp_path / "ethercat-server"
-    monkeypatch.setattr(lock, "DIRECTORY", found)
+    monkeypatch.setattr(nic, "DIRECTORY", found)
     return found
 
 
@@ -111,7 +110,7 @@ exec "$@"
 REFUSE = """
 import sys
 from ethercat_server.errors import InterfaceError
-from ethercat_server.ethercat.nic.claim import claimed
+from ethercat_server.ethercat.nic import claimed
 try:
     with claimed("near0"):
         pass
@@ -219,7 +218,7 @@ def test_the_process_that_has_the_interface_is_named_until_it_ends_in_any_way(ve
     with another(veth.near) as process:
         name = Path(f"/proc/{process.pid}/comm").read_text().strip()
         expected = f"{veth.near} is in use by another EtherCAT master, process {process.pid} ({name}): stop"
-        if os.access(lock.DIRECTORY, os.W_OK):
+        if os.access(nic.DIRECTORY, os.W_OK):
             assert refusal(veth.near).startswith(expected)
             with claimed(veth.far):
                 pass
@@ -235,7 +234,7 @@ def test_another_user_can_take_neither_the_lock_nor_its_file(
 ) -> None:
     """As it could an abstract socket."""
     directory = readable.temporary() / "ethercat-server"
-    monkeypatch.setattr(lock, "DIRECTORY", directory)
+    monkeypatch.setattr(nic, "DIRECTORY", directory)
     with claimed(veth.near):
         pass
     taking = f"""
@@ -286,7 +285,7 @@ def test_a_file_that_may_be_anothers_is_not_touched(veth: Veth, directory: Path,
     else:
         directory.chmod(0o777)
     with claimed(veth.near), pytest.raises(OSError):  # noqa: PT011 - any
-        lock._open(lock.DIRECTORY)
+        nic._open(nic.DIRECTORY)
     assert (victim.stat().st_uid, victim.stat().st_mode) == (before.st_uid, before.st_mode)
 
 
@@ -294,7 +293,7 @@ def test_without_run_it_is_a_name_in_the_network_namespace(
     veth: Veth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As for the root of a user namespace."""
-    monkeypatch.setattr(lock, "DIRECTORY", Path("/proc/ethercat-server"))
+    monkeypatch.setattr(nic, "DIRECTORY", Path("/proc/ethercat-server"))
     for _ in range(2):
         with claimed(veth.near), pytest.raises(InterfaceError, match="in use"), claimed(veth.near):
             pass

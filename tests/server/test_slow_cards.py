@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import pytest
 
 from bota_ethercat.framing import DataMessage
-from ethercat_server.acquisition.health import round_trip
+from ethercat_server.acquisition import health
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import Simulation, check_frames, fresh, more_if_long, reading
@@ -59,7 +59,7 @@ CARDS = [
 def test_a_slow_card_costs_age_and_no_sample(
     sinc_length: int, milliseconds: float, jitter_us: float, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.INFO, logger=round_trip.__name__)
+    caplog.set_level(logging.INFO, logger=health.__name__)
     running = run(card(milliseconds, jitter_us), sinc_length)
     assert running.events == []
     check_frames(running.frames)
@@ -77,8 +77,7 @@ def test_a_slow_card_costs_age_and_no_sample(
     )
     best_us = 1000 * milliseconds / 2
     assert ages_us[len(ages_us) // 2] <= best_us + 1000 * milliseconds / 2 + 10
-    (message,) = caplog.messages
-    assert message.startswith("frames take ")
+    (message,) = [each for each in caplog.messages if each.startswith("frames take ")]
     assert "older than through a PCIe network card" in message
     assert status["round_trip"]["usual_us"] == pytest.approx(1000 * milliseconds + jitter_us / 2, rel=0.1)
 

@@ -6,7 +6,7 @@ from bota_ethercat.framing import DataMessage, FrameDecoder
 from ethercat_server.acquisition.clock import SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.stream import DISCARDED_AT_START, GAP, INVALID, REPEATED, SensorStream
-from ethercat_server.ethercat.exchange.process_data import Exchange
+from ethercat_server.ethercat.exchange import Exchange
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 
 PERIOD_NS = 1_250_000

@@ -20,10 +20,9 @@ from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.serving.connection import Connection, Subscription
 from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.in_memory import InMemoryTransport, ManualClock
 from ethercat_server.serving.permissions import controlling_uids
-from ethercat_server.serving.transport.base import Stream, Transport
-from ethercat_server.serving.transport.in_memory import InMemoryTransport, ManualClock
-from ethercat_server.serving.transport.sockets import SocketTransport
+from ethercat_server.serving.transport import SocketTransport, Stream, Transport
 from tests.server.running import free_port
 
 PATIENCE_S = 20.0

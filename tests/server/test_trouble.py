@@ -19,10 +19,9 @@ from ethercat_server.acquisition.start_up import Wanted, bring_up
 from ethercat_server.daemon.cli import main
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.errors import ServerError, SetUpError, StopRequestedError
+from ethercat_server.ethercat import mapping, nic
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.master import mapping
-from ethercat_server.ethercat.nic import claim
 from ethercat_server.ethercat.slave.controller import SlaveController
 from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE, SYNC_MANAGER, pack_sync_manager
 from ethercat_server.process import realtime
@@ -113,7 +112,7 @@ def test_interfaces_without_a_sensor(
             unprepared.setattr(realtime, "prepare", lambda *_, **__: None)
             said = fails(caplog, veth.near, "PORT", "--user", "root")
         assert "no EtherCAT slave answers" in said
-        monkeypatch.setattr(claim, "_CARRIER_TIMEOUT_S", 0.1)
+        monkeypatch.setattr(nic, "_CARRIER_TIMEOUT_S", 0.1)
         veth.ip("link", "set", veth.near, "down")
         assert f"{veth.near} is down: bring it up" in fails(caplog, veth.near, "PORT")
         veth.ip("link", "set", veth.far, "down")

@@ -12,7 +12,7 @@ import pytest
 from bota_ethercat.settings import check_settings, start_up_defaults
 from bridge.parameters.table import PARAMETERS
 from ethercat_server.daemon.options import EMPTY, SERVER_SETTINGS, parse_options, read_config
-from ethercat_server.ethercat.nic import lock
+from ethercat_server.ethercat import nic
 from ethercat_server.process import realtime
 from tests.systemd.staging import (
     BRIDGE_UNIT,
@@ -65,7 +65,7 @@ def test_little_is_exposed(unit: Path) -> None:
         (SERVER_UNIT, "RestrictRealtime", []),
         (SERVER_UNIT, "LimitRTPRIO", ["99"]),
         (SERVER_UNIT, "LimitMEMLOCK", ["infinity"]),
-        (SERVER_UNIT, "RuntimeDirectory", [lock.DIRECTORY.relative_to("/run").name]),
+        (SERVER_UNIT, "RuntimeDirectory", [nic.DIRECTORY.relative_to("/run").name]),
         (SERVER_UNIT, "RuntimeDirectoryPreserve", ["yes"]),  # other instances use it
         (SERVER_UNIT, "Restart", ["on-failure"]),
         (BRIDGE_UNIT, "AmbientCapabilities", []),

@@ -13,7 +13,7 @@ from ethercat_server.access.adapters import Adapter
 from ethercat_server.access.holder import Holder
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.nic.interface import Routes
+from ethercat_server.ethercat.nic import Routes
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.tool.commands import find
 from tests.json_schema import problems

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bota_ethercat.control import MAX_SII_WORDS
-from ethercat_server.ethercat.slave.sii_content import decode, raw_lines, read_image
+from ethercat_server.ethercat.slave.sii import decode, raw_lines, read_image
 from ethercat_server.virtual_sensor.firmware.layout import sensor_device
 from ethercat_server.virtual_sensor.slave.image import build_image
 

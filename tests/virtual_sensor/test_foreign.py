@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.slave import sii_content
+from ethercat_server.ethercat.slave import sii
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.wire import Command
@@ -107,7 +107,7 @@ def test_a_chain_need_not_have_a_sensor() -> None:
 def test_the_eeprom_says_what_it_is(kind: str) -> None:
     life = foreign(master_of(kind)).life
     assert life is not None
-    found = sii_content.decode(life.esc.sii.image)
+    found = sii.decode(life.esc.sii.image)
     device = KINDS[kind]
     assert (found["vendor"], found["product"], found["name"]) == (device.vendor, device.product, kind)
     assert found["check_byte_right"]

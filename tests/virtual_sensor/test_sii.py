@@ -5,7 +5,7 @@ import struct
 import pytest
 
 from bota_ethercat.pdo import LAYOUTS
-from ethercat_server.ethercat.slave.sii_content import checksum
+from ethercat_server.ethercat.slave.sii import checksum
 from ethercat_server.virtual_sensor.firmware.layout import sensor_device
 from ethercat_server.virtual_sensor.options import EEPROM_MS, SensorOptions
 from ethercat_server.virtual_sensor.slave.image import build_image

@@ -20,7 +20,7 @@ from ethercat_server.errors import ServerError
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.permissions import controlling_uids, local_names
-from ethercat_server.serving.transport.sockets import SocketTransport
+from ethercat_server.serving.transport import SocketTransport
 
 _say = partial(say, "ethercat-replay")
 

@@ -13,7 +13,7 @@ from typing import Final
 from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.datagrams import Datagrams
-from ethercat_server.ethercat.exchange.frames import Area
+from ethercat_server.ethercat.exchange import Area
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import ACKNOWLEDGE_S, STATE_S, AlState, AlStatus
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps

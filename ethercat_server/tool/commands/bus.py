@@ -11,7 +11,7 @@ from typing import Any
 from ethercat_server.access.raw import read_images
 from ethercat_server.access.sensors import choose, find_server, note
 from ethercat_server.errors import BusError
-from ethercat_server.ethercat.slave import sii_content
+from ethercat_server.ethercat.slave import sii
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.sensor import Found, Identity
 from ethercat_server.tool.command import DONE, Command, add_sensor_arguments, columns, say, say_json
@@ -39,7 +39,7 @@ def _images(args: argparse.Namespace) -> dict[int, bytes | BusError]:
 
 def _image(read: Callable[[int, int], bytes]) -> bytes | BusError:
     try:
-        return sii_content.read_image(read)
+        return sii.read_image(read)
     except BusError as error:
         return error
 
@@ -47,7 +47,7 @@ def _image(read: Callable[[int, int], bytes]) -> bytes | BusError:
 def _identified(position: int, image: bytes | BusError) -> Found:
     row: dict[str, Any] = {"name": "", "serial": 0}
     if isinstance(image, bytes):
-        row = sii_content.decode(image)
+        row = sii.decode(image)
     return Found(position, Identity(row["name"], row["serial"], "", ""))
 
 
@@ -57,7 +57,7 @@ def _eeprom(args: argparse.Namespace) -> int:
     errors = {n: image for n, image in images.items() if isinstance(image, BusError)}
     if not read:
         raise next(iter(errors.values()))
-    decoded = {n: sii_content.decode(image) for n, image in read.items()}
+    decoded = {n: sii.decode(image) for n, image in read.items()}
     if args.json:
         rows = [{"sensor": n, **row, "raw": read[n].hex()} for n, row in decoded.items()]
         rows += [{"sensor": n, "error": str(error)} for n, error in errors.items()]
@@ -66,7 +66,7 @@ def _eeprom(args: argparse.Namespace) -> int:
         for n, row in decoded.items():
             say(f"slave {n}: {row['name'] or 'nameless'}")
             say(columns(_rows(row), indent=2))
-            say("\n".join(sii_content.raw_lines(read[n])))
+            say("\n".join(sii.raw_lines(read[n])))
     for error in errors.values():
         note(str(error))
     return FAILED if errors else DONE

@@ -10,7 +10,7 @@ from ethercat_server.access.adapters import Adapter, adapters
 from ethercat_server.access.raw import look_on
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.errors import ServerError
-from ethercat_server.ethercat.nic.interface import network_trouble
+from ethercat_server.ethercat.nic import network_trouble
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.scan import NoSlaveError
 from ethercat_server.tool.command import DONE, Command, columns, say, say_json

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 from bota_ethercat.pdo import INPUT_OBJECT, LAYOUTS
-from ethercat_server.ethercat.slave.sii_content import MailboxProtocol
+from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects.dictionary import BY_ADDRESS, PRODUCT_CODE, REVISION, VENDOR_ID
 from ethercat_server.virtual_sensor.slave.device import (
     INPUTS,

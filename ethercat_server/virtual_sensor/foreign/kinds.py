@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from ethercat_server.ethercat.slave.sii_content import MailboxProtocol
+from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry, ObjectType
 from ethercat_server.virtual_sensor.foreign import drive
 from ethercat_server.virtual_sensor.slave.device import (

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from ethercat_server.ethercat.slave.sii_content import MailboxProtocol
+from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry, ObjectType
 
 MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS = range(1, 5)

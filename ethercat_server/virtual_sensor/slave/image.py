@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-from ethercat_server.ethercat.slave.sii_content import (
+from ethercat_server.ethercat.slave.sii import (
     CATEGORIES_WORD,
     CATEGORY_HEADER,
     CHECKED_BYTES,

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final
 
-from ethercat_server.ethercat.slave.sii_content import MailboxProtocol
+from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.virtual_sensor.esc.sync_manager import SyncManager
 
 HEADER: Final = struct.Struct("<HHBB")

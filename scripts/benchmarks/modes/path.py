@@ -20,7 +20,7 @@ from ethercat_server.acquisition.start_up import AsFound
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.transport.in_memory import InMemoryStream, InMemoryTransport
+from ethercat_server.serving.in_memory import InMemoryStream, InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
 from scripts.benchmarks.chain import Figures, Setup

@@ -1,20 +1,90 @@
-"""What the kernel says of a network interface, and what it needs to carry EtherCAT frames. Needs no rights.
+"""The network interface: what the kernel says of it, who has packet sockets on it, the lock that keeps it for
+one master, and the check of all that before the bus is opened. SOEM itself would say only that it failed,
+and open it beside another master.
 
-Asked by netlink (linux/rtnetlink.h), not of /sys, which shows the namespace it was mounted in. Server, tool
-and doctor ask `network_trouble` whether addresses and routes make it one to send no EtherCAT frames on.
+Asked by netlink (linux/rtnetlink.h), not of /sys, which shows the namespace it was mounted in. The packet
+sockets are found by inodes: those in /proc/net, and those of each process in /proc/PID/fd, where only root
+sees other users' descriptors. The lock is a byte of a file for each interface; the file is root's, or the
+service's, so that no other user can take it; the kernel knows which process has it, and releases it with
+the process. The root of a user namespace may not write it, and takes an abstract socket of its network
+namespace instead.
 """
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import fcntl
 import ipaddress
+import os
 import socket
+import stat
 import struct
 import sys
+import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from ethercat_server.errors import InterfaceError
+
+_ETHERCAT: Final = 0x88A4
+
+
+class Listener(NamedTuple):
+    """A packet socket, which receives a copy of frames."""
+
+    protocol: int  # Ethernet type; 3 for all
+    ifindex: int  # interface; 0 for all
+    inode: int
+
+
+class Process(NamedTuple):
+    """A process that has sockets."""
+
+    pid: int
+    name: str
+    sockets: set[int]  # inodes of all its sockets
+
+
+def master_sockets(ifname: str) -> set[int]:
+    """Inodes of the EtherCAT sockets on `ifname`; empty if there is none, or no such interface."""
+    try:
+        index = socket.if_nametoindex(ifname)
+    except OSError:
+        return set()
+    return {row.inode for row in packet_sockets() if (row.protocol, row.ifindex) == (_ETHERCAT, index)}
+
+
+def packet_sockets(path: str | Path = "/proc/self/net/packet") -> list[Listener]:
+    """The packet sockets of this network namespace, from the kernel's table of them."""
+    return [Listener(int(row[3], 16), int(row[4]), int(row[-1])) for row in table(path)]
+
+
+def users_of(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Process]:
+    """The visible processes that have one of these sockets."""
+    for process in processes.iterdir():
+        if process.name.isdecimal() and (sockets := set(_sockets(process))) & inodes:
+            name = ""
+            with contextlib.suppress(OSError):  # it has just ended
+                name = (process / "comm").read_text(encoding="utf-8", errors="replace").strip()
+            yield Process(int(process.name), name, sockets)
+
+
+def table(path: str | Path) -> Iterator[list[str]]:
+    """The rows of a table in /proc/net."""
+    for line in Path(path).read_text(encoding="ascii").splitlines()[1:]:
+        yield line.split()
+
+
+def _sockets(process: Path) -> Iterator[int]:
+    with contextlib.suppress(OSError):  # it has ended, or is another user's
+        for descriptor in (process / "fd").iterdir():
+            with contextlib.suppress(OSError):
+                target = str(descriptor.readlink())
+                if target.startswith("socket:["):
+                    yield int(target[8:-1])
+
 
 LEAST_MTU: Final = 1500  # bytes: an EtherCAT frame may be as long as any Ethernet frame
 CHECK_CABLE: Final = "check cable and power"
@@ -221,3 +291,153 @@ def _attributes(data: bytes) -> dict[int, bytes]:
         found[attribute & _TYPE] = data[at + _ATTRIBUTE.size : at + length]
         at += max(_ATTRIBUTE.size, length + 3 & ~3)
     return found
+
+
+DIRECTORY: Final = Path("/run/ethercat-server")  # RuntimeDirectory= of the service, which then owns it
+_FILE: Final = "lock"
+_NAME: Final = "\0ethercat-server/ifindex/{}"
+_INDEX_BITS: Final = 31
+_NAMESPACE: Final = 0xFFFFFFFF
+_FLOCK: Final = struct.Struct("@hhqqi0q")  # type, whence, start, length, process
+
+
+@contextlib.contextmanager
+def locked(ifname: str, index: int) -> Iterator[None]:
+    """Within it no other process has the lock of the interface `index`; InterfaceError if one has it.
+
+    For one interface at a time: closing the file releases all locks that this process has on it.
+    """
+    try:
+        file = _open(DIRECTORY)
+    except OSError:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:
+            try:
+                name.bind(_NAME.format(index))
+            except OSError:
+                raise in_use(ifname) from None
+            yield
+        return
+    try:
+        place = (_network_namespace() & _NAMESPACE) << _INDEX_BITS | index
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
+        except OSError:
+            raise in_use(ifname, _owner(file, place)) from None
+        yield
+    finally:
+        os.close(file)
+
+
+def in_use(ifname: str, process: int = 0) -> InterfaceError:
+    """The error to be raised; `process` has the interface, 0 if that is not known."""
+    who = "another EtherCAT master"
+    if process > 0:
+        with contextlib.suppress(OSError):  # it has just ended
+            name = Path(f"/proc/{process}/comm").read_text(encoding="utf-8", errors="replace").strip()
+            who += f", process {process} ({name})"
+    return InterfaceError(f"{ifname} is in use by {who}: stop that one first")
+
+
+def _network_namespace() -> int:
+    return Path("/proc/self/ns/net").stat().st_ino
+
+
+def _open(directory: Path) -> int:
+    """The open lock file in `directory`; OSError if it cannot be had, or others could replace it."""
+    with contextlib.suppress(FileExistsError):
+        directory.mkdir(mode=0o755)
+    folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        owned = os.fstat(folder)
+        if owned.st_mode & 0o022:
+            raise PermissionError(f"{directory} is writable for others")
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
+        file = os.open(_FILE, flags, 0o600, dir_fd=folder)
+    finally:
+        os.close(folder)
+    try:
+        made = os.fstat(file)
+        if not stat.S_ISREG(made.st_mode) or made.st_nlink != 1:
+            raise PermissionError(f"{directory / _FILE} is not a file of its own")
+        if made.st_uid == os.geteuid() != owned.st_uid:
+            os.fchown(file, owned.st_uid, owned.st_gid)  # root made it first: the service needs it too
+    except OSError:
+        os.close(file)
+        raise
+    return file
+
+
+def _owner(file: int, place: int) -> int:
+    """The process that has the lock; 0 if there is none any more, or none that is visible."""
+    asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, place, 1, 0)
+    try:
+        kind, _, _, _, process = _FLOCK.unpack(fcntl.fcntl(file, fcntl.F_GETLK, asked))
+    except OSError:
+        return 0
+    return 0 if kind == fcntl.F_UNLCK else int(process)
+
+
+MAX_NAME_LENGTH: Final = 15  # Linux's limit; a longer name would overflow SOEM's buffer
+
+_CARRIER_TIMEOUT_S: Final = 5.0
+_CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
+
+
+@contextlib.contextmanager
+def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
+    """Within it the bus may be opened on `ifname`, by nobody else of this project.
+
+    InterfaceError unless the interface exists, is free, can carry EtherCAT frames, may be opened, and is not
+    one of the machine's network, which `allow_ip` permits.
+    """
+    index = _check_allowed(ifname, allow_ip=allow_ip)
+    # Of two that start at once neither has the bus open yet, so looking for that is not enough.
+    with locked(ifname, index):
+        if inodes := master_sockets(ifname):
+            raise in_use(ifname, next((process.pid for process in users_of(inodes)), 0))
+        _wait_usable(ifname)
+        yield
+
+
+def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
+    if not 0 < len(ifname.encode()) <= MAX_NAME_LENGTH or "/" in ifname:
+        raise InterfaceError(
+            f"{ifname!r} is no name of a network interface: it must have 1 to {MAX_NAME_LENGTH} characters; "
+            "'ip link' lists them"
+        )
+    found = look_up(ifname)
+    if found.is_loopback:
+        raise InterfaceError(f"{ifname} is the loopback interface: name the one the sensor is connected to")
+    if not allow_ip:
+        try:
+            routes = find_routes(ifname)
+        except OSError as error:
+            raise InterfaceError(
+                f"the kernel does not say whether {ifname} has an IP address ({error}): {ALLOW_IP} "
+                "uses it all the same"
+            ) from None
+        if problem := network_trouble(ifname, routes):
+            raise InterfaceError(problem)
+    if missing := _missing_capabilities():
+        raise InterfaceError(
+            f"not allowed to open {ifname}: {' and '.join(missing)} missing; run with sudo, or "
+            "give the service CAP_NET_RAW and CAP_NET_ADMIN"
+        )
+    return found.ifindex
+
+
+def _wait_usable(ifname: str) -> None:
+    # A link that was just brought up takes a moment, with a real network card up to some seconds.
+    deadline = time.monotonic() + _CARRIER_TIMEOUT_S
+    while (found := look_up(ifname)).is_up and not found.has_carrier and time.monotonic() < deadline:
+        time.sleep(0.02)
+    if problem := trouble(ifname):
+        raise InterfaceError(problem)
+
+
+def _missing_capabilities() -> list[str]:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("CapEff:"):
+            effective = int(line.split()[1], 16)
+            return [name for bit, name in _CAPABILITIES.items() if not effective >> bit & 1]
+    return []

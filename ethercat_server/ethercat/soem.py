@@ -18,7 +18,7 @@ import pysoem
 from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt, Master
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.nic.interface import check_present, why_silent
+from ethercat_server.ethercat.nic import check_present, why_silent
 from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
 from ethercat_server.ethercat.slave.abort_codes import abort_meaning
 

@@ -16,7 +16,7 @@ from ethercat_server.ethercat.datagrams import Datagrams
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.controller import SlaveController
-from ethercat_server.ethercat.slave.sii_content import Sii
+from ethercat_server.ethercat.slave.sii import Sii
 
 _FIRST_STATION: Final = 0x1001
 _LOGICAL_BYTES: Final = 0x10000  # of the logical address space for the sensors' process data

@@ -1,0 +1,241 @@
+"""What is looked at about once a second while the bus runs, and told once: a slow network card, another
+master or a busy computer as causes of losses, emergencies in the sensors' mailboxes, and what a sensor's
+samples show of it.
+
+While nobody asks a sensor for an object, nobody else reads what it puts into its mailbox. A wrong rate,
+silence, NaN and infinity are logged when they begin and when they end, so a sensor that does it all the
+time makes two lines.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from bota_ethercat.control import Event, event
+from bota_ethercat.text.json_text import JsonObject
+from ethercat_server.acquisition.clock import PLAUSIBLE_PULL, SampleClock
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.slave_clock import Verdict
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.datagrams import FIRST_INDEX
+from ethercat_server.ethercat.slave.emergencies import Emergency
+from ethercat_server.ethercat.wire import DATAGRAM_INDEX, PROCESSED_BIT, SOURCE, SOURCE_ADDRESS
+from ethercat_server.sensor.sensor import Sensor
+
+# A usual round trip above this is a slow network card's, or a slow driver's.
+SLOW_US: Final = 300.0
+# A usual round trip through a PCIe card, system calls included.
+_PCIE_US: Final = 100.0
+_SLOW_SECONDS: Final = 5
+
+log = logging.getLogger(__name__)
+
+
+def cost(usual_us: float) -> str:
+    """What a slow round trip costs, as part of a sentence."""
+    older_us = (usual_us - _PCIE_US) / 2
+    return f"samples are {older_us:.0f} µs older than through a PCIe network card, but none is lost by it"
+
+
+class RoundTripHealth:
+    """Of the exchanges on `ifname`. `check` is to be called once a second."""
+
+    def __init__(self, timing: ExchangeTiming, ifname: str) -> None:
+        self._timing = timing
+        self._ifname = ifname
+        self._slow_s = 0
+
+    def check(self) -> None:
+        """What the last second showed."""
+        usual_us = self._timing.usual_ns / 1000
+        if self._slow_s < _SLOW_SECONDS:
+            self._slow_s = self._slow_s + 1 if usual_us > SLOW_US else 0
+            if self._slow_s == _SLOW_SECONDS:
+                log.info("frames take %.0f µs through %s: %s", usual_us, self._ifname, cost(usual_us))
+
+
+# Frames of others in a second that are a master's; fewer may be late answers from before the loop.
+_MASTER_FRAMES: Final = 3
+# Seconds without any after which it has gone.
+_GONE_S: Final = 10
+_RECENT_NS: Final = 1_000_000_000
+# Standing still for so long in that time explains a missing answer, or the end of a watchdog.
+_STALL_NS: Final = 20_000_000
+
+
+class Causes:
+    """Of the bus on `ifname`. `check` is to be called once a second."""
+
+    def __init__(self, ifname: str) -> None:
+        self._ifname = ifname
+        self._frames = self._frames_checked = 0
+        """Of other masters."""
+        self._frame_ns = self._stall_ns = -_RECENT_NS
+        """When the last one came, when this computer stood still last."""
+        self._stalled_ns = 0
+        """For how long, all in all, without longer breaks in between."""
+        self._gone_s = _GONE_S
+
+    def stray(self, frame: bytes, now_ns: int) -> None:
+        """A frame has arrived that answers no exchange."""
+        at = SOURCE_ADDRESS
+        if len(frame) <= DATAGRAM_INDEX:
+            return
+        source = bytes([frame[at] & ~PROCESSED_BIT]) + frame[at + 1 : at + 6]
+        # Of our own only single datagrams arrive here, and answers that come late or twice.
+        if source != SOURCE or frame[DATAGRAM_INDEX] < FIRST_INDEX:
+            self._frames += 1
+            self._frame_ns = now_ns
+
+    def stood_still(self, late_ns: float, now_ns: int) -> None:
+        """This computer did something else for so long."""
+        if now_ns - self._stall_ns > _RECENT_NS:
+            self._stalled_ns = 0
+        self._stalled_ns += int(late_ns)
+        self._stall_ns = now_ns
+
+    def explain(self, reason: str, now_ns: int, otherwise: str = "") -> str:
+        """Why a sensor is lost, with what explains it; `otherwise` if nothing does."""
+        if now_ns - self._frame_ns < _RECENT_NS:
+            otherwise = f"check for another EtherCAT master, whose frames arrive on {self._ifname}"
+        elif now_ns - self._stall_ns < _RECENT_NS and self._stalled_ns > _STALL_NS:
+            stalled_ms = self._stalled_ns / 1e6
+            otherwise = f"this computer stood still for {stalled_ms:.0f} ms, check it with ethercat-doctor"
+        return f"{reason}: {otherwise}" if otherwise else reason
+
+    def check(self) -> None:
+        """Say once that there is another master, and once that it has gone."""
+        frames, self._frames_checked = self._frames - self._frames_checked, self._frames
+        if frames >= _MASTER_FRAMES:
+            if self._gone_s >= _GONE_S:
+                log.warning(
+                    "another EtherCAT master is sending on %s (%d frames in a second): stop it, for two "
+                    "masters disturb each other's slaves",
+                    self._ifname, frames,
+                )  # fmt: skip
+            self._gone_s = 0
+        elif self._gone_s < _GONE_S and not frames:
+            self._gone_s += 1
+            if self._gone_s == _GONE_S:
+                log.info("the other EtherCAT master on %s has stopped sending", self._ifname)
+
+
+class Mailboxes:
+    """Of all sensors of the bus. `announce` sends an event to the clients."""
+
+    def __init__(self, bus: Bus, sensors: Sequence[Sensor], announce: Callable[[JsonObject], None]) -> None:
+        self._bus = bus
+        self._sensors = sensors
+        self._announce = announce
+        self._turn = -1
+        bus.emergencies.tell = self._tell
+
+    def look_at_next(self) -> None:
+        """Look at the next sensor's: one datagram, a second one to read one message that is there."""
+        self._turn = (self._turn + 1) % len(self._sensors)
+        if self._sensors[self._turn].streams:
+            self._bus.slaves[self._turn].sdo.look()
+
+    def _tell(self, number: int, emergency: Emergency, count: int) -> None:
+        message = f"sensor {number} reports {emergency}"
+        keys = {**emergency.as_json(), "count": count, "message": message}
+        self._announce(event(Event.EMERGENCY, sensor=number, **keys))
+
+
+# Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment.
+_DEVIATING_SECONDS: Final = 10
+# Seconds with finite samples only after which it is over.
+_FINITE_SECONDS: Final = 10
+
+
+class SampleHealth:
+    """Of the sensor `number`. `check` is to be called once a second."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+        self.not_finite = 0
+        """New samples with a number that is NaN or infinite."""
+        self._checked = (0, 0, 0)
+        """The counts of the last check: fresh, repeated, not finite."""
+        self._silent_s = 0
+        self._finite_s = _FINITE_SECONDS
+        self._rate_reported = False
+        self._trusted = self._distrusted = False
+        """Whether it was reported last that event times date the samples; that they do not."""
+        self._deviating_s = 0
+
+    def check(self, fresh: int, repeated: int, clock: SampleClock) -> None:
+        """What the last second showed; `fresh` and `repeated` count frames since the start."""
+        now = fresh, repeated, self.not_finite
+        new, repeats, not_finite = (count - before for count, before in zip(now, self._checked, strict=True))
+        self._checked = now
+        self._check_silence(new, repeats)
+        self._check_numbers(new, not_finite)
+        self._check_rate(clock)
+        self._check_events(clock)
+
+    def _check_silence(self, new: int, repeats: int) -> None:
+        if new:
+            if self._silent_s:
+                log.info("sensor %d gives new samples again after %d s", self._number, self._silent_s)
+            self._silent_s = 0
+        elif repeats or self._silent_s:  # neither: it is lost, which is reported as such
+            self._silent_s += 1
+            if self._silent_s == 1:
+                log.warning(
+                    "sensor %d gives nothing new: it is in OP but repeats the same sample; power cycle it",
+                    self._number,
+                )
+
+    def _check_numbers(self, new: int, not_finite: int) -> None:
+        if not_finite:
+            if self._finite_s >= _FINITE_SECONDS:
+                log.warning(
+                    "sensor %d measures NaN or infinity: %d of its last %d samples; power cycle it",
+                    self._number, not_finite, new,
+                )  # fmt: skip
+            self._finite_s = 0
+        elif new and self._finite_s < _FINITE_SECONDS:
+            self._finite_s += 1
+            if self._finite_s == _FINITE_SECONDS:
+                log.info(
+                    "sensor %d measures finite numbers again; %d samples were not",
+                    self._number,
+                    self.not_finite,
+                )
+
+    def _check_rate(self, clock: SampleClock) -> None:
+        """Say once if the sensor samples at another rate than it is set to."""
+        pull = clock.estimate.pull
+        deviates = clock.locked and abs(pull) > PLAUSIBLE_PULL
+        self._deviating_s = self._deviating_s + 1 if deviates else 0
+        if self._deviating_s == _DEVIATING_SECONDS and not self._rate_reported:
+            self._rate_reported = True
+            log.warning(
+                "sensor %d samples every %.1f µs, %+.1f %% off what it is set to: check its settings",
+                self._number, clock.period_ns / 1000, 100 * pull,
+            )  # fmt: skip
+
+    def _check_events(self, clock: SampleClock) -> None:
+        """Say when the slave controller time-stamps the samples, and when it no longer does."""
+        if clock.events is None:
+            return
+        trust = clock.events.trust
+        if trust.verdict is Verdict.TRUSTED:
+            if not self._trusted:
+                log.info(
+                    "sensor %d: its samples are time-stamped by the distributed clock of its slave "
+                    "controller%s",
+                    self._number, " again" if self._distrusted else "",
+                )  # fmt: skip
+            self._trusted, self._distrusted = True, False
+        elif trust.verdict is Verdict.REFUSED and not self._distrusted:
+            log.log(
+                logging.WARNING if self._trusted else logging.INFO,
+                "sensor %d: its samples are time-stamped by polling, for its slave controller's event times "
+                "are unusable: %s",
+                self._number, trust.why,
+            )  # fmt: skip
+            self._trusted, self._distrusted = False, True

@@ -1,0 +1,384 @@
+"""The exchange of process data: frames of our own, several at a time, each matched by its index; which
+process data, and whose latched times, each of them carries, and where.
+
+Distributed clocks, by ETG.1000.4 and the data sheets of slave controllers: the local time counts ns from
+power-on; the system time is that and an offset, less a delay, which masters that synchronize slaves have
+written. Events are latched in local time, for the sync managers that are asked to; nothing else is written
+here, and only to sensors.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from ethercat_server.errors import SetUpError
+from ethercat_server.ethercat.backend import Backend
+from ethercat_server.ethercat.datagrams import Datagrams
+from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.wire import (
+    BYTE_NS,
+    COUNTER_SIZE,
+    DATAGRAM_HEADER,
+    DATAGRAM_INDEX,
+    FIRST_DATA,
+    FRAME_HEADER,
+    SHORTEST_FRAME,
+    Command,
+    build,
+)
+
+_U64_U32: Final = struct.Struct("<QI")
+_PORTS: Final = struct.Struct("<4I")
+# Bit of the DL status that says whether port 0 has a link.
+_LINKS: Final = 4
+_MOST_BEHIND_NS: Final = 1_000_000
+_WRAP: Final = 1 << 32
+_TIME_SIZE: Final = 4
+_SLACK_NS: Final = 10_000
+# One lost frame is no reason to do without event times; many would hold up the loop.
+_ATTEMPTS: Final = 3
+
+# System time when the frame arrived, a working counter; local time of the event PDI buffer change, a working
+# counter. Both times are modulo 2**32 ns.
+Latched = tuple[int, int, int, int]
+LATCHED: Final = struct.Struct(f"<IH{DATAGRAM_HEADER}xIH")
+# Bytes in a frame, of two datagrams.
+LATCHED_SIZE: Final = DATAGRAM_HEADER + LATCHED.size
+
+
+class DistributedClock(NamedTuple):
+    """Of one slave controller."""
+
+    offset: int
+    """System time less local time, modulo 2**32 ns."""
+    behind_ns: int
+    """Time from when a frame arrives at the slave until it is there again on its way back."""
+    reading_ns: int
+    """Time from when a frame arrives until it has read what is latched, at most."""
+
+
+def latched_datagrams(station: int) -> tuple[tuple[int, int, int, bytes], ...]:
+    """The datagrams that read `Latched`, for `wire.build`."""
+    return (
+        (Command.FPRD, station, reg.DC_SYSTEM_TIME, bytes(_TIME_SIZE)),
+        (Command.FPRD, station, reg.DC_PDI_CHANGE_EVENT, bytes(_TIME_SIZE)),
+    )
+
+
+def switch_latched(frame: bytearray, at: int, *, reads: bool) -> None:
+    """Have a frame read what is latched, to be found at `at`, or not (NOP)."""
+    for data in (at, at + LATCHED.size - COUNTER_SIZE - _TIME_SIZE):
+        frame[data - DATAGRAM_HEADER] = Command.FPRD if reads else Command.NOP
+
+
+def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
+    """What another master has left in a sensor's controller; None if it does not answer.
+
+    `at` is where frames read what is latched.
+    """
+    tries = (bus.read_register(number, reg.DC_OFFSET, _U64_U32.size) for _ in range(_ATTEMPTS))
+    if (data := next(filter(None, tries), None)) is None:
+        return None
+    offset, delay = _U64_U32.unpack(data)
+    return DistributedClock((offset - delay) % _WRAP, _behind_ns(bus, number), at * BYTE_NS + _SLACK_NS)
+
+
+def _behind_ns(bus: Datagrams, number: int) -> int:
+    """A write to the receive times has the controller note when a frame arrives at each of its ports."""
+    if not bus.write_register(number, reg.DC_RECEIVE_TIMES, bytes(4)):
+        return 0
+    data = bus.read_register(number, reg.DC_RECEIVE_TIMES, _PORTS.size)
+    links = bus.read_register(number, reg.DL_STATUS, 2)
+    if data is None or links is None:
+        return 0
+    status = int.from_bytes(links, "little")
+    out, *back = _PORTS.unpack(data)
+    times = [(time - out) % _WRAP for port, time in enumerate(back, 1) if status >> _LINKS + port & 1]
+    return max((time for time in times if time < _MOST_BEHIND_NS), default=0)
+
+
+# Each frame carries its number in a last datagram (NOP), which comes back as it was sent: by the index
+# alone one that comes back very late would be taken for a later one.
+TAG_SIZE: Final = 4
+_AROUND_DATA: Final = DATAGRAM_HEADER + COUNTER_SIZE
+# Bytes of datagrams that fit one frame.
+_LONGEST: Final = 1498
+# What is sent where the inputs will be; no sensor says it, for its numbers would be NaN throughout.
+_NEVER: Final = b"\xff"
+
+
+class Area(NamedTuple):
+    """Process data of one slave in the logical address space."""
+
+    start: int
+    end: int
+    kind: int
+
+
+class Inputs(NamedTuple):
+    """Where the inputs of a sensor are in the frame that carries them."""
+
+    number: int
+    """Of the sensor."""
+    start: int
+    end: int
+    untouched: bytes
+    """What is there after an exchange in which the sensor did not take part."""
+    latched: int
+    """Where the times are that its controller latched (`LATCHED`); 0 if the frame does not read them."""
+
+
+class Frame(NamedTuple):
+    """One of an exchange, as it is sent but for its index and number."""
+
+    content: bytearray
+    inputs: list[Inputs]
+    end: int
+    """Of the process data (at least the inputs): there is the working counter."""
+    written: int
+    """End of the outputs if they have a datagram of their own, else 0."""
+    tag: int
+    counters: list[int]
+    """What each sensor adds to the working counter: 2 for its outputs, 1 for its inputs."""
+
+
+def make_frames(areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool) -> list[Frame]:
+    """The frames that exchange the `areas` of each sensor, by number.
+
+    Without `lrw` each reads (LRD) and writes (LWR) with datagrams of their own. `stations` are the addresses
+    of the sensors whose latched times are read, None for others. SetUpError if the inputs of a sensor are not
+    in one frame.
+    """
+    spans = _spans(areas, stations, lrw=lrw)
+    carried: list[list[int]] = [[] for _ in spans]
+    for number, each in enumerate(areas):
+        first, last = _inputs(each)
+        which = next((n for n, (start, end) in enumerate(spans) if start <= first and last <= end), None)
+        if which is None:
+            raise SetUpError(f"the process data of sensor {number} lies among that of others: start again")
+        carried[which].append(number)
+    return [
+        _frame(span, numbers, areas, stations, lrw=lrw) for span, numbers in zip(spans, carried, strict=True)
+    ]
+
+
+def fit_a_frame(areas: Sequence[Area], *, lrw: bool) -> bool:
+    """Whether one frame can carry all the process data of a sensor."""
+    return _size(max(area.end for area in areas) - min(area.start for area in areas), 1, lrw=lrw) <= _LONGEST
+
+
+def _size(length: int, latching: int, *, lrw: bool) -> int:
+    """Bytes of the datagrams that exchange so much process data, and the latched times of so many."""
+    exchanged = (1 if lrw else 2) * (_AROUND_DATA + length)
+    return exchanged + latching * LATCHED_SIZE + _AROUND_DATA + TAG_SIZE
+
+
+def _spans(
+    areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool
+) -> list[tuple[int, int]]:
+    """Logical addresses of each frame: as many areas as fit one."""
+    spans: list[tuple[int, int]] = []
+    latching = 0
+    for area, number in sorted((area, number) for number, each in enumerate(areas) for area in each):
+        adds = area.kind == reg.FMMU_READ and stations[number] is not None
+        if not spans or _size(area.end - spans[-1][0], latching + adds, lrw=lrw) > _LONGEST:
+            spans.append((area.start, area.end))
+            latching = 0
+        spans[-1] = spans[-1][0], max(spans[-1][1], area.end)
+        latching += adds
+    return spans
+
+
+def _inputs(areas: Sequence[Area]) -> tuple[int, int]:
+    """Where the inputs of a sensor begin and end."""
+    inputs = [area for area in areas if area.kind == reg.FMMU_READ]
+    return min(area.start for area in inputs), max(area.end for area in inputs)
+
+
+def _frame(
+    span: tuple[int, int],
+    numbers: Sequence[int],
+    areas: Sequence[Sequence[Area]],
+    stations: Sequence[int | None],
+    *,
+    lrw: bool,
+) -> Frame:
+    """The frame for the logical addresses of `span`, with the inputs of the sensors with these `numbers`."""
+    start, length = span[0], span[1] - span[0]
+    end = FIRST_DATA + length
+    written = 0 if lrw else end + _AROUND_DATA + length
+    commands = (Command.LRW,) if lrw else (Command.LRD, Command.LWR)
+    datagrams: list[tuple[int, int, int, bytes]] = [
+        (command, start & 0xFFFF, start >> 16, bytes(length)) for command in commands
+    ]
+    content = bytearray(length)
+    inputs: list[Inputs] = []
+    at = (written or end) + COUNTER_SIZE + DATAGRAM_HEADER
+    for number in numbers:
+        for area in areas[number]:
+            if area.kind == reg.FMMU_READ:
+                content[area.start - start : area.end - start] = _NEVER * (area.end - area.start)
+        first, last = (each - start for each in _inputs(areas[number]))
+        station, latched = stations[number], 0
+        if station is not None:
+            latched, at = at, at + LATCHED_SIZE
+            datagrams += latched_datagrams(station)
+        inputs.append(
+            Inputs(number, first + FIRST_DATA, last + FIRST_DATA, bytes(content[first:last]), latched)
+        )
+    made = build(*datagrams, (Command.NOP, 0, 0, bytes(TAG_SIZE))).ljust(SHORTEST_FRAME, b"\0")
+    made[FIRST_DATA:end] = content
+    counters = [_working_counter(each, span) for each in areas]
+    return Frame(made, inputs, end, written, at, counters)
+
+
+def _working_counter(areas: Sequence[Area], span: tuple[int, int]) -> int:
+    kinds = {area.kind for area in areas if span[0] <= area.start < span[1]}
+    return 2 * (reg.FMMU_WRITE in kinds) + (reg.FMMU_READ in kinds)
+
+
+# Single datagrams and SOEM use the indices below.
+FIRST_INDEX: Final = 0x90
+_INDICES: Final = 0x100
+# Frames on the wire; a limit for a bus that does not answer.
+MOST_IN_FLIGHT = 100
+# A frame that is not back after this time counts as lost: its index is used again.
+_LOST_NS: Final = 100_000_000
+_TAG: Final = struct.Struct("<I")
+_NOTHING: Final = (0, 0, -1)
+_IMPOSSIBLE: Final = 0xFFFF
+
+
+class Exchange(NamedTuple):
+    """One that is back. Times are CLOCK_MONOTONIC ns."""
+
+    sent_ns: int
+    back_ns: int
+    frame: bytes
+    wkc: int
+    """Working counter; 0xFFFF if it cannot be."""
+    which: int
+    """Number of the frame, of those that make up an exchange."""
+
+
+# An answer that was taken before.
+DUPLICATE: Final = Exchange(0, 0, b"", 0, 0)
+
+
+class ProcessData:
+    """The frames of an exchange, and those that are on the wire."""
+
+    def __init__(
+        self,
+        areas: Sequence[Sequence[Area]],
+        backend: Backend,
+        *,
+        lrw: bool = True,
+        stations: Sequence[int | None] = (),
+    ) -> None:
+        """See `make_frames`."""
+        self._send, self._monotonic_ns = backend.send, backend.clock.monotonic_ns
+        frames = make_frames(areas, stations or [None] * len(areas), lrw=lrw)
+        self._lrw, self._command = lrw, int(Command.LRW if lrw else Command.LRD)
+        self._frames = [frame.content for frame in frames]
+        self.wire_ns = [len(frame.content) * BYTE_NS for frame in frames]
+        """By frame: what its bytes take on the wire."""
+        self._ends = [frame.end for frame in frames]
+        self._written = [frame.written for frame in frames]
+        self._tags = [frame.tag for frame in frames] or [0]
+        self.inputs = [frame.inputs for frame in frames]
+        """By frame: the sensors whose inputs it carries."""
+        self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
+        """What each sensor adds to the working counter of each frame."""
+        self.most_wkc = [sum(frame.counters) for frame in frames]
+        """The highest working counter of each frame that there can be."""
+        self._most = [
+            (sum(each & 1 for each in frame.counters), sum(each >> 1 for each in frame.counters))
+            for frame in frames
+        ]
+        """By frame: the highest counters of LRD and LWR."""
+        self._index, self._number = FIRST_INDEX, 0
+        # By index: when a frame was sent that is not back, else 0; which it was; its tag, -1 once it is lost.
+        self._sent = [_NOTHING] * _INDICES
+        self.in_flight = 0
+        """Frames in flight: not back, and not known to be lost."""
+        self._lost = 0
+        self.duplicates = 0
+        """Answers that came once more."""
+        self.blocked_until_ns = 0
+        """Nothing can be sent before, as long as nothing comes back."""
+
+    def read_latched(self, number: int, *, reads: bool) -> int | None:
+        """Read what a sensor's controller latches, or no longer; where, or None if it latches nothing."""
+        for content, inputs in zip(self._frames, self.inputs, strict=True):
+            for each in inputs:
+                if each.number == number and each.latched:
+                    switch_latched(content, each.latched, reads=reads)
+                    return each.latched
+        return None
+
+    def send(self) -> int:
+        """Send an exchange, unless too many are on the wire. Returns when."""
+        for which, frame in enumerate(self._frames):
+            index = self._index
+            if self.in_flight >= MOST_IN_FLIGHT or self._sent[index][0]:
+                now_ns = self._monotonic_ns()
+                self._forget(now_ns)
+                if self.in_flight >= MOST_IN_FLIGHT:
+                    self.blocked_until_ns = min(sent[0] for sent in self._sent if sent[0]) + _LOST_NS
+                    return now_ns
+                while self._sent[index][0]:
+                    index = max(FIRST_INDEX, (index + 1) % _INDICES)
+            self._index = max(FIRST_INDEX, (index + 1) % _INDICES)
+            self._number = number = (self._number + 1) & 0xFFFFFFFF
+            frame[DATAGRAM_INDEX] = index
+            _TAG.pack_into(frame, self._tags[which], number)
+            self.in_flight += 1
+            now_ns = self._monotonic_ns()
+            self._send(frame)
+            self._sent[index] = now_ns, which, number
+        return now_ns
+
+    def take(self, frame: bytes, back_ns: int) -> Exchange | None:
+        """Take a frame that has arrived; None if it is no answer that is awaited."""
+        if len(frame) <= DATAGRAM_INDEX or frame[FRAME_HEADER] != self._command:
+            return None
+        index = frame[DATAGRAM_INDEX]
+        sent_ns, which, number = self._sent[index]
+        at = self._tags[which]
+        if len(frame) < at + _TAG.size or _TAG.unpack_from(frame, at)[0] != number:  # an older one
+            return None
+        if not sent_ns:
+            self.duplicates += 1
+            return DUPLICATE
+        self._sent[index], self.blocked_until_ns = (0, which, number), 0
+        self.in_flight -= 1
+        end = self._ends[which]
+        wkc = frame[end] | frame[end + 1] << 8
+        if not self._lrw:  # an LRW would have counted 2
+            end = self._written[which]
+            written = frame[end] | frame[end + 1] << 8
+            reads, writes = self._most[which]
+            wkc = wkc + 2 * written if wkc <= reads and written <= writes else _IMPOSSIBLE
+        return Exchange(sent_ns, back_ns, frame, wkc, which)
+
+    @property
+    def sent(self) -> int:
+        """Exchanges that were sent."""
+        return self._number // max(1, len(self._frames))
+
+    @property
+    def lost(self) -> int:
+        """Frames that did not come back."""
+        self._forget(self._monotonic_ns())
+        return self._lost
+
+    def _forget(self, now_ns: int) -> None:
+        """Give up the frames that have been away for too long."""
+        for index, (sent_ns, _, _) in enumerate(self._sent):
+            if sent_ns and now_ns - sent_ns >= _LOST_NS:
+                self._sent[index] = _NOTHING
+                self.in_flight -= 1
+                self._lost += 1
