@@ -11,9 +11,9 @@ from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
 from ethercat_server.virtual_sensor import bus as virtual
-from ethercat_server.virtual_sensor.dc.unit import HOP_NS
-from ethercat_server.virtual_sensor.faults.table import obey
-from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions, SlaveOptions
+from ethercat_server.virtual_sensor.distributed_clock import HOP_NS
+from ethercat_server.virtual_sensor.faults import obey
+from ethercat_server.virtual_sensor.options import SensorOptions, SlaveOptions
 
 
 class MemoryBackend:
@@ -26,7 +26,7 @@ class MemoryBackend:
         self.ifname = "memory"
         self.clock = SimulatedClock(machine)
         self.wire = Wire(machine)
-        self.sensors = virtual.Bus(BusOptions(slaves or (SensorOptions(),)), self.clock.now_ns)
+        self.sensors = virtual.Bus(slaves or (SensorOptions(),), self.clock.now_ns)
         self._on_the_wire: list[tuple[int, int, bytes]] = []
         self._sent = 0
         self._free_at_ns = 0

@@ -13,10 +13,9 @@ from itertools import count
 from typing import Final
 
 START_NS: Final = 3_600 * 10**9
-REALTIME_START_NS: Final = 1_767_225_600 * 10**9
-"""2026-01-01 00:00:00 UTC."""
+REALTIME_START_NS: Final = 1_767_225_600 * 10**9  # 2026-01-01 00:00:00 UTC
+# Time that passes when a program asks for the time: programs take time, and no loop is endless.
 _CALL_NS: Final = 150
-"""Time that passes when a program asks for the time: programs take time, and no loop is endless."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,22 +23,15 @@ class Machine:
     """What the machine and its wire do to a program. Times in ns, chances per frame from 0 to 1."""
 
     seed: int = 0
-    wake_ns: float = 15_000.0
-    """Mean lateness of a wake-up; exponentially distributed."""
+    wake_ns: float = 15_000.0  # mean lateness of a wake-up; exponentially distributed
+    # Mean time between two moments in which the machine runs something else; 0 for never.
     stall_every_s: float = 0.0
-    """Mean time between two moments in which the machine runs something else; 0 for never."""
-    stall_ns: float = 0.0
-    """How long each takes."""
-    frame_ns: float = 40_000.0
-    """Round trip of a frame at least."""
-    frame_jitter_ns: float = 10_000.0
-    """Mean of what comes on top; exponentially distributed."""
-    even_jitter_ns: float = 0.0
-    """Up to so much comes on top, too; evenly distributed."""
-    lost: float = 0.0
-    """Chance that a frame does not come back."""
-    late: float = 0.0
-    """Chance that a frame comes back `late_ns` later; the next may overtake it."""
+    stall_ns: float = 0.0  # how long each takes
+    frame_ns: float = 40_000.0  # round trip of a frame at least
+    frame_jitter_ns: float = 10_000.0  # mean of what comes on top; exponentially distributed
+    even_jitter_ns: float = 0.0  # up to so much comes on top, too; evenly distributed
+    lost: float = 0.0  # chance that a frame does not come back
+    late: float = 0.0  # chance that a frame comes back `late_ns` later; the next may overtake it
     late_ns: float = 2_000_000.0
 
 

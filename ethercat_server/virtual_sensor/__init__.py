@@ -1,6 +1,6 @@
 """A simulated Bota EtherCAT force/torque sensor with fault injection. Standard library only.
 
-From the wire inwards: `link` (raw socket), `bus` (a chain of slaves, in memory), `sensor`, `esc` (slave
-controller), `slave` (what every slave has behind it), `firmware`, `measurement` (the sensor's samples),
-`foreign` (slaves of other vendors), `faults` (the commands).
+From the wire inwards: `link` (raw socket), `bus` (a chain of slaves, in memory), `esc` and
+`distributed_clock` (slave controller), `application`, `mailbox` and `coe` (what every slave has behind it),
+`sensor` with its `dictionary`, `sampler` and `signals`, `foreign` (slaves of other vendors), `faults`.
 """

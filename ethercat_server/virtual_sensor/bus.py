@@ -2,10 +2,10 @@
 
 Time is an argument, in ns of any clock that only goes forward; nothing in here asks for it elsewhere:
 
-    bus = Bus(BusOptions((SensorOptions(serial=1), SensorOptions(serial=2))), now=0)
-    answer = bus.exchange(frame, now)       # an Ethernet frame; None if it is lost on the bus
+    bus = Bus((SensorOptions(serial=1), SensorOptions(serial=2)), now=0)
+    if bus.process(frame, len(frame), now)  # an Ethernet frame, in place; False if it is lost on the bus
     bus.idle(now)                           # no frame for a while: watchdogs expire, power returns
-    faults.table.obey(bus, "power off @1")  # a fault, as one line of text; answers "ok" or "error: ..."
+    faults.obey(bus, "power off @1")        # a fault, as one line of text; answers "ok" or "error: ..."
     bus.statistics()                        # AL states, SDO writes, frames: what the command `stats` prints
 
 The same options (with their seeds), frames, commands and times give the same answers. `bus.slaves` are in
@@ -14,27 +14,27 @@ wire order; the sensors among them, with their settings and their flash, are in 
 
 from __future__ import annotations
 
+import contextlib
 import math
 import operator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from ethercat_server.ethercat import wire
-from ethercat_server.virtual_sensor.esc import registers as reg
-from ethercat_server.virtual_sensor.esc.commands import pass_through
-from ethercat_server.virtual_sensor.esc.controller import Esc
-from ethercat_server.virtual_sensor.foreign.left_behind import leave_in
-from ethercat_server.virtual_sensor.foreign.slave import ForeignSlave
-from ethercat_server.virtual_sensor.options import BusOptions, ForeignOptions, SensorOptions
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.virtual_sensor import registers as reg
+from ethercat_server.virtual_sensor.application import Application
+from ethercat_server.virtual_sensor.device import size_of
+from ethercat_server.virtual_sensor.esc import Esc, pass_through
+from ethercat_server.virtual_sensor.foreign import ForeignSlave, leave_in
+from ethercat_server.virtual_sensor.options import SensorOptions, SlaveOptions, UsageError
 from ethercat_server.virtual_sensor.sensor import VirtualSensor
-from ethercat_server.virtual_sensor.slave.al import AlState
-from ethercat_server.virtual_sensor.slave.application import Application
 
 Slave = VirtualSensor | ForeignSlave
 
 _LONGEST_PERIOD_NS = 50_000_000
-_FIRST_STATION = 0x1001
-"""Where another master begins."""
+_FIRST_STATION: Final = 0x1001  # where another master begins
 
 
 @dataclass(slots=True)
@@ -42,35 +42,27 @@ class Damage:
     """Frames that arrive corrupted at one port of one slave."""
 
     slave: Slave
-    port: int
-    """0: on the way out; 1: on the way back, from the slave behind."""
-    frames: int
-    """How many more."""
+    port: int  # 0: on the way out; 1: on the way back, from the slave behind
+    frames: int  # how many more
 
 
 class Bus:
-    """Slaves in the order in which frames reach them. All times are in ns, on the caller's clock.
+    """Slaves in the order in which frames reach them. All times are in ns, on the caller's clock."""
 
-    Attributes:
-        now: time of the latest call, or at which the latest datagram passed.
-        lose: number of the next frames that are lost.
-        deaf_until: no frame comes back before this time; None if the bus answers.
-        deaf_after: number of frames after which the bus stops answering; None for never.
-        damage: corruption of the next frames on the cable; None for none.
-    """
-
-    def __init__(self, options: BusOptions, now: int) -> None:
+    def __init__(self, slaves: Iterable[SlaveOptions], now: int) -> None:
         """All slaves are switched on at `now`."""
-        self.now = now
-        self.slaves: list[Slave] = [self._made(each) for each in options.slaves]
+        self.now = now  # time of the latest call, or at which the latest datagram passed
+        self.slaves: list[Slave] = [
+            VirtualSensor(options, lambda: self.now)
+            if isinstance(options, SensorOptions)
+            else ForeignSlave(options, lambda: self.now)
+            for options in slaves
+        ]
         self.sensors = [slave for slave in self.slaves if isinstance(slave, VirtualSensor)]
-        self.disconnected: set[Slave] = set()
-        """Those whose cable at port 0 is unplugged."""
-        self.lose = 0
-        self.deaf_until: float | None = None
-        self.deaf_after: int | None = None
-        self.damage: Damage | None = None
+        self.disconnected: set[Slave] = set()  # those whose cable at port 0 is unplugged
+        self.due: list[Callable[[], object]] = []  # for the end of the frame that is being processed
         self.frames = self.frames_lost = 0
+        self.repair()
         self._power_events: list[tuple[int, Slave]] = []
         self._alive: list[Application] = []
         self._escs: list[Esc] = []
@@ -78,23 +70,25 @@ class Bus:
         self.rewire()
         self._leave_behind()
 
-    def _made(self, options: SensorOptions | ForeignOptions) -> Slave:
-        if isinstance(options, ForeignOptions):
-            return ForeignSlave(options, lambda: self.now)
-        return VirtualSensor(options, lambda: self.now)
+    def repair(self) -> None:
+        """End what loses or damages frames."""
+        self.lose = 0  # number of the next frames that are lost
+        self.deaf_until: float | None = None  # no frame comes back before this time
+        self.deaf_after: int | None = None  # number of frames after which the bus stops answering
+        self.damage: Damage | None = None  # of the next frames on the cable
 
     def _leave_behind(self) -> None:
         """Take slaves to the state of their options as another master does: all outputs, then all inputs."""
-        left = [slave for slave in self.slaves if slave.options.state > AlState.INIT]
+        left = [
+            (n, each, each.life) for n, each in enumerate(self.slaves) if each.options.state > AlState.INIT
+        ]
         outputs = 0
-        inputs = sum(pdo.size for slave in left if slave.life for pdo in slave.life.device.outputs)
-        for slave in left:
-            life = slave.life
+        inputs = sum(size_of(life.device.output_entries) for _, _, life in left if life)
+        for position, slave, life in left:
             assert life is not None
-            station = _FIRST_STATION + self.slaves.index(slave)
-            leave_in(life, slave.options.state, station, outputs, inputs)
-            outputs += sum(pdo.size for pdo in life.device.outputs)
-            inputs += sum(pdo.size for pdo in life.device.inputs)
+            leave_in(life, slave.options.state, _FIRST_STATION + position, outputs, inputs)
+            outputs += size_of(life.device.output_entries)
+            inputs += size_of(life.device.input_entries)
             if isinstance(slave, ForeignSlave):
                 slave.left_at_work()
 
@@ -171,16 +165,10 @@ class Bus:
             self.frames_lost += 1
             return False
         frame[wire.SOURCE_ADDRESS] |= wire.PROCESSED_BIT
-        for sensor in self.sensors:
-            while sensor.due:
-                sensor.due.pop(0)()
+        while self.due:
+            with contextlib.suppress(UsageError):  # it has no power any more
+                self.due.pop(0)()
         return True
-
-    def exchange(self, frame: bytes, now: int) -> bytes | None:
-        """The frame as it comes back from the bus; None if it is lost. Watchdogs expire before it arrives."""
-        self.idle(now)
-        answer = bytearray(frame)
-        return bytes(answer) if self.process(answer, len(answer), now) else None
 
     def _damaged_at(self) -> int | None:
         """Count a corrupted frame in the error counters; how many slaves received it intact, None for all.
@@ -195,8 +183,8 @@ class Bus:
         if damage.frames <= 0:
             self.damage = None
         position = self._alive.index(damage.slave.life)
-        self._alive[position].esc.count(reg.RX_ERRORS + 2 * damage.port)
-        self._alive[position].esc.count(reg.RX_ERRORS + 2 * damage.port + 1)
+        for counter in (0, 1):
+            self._alive[position].esc.count(reg.RX_ERRORS + 2 * damage.port + counter)
         if damage.port == 1:
             back = self._alive[:position]
         else:
@@ -223,16 +211,13 @@ class Bus:
         period = min(self.now - self._last_frame, _LONGEST_PERIOD_NS)
         expected = self.now + period
         self._last_frame = self.now
-        self._check_watchdogs(self.now)
+        self.idle(self.now)
         for life in self._alive:
             life.prepare(expected)
 
     def idle(self, now: int) -> None:
         """No frame is waiting: let time pass up to `now`, watchdogs included."""
         self.set_time(now)
-        self._check_watchdogs(now)
-
-    def _check_watchdogs(self, now: int) -> None:
         for slave in self.slaves:
             if slave.life is not None:
                 slave.life.check_watchdog(now)

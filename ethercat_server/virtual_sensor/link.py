@@ -1,4 +1,4 @@
-"""The raw socket: passes frames from a network interface through the bus, and executes commands.
+"""The raw socket: frames from a network interface go through the bus; commands come by a stream and a socket.
 
 One thread, which polls for frames and commands, and checks watchdogs.
 """
@@ -8,44 +8,45 @@ from __future__ import annotations
 import contextlib
 import errno
 import gc
+import os
 import select
 import socket
+import stat
 import struct
 import threading
 import time
-from collections.abc import Callable
-from typing import Final, TextIO
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Final, Self, TextIO
 
 from ethercat_server.ethercat.nic import look_up
 from ethercat_server.ethercat.raw_socket import arrived_ns
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
-from ethercat_server.virtual_sensor.control import CommandChannel
-from ethercat_server.virtual_sensor.faults.table import QuitCommand
-from ethercat_server.virtual_sensor.options import BusOptions
+from ethercat_server.virtual_sensor.faults import LONGEST_LINE, QuitCommand, obey
+from ethercat_server.virtual_sensor.options import SlaveOptions
 
-LONGEST_NAME: Final = 15
-"""Characters in the name of a network interface."""
+LONGEST_NAME: Final = 15  # characters in the name of a network interface
 _BUFFER = 2048
 _SOL_PACKET, _PACKET_AUXDATA, _ETH_P_ALL = 263, 8, 3
-_AUXDATA: Final = struct.Struct("=I12xHH")
-"""Status, VLAN tag: control information and type."""
+_AUXDATA: Final = struct.Struct("=I12xHH")  # status, VLAN tag: control information and type
 _VLAN_VALID: Final = 0x10
-_ADDRESSES: Final = 12
-"""Bytes of an Ethernet frame before its VLAN tag."""
+_ADDRESSES: Final = 12  # bytes of an Ethernet frame before its VLAN tag
 _IDLE_MS = 10
 _FRAMES_PER_TURN = 64
 _FIRST_HALF_NS: Final = 20_000.0
+# A frame that seems to have waited for longer has no usable time stamp: CLOCK_REALTIME was set.
 _LONGEST_WAIT_NS: Final = 100_000_000
-"""A frame that seems to have waited for longer has no usable time stamp: CLOCK_REALTIME was set."""
 _STEP: Final = 0.001
+# Quantile of half the time that an answer takes, followed in steps of `_STEP`: a master estimates the round
+# trip from its quickest frames.
 _QUICK: Final = 1 / 16
-"""Quantile of half the time that an answer takes, followed in steps of `_STEP`: a master estimates the round
-trip from its quickest frames."""
+_MOST_CONNECTIONS: Final = 16
+_CHUNK: Final = 4096
 
 
 class LinkError(Exception):
-    """The interface cannot be used, or no longer."""
+    """The interface cannot be used, or no longer, or the control socket cannot be created."""
 
 
 def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
@@ -55,7 +56,10 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
     """
     if not ifname or len(ifname.encode()) > LONGEST_NAME:
         raise LinkError(f"interface name {ifname!r}: it must have 1 to {LONGEST_NAME} characters")
-    _index(ifname)
+    if not _index(ifname):
+        raise LinkError(f"no network interface {ifname!r}: see `ip link`")
+    if not look_up(ifname).is_up:
+        raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
     try:
         # No protocol yet: with one, it would receive frames of all interfaces until it is bound.
         raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
@@ -64,52 +68,47 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
             f"not allowed to open a raw socket on {ifname}: it needs CAP_NET_RAW, so run it as root"
         ) from None
     try:
-        if not look_up(ifname).is_up:
-            raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
         raw.setsockopt(_SOL_PACKET, _PACKET_AUXDATA, 1)
         raw.bind((ifname, protocol))
         raw.setblocking(False)
     except OSError as error:
         raw.close()
         raise LinkError(f"interface {ifname} cannot be used: {error.strerror}") from None
-    except LinkError:
-        raw.close()
-        raise
     return raw
 
 
 def _index(ifname: str) -> int:
+    """Of the interface; 0 if there is none."""
     try:
         return socket.if_nametoindex(ifname)
     except OSError:
-        raise LinkError(f"no network interface {ifname!r}: see `ip link`") from None
+        return 0
 
 
 def run(
     ifname: str,
-    options: BusOptions,
+    slaves: Iterable[SlaveOptions],
     *,
     control_path: str | None = None,
     commands: TextIO | None = None,
     exit_on_eof: bool = False,
     on_open: Callable[[], None] = lambda: None,
     on_ready: Callable[[], None] = lambda: None,
-    should_stop: threading.Event | Callable[[], bool] = lambda: False,
+    stop: threading.Event,
 ) -> None:
     """Answer EtherCAT frames on `ifname` until stopped.
 
-    Stops when `should_stop` is set or returns true (checked every 10 ms), on the command `quit`, and at
-    the end of `commands` if `exit_on_eof`. LinkError if the interface cannot be
-    used, or disappears (one that is only down is waited for); ControlError if `control_path` cannot be used.
+    Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the
+    end of `commands` if `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is
+    only down is waited for), or `control_path` cannot be used.
     """
-    stop = should_stop.is_set if isinstance(should_stop, threading.Event) else should_stop
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
         # By it others see that the interface is in use for EtherCAT; nobody reads it.
         shown = stack.enter_context(open_interface(ifname, ETHERTYPE))
         shown.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
         on_open()
-        bus = Bus(options, time.monotonic_ns())
+        bus = Bus(slaves, time.monotonic_ns())
         poller = select.poll()
         poller.register(raw, select.POLLIN)
         channel = stack.enter_context(CommandChannel(bus, poller, control_path, commands))
@@ -117,38 +116,134 @@ def run(
         gc.collect()
         gc.freeze()
         on_ready()
-        with contextlib.suppress(QuitCommand):
-            _serve(raw, bus, poller, channel, ifname, stop, exit_on_eof)
+        answers, index, up = _Answers(raw, bus, ifname), _index(ifname), True
+        stack.enter_context(contextlib.suppress(QuitCommand))
+        while not stop.is_set() and not (exit_on_eof and channel.ended):
+            ready = [descriptor for descriptor, _ in poller.poll(_IDLE_MS)]
+            if not ready:
+                bus.idle(time.monotonic_ns())
+                # Down is like an unplugged cable: it may come back, unless the interface was deleted.
+                if not up and _index(ifname) != index:
+                    raise LinkError(f"interface {ifname} has disappeared: create it again, and restart")
+            for descriptor in ready:
+                if descriptor != raw.fileno():
+                    bus.set_time(time.monotonic_ns())
+                    channel.handle(descriptor)
+            if raw.fileno() in ready:
+                up = answers.waiting()
 
 
-def _serve(
-    raw: socket.socket,
-    bus: Bus,
-    poller: select.poll,
-    channel: CommandChannel,
-    ifname: str,
-    stop: Callable[[], bool],
-    exit_on_eof: bool,
-) -> None:
-    descriptor = raw.fileno()
-    answers = _Answers(raw, bus, ifname)
-    index = _index(ifname)
-    up = True
-    while not stop():
-        if exit_on_eof and channel.ended:
+class CommandChannel:
+    """Reads commands and writes one line of answer to each."""
+
+    def __init__(
+        self, bus: Bus, poller: select.poll, control_path: str | None, commands: TextIO | None
+    ) -> None:
+        """LinkError if `control_path` cannot be used."""
+        self._bus = bus
+        self._poller = poller
+        self._path = control_path
+        self._listener: socket.socket | None = None
+        self._connections: dict[int, socket.socket] = {}
+        self._pending: dict[int, bytes] = {}  # the beginning of a line, by descriptor
+        self.ended = False  # the text stream has
+        if control_path is not None:
+            self._listener = _listen(control_path)
+            poller.register(self._listener, select.POLLIN)
+        if commands is not None:
+            with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
+                self._pending[commands.fileno()] = b""
+                poller.register(commands, select.POLLIN)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for connection in self._connections.values():
+            connection.close()
+        self._connections.clear()
+        if self._listener is not None and self._path is not None:
+            self._listener.close()
+            with contextlib.suppress(OSError):
+                Path(self._path).unlink()
+
+    def handle(self, descriptor: int) -> None:
+        """Handle what has come on `descriptor`. QuitCommand if the command was `quit`."""
+        if descriptor in self._pending:
+            self._read(descriptor)
+        elif self._listener is not None and descriptor == self._listener.fileno():
+            with contextlib.suppress(OSError):
+                self._add(self._listener.accept()[0])
+
+    def _add(self, connection: socket.socket) -> None:
+        if len(self._connections) >= _MOST_CONNECTIONS:
+            connection.close()
             return
-        events = poller.poll(_IDLE_MS)
-        if not events:
-            bus.idle(time.monotonic_ns())
-            if not up:  # like an unplugged cable: it may come back, unless the interface was deleted
-                _check_there(ifname, index)
-            continue
-        for ready, event in events:
-            if ready != descriptor:
-                bus.set_time(time.monotonic_ns())
-                channel.handle(ready, event)
-        if any(ready == descriptor for ready, _ in events):
-            up = answers.waiting()
+        connection.setblocking(False)
+        self._connections[connection.fileno()] = connection
+        self._pending[connection.fileno()] = b""
+        self._poller.register(connection, select.POLLIN)
+
+    def _read(self, descriptor: int) -> None:
+        try:
+            data = os.read(descriptor, _CHUNK)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        ended = not data
+        for line in self._lines(descriptor, data or (b"\n" if self._pending[descriptor] else b"")):
+            try:
+                answer = obey(self._bus, line)
+            except QuitCommand:
+                self._answer(descriptor, "ok")
+                raise
+            # Disconnected, or not reading: its commands are executed nevertheless.
+            ended = not self._answer(descriptor, answer) or ended
+        if ended:
+            self._poller.unregister(descriptor)
+            del self._pending[descriptor]
+            if descriptor in self._connections:
+                self._connections.pop(descriptor).close()
+            else:
+                self.ended = True
+
+    def _answer(self, descriptor: int, answer: str) -> bool:
+        """Whether the source goes on: the text stream does without its answers."""
+        connection = self._connections.get(descriptor)
+        try:
+            if connection is not None:
+                connection.sendall(answer.encode() + b"\n")
+            else:
+                os.write(1, answer.encode() + b"\n")
+        except OSError:
+            return connection is None
+        return True
+
+    def _lines(self, descriptor: int, data: bytes) -> list[str]:
+        *lines, rest = (self._pending[descriptor] + data).split(b"\n")
+        if len(rest) > LONGEST_LINE:
+            lines.append(rest)
+            rest = b""
+        self._pending[descriptor] = rest
+        return [line[:LONGEST_LINE].decode(errors="replace") for line in lines if line.strip()]
+
+
+def _listen(path: str) -> socket.socket:
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        # Remove a stale socket, left by a killed process; nothing else.
+        if stat.S_ISSOCK(Path(path).stat().st_mode) and probe.connect_ex(path) != 0:
+            Path(path).unlink()
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        listener.bind(path)
+        Path(path).chmod(0o600)
+        listener.listen()
+        listener.setblocking(False)
+    except OSError as error:
+        listener.close()
+        raise LinkError(f"cannot create the control socket {path!r}: {error.strerror or error}") from None
+    return listener
 
 
 class _Answers:
@@ -190,11 +285,3 @@ class _Answers:
                     return False
                 raise LinkError(f"interface {self._ifname} failed: {error.strerror}") from None
         return True
-
-
-def _check_there(ifname: str, index: int) -> None:
-    """LinkError if the interface is no longer the one that was opened."""
-    with contextlib.suppress(OSError):
-        if socket.if_nametoindex(ifname) == index:
-            return
-    raise LinkError(f"interface {ifname} has disappeared: create it again and restart the virtual sensor")

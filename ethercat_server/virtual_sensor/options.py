@@ -1,17 +1,22 @@
-"""Options of a simulated sensor, of a foreign slave, and of a chain."""
+"""Options of a simulated sensor and of a foreign slave; the numbers in options and commands."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Final
+import contextlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
+from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.objects.dictionary import MODELS
-from ethercat_server.virtual_sensor.slave.al import AlState
 
-WRITE_US: Final = 12.0
-"""About what 61 bytes take over SPI at 40 MHz."""
-EEPROM_MS: Final = 2.0
-"""About what a real EEPROM needs for the eight bytes of a read command."""
+WRITE_US: Final = 12.0  # about what 61 bytes take over SPI at 40 MHz
+EEPROM_MS: Final = 2.0  # about what a real EEPROM needs for the eight bytes of a read command
+
+
+class UsageError(Exception):
+    """Wrong or contradictory options, or a command that is wrong or cannot be executed: a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,46 +26,80 @@ class SensorOptions:
     model: str = MODELS[0]
     serial: int = 1
     pdo_size: int = 61
-    sinc_length: int | None = None
-    """None: the value in flash, by default 64."""
-    chop_divides: int = 1
-    """By what CHOP divides its sampling rate."""
-    ppm: float = 0.0
-    """Error of its clock: positive is fast."""
-    dc: str = ""
-    """What its distributed clock is like, in the words of `dc.kinds`: `32-bit+ppm=20+late=50`."""
-    write_us: float = WRITE_US
-    """Time that its firmware takes to write a sample to the controller, before the sample's instant."""
+    sinc_length: int | None = None  # None: the value in flash, by default 64
+    chop_divides: int = 1  # by what CHOP divides its sampling rate
+    ppm: float = 0.0  # error of its clock: positive is fast
+    dc: str = ""  # its distributed clock, in `distributed_clock.CLOCK_WORDS`: `32-bit+ppm=20+late=50`
+    write_us: float = WRITE_US  # in which its firmware writes a sample to the controller, before its instant
     signal: str = "scene"
     noise: bool = True
     seed: int = 0
-    state: AlState = AlState.INIT
-    """In which another master has left it."""
-    eeprom_ms: float = EEPROM_MS
-    """Time that reading from its EEPROM takes."""
+    state: AlState = AlState.INIT  # in which another master has left it
+    eeprom_ms: float = EEPROM_MS  # time that reading from its EEPROM takes
 
 
 @dataclass(frozen=True, slots=True)
 class ForeignOptions:
     """One slave of another vendor."""
 
-    kind: str
-    """One of `foreign.kinds.KINDS`."""
-    state: AlState = AlState.INIT
-    """In which another master has left it; a drive in OP turns."""
+    kind: str  # one of `foreign.KINDS`
+    state: AlState = AlState.INIT  # in which another master has left it; a drive in OP turns
     eeprom_ms: float = EEPROM_MS
 
 
 SlaveOptions = SensorOptions | ForeignOptions
 
 
-@dataclass(frozen=True, slots=True)
-class BusOptions:
-    """A chain of slaves, first to last."""
+def whole(lowest: int, highest: int) -> Callable[[str], int]:
+    """Parses a whole number, decimal or 0x...; UsageError if it is invalid or out of range."""
 
-    slaves: tuple[SlaveOptions, ...] = field(default_factory=lambda: (SensorOptions(),))
+    def parse(text: str) -> int:
+        try:
+            value = int(text, 0)
+        except ValueError:
+            raise UsageError(f"{text!r} is not a whole number such as 27 or 0x1B") from None
+        if not lowest <= value <= highest:
+            raise UsageError(f"{text} is out of range: it must be from {lowest} to {highest}")
+        return value
+
+    return parse
+
+
+def real(lowest: float, highest: float) -> Callable[[str], float]:
+    """Parses a finite number; UsageError if it is invalid or out of range."""
+
+    def parse(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            if lowest <= (value := float(text)) <= highest:
+                return value
+        raise UsageError(f"{text!r} must be a number from {lowest:g} to {highest:g}")
+
+    return parse
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A fault command, or a word of a distributed clock: `run` takes what it is for, and the arguments.
+
+    Each is parsed by one of `arguments`. Those in brackets in `usage` can be left out; the last one may be
+    repeated where there are dots.
+    """
+
+    usage: str
+    meaning: str
+    run: Callable[..., Any]
+    arguments: tuple[Callable[[str], Any], ...] = ()
 
     @property
-    def sensors(self) -> tuple[SensorOptions, ...]:
-        """The sensors among them."""
-        return tuple(slave for slave in self.slaves if isinstance(slave, SensorOptions))
+    def name(self) -> str:
+        """Its first word."""
+        return self.usage.split()[0]
+
+    def parse(self, words: Sequence[str]) -> list[Any]:
+        """The arguments; UsageError if they are wrong."""
+        least = len(self.arguments) - self.usage.replace("[@N]", "").count("[")
+        most = math.inf if "..." in self.usage else len(self.arguments)
+        if not least <= len(words) <= most:
+            raise UsageError(f"wrong number of arguments: {self.usage}")
+        parsers = (*self.arguments, *self.arguments[-1:] * len(words))
+        return [parse(word) for parse, word in zip(parsers, words, strict=False)]

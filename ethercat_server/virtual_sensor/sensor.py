@@ -1,34 +1,96 @@
-"""One simulated sensor: power, replacement, and a record of the SDO writes it received."""
+"""One simulated sensor: its firmware from power-on to power-off, replacement, its record of SDO writes."""
 
 from __future__ import annotations
 
-import struct
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
-from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
-from ethercat_server.virtual_sensor.firmware.firmware import Firmware
-from ethercat_server.virtual_sensor.firmware.flash import Flash
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.sensor.objects.dictionary import BY_SETTING, FACTORY_CALIBRATION
+from ethercat_server.virtual_sensor.application import Application, al_statistics
+from ethercat_server.virtual_sensor.coe import Address, SdoAbortError
+from ethercat_server.virtual_sensor.dictionary import Dictionary, Flash, sensor_device
+from ethercat_server.virtual_sensor.distributed_clock import parse_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.slave.al import AlState
-from ethercat_server.virtual_sensor.slave.objects import Address
+from ethercat_server.virtual_sensor.sampler import Sampler
 
-_WRITES_REMEMBERED: Final = 1000
-_WRITES_TOLD: Final = 200
+_REPETITION_NS: Final = 300_000_000
+_WRITES_REMEMBERED: Final = 200
 
 
-@dataclass(frozen=True, slots=True)
-class SdoWrite:
-    """One SDO write request."""
+class Firmware(Application):
+    """Objects and measurement behind the application.
 
-    index: int
-    subindex: int
-    data: bytes
-    state: AlState
-    abort: int
-    """Abort code; 0 if it succeeded."""
+    `clock` gives the time in ns; `on_write` is called for every SDO write: index, sub-index, data, AL state,
+    abort code or 0. The next transfer of an entry in `aborts` is aborted with the code there.
+    """
+
+    def __init__(
+        self,
+        options: SensorOptions,
+        flash: Flash,
+        clock: Callable[[], int],
+        on_write: Callable[[int, int, bytes, AlState, int], None],
+    ) -> None:
+        self._on_write = on_write
+        self.dictionary = Dictionary(options, flash, self.inputs, clock)
+        self.sampler = Sampler(options, self.dictionary, clock)
+        self.dictionary.changed = self.sampler.settings_changed
+        self.aborts: dict[Address, int] = {}
+        self._aborted: dict[
+            tuple[Address, bytes | None], tuple[int | None, int]
+        ] = {}  # code and until when, by write
+        device = sensor_device(options.model, options.serial, options.pdo_size)
+        super().__init__(device, clock, self.dictionary, options.eeprom_ms)
+        self.esc.clock.events.follow(
+            self.sampler.number_at, self.sampler.clock.instant, round(options.write_us * 1000)
+        )
+        for apply in parse_clock(options.dc):
+            apply(self.esc.clock)
+
+    def inputs(self) -> bytes:
+        """The newest process data when its first byte passes."""
+        return self.sampler.newest(self.esc.clock.way_ns + self.esc.into_ns)
+
+    def prepare(self, expected: int) -> None:
+        """Compute the sample that a frame at the time `expected` will read."""
+        self.sampler.prepare(expected)
+
+    def _check_abort(self, address: Address, data: bytes | None = None) -> None:
+        code, until = self._aborted.get((address, data), (None, 0))
+        if self.clock() >= until:
+            code = self.aborts.pop(address, None)
+            if code is not None and data is not None:  # if it is repeated soon after, its answer was lost
+                self._aborted = {(address, data): (code, self.clock() + _REPETITION_NS)}
+        if code is not None:
+            raise SdoAbortError(code)
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """See `Application`."""
+        self._check_abort((index, subindex))
+        return super().read(index, subindex)
+
+    def check_download(self, index: int, subindex: int, length: int) -> None:
+        """See `Application`."""
+        try:
+            super().check_download(index, subindex, length)
+        except SdoAbortError as error:
+            self._on_write(index, subindex, b"", self.state, error.code)
+            raise
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """See `Application`."""
+        abort = 0
+        try:
+            self._check_abort((index, subindex), data)
+            super().write(index, subindex, data)
+        except SdoAbortError as error:
+            abort = error.code
+            raise
+        finally:
+            self._on_write(index, subindex, data, self.state, abort)
 
 
 class VirtualSensor:
@@ -36,43 +98,35 @@ class VirtualSensor:
 
     def __init__(self, options: SensorOptions, clock: Callable[[], int]) -> None:
         self._clock = clock
-        self._options = options
-        self.flash = Flash()
-        self._writes: deque[SdoWrite] = deque(maxlen=_WRITES_REMEMBERED)
+        self.options = options  # its current ones
+        # The latest, oldest first, across power cycles, as `stats` reports them.
+        self.sdo_writes: deque[dict[str, Any]] = deque(maxlen=_WRITES_REMEMBERED)
         self.sdo_write_count = self.calibration_writes = 0
-        self._on_write: dict[Address, Callable[[], None]] = {}
-        self.due: list[Callable[[], None]] = []
-        """Actions for the end of the frame that is being processed."""
-        self.life: Firmware | None = None
-        self._apply_sinc()
+        self.on_write: dict[Address, Callable[[], None]] = {}  # actions for the next SDO write to an entry
+        self._begin()
+
+    def _begin(self) -> None:
+        self.flash = Flash()
+        if self.options.sinc_length is not None:
+            row = BY_SETTING["sinc_length"]
+            self.flash.entries[row.address] = row.type.pack(self.options.sinc_length)
+        self.life: Firmware | None = None  # from power-on to power-off
         self.power(True)
 
-    def _apply_sinc(self) -> None:
-        if self._options.sinc_length is not None:
-            self.flash.entries[0x8006, 1] = struct.pack("<H", self._options.sinc_length)
-
-    @property
-    def options(self) -> SensorOptions:
-        """Its current options."""
-        return self._options
-
-    @property
-    def sdo_writes(self) -> list[SdoWrite]:
-        """The latest SDO writes, oldest first, across power cycles."""
-        return list(self._writes)
-
     def _remember(self, index: int, subindex: int, data: bytes, state: AlState, abort: int) -> None:
-        self._writes.append(SdoWrite(index, subindex, data, state, abort))
+        self.sdo_writes.append(
+            {
+                "index": f"0x{index:04X}",
+                "subindex": subindex,
+                "hex": data.hex(),
+                "state": state.name,
+                "abort": f"0x{abort:08X}" if abort else None,
+            }
+        )
         self.sdo_write_count += 1
-        if index == FACTORY_CALIBRATION:
-            self.calibration_writes += 1
-        action = self._on_write.pop((index, subindex), None)
-        if action is not None:
-            self.due.append(action)
-
-    def on_write(self, address: Address, action: Callable[[], None]) -> None:
-        """Do `action` right after the next SDO write to this entry."""
-        self._on_write[address] = action
+        self.calibration_writes += index == FACTORY_CALIBRATION
+        if (action := self.on_write.pop((index, subindex), None)) is not None:
+            action()
 
     def power(self, on: bool) -> None:
         """Switch it off or on; no effect if it already is."""
@@ -80,53 +134,38 @@ class VirtualSensor:
             self.life = None
             self.flash.power_cut(self._clock())
         elif self.life is None:
-            self.life = Firmware(self._options, self.flash, self._clock, self._remember)
+            self.life = Firmware(self.options, self.flash, self._clock, self._remember)
 
     def swap(self, model: str, serial: int) -> None:
         """Replace it by a new sensor of another model or serial number, just switched on."""
-        self._options = replace(self._options, model=model, serial=serial)
-        self.flash = Flash()
-        self._apply_sinc()
-        self.life = None
-        self.power(True)
+        self.options = replace(self.options, model=model, serial=serial)
+        self._begin()
 
     def set_ppm(self, ppm: float) -> None:
         """Set the error of its clock, now and after a power cycle."""
-        self._options = replace(self._options, ppm=ppm)
+        self.options = replace(self.options, ppm=ppm)
         if self.life is not None:
             self.life.esc.clock.settle()
             self.life.sampler.set_ppm(ppm)
 
     def set_signal(self, signal: str) -> None:
         """Measure another signal, now and after a power cycle."""
-        self._options = replace(self._options, signal=signal)
+        self.options = replace(self.options, signal=signal)
         if self.life is not None:
-            self.life.sampler.set_signal(self._options)
+            self.life.sampler.set_signal(self.options)
 
     def statistics(self) -> dict[str, Any]:
         """Its part of what the command `stats` reports."""
         life = self.life
         return {
-            "model": self._options.model,
-            "serial": self._options.serial,
-            "powered": life is not None,
-            "al_state": life.al.state.name if life else None,
-            "al_error": life is not None and life.al.error,
-            "al_status_code": life.al.code if life else 0,
+            "model": self.options.model,
+            "serial": self.options.serial,
+            **al_statistics(life),
             "sample": life.sampler.clock.number_at(self._clock()) if life else None,
             "samples_made": life.sampler.made if life else 0,
             "sinc_length": life.sampler.clock.sinc_length if life else None,
-            "ppm": self._options.ppm,
+            "ppm": self.options.ppm,
             "calibration_writes": self.calibration_writes,
             "sdo_write_count": self.sdo_write_count,
-            "sdo_writes": [
-                {
-                    "index": f"0x{w.index:04X}",
-                    "subindex": w.subindex,
-                    "hex": w.data.hex(),
-                    "state": w.state.name,
-                    "abort": f"0x{w.abort:08X}" if w.abort else None,
-                }
-                for w in self.sdo_writes[-_WRITES_TOLD:]
-            ],
+            "sdo_writes": list(self.sdo_writes),
         }

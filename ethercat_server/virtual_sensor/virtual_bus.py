@@ -17,14 +17,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from types import TracebackType
 from typing import Final
 
 from ethercat_server.errors import ServerError
 from ethercat_server.process.privileges import become, user_to_become
 
-VIRTUAL_INTERFACE: Final = "virtual"
-"""Interface name that requests a virtual bus."""
+VIRTUAL_INTERFACE: Final = "virtual"  # the interface name that requests a virtual bus
 _CLONE_NEWNET: Final = 0x40000000
 _START_TIMEOUT_S: Final = 20.0
 _GONE_TIMEOUT_S: Final = 3.0
@@ -74,7 +72,7 @@ class VirtualBus:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(_START_TIMEOUT_S)
             code = self._process.poll()
-            self.__exit__(None, None, None)
+            self.__exit__()
             raise ServerError(
                 "the virtual sensor did not start"
                 + (f" (exit code {code})" if code is not None else "")
@@ -83,24 +81,17 @@ class VirtualBus:
             )
         return self
 
-    def __exit__(
-        self, _type: type[BaseException] | None, _value: BaseException | None, _trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """End the sensor's process, and with it the bus."""
         process, self._process = self._process, None
         if process is None:
             return
-        assert process.stdin is not None
-        assert process.stdout is not None
-        with contextlib.suppress(OSError):
-            process.stdin.close()
         try:
-            process.wait(timeout=3)
+            process.communicate(timeout=_GONE_TIMEOUT_S)  # its standard input ends
         except subprocess.TimeoutExpired:
             with contextlib.suppress(PermissionError, subprocess.TimeoutExpired):
                 process.kill()
-                process.wait(_GONE_TIMEOUT_S)
-        process.stdout.close()
+                process.communicate(timeout=_GONE_TIMEOUT_S)
         # The kernel removes a namespace a moment after its last process.
         deadline = time.monotonic() + _GONE_TIMEOUT_S
         while time.monotonic() < deadline and self.ifname in {name for _, name in socket.if_nameindex()}:

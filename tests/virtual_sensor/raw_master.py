@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.bus import Bus
-from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions, SlaveOptions
+from ethercat_server.virtual_sensor.faults import obey
+from ethercat_server.virtual_sensor.options import SensorOptions, SlaveOptions
 
 MAILBOX = 128
 INIT, PREOP, BOOT, SAFEOP, OP = 1, 2, 3, 4, 8
@@ -35,7 +36,7 @@ class RawMaster:
 
     def __init__(self, *slaves: SlaveOptions, start: int = 5_000_000_123) -> None:
         self.now = start
-        self.bus = Bus(BusOptions(slaves or (SensorOptions(),)), start)
+        self.bus = Bus(slaves or (SensorOptions(),), start)
         self.count = len(slaves) or 1
         self.mailbox_counter = 0
         self.pdo_size = self.bus.sensors[0].options.pdo_size if self.bus.sensors else 0
@@ -108,8 +109,6 @@ class RawMaster:
         start = position * (self.pdo_size + 1) + 1
         return data[start : start + self.pdo_size]
 
-    # Mailbox.
-
     def send_mailbox(self, kind: int, body: bytes, counter: int | None = None, position: int = 0) -> int:
         if counter is None:
             self.mailbox_counter = self.mailbox_counter % 7 + 1
@@ -128,17 +127,17 @@ class RawMaster:
         length, _, _, kind = struct.unpack_from("<HHBB", data)
         return kind & 0x0F, data[6 : 6 + length]
 
-    def coe(self, request: bytes, service: int = 2, position: int = 0) -> bytes:
+    def coe(self, request: bytes, position: int = 0) -> bytes:
         """A CoE request and its reply, without the CoE header."""
-        assert self.send_mailbox(3, struct.pack("<H", service << 12) + request, position=position) == 1
+        assert self.send_mailbox(3, struct.pack("<H", 2 << 12) + request, position=position) == 1
         reply = self.fetch_mailbox(position)
         assert reply is not None
         kind, body = reply
         assert kind == 3
-        if body[2] == 0x80 and service == 2:
+        if body[2] == 0x80:
             assert body[1] >> 4 == 2, "an abort is coded as an SDO request"
             raise Abort(struct.unpack_from("<I", body, 6)[0])
-        assert body[1] >> 4 == (3 if service == 2 else 8)
+        assert body[1] >> 4 == 3
         return body[2:]
 
     def upload(self, index: int, subindex: int, position: int = 0) -> bytes:
@@ -167,6 +166,14 @@ class RawMaster:
             assert reply[0] == 3
             found.append(reply[1][2:])
         return found
+
+
+def do(master: RawMaster, *lines: str) -> str:
+    """Give fault commands, which are executed; what the last one answers."""
+    for line in lines:
+        answer = obey(master.bus, line)
+        assert answer.split()[0] == "ok", answer
+    return answer[3:]
 
 
 def chain(count: int, **each: object) -> Sequence[SensorOptions]:

@@ -13,15 +13,10 @@ from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.sensor.scan import look_safely
-from ethercat_server.virtual_sensor.cli import build_parser, options_from
-from ethercat_server.virtual_sensor.faults.table import obey
-from ethercat_server.virtual_sensor.foreign.chain import MOST_SLAVES, ChainError, parse_chain, slaves_in
-from ethercat_server.virtual_sensor.foreign.kinds import KINDS
-from ethercat_server.virtual_sensor.foreign.slave import ForeignSlave
-from ethercat_server.virtual_sensor.options import BusOptions
-from ethercat_server.virtual_sensor.sensor import VirtualSensor
-from tests.simulated_links import chain
-from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, RawMaster, fmmu, sync_manager
+from ethercat_server.virtual_sensor.faults import obey
+from ethercat_server.virtual_sensor.foreign import KINDS, ForeignSlave, parse_chain, slaves_in
+from tests.simulation import chain
+from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, RawMaster, do, fmmu, sync_manager
 
 MS = 1_000_000
 ERROR = 0x10
@@ -68,39 +63,15 @@ def enabled(master: RawMaster, velocity: int) -> None:
         exchange(master, word, velocity)
 
 
-def options_of(*words: str) -> BusOptions:
-    return options_from(build_parser().parse_args(["veth0", *words]))
-
-
 def test_slaves_are_in_wire_order_and_sensors_numbered_among_themselves() -> None:
-    master = RawMaster(*options_of("--chain", "ek1100, BOTA,EL3102,BOTA", "--serial", "7,9").slaves)
-    assert [type(slave) for slave in master.bus.slaves] == [
-        ForeignSlave, VirtualSensor, ForeignSlave, VirtualSensor
-    ]  # fmt: skip
-    assert [sensor.options.serial for sensor in master.bus.sensors] == [7, 9]
-    assert obey(master.bus, "power off @1") == "ok"
+    master = master_of("ek1100, BOTA,EL3102,BOTA")
+    assert [isinstance(slave, ForeignSlave) for slave in master.bus.slaves] == [True, False, True, False]
+    assert [sensor.options.serial for sensor in master.bus.sensors] == [1, 2]
+    do(master, "power off @1")
     assert master.bus.slaves[3].life is None
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--chain", "BOTA,EL9999"], ["--chain", "DRIVE:BOOT"], ["--chain", "BOTA,,BOTA"], ["--chain", ""],
-        ["--chain", ",".join(["EK1100"] * (MOST_SLAVES + 1))], ["--chain", "BOTA", "--sensors", "1"],
-        ["--chain", "EK1100,BOTA", "--serial", "1,2"],
-    ],
-)  # fmt: skip
-def test_wrong_chains(words: list[str]) -> None:
-    with pytest.raises(Exception, match=r"available|at most|leave --sensors out|named"):
-        options_of(*words)
-
-
-def test_a_chain_need_not_have_a_sensor() -> None:
-    master = RawMaster(*options_of("--chain", "EK1100,EL3102").slaves)
-    assert master.one(Command.BRD, 0, 0x0130, bytes(2))[1] == 2
-    assert obey(master.bus, "stick").startswith("error: that slave is no sensor")
-    with pytest.raises(ChainError):
-        parse_chain("?")
+    without = master_of("EK1100,EL3102")
+    assert without.one(Command.BRD, 0, 0x0130, bytes(2))[1] == 2
+    assert obey(without.bus, "stick").startswith("error: that slave is no sensor")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -112,30 +83,20 @@ def test_the_eeprom_says_what_it_is(kind: str) -> None:
     assert (found["vendor"], found["product"], found["name"]) == (device.vendor, device.product, kind)
     assert found["check_byte_right"]
     assert found["protocols"] == ([] if kind == "EK1100" else ["CoE"])
-    assert len(found["sync_managers"]) == len(device.sync_managers)
+    controls = {"EK1100": [], "EL3102": [0x26, 0x22, 0x24, 0x20], "DRIVE": [0x26, 0x22, 0x64, 0x20]}
+    assert [manager["control"] for manager in found["sync_managers"]] == controls[kind], "0x40: the watchdog"
 
 
-def test_a_coupler_goes_to_op_without_anything() -> None:
-    master = master_of("EK1100")
+def test_what_a_slave_needs_for_its_states() -> None:
+    coupler = master_of("EK1100")
     for state in (PREOP, SAFEOP, OP, INIT):
-        assert master.request(state) == (state, 0)
-    assert master.request(OP) == (INIT | ERROR, 0x0011)
-    assert master.request(INIT) == (INIT, 0)
-
-
-@pytest.mark.parametrize(
-    ("state", "managers", "code"),
-    [
-        (PREOP, b"", 0x0016),
-        (SAFEOP, b"", 0x001D),
-        (SAFEOP, sync_manager(OUTPUTS, 6, 0x64) + sync_manager(INPUTS, 61, 0x20), 0x001E),
-    ],
-)
-def test_a_wrong_configuration_is_refused(state: int, managers: bytes, code: int) -> None:
-    master = master_of("DRIVE") if state == PREOP else drive_in(PREOP)
-    if managers:
-        master.write(0x0810, managers)
-    assert master.request(state)[1] == code
+        assert coupler.request(state) == (state, 0), "nothing"
+    assert coupler.request(OP) == (INIT | ERROR, 0x0011)
+    assert master_of("DRIVE").request(PREOP)[1] == 0x0016
+    drive = drive_in(PREOP)
+    assert drive.request(SAFEOP)[1] == 0x001D
+    drive.write(0x0810, sync_manager(OUTPUTS, 6, 0x64) + sync_manager(INPUTS, 61, 0x20))
+    assert drive.request(SAFEOP | ERROR)[1] == 0x001E
 
 
 def test_objects_of_a_terminal() -> None:
@@ -185,27 +146,26 @@ def test_a_drive_stops_when_process_data_stops() -> None:
     assert master.upload(0x603F, 0) == b"\0\0"
 
 
-def test_an_orderly_end_is_no_fault() -> None:
+def test_a_drive_obeys_objects_too_and_an_orderly_end_is_no_fault() -> None:
+    def status() -> int:
+        return int.from_bytes(master.upload(0x6041, 0), "little") & 0x6F
+
     master = drive_in(OP)
     enabled(master, 1000)
     master.request(SAFEOP)
-    assert struct.unpack("<H", master.upload(0x6041, 0))[0] & 0x6F == 0x40
-
-
-def test_a_drive_obeys_objects_too() -> None:
+    assert status() == 0x40
     master = drive_in(PREOP)
     for word in (6, 7):
         master.download(0x6040, 0, struct.pack("<H", word))
-    assert struct.unpack("<H", master.upload(0x6041, 0))[0] & 0x6F == 0x23
+    assert status() == 0x23
 
 
-@pytest.mark.parametrize(("name", "number"), [("PREOP", PREOP), ("SAFEOP", SAFEOP), ("OP", OP)])
+@pytest.mark.parametrize("state", [AlState.PREOP, AlState.SAFEOP, AlState.OP])
 @pytest.mark.parametrize("kind", ["BOTA", *KINDS])
-def test_left_in_a_state_by_another_master(kind: str, name: str, number: int) -> None:
-    master = master_of(f"EK1100,{kind}:{name}")
-    assert master.read16(0x0130, 1) == number
-    assert master.one(Command.FPRD, 0x1002, 0x0130, bytes(2)) == (struct.pack("<H", number), 1)
-    obey(master.bus, "power cycle 0 #1")
+def test_left_in_a_state_by_another_master(kind: str, state: AlState) -> None:
+    master = master_of(f"EK1100,{kind}:{state.name}")
+    assert master.one(Command.FPRD, 0x1002, 0x0130, bytes(2)) == (struct.pack("<H", state), 1)
+    do(master, "power cycle 0 #1")
     master.wait(1)
     assert master.read16(0x0130, 1) == INIT
 
@@ -231,24 +191,14 @@ def test_a_drive_left_at_work_turns_and_records_what_is_written() -> None:
 
 def test_power_and_cable_of_a_place() -> None:
     master = master_of("BOTA,DRIVE:OP,BOTA")
-
-    def answering() -> int:
-        answer = master.frame((Command.BRD, 0, 0x0130, bytes(2)))
-        return answer[0][1] if answer else 0
-
-    assert answering() == 3
-    obey(master.bus, "disconnect #1")
-    assert answering() == 1
-    assert foreign(master, 1).turning, "it has power"
-    obey(master.bus, "connect #1")
-    assert answering() == 3
-    assert master.read(0x0310, 1, 1) == b"\1"
-    obey(master.bus, "power off #1")
-    assert answering() == 1
-    obey(master.bus, "power on #1")
-    assert answering() == 3
+    for line, answering in (("disconnect", 1), ("connect", 3), ("power off", 1), ("power on", 3)):
+        do(master, f"{line} #1")
+        assert foreign(master, 1).turning == (line in ("disconnect", "connect")), "it has power"
+        assert master.one(Command.BRD, 0, 0x0130, bytes(2))[1] == answering
+        if line == "connect":
+            assert master.read(0x0310, 1, 1) == b"\1"
     assert obey(master.bus, "power off #3").startswith("error: ")
-    assert obey(master.bus, "error 0x1E #1") == "ok"
+    do(master, "error 0x1E #1")
     assert master.read16(0x0134, 1) == 0x001E
 
 
@@ -264,7 +214,7 @@ def test_the_backend_in_memory_takes_a_mixed_chain_to_safeop(state: str) -> None
     assert bus.map_process_data(no_check) == [61, 6, 6]
     for slave in bus.slaves:
         finish(slave.go(AlState.SAFEOP), clock=bus.clock)
-    states = [slave.life.al.state for slave in backend.sensors.slaves[1:] if slave.life]
+    states = [slave.life.state for slave in backend.sensors.slaves[1:] if slave.life]
     assert states == [SAFEOP] * 3
 
 

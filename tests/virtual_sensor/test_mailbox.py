@@ -5,28 +5,23 @@ import struct
 import pytest
 
 from ethercat_server.ethercat.wire import Command
-from ethercat_server.virtual_sensor.faults.table import obey
-from ethercat_server.virtual_sensor.foreign.chain import parse_chain, slaves_in
-from tests.virtual_sensor.raw_master import INIT, MAILBOX, PREOP, RawMaster
+from ethercat_server.virtual_sensor.faults import obey
+from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
+from tests.virtual_sensor.raw_master import INIT, MAILBOX, PREOP, RawMaster, do
 
 READ_NAME = struct.pack("<HBHBI", 0x2000, 0x40, 0x1008, 0, 0)
 READ_TYPE = struct.pack("<HBHBI", 0x2000, 0x40, 0x1000, 0, 0)
 
 
-def test_reading_an_empty_mailbox_counts_nothing() -> None:
-    master = RawMaster().go(PREOP)
-    assert master.one(Command.APRD, 0, 0x1080, b"\xaa" * MAILBOX) == (b"\xaa" * MAILBOX, 0)
-
-
 def test_a_mailbox_is_full_until_its_last_byte_is_read() -> None:
     master = RawMaster().go(PREOP)
+    assert master.one(Command.APRD, 0, 0x1080, b"\xaa" * MAILBOX) == (b"\xaa" * MAILBOX, 0), "it is empty"
     assert master.send_mailbox(3, READ_NAME) == 1
-    assert master.mailbox_full()
-    assert master.one(Command.APRD, 0, 0x1090, bytes(4))[1] == 0, "not before the first byte"
-    assert master.one(Command.APRD, 0, 0x1080, bytes(16))[1] == 1
-    assert master.mailbox_full()
-    assert master.one(Command.APRD, 0, 0x1090, bytes(MAILBOX - 16))[1] == 1
-    assert not master.mailbox_full()
+    parts = ((0x1090, 4, 0, True), (0x1080, 16, 1, True), (0x1090, MAILBOX - 16, 1, False))
+    for start, size, counter, full in parts:  # not before the first byte
+        assert master.mailbox_full()
+        assert master.one(Command.APRD, 0, start, bytes(size))[1] == counter
+        assert master.mailbox_full() == full
 
 
 def test_a_request_counts_when_its_last_byte_is_written() -> None:
@@ -62,16 +57,13 @@ def test_the_same_counter_again_is_a_duplicate() -> None:
     for _ in range(2):
         assert master.send_mailbox(3, READ_NAME, counter=0) == 1, "0 is not counted"
         assert master.fetch_mailbox() is not None
-
-
-def test_counting_starts_afresh_after_init() -> None:
-    master = RawMaster().go(PREOP)
     master.send_mailbox(3, READ_NAME, counter=3)
     master.request(INIT)
+    assert master.send_mailbox(3, READ_NAME) == 0, "no mailbox in INIT"
     assert master.request(PREOP) == (PREOP, 0)
     assert not master.mailbox_full()
     master.send_mailbox(3, READ_NAME, counter=3)
-    assert master.mailbox_full()
+    assert master.mailbox_full(), "counting starts afresh"
 
 
 def test_a_lost_reply_can_be_had_again() -> None:
@@ -85,38 +77,20 @@ def test_a_lost_reply_can_be_had_again() -> None:
     assert master.fetch_mailbox() is None
 
 
-def test_unknown_protocols_get_a_mailbox_error() -> None:
+def test_requests_that_get_a_mailbox_error() -> None:
     master = RawMaster().go(PREOP)
     for kind in (1, 2, 5, 15):
         master.send_mailbox(kind, b"hello")
-        assert master.fetch_mailbox() == (0, struct.pack("<HH", 1, 2))
-
-
-def test_lengths_that_lie() -> None:
-    master = RawMaster().go(PREOP)
+        assert master.fetch_mailbox() == (0, struct.pack("<HH", 1, 2)), "an unknown protocol"
     master.write(0x1000, struct.pack("<HHBB", 2000, 0, 0, 0x13).ljust(MAILBOX, b"\0"))
-    assert master.fetch_mailbox() == (0, struct.pack("<HH", 1, 8))
-    master.send_mailbox(3, b"\0", counter=0)
-    assert master.fetch_mailbox() == (0, struct.pack("<HH", 1, 6))
-    master.send_mailbox(3, READ_NAME[:6], counter=0)
-    assert master.fetch_mailbox() == (0, struct.pack("<HH", 1, 6))
-
-
-def test_foe_is_refused() -> None:
-    master = RawMaster().go(PREOP)
+    assert master.fetch_mailbox() == (0, struct.pack("<HH", 1, 8)), "a length that lies"
+    for short in (b"\0", READ_NAME[:6]):
+        master.send_mailbox(3, short, counter=0)
+        assert master.fetch_mailbox() == (0, struct.pack("<HH", 1, 6))
     master.send_mailbox(4, struct.pack("<BBI", 1, 0, 0) + b"firmware")
     reply = master.fetch_mailbox()
     assert reply is not None
-    assert reply[0] == 4
-    assert reply[1][0] == 5
-
-
-def test_no_mailbox_in_init() -> None:
-    master = RawMaster()
-    master.set_up_mailbox()
-    master.request(PREOP)
-    master.request(INIT)
-    assert master.send_mailbox(3, READ_NAME) == 0
+    assert (reply[0], reply[1][0]) == (4, 5), "FoE is refused"
 
 
 def emergency_of(message: tuple[int, bytes] | None) -> tuple[int, int, bytes]:
@@ -130,17 +104,17 @@ def emergency_of(message: tuple[int, bytes] | None) -> tuple[int, int, bytes]:
 
 def test_an_emergency_is_the_next_message_out() -> None:
     master = RawMaster().go(PREOP)
-    assert obey(master.bus, "emergency 0x8130 0x11 0102030405") == "ok"
+    do(master, "emergency 0x8130 0x11 0102030405")
     assert master.mailbox_full()
     assert emergency_of(master.fetch_mailbox()) == (0x8130, 0x11, b"\1\2\3\4\5")
     assert master.fetch_mailbox() is None
-    obey(master.bus, "emergency 0x1000")
+    do(master, "emergency 0x1000")
     assert emergency_of(master.fetch_mailbox()) == (0x1000, 0, bytes(5))
 
 
 def test_messages_are_numbered_in_the_order_in_which_they_go_out() -> None:
     master = RawMaster().go(PREOP)
-    obey(master.bus, "on-request emergency 0x1000")
+    do(master, "on-request emergency 0x1000")
     counters = []
     for _ in range(4):
         master.send_mailbox(3, READ_TYPE)
@@ -152,7 +126,10 @@ def test_messages_are_numbered_in_the_order_in_which_they_go_out() -> None:
 @pytest.mark.parametrize("command", ["on-request emergency 0x8130", "on-write 0x8000 1 emergency 0x8130"])
 def test_an_emergency_between_a_request_and_its_answer(command: str) -> None:
     master = RawMaster().go(PREOP)
-    assert obey(master.bus, command) == "ok"
+    master.send_mailbox(3, READ_TYPE)
+    do(master, command)
+    assert master.fetch_mailbox() is not None
+    assert not master.mailbox_full(), "it waits for the next request"
     request = struct.pack("<HBHBf", 0x2000, 0x23, 0x8000, 1, 2.5)
     for first in (True, False):
         assert master.send_mailbox(3, request) == 1
@@ -171,10 +148,7 @@ def test_emergencies_that_cannot_be_sent() -> None:
     for wrong in ("emergency 0x10000", "emergency 1 256", "emergency 1 0 xy", "emergency 1 0 010203040506"):
         assert obey(master.bus, wrong).startswith("error: ")
     assert master.fetch_mailbox() is None
-
-
-def test_an_emergency_of_a_foreign_slave() -> None:
-    master = RawMaster(*slaves_in(parse_chain("EK1100,DRIVE:OP")))
-    obey(master.bus, "emergency 0x3210 #1")
-    assert emergency_of(master.fetch_mailbox(1))[0] == 0x3210
-    assert obey(master.bus, "emergency 0x3210 #0").startswith("error: ")
+    foreign = RawMaster(*slaves_in(parse_chain("EK1100,DRIVE:OP")))
+    do(foreign, "emergency 0x3210 #1")
+    assert emergency_of(foreign.fetch_mailbox(1))[0] == 0x3210
+    assert obey(foreign.bus, "emergency 0x3210 #0").startswith("error: ")

@@ -20,33 +20,33 @@ from bota_ethercat.pdo import encode
 from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.sensor.objects.dictionary import Access
-from ethercat_server.virtual_sensor.firmware.dictionary import entries_of
-from ethercat_server.virtual_sensor.measurement.signals import decode_clock
-from tests.virtual_sensor.conftest import SensorProcess
+from ethercat_server.virtual_sensor.dictionary import sensor_entries
+from ethercat_server.virtual_sensor.signals import decode_clock
+from tests.server.running import VirtualSensor, wait_until
+from tests.virtual_sensor.conftest import Start
 
 pytestmark = pytest.mark.bus
 
-Start = Callable[..., SensorProcess]
+Bench = Callable[..., tuple[VirtualSensor, Any]]
 _PATIENCE = 20.0
 SOL_PACKET, PACKET_AUXDATA, ETH_P_ALL = 263, 8, 3
 
 
 @pytest.fixture
-def open_master(veth: tuple[str, str]) -> Iterator[Callable[[], Any]]:
-    masters: list[Any] = []
+def bench(veth: tuple[str, str], start: Start) -> Iterator[Bench]:
+    """Starts a virtual sensor with these arguments, and opens a master on the other end."""
+    master = pysoem.Master()
 
-    def opened() -> Any:
-        master = pysoem.Master()
+    def made(*arguments: str) -> tuple[VirtualSensor, Any]:
+        sensor = start(veth[0], *arguments)
         try:
             master.open(veth[1])
         except ConnectionError as error:
             pytest.skip(f"pysoem cannot open {veth[1]}: {error}")
-        masters.append(master)
-        return master
+        return sensor, master
 
-    yield opened
-    for master in masters:
-        master.close()
+    yield made
+    master.close()
 
 
 def exchange(master: Any) -> int:
@@ -79,37 +79,24 @@ def read(slave: Any, index: int, subindex: int) -> bytes:
     return data
 
 
-def write(slave: Any, index: int, subindex: int, data: bytes) -> None:
-    patiently(lambda: slave.sdo_write(index, subindex, data))
-
-
 def register(slave: Any, address: int, layout: str) -> int:
     data = patiently(lambda: slave._fprd(address, struct.calcsize(layout)))
     return int(struct.unpack(layout, data)[0])
 
 
 def find(master: Any, count: int) -> None:
-    """config_init until all slaves are there."""
-    end = time.monotonic() + _PATIENCE
-    while (found := master.config_init()) != count:
-        assert time.monotonic() < end, f"{found} slaves instead of {count}"
+    wait_until(lambda: master.config_init() == count, f"{count} slaves", _PATIENCE)
 
 
 def reach_op(master: Any) -> None:
     master.state = pysoem.OP_STATE
     master.write_state()
-    end = time.monotonic() + _PATIENCE
-    while time.monotonic() < end:
-        exchange(master)
-        if master.state_check(pysoem.OP_STATE, 20_000) == pysoem.OP_STATE:
-            return
-    pytest.fail("OP not reached")
+    op = pysoem.OP_STATE
+    wait_until(lambda: exchange(master) >= 0 and master.state_check(op, 20_000) == op, "OP", _PATIENCE)
 
 
 def bring_up(master: Any, count: int = 1) -> None:
-    end = time.monotonic() + _PATIENCE
-    while not set_up(master, count):
-        assert time.monotonic() < end, "SAFEOP not reached"
+    wait_until(lambda: set_up(master, count), "SAFEOP", _PATIENCE)
     reach_op(master)
 
 
@@ -126,11 +113,8 @@ def set_up(master: Any, count: int) -> bool:
 
 
 @pytest.mark.parametrize("size", [61, 77])
-def test_to_op_with_the_clock_signal(
-    size: int, veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
-) -> None:
-    start(veth[0], "--pdo", str(size), "--signal", "clock", "--serial", "42")
-    master = open_master()
+def test_to_op_with_the_clock_signal(size: int, bench: Bench) -> None:
+    _, master = bench("--pdo", str(size), "--signal", "clock", "--serial", "42")
     bring_up(master)
     slave = master.slaves[0]
     assert (slave.name, slave.man, slave.id, slave.rev) == ("BFT-SENS-ECAT-M8", 0xB07A, 1, 3)
@@ -152,22 +136,19 @@ def test_to_op_with_the_clock_signal(
         previous = reading
 
 
-def test_the_whole_dictionary(veth: tuple[str, str], start: Start, open_master: Callable[[], Any]) -> None:
-    start(veth[0], "--pdo", "77")
-    master = open_master()
+def test_the_whole_dictionary(bench: Bench) -> None:
+    _, master = bench("--pdo", "77")
     bring_up(master)
     slave = master.slaves[0]
-    entries = entries_of(77)
+    entries = sensor_entries(77)
     sizes = {}
     for (index, subindex), row in entries.items():
         data = read(slave, index, subindex)
         assert len(data) == (row.type.size or len(data))
         sizes[index, subindex] = len(data) * 8
-    for (index, subindex), row in entries.items():
         if row.access is Access.RW_PREOP:
-            value = read(slave, index, subindex)
             with pytest.raises(pysoem.SdoError) as caught:
-                write(slave, index, subindex, value)
+                patiently(functools.partial(slave.sdo_write, index, subindex, data))
             assert caught.value.abort_code == 0x08000022
     # Last, because the gap at 0x6000:03 leaves an error in SOEM's ring that the next call would raise.
     variables, parts = set(), {}
@@ -180,49 +161,39 @@ def test_the_whole_dictionary(veth: tuple[str, str], start: Start, open_master: 
     assert all(sizes[address] == bits for address, bits in parts.items())
 
 
-def test_a_chain_of_three(veth: tuple[str, str], start: Start, open_master: Callable[[], Any]) -> None:
-    start(veth[0], "--sensors", "3", "--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", "--signal", "constant")
-    master = open_master()
-    bring_up(master, 3)
-    # Not `slave.name`: SOEM copies the SII of the slave before if vendor, product and revision are the same.
-    names = [read(slave, 0x1008, 0).rstrip(b"\0") for slave in master.slaves]
-    assert names == [b"BFT-SENS-ECAT-M8", b"BFT-ROKS-ECAT-M8", b"BFT-ROKS-ECAT-M8"]
-    assert exchange(master) == master.expected_wkc == 9
-    assert len({slave.input for slave in master.slaves}) == 1
-    serials = [struct.unpack("<I", read(slave, 0x1018, 4))[0] for slave in master.slaves]
-    assert serials == [serials[0] + n for n in range(3)]
-
-
-@pytest.mark.parametrize("chain", ["EK1100,BOTA,EL3102,DRIVE", "EK1100:OP,BOTA:OP,EL3102:OP,DRIVE:OP"])
-def test_a_chain_with_foreign_slaves(
-    chain: str, veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
-) -> None:
-    sensor = start(veth[0], "--chain", chain, "--signal", "constant")
-    assert sensor.ready.endswith(", beside EK1100, EL3102, DRIVE")
-    master = open_master()
-    bring_up(master, 4)
-    coupler, bota, terminal, drive = master.slaves
+@pytest.mark.parametrize("state", ["", ":OP"])
+def test_a_chain_with_foreign_slaves(state: str, bench: Bench) -> None:
+    chain = ",".join(kind + state for kind in ("EK1100", "BOTA", "EL3102", "DRIVE", "BOTA"))
+    models = ("--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", "--signal", "constant")
+    sensor, master = bench("--chain", chain, *models)
+    assert sensor.said().endswith(", beside EK1100, EL3102, DRIVE\n")
+    bring_up(master, 5)
+    coupler, bota, terminal, drive, last = master.slaves
     drive.output = struct.pack("<Hi", 0x06, 0)
-    assert [slave.name for slave in master.slaves] == ["EK1100", "BFT-SENS-ECAT-M8", "EL3102", "DRIVE"]
+    # Not `slave.name` of the last: SOEM copies the SII of another of the same vendor, product and revision.
+    names = ["EK1100", "BFT-SENS-ECAT-M8", "EL3102", "DRIVE"]
+    assert [slave.name for slave in master.slaves[:4]] == names
+    assert read(last, 0x1008, 0).rstrip(b"\0") == b"BFT-ROKS-ECAT-M8"
+    serials = [struct.unpack("<I", read(slave, 0x1018, 4))[0] for slave in (bota, last)]
+    assert serials == [serials[0], serials[0] + 1]
     assert (coupler.man, coupler.id) == (2, 0x044C2C52)
     assert (terminal.man, terminal.id) == (2, 0x0C1E3052)
-    assert [(len(s.output), len(s.input)) for s in master.slaves] == [(0, 0), (1, 61), (0, 6), (6, 6)]
-    assert exchange(master) == master.expected_wkc == 3 + 1 + 3
+    sizes = [(len(s.output), len(s.input)) for s in master.slaves]
+    assert sizes == [(0, 0), (1, 61), (0, 6), (6, 6), (1, 61)]
+    assert exchange(master) == master.expected_wkc == 3 + 1 + 3 + 3
     assert struct.unpack_from("<f", bota.input, 5) == (1.5,)
+    assert bota.input == last.input
     assert struct.unpack("<BhBh", terminal.input) == (0, 0x4000, 0, -0x2000)
-    for word, state in ((0x06, 0x21), (0x07, 0x23), (0x0F, 0x27)):
+    for word, drive_state in ((0x06, 0x21), (0x07, 0x23), (0x0F, 0x27)):
         drive.output = struct.pack("<Hi", word, 1000)
         exchange(master)
         exchange(master)
-        assert struct.unpack_from("<H", drive.input)[0] & 0x6F == state
+        assert struct.unpack_from("<H", drive.input)[0] & 0x6F == drive_state
     assert read(drive, 0x1008, 0) == b"DRIVE"
 
 
-def test_soem_sets_distributed_clocks_up(
-    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
-) -> None:
-    start(veth[0], "--chain", "EK1100,BOTA,DRIVE")
-    master = open_master()
+def test_soem_sets_distributed_clocks_up(bench: Bench) -> None:
+    _, master = bench("--chain", "EK1100,BOTA,DRIVE")
     find(master, 3)
     patiently(master.config_map)
     end = time.monotonic() + _PATIENCE
@@ -239,32 +210,23 @@ def test_soem_sets_distributed_clocks_up(
     reach_op(master)
 
 
-def test_pysoem_reports_an_emergency(
-    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
-) -> None:
-    sensor = start(veth[0])
-    master = open_master()
+def test_pysoem_reports_an_emergency_and_no_eeprom_write(bench: Bench) -> None:
+    sensor, master = bench()
     find(master, 1)
     [slave] = master.slaves
+    with pytest.raises(pysoem.EepromError):
+        slave.eeprom_write(0x08, b"\xde\xad")
     told: list[Any] = []
     slave.add_emergency_callback(told.append)
     master.state_check(pysoem.PREOP_STATE, 2_000_000)
-    for command in ("emergency 0x8130 0x11 0102030405", "on-request emergency 0x8130 0x11 0102030405"):
+    for line in ("emergency 0x8130 0x11 0102030405", "on-request emergency 0x8130 0x11 0102030405"):
         told.clear()
-        assert sensor.command(command) == "ok"
+        sensor.command(line)
         assert read(slave, 0x1008, 0).rstrip(b"\0") == b"BFT-SENS-ECAT-M8"
         assert [(e.error_code, e.error_reg) for e in told] == [(0x8130, 0x11)]
-    assert sensor.command("emergency 0x8131") == "ok"
+    sensor.command("emergency 0x8131")
     patiently(master.config_map)
     assert master.state_check(pysoem.SAFEOP_STATE, 2_000_000) == pysoem.SAFEOP_STATE
-
-
-def test_an_eeprom_write_fails(veth: tuple[str, str], start: Start, open_master: Callable[[], Any]) -> None:
-    start(veth[0])
-    master = open_master()
-    find(master, 1)
-    with pytest.raises(pysoem.EepromError):
-        master.slaves[0].eeprom_write(0x08, b"\xde\xad")
 
 
 @pytest.mark.parametrize("tag", ["8100e000", "81006005", "88a80005"])
@@ -284,12 +246,9 @@ def test_an_answer_has_the_vlan_tag_of_its_frame(tag: str, veth: tuple[str, str]
     assert f"{kind:04x}{control:04x}" == tag
 
 
-def test_an_interface_down_for_a_while(
-    veth: tuple[str, str], start: Start, open_master: Callable[[], Any]
-) -> None:
-    start(veth[0])
+def test_an_interface_down_for_a_while(veth: tuple[str, str], bench: Bench) -> None:
+    _, master = bench()
     for state in ("down", "up"):
         subprocess.run(["ip", "link", "set", veth[0], state], check=True)
-    master = open_master()
     bring_up(master)
     assert exchange(master) == 3

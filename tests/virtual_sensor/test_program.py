@@ -2,58 +2,53 @@
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import json
+import signal
 import socket
 import subprocess
-import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from ethercat_server.virtual_sensor import link
-from ethercat_server.virtual_sensor.cli import UsageError, build_parser, main, options_from
-from ethercat_server.virtual_sensor.options import BusOptions
-from tests.virtual_sensor.conftest import SensorProcess
-
-Start = Callable[..., SensorProcess]
+from ethercat_server.virtual_sensor.cli import build_parser, main, options_from
+from ethercat_server.virtual_sensor.options import SensorOptions, UsageError
+from tests.virtual_sensor.conftest import Start
 
 
-def parse(*words: str) -> argparse.Namespace:
-    return build_parser().parse_args(["veth0", *words])
+def sensors(*words: str) -> list[SensorOptions]:
+    slaves = options_from(build_parser().parse_args(["veth0", *words]))
+    return [slave for slave in slaves if isinstance(slave, SensorOptions)]
 
 
-def test_defaults() -> None:
-    [sensor] = options_from(parse()).sensors
-    assert (sensor.model, sensor.serial, sensor.pdo_size) == ("BFT-SENS-ECAT-M8", 1, 61)
-    assert (sensor.signal, sensor.noise, sensor.ppm, sensor.sinc_length) == ("scene", True, 0.0, None)
-
-
-def test_a_chain() -> None:
-    options = options_from(
-        parse("--sensors", "3", "--model", "A,B", "--serial", "5", "--ppm", "1.5", "--ppm=-2", "--seed", "7")
+def test_options_go_along_the_chain() -> None:
+    assert sensors() == [
+        SensorOptions(model="BFT-SENS-ECAT-M8", serial=1, pdo_size=61, signal="scene", seed=0)
+    ]
+    options = sensors(
+        *["--sensors", "3", "--model", "A,B", "--serial", "5", "--ppm", "1.5", "--ppm=-2", "--seed", "7"]
     )
-    assert [s.model for s in options.sensors] == ["A", "B", "B"]
-    assert [s.serial for s in options.sensors] == [5, 6, 7]
-    assert [s.ppm for s in options.sensors] == [1.5, -2.0, -2.0]
-    assert [s.seed for s in options.sensors] == [7, 8, 9]
-    assert len(options_from(parse("--model", "A", "--model", "B")).sensors) == 2
+    found = [(sensor.model, sensor.serial, sensor.ppm, sensor.seed) for sensor in options]
+    assert found == [("A", 5, 1.5, 7), ("B", 6, -2.0, 8), ("B", 7, -2.0, 9)]
+    assert len(sensors("--model", "A", "--model", "B")) == 2
+    chain = sensors(*["--dc", "none,32-bit+late=5", "--write-us", "8.5", "--chain", "BOTA,EK1100,BOTA"])
+    assert [(sensor.dc, sensor.write_us) for sensor in chain] == [("none", 8.5), ("32-bit+late=5", 8.5)]
+    assert [(sensor.dc, sensor.write_us) for sensor in sensors("--sensors", "2")] == [("", 12.0)] * 2
 
 
 @pytest.mark.parametrize(
     "words",
     [
-        ["--sensors", "0"], ["--sensors", "many"], ["--sensors", "17"], ["--sensors", "1", "--model", "A,B"],
-        ["--serial", "-1"], ["--ppm", "nan"], ["--sinc", "31"], ["--eeprom-ms", "-1"],
-        ["--model", "x" * 21], ["--model", "é"],
+        "--sensors 0", "--sensors many", "--sensors 17", "--sensors 1 --model A,B", "--serial -1",
+        "--ppm nan", "--sinc 31", "--eeprom-ms -1", "--model " + "x" * 21, "--model é", "--dc late",
+        "--chain BOTA,EL9999", "--chain DRIVE:BOOT", "--chain BOTA,,BOTA", "--chain ,",
+        "--chain " + ",".join(["EK1100"] * 17), "--chain BOTA --sensors 1",
+        "--chain EK1100,BOTA --serial 1,2",
     ],
 )  # fmt: skip
-def test_wrong_arguments(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_arguments(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(UsageError):
-        options_from(parse(*words))
-    assert main(["veth0", *words]) == 2
+        sensors(*words.split())
+    assert main(["veth0", *words.split()]) == 2
     assert capsys.readouterr().err.startswith("ethercat-virtual-sensor: ")
 
 
@@ -72,18 +67,28 @@ def test_an_interface_that_is_down(veth: tuple[str, str], capsys: pytest.Capture
 
 
 @pytest.mark.bus
-def test_it_says_when_it_is_ready_and_ends_on_sigterm(veth: tuple[str, str], start: Start) -> None:
+def test_it_says_when_it_is_ready_and_how_it_ends(veth: tuple[str, str], start: Start) -> None:
     sensor = start(veth[0], "--sensors", "2")
-    assert sensor.ready.startswith(f"ready: 2 sensor(s) BFT-SENS-ECAT-M8 on {veth[0]},")
-    assert sensor.end() == (0, "")
+    assert sensor.said().startswith(f"ready: 2 sensor(s) BFT-SENS-ECAT-M8 on {veth[0]},")
+    sensor.signal(signal.SIGTERM)
+    assert sensor.wait() == 0
+    assert sensor.said().count("\n") == 1
+    quitting = start(veth[0])
+    quitting.command("quit")
+    assert quitting.wait() == 0
+    ending = start(veth[0], "--exit-on-eof")
+    assert ending.process.stdin is not None
+    ending.process.stdin.close()
+    assert ending.wait() == 0
 
 
 @pytest.mark.bus
 def test_each_interface_has_serial_numbers_of_its_own(veth: tuple[str, str], start: Start) -> None:
     def serials(ifname: str) -> list[int]:
         sensor = start(ifname, "--sensors", "2")
-        answer = json.loads(sensor.command("stats").removeprefix("ok "))
-        sensor.end()
+        answer = json.loads(sensor.command("stats"))
+        sensor.signal(signal.SIGINT)
+        assert sensor.wait() == 0
         return [each["serial"] for each in answer["sensors"]]
 
     for number, end in enumerate(veth):  # as of two ports of one card
@@ -94,54 +99,25 @@ def test_each_interface_has_serial_numbers_of_its_own(veth: tuple[str, str], sta
 
 
 @pytest.mark.bus
-def test_quit_and_end_of_input(veth: tuple[str, str], start: Start) -> None:
-    sensor = start(veth[0])
-    assert sensor.process.stdin is not None
-    sensor.process.stdin.write("quit\n")
-    sensor.process.stdin.flush()
-    assert sensor.process.wait(30) == 0
-    sensor = start(veth[0], "--exit-on-eof")
-    assert sensor.process.stdin is not None
-    sensor.process.stdin.close()
-    assert sensor.process.wait(30) == 0
-
-
-@pytest.mark.bus
-def test_it_goes_on_without_input(veth: tuple[str, str], start: Start, tmp_path: Path) -> None:
-    path = tmp_path / "control"
-    sensor = start(veth[0], "--control", str(path))
-    assert sensor.process.stdin is not None
-    sensor.process.stdin.close()
-    with socket.socket(socket.AF_UNIX) as peer:
-        peer.connect(str(path))
-        peer.sendall(b"lose 1\n")
-        assert peer.recv(100) == b"ok\n"
-    assert sensor.end()[0] == 0
-
-
-@pytest.mark.bus
 def test_the_control_socket(veth: tuple[str, str], start: Start, tmp_path: Path) -> None:
     path = tmp_path / "control"
     sensor = start(veth[0], "--control", str(path))
-    assert sensor.command("lose 1") == "ok"
-    with (
-        socket.socket(socket.AF_UNIX) as one,
-        socket.socket(socket.AF_UNIX) as other,
-        contextlib.ExitStack() as stack,
-    ):
+    sensor.command("lose 1")
+    assert sensor.process.stdin is not None
+    sensor.process.stdin.close()  # it goes on without input
+    with socket.socket(socket.AF_UNIX) as one, socket.socket(socket.AF_UNIX) as other:
         for peer in (one, other):
             peer.connect(str(path))
         other.sendall(b"sta")
         one.sendall(b"nonsense\nhear\n")
-        answers = stack.enter_context(one.makefile())
-        assert answers.readline().startswith("error: ")
-        assert answers.readline() == "ok\n"
-        other.sendall(b"ts\n")
-        answer = stack.enter_context(other.makefile()).readline()
-        assert json.loads(answer.removeprefix("ok "))["frames"] == 0
-        one.sendall(b"quit\n")
-        assert answers.readline() == "ok\n"
-    assert sensor.process.wait(30) == 0
+        with one.makefile() as answers, other.makefile() as other_answers:
+            assert answers.readline().startswith("error: ")
+            assert answers.readline() == "ok\n"
+            other.sendall(b"ts\n")
+            assert json.loads(other_answers.readline().removeprefix("ok "))["frames"] == 0
+            one.sendall(b"quit\n")
+            assert answers.readline() == "ok\n"
+    assert sensor.wait() == 0
     assert not path.exists(), "nothing is left behind"
 
 
@@ -149,41 +125,23 @@ def test_the_control_socket(veth: tuple[str, str], start: Start, tmp_path: Path)
 def test_a_control_socket_in_use_and_one_left_behind(
     veth: tuple[str, str], start: Start, tmp_path: Path
 ) -> None:
-    path = tmp_path / "control"
+    path, left, not_ours = (tmp_path / name for name in ("control", "left", "file"))
+    not_ours.write_text("precious")
     start(veth[0], "--control", str(path))
-    second = start(veth[1], "--control", str(path))
-    code, errors = second.end()
-    assert (code, second.ready) == (1, "")
-    assert str(path) in errors
-    left = tmp_path / "left"
+    for used in (path, not_ours):
+        second = start(veth[1], "--control", str(used), ready=False)
+        assert second.wait() == 1
+        assert str(used) in second.said()
+    assert not_ours.read_text() == "precious"
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(left))
-    assert start(veth[1], "--control", str(left)).ready.startswith("ready")
-    not_ours = tmp_path / "file"
-    not_ours.write_text("precious")
-    assert start(veth[1], "--control", str(not_ours)).end()[0] == 1
-    assert not_ours.read_text() == "precious"
+    start(veth[1], "--control", str(left))
 
 
 @pytest.mark.bus
 def test_an_interface_that_disappears(veth: tuple[str, str], start: Start) -> None:
     sensor = start(veth[0])
     subprocess.run(["ip", "link", "del", veth[0]], check=True)
-    assert sensor.process.wait(30) == 1
-    assert sensor.process.stderr is not None
-    message = sensor.process.stderr.read()
+    assert sensor.wait() == 1
+    _ready, message = sensor.said().splitlines()
     assert veth[0] in message
-    assert message.count("\n") == 1
-
-
-@pytest.mark.bus
-def test_run_in_a_thread(veth: tuple[str, str]) -> None:
-    ready, stop = threading.Event(), threading.Event()
-    thread = threading.Thread(
-        target=link.run, args=(veth[0], BusOptions()), kwargs={"on_ready": ready.set, "should_stop": stop}
-    )
-    thread.start()
-    assert ready.wait(30)
-    stop.set()
-    thread.join(30)
-    assert not thread.is_alive()

@@ -4,9 +4,10 @@ import struct
 
 import pytest
 
+from ethercat_server.ethercat import wire
+from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.options import ForeignOptions
-from ethercat_server.virtual_sensor.slave.al import AlState
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, RawMaster, chain, fmmu, sync_manager
 
 
@@ -18,15 +19,12 @@ def test_dl_information() -> None:
     assert features & 0x0C == 0x0C, "a distributed clock of 64 bits"
 
 
-def test_broadcast_counts_slaves_and_ors_data() -> None:
+def test_addresses() -> None:
     master = RawMaster(*chain(3))
     master.set_up_mailbox(1)
     assert master.request(PREOP, 1) == (PREOP, 0)
-    assert master.one(Command.BRD, 0, 0x0130, bytes(2)) == (struct.pack("<H", INIT | PREOP), 3)
-
-
-def test_auto_increment_addresses_are_counted_up_by_every_slave() -> None:
-    master = RawMaster(*chain(3))
+    status = master.one(Command.BRD, 0, 0x0130, bytes(2))
+    assert status == (struct.pack("<H", INIT | PREOP), 3), "a broadcast ORs the data"
     for position in range(3):
         assert master.write(0x0010, struct.pack("<H", 0x1000 + position), position) == 1
     for position in range(3):
@@ -34,14 +32,7 @@ def test_auto_increment_addresses_are_counted_up_by_every_slave() -> None:
         assert (data, counter) == (struct.pack("<H", 0x1000 + position), 1)
     assert master.one(Command.APRD, -3, 0x0010, bytes(2)) == (bytes(2), 0)
     assert master.one(Command.FPRD, 0x2000, 0x0010, bytes(2)) == (bytes(2), 0)
-
-
-def test_ports_follow_the_chain() -> None:
-    master = RawMaster(*chain(2))
-    first, last = master.read16(0x0110, 0), master.read16(0x0110, 1)
-    assert first & 0x0300 == last & 0x0300 == 0x0200
-    assert first & 0x0C00 == 0x0800
-    assert last & 0x0C00 == 0x0400
+    assert [master.read16(0x0110, n) & 0x0F00 for n in range(3)] == [0x0A00, 0x0A00, 0x0600], "the ports"
 
 
 @pytest.mark.parametrize("register", [0x0000, 0x0008, 0x0012, 0x0110, 0x0130, 0x0134, 0x0140, 0x0220, 0x0904])
@@ -52,15 +43,14 @@ def test_read_only_registers_ignore_writes(register: int) -> None:
     assert master.read(register, 2) == before
 
 
-def test_reading_beyond_memory_counts_nothing() -> None:
-    assert RawMaster().one(Command.APRD, 0, 0x8000, b"ab") == (b"ab", 0)
-
-
-def test_read_write_counts_three() -> None:
-    master = RawMaster()
+def test_what_commands_count() -> None:
+    master = RawMaster().go(PREOP)
+    assert master.one(Command.APRD, 0, 0x8000, b"ab") == (b"ab", 0), "beyond memory"
     assert master.one(Command.APRW, 0, 0x0F80, b"new!") == (bytes(4), 3)
     assert master.one(Command.BRW, 0, 0x0F80, b"\1\1\1\1")[1] == 3
     assert master.read(0x0F80, 4) == b"\1\1\1\1"
+    assert master.frame((Command.NOP, 0, 0x0130, b"\0"), (15, 0, 0x0130, b"\0")) == [(b"\0", 0)] * 2
+    assert master.one(Command.APRW, 0, 0x1000, b"") == (b"", 0), "no data"
 
 
 def test_read_multiple_write() -> None:
@@ -71,24 +61,22 @@ def test_read_multiple_write() -> None:
     assert [master.read(0x0F80, 1, position) for position in range(3)] == [b"\x11", b"\xaa", b"\xaa"]
 
 
-def test_nop_and_unknown_commands_pass() -> None:
-    master = RawMaster()
-    assert master.frame((Command.NOP, 0, 0x0130, b"\0"), (15, 0, 0x0130, b"\0")) == [(b"\0", 0)] * 2
-
-
 def test_interrupt_field_shows_masked_events() -> None:
     master = RawMaster().go(PREOP)
+
+    def interrupt() -> int:
+        frame = wire.build((Command.BRD, 0, 0x0000, b"\0"))
+        assert master.bus.process(frame, len(frame), master.now)
+        return int.from_bytes(frame[wire.FIRST_DATA - 2 : wire.FIRST_DATA], "little")
+
     master.read(0x0130, 2)
     assert master.read16(0x0210) & 0x08 == 0
-    master.request(INIT)
+    assert master.write(0x0200, b"\x08\0") == 1
+    assert interrupt() == 0
     master.write(0x0120, b"\1\0")
-    assert master.one(Command.APWR, 0, 0x0200, b"\xff\0")[1] == 1
-
-
-def test_an_enabled_sync_manager_keeps_its_area() -> None:
-    master = RawMaster().go(PREOP)
-    master.write(0x0800, struct.pack("<HH", 0x1400, 64))
-    assert master.read(0x0800, 4) == struct.pack("<HH", 0x1000, 128)
+    assert (interrupt(), master.read16(0x0210) & 0x08) == (0x08, 0x08), "the AL status has changed"
+    master.read(0x0130, 2)
+    assert interrupt() == 0
 
 
 def test_process_data_by_fmmu() -> None:
@@ -100,14 +88,9 @@ def test_process_data_by_fmmu() -> None:
     assert master.one(Command.LRD, 1, 0, bytes(61)) == (data[1:62], 1)
     assert master.one(Command.LWR, 0, 0, b"\1")[1] == 1
     assert master.one(Command.LRW, 0x1000, 0, bytes(4)) == (bytes(4), 0)
-
-
-def test_inputs_and_outputs_may_share_logical_addresses() -> None:
-    master = RawMaster(*chain(1, signal="constant")).go(OP)
     master.write(0x0600, fmmu(0, 1, 0x1100, 2) + fmmu(0, 61, 0x1180, 1))
-    data, counter = master.one(Command.LRW, 0, 0, b"\x07" + bytes(60))
-    assert counter == 3
-    assert struct.unpack_from("<f", data, 5) == (1.5,)
+    shared, counter = master.one(Command.LRW, 0, 0, b"\x07" + bytes(60))
+    assert (shared[1:], counter) == (data[2:62], 3), "inputs and outputs may share logical addresses"
     assert master.upload(0x7000, 0) == b"\x07"
 
 
@@ -118,27 +101,14 @@ def test_single_bits_by_fmmu() -> None:
     assert master.one(Command.LRD, 0x200, 0, b"\x81") == (b"\x81", 1)
     master.send_mailbox(3, struct.pack("<HBHBI", 0x2000, 0x40, 0x1000, 0, 0))
     assert master.one(Command.LRD, 0x200, 0, b"\x81") == (b"\xa1", 1)
-
-
-def test_written_bits_leave_the_others() -> None:
-    master = RawMaster()
     master.write(0x0F80, b"\xff\xff")
     master.write(0x0600, fmmu(0, 1, 0x0F80, 2, 0, 3, 6))
     assert master.one(Command.LWR, 0, 0, b"\x05")[1] == 1
-    # Bits 6 to 9 become 0101 (lowest first: 1, 0, 1, 0).
+    # Bits 6 to 9 become 0101 (lowest first: 1, 0, 1, 0), and the others stay.
     assert master.read16(0x0F80) == 0xFFFF & ~(0xF << 6) | 5 << 6
-
-
-def test_bits_at_the_end_of_memory() -> None:
-    master = RawMaster()
-    master.write(0x0600, fmmu(0, 4, 0x1FFE, 3, 0, 7, 5))
+    master.write(0x0600, fmmu(0, 4, 0x1FFE, 3, 0, 7, 5))  # at the end of memory
     assert master.one(Command.LRW, 0, 0, b"\xff" * 4)[1] == 3
     assert master.read(0x1FFE, 2) == b"\xe0\xff"
-
-
-def test_a_datagram_without_data_counts_nothing() -> None:
-    master = RawMaster().go(PREOP)
-    assert master.one(Command.APRW, 0, 0x1000, b"") == (b"", 0)
 
 
 def test_process_data_needs_the_state() -> None:
@@ -169,26 +139,25 @@ def test_a_buffer_is_read_and_written_from_its_first_byte_on() -> None:
     assert [drive.write(at + n, bytes(size)) for n, size in ((1, 5), (0, 1), (1, 5), (1, 5))] == [0, 1, 1, 0]
 
 
-def test_the_sync_unit_can_be_set_up() -> None:
+def test_registers_that_can_be_written() -> None:
     master = RawMaster()
     for register, value in ((0x0981, b"\3"), (0x0990, bytes(range(8))), (0x09A0, bytes(range(8)))):
-        assert master.write(register, value) == 1
+        assert master.write(register, value) == 1, "the SYNC unit can be set up"
         assert master.read(register, len(value)) == value
+    master.go(PREOP).write(0x0800, struct.pack("<HH", 0x1400, 64))
+    assert master.read(0x0800, 4) == struct.pack("<HH", 0x1000, 128), "an enabled one keeps its area"
 
 
-def test_wrong_direction_is_refused() -> None:
-    master = RawMaster().go(OP)
-    assert master.one(Command.APWR, 0, 0x1180, b"x")[1] == 0
+def test_memory_that_sync_managers_guard() -> None:
+    master = RawMaster()
+    master.write(0x0800, sync_manager(0x1000, 128, 0x26, 0))
+    assert master.write(0x1010, b"x") == 1, "a disabled one frees its memory"
+    master.go(OP)
+    assert master.one(Command.APWR, 0, 0x1180, b"x")[1] == 0, "the wrong direction"
     assert master.one(Command.APRD, 0, 0x1100, b"x") == (b"x", 0)
     # Free memory behind the buffers is anyone's.
     assert master.write(0x1F00, b"note") == 1
     assert master.read(0x1F00, 4) == b"note"
-
-
-def test_a_disabled_sync_manager_frees_its_memory() -> None:
-    master = RawMaster()
-    master.write(0x0800, sync_manager(0x1000, 128, 0x26, 0))
-    assert master.write(0x1010, b"x") == 1
 
 
 def receive_times(master: RawMaster, position: int) -> tuple[int, int]:

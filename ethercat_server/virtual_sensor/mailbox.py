@@ -9,51 +9,34 @@ from __future__ import annotations
 import struct
 from collections import deque
 from collections.abc import Callable
-from enum import IntEnum
 from typing import Final
 
 from ethercat_server.ethercat.slave.sii import MailboxProtocol
-from ethercat_server.virtual_sensor.esc.sync_manager import SyncManager
+from ethercat_server.virtual_sensor.esc import SyncManager
 
 HEADER: Final = struct.Struct("<HHBB")
-COE_EMERGENCY: Final = 1
-"""Service in the CoE header."""
-_TYPE_MASK = 0x0F
+_ERROR, _COE, _FOE = 0, 3, 4  # protocols, as numbered in the header
+_COE_EMERGENCY: Final = 1  # service in the CoE header
+_ACCESS_DENIED: Final = struct.pack("<BBI", 5, 0, 0x8002) + b"Access denied"  # FoE is for firmware updates
 
 
-class MailboxType(IntEnum):
-    """Protocols, as numbered in the mailbox header."""
-
-    ERROR = 0
-    COE = 3
-    FOE = 4
+# Details of a mailbox error reply.
+UNSUPPORTED_PROTOCOL, INVALID_HEADER, TOO_SHORT, INVALID_SIZE = 0x02, 0x05, 0x06, 0x08
 
 
-class MailboxError(IntEnum):
-    """Details of a mailbox error reply."""
+class MailboxError(Exception):
+    """The request cannot be answered by its protocol; the reply is a mailbox error with this detail."""
 
-    UNSUPPORTED_PROTOCOL = 0x02
-    INVALID_HEADER = 0x05
-    TOO_SHORT = 0x06
-    INVALID_SIZE = 0x08
-
-
-class MailboxRequestError(Exception):
-    """The request cannot be answered by its protocol; the reply is a mailbox error."""
-
-    def __init__(self, detail: MailboxError) -> None:
-        super().__init__(detail.name)
+    def __init__(self, detail: int) -> None:
+        super().__init__(detail)
         self.detail = detail
-
-
-_FOE_ERROR = struct.pack("<BBI", 5, 0, 0x8002) + b"Access denied"
 
 
 class Mailbox:
     """Both directions of one slave's mailbox.
 
     `coe` answers a CoE request (what follows the mailbox header) with any number of replies; it may raise
-    MailboxRequestError.
+    MailboxError.
     """
 
     def __init__(
@@ -67,14 +50,12 @@ class Mailbox:
         self._written = written
         self._read = read
         self._coe = coe
-        self._replies: deque[tuple[MailboxType, int, bytes]] = deque()
-        self._last: tuple[MailboxType, int, bytes] | None = None
-        """Type, address and body of what is in the read mailbox, or was."""
+        self._replies: deque[tuple[int, int, bytes]] = deque()  # type, address and body
+        self._last: tuple[int, int, bytes] | None = None  # what is in the read mailbox, or was
         self._last_reply = b""
-        self._last_counter = 0
-        self._counter = 0
-        self.mute = 0
-        """Number of the next requests to drop: a fault."""
+        self._last_counter = self._counter = 0
+        self.mute = 0  # number of the next requests to drop: a fault
+        self.on_request: Callable[[], None] | None = None  # called once, after the next request
 
     def reset(self) -> None:
         """The mailbox was switched off or on."""
@@ -89,7 +70,8 @@ class Mailbox:
         """
         if self._read.full:
             return
-        if not self._replies and self._written.full:
+        requested = not self._replies and self._written.full
+        if requested:
             message = self._written.content()
             self._written.full = False
             self._request(message)
@@ -99,20 +81,22 @@ class Mailbox:
             self._counter = self._counter % 7 + 1
             self._last_reply = HEADER.pack(len(body), address, 0, kind | self._counter << 4) + body
             self._read.load(self._last_reply)
+        if requested and (action := self.on_request) is not None:
+            self.on_request = None
+            action()
 
     def raise_emergency(self, code: int, register: int, data: bytes) -> None:
         """Put a CoE emergency before all that the master has not read yet; the mailbox must be on."""
-        body = struct.pack("<HHB5s", COE_EMERGENCY << 12, code, register, data)
-        if self._read.unread and self._last is not None:
+        body = struct.pack("<HHB5s", _COE_EMERGENCY << 12, code, register, data)
+        if self._read.full and not self._read.open and self._last is not None:
             self._replies.appendleft(self._last)
             self._read.full = False
             self._counter = (self._counter - 2) % 7 + 1
-        self._replies.appendleft((MailboxType.COE, 0, body))
+        self._replies.appendleft((_COE, 0, body))
         self.work()
 
     def repeat(self) -> None:
         """The master lost the last reply: repeat it."""
-        self._read.acknowledge_repeat()
         if not self._read.full and self._last_reply:
             self._read.load(self._last_reply)
 
@@ -127,20 +111,17 @@ class Mailbox:
         if self.mute:
             self.mute -= 1
             return
-        body = message[HEADER.size : HEADER.size + length]
-        reply_type = MailboxType.ERROR
         try:
             if length > len(message) - HEADER.size:
-                raise MailboxRequestError(MailboxError.INVALID_SIZE)
-            reply_type, replies = self._answer(kind & _TYPE_MASK, body)
-        except MailboxRequestError as fault:
-            replies = [struct.pack("<HH", 1, fault.detail)]
-        self._replies += [(reply_type, address, reply) for reply in replies]
+                raise MailboxError(INVALID_SIZE)
+            kind, replies = self._answer(kind & 0x0F, message[HEADER.size : HEADER.size + length])
+        except MailboxError as fault:
+            kind, replies = _ERROR, [struct.pack("<HH", 1, fault.detail)]
+        self._replies += [(kind, address, reply) for reply in replies]
 
-    def _answer(self, kind: int, body: bytes) -> tuple[MailboxType, list[bytes]]:
-        if kind == MailboxType.COE and MailboxProtocol.CoE in self._protocols:
-            return MailboxType.COE, self._coe(body, self._read.length - HEADER.size)
-        if kind == MailboxType.FOE and MailboxProtocol.FoE in self._protocols:
-            # FoE is for firmware updates.
-            return MailboxType.FOE, [_FOE_ERROR]
-        raise MailboxRequestError(MailboxError.UNSUPPORTED_PROTOCOL)
+    def _answer(self, kind: int, body: bytes) -> tuple[int, list[bytes]]:
+        if kind == _COE and MailboxProtocol.CoE in self._protocols:
+            return kind, self._coe(body, self._read.length - HEADER.size)
+        if kind == _FOE and MailboxProtocol.FoE in self._protocols:
+            return kind, [_ACCESS_DENIED]
+        raise MailboxError(UNSUPPORTED_PROTOCOL)

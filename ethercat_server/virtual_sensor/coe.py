@@ -1,0 +1,321 @@
+"""CANopen over EtherCAT (CoE): the objects of a slave, the SDO server, and the SDO Information service.
+
+Source: ETG.1000.6. Bytes in, bytes out: what follows the mailbox header.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from ethercat_server.ethercat.slave.abort_codes import AbortCode, abort_meaning
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry
+from ethercat_server.sensor.objects.search import TITLES
+from ethercat_server.virtual_sensor.device import Device
+from ethercat_server.virtual_sensor.mailbox import INVALID_HEADER, TOO_SHORT, MailboxError
+
+Address = tuple[int, int]  # index and sub-index of an object entry
+
+
+class SdoAbortError(Exception):
+    """The slave aborts the SDO transfer with `code`."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(abort_meaning(code))
+        self.code = code
+
+
+class ObjectTable:
+    """The object entries of a slave, and their values unless computed."""
+
+    def __init__(self, entries: dict[Address, ObjectEntry], values: dict[Address, bytes]) -> None:
+        self.entries = entries
+        self.values = values
+
+    def entry(self, index: int, subindex: int) -> ObjectEntry:
+        """The entry at an address; SdoAbortError if there is none."""
+        row = self.entries.get((index, subindex))
+        if row is None:
+            exists = any(known == index for known, _ in self.entries)
+            raise SdoAbortError(AbortCode.NO_SUBINDEX if exists else AbortCode.NO_OBJECT)
+        return row
+
+    def size(self, row: ObjectEntry) -> int:
+        """Bytes of the entry `row`."""
+        return row.type.size or len(self.values[row.address])
+
+    def number(self, address: Address) -> float:
+        """The number that an entry holds."""
+        value = self.entries[address].type.unpack(self.values[address])
+        assert not isinstance(value, str)
+        return value
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """The bytes of an entry; SdoAbortError if it cannot be read."""
+        return self.values[self.entry(index, subindex).address]
+
+    def write(self, index: int, subindex: int, data: bytes, state: AlState) -> None:
+        """Write an entry as a master does in the AL state `state`; SdoAbortError if it cannot be."""
+        self.check_write(self.entry(index, subindex), len(data), state)
+        self.values[index, subindex] = data
+
+    def check_write(self, row: ObjectEntry, length: int, state: AlState) -> None:
+        """SdoAbortError if `length` bytes cannot be written to `row` in `state`, whatever they are."""
+        if row.access is Access.RO:
+            raise SdoAbortError(AbortCode.READ_ONLY)
+        if row.access is Access.RW_PREOP and state is not AlState.PREOP:
+            raise SdoAbortError(AbortCode.NOT_IN_THIS_STATE)
+        if length != self.size(row):
+            raise SdoAbortError(AbortCode.TOO_LONG if length > self.size(row) else AbortCode.TOO_SHORT)
+
+
+_COE_HEADER: Final = struct.Struct("<H")
+_SDO_HEADER_SIZE: Final = 8
+_REQUEST, _RESPONSE, _INFORMATION = 2, 3, 8  # services in the CoE header
+_SEGMENT_MINIMUM = 7
+# Command specifiers, in the top three bits of the command.
+_DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0, 1, 2, 3, 4
+_DOWNLOADED = 3
+_SIZE_INDICATED, _EXPEDITED, _COMPLETE, _TOGGLE = 0x01, 0x02, 0x10, 0x10
+
+
+class _Objects(Protocol):
+    """What the server reads and writes: see `Application`."""
+
+    def read(self, index: int, subindex: int) -> bytes: ...
+    def length(self, index: int, subindex: int) -> int: ...
+    def check_download(self, index: int, subindex: int, length: int) -> None: ...
+    def write(self, index: int, subindex: int, data: bytes) -> None: ...
+
+
+@dataclass
+class _Transfer:
+    """A segmented transfer under way."""
+
+    index: int
+    subindex: int
+    upload: bool
+    data: bytearray
+    size: int
+    toggle: int = 0
+
+
+class CoeServer:
+    """Answers CoE requests one at a time: SDO upload and download, expedited, normal and segmented.
+
+    `information` answers requests to the SDO Information service.
+    """
+
+    def __init__(self, objects: _Objects, information: Callable[[bytes, int], list[bytes]]) -> None:
+        self._objects = objects
+        self._information = information
+        self._transfer: _Transfer | None = None
+
+    def answer(self, message: bytes, room: int) -> list[bytes]:
+        """The replies to `message`, each at most `room` bytes.
+
+        MailboxError if it is no CoE request.
+        """
+        if len(message) < _COE_HEADER.size:
+            raise MailboxError(TOO_SHORT)
+        service, request, room = message[1] >> 4, message[_COE_HEADER.size :], room - _COE_HEADER.size
+        if service == _INFORMATION:
+            return [_COE_HEADER.pack(service << 12) + reply for reply in self._information(request, room)]
+        if service != _REQUEST:
+            raise MailboxError(INVALID_HEADER)
+        # A segment may be shorter than the full SDO header; nothing else may.
+        if not request or (request[0] >> 5 in (_DOWNLOAD, _UPLOAD) and len(request) < _SDO_HEADER_SIZE):
+            raise MailboxError(TOO_SHORT)
+        index, subindex = struct.unpack_from("<HB", request.ljust(_SDO_HEADER_SIZE, b"\0"), 1)
+        if self._transfer is not None and request[0] >> 5 in (_DOWNLOAD_SEGMENT, _UPLOAD_SEGMENT):
+            index, subindex = self._transfer.index, self._transfer.subindex
+        try:
+            reply = self._sdo(request, index, subindex, room)
+        except SdoAbortError as abort:
+            self._transfer = None
+            # An abort is coded as a request.
+            return [struct.pack("<HBHBI", _REQUEST << 12, _ABORT << 5, index, subindex, abort.code)]
+        return [_COE_HEADER.pack(_RESPONSE << 12) + reply] if reply else []
+
+    def _sdo(self, request: bytes, index: int, subindex: int, room: int) -> bytes:
+        command, transfer = request[0], self._transfer
+        specifier = command >> 5
+        if specifier in (_UPLOAD, _DOWNLOAD, _ABORT):
+            self._transfer = None
+            if specifier == _ABORT:
+                return b""
+            if command & _COMPLETE:
+                raise SdoAbortError(AbortCode.UNSUPPORTED_ACCESS)
+            if specifier == _UPLOAD:
+                return self._upload(index, subindex, room)
+            return self._download(request, index, subindex)
+        if transfer is None or specifier != (_UPLOAD_SEGMENT if transfer.upload else _DOWNLOAD_SEGMENT):
+            raise SdoAbortError(AbortCode.UNKNOWN_COMMAND)
+        if command & _TOGGLE != transfer.toggle:
+            raise SdoAbortError(AbortCode.TOGGLE_NOT_CHANGED)
+        if transfer.upload:
+            return self._upload_segment(transfer, room)
+        return self._download_segment(transfer, request)
+
+    def _upload(self, index: int, subindex: int, room: int) -> bytes:
+        data = self._objects.read(index, subindex)
+        if 0 < len(data) <= 4:
+            command = _UPLOAD << 5 | (4 - len(data)) << 2 | _EXPEDITED | _SIZE_INDICATED
+            return struct.pack("<BHB", command, index, subindex) + data.ljust(4, b"\0")
+        first = data[: room - _SDO_HEADER_SIZE]
+        if len(first) < len(data):
+            rest = bytearray(data[len(first) :])
+            self._transfer = _Transfer(index, subindex, True, rest, len(data))
+        return struct.pack("<BHBI", _UPLOAD << 5 | _SIZE_INDICATED, index, subindex, len(data)) + first
+
+    def _upload_segment(self, transfer: _Transfer, room: int) -> bytes:
+        part = bytes(transfer.data[: room - 1])
+        del transfer.data[: len(part)]
+        command = transfer.toggle | max(_SEGMENT_MINIMUM - len(part), 0) << 1 | (not transfer.data)
+        transfer.toggle ^= _TOGGLE
+        if not transfer.data:
+            self._transfer = None
+        return bytes([command]) + part.ljust(_SEGMENT_MINIMUM, b"\0")
+
+    def _download(self, request: bytes, index: int, subindex: int) -> bytes:
+        command = request[0]
+        if command & _EXPEDITED:
+            if command & _SIZE_INDICATED:
+                size = 4 - (command >> 2 & 3)
+            else:  # the client leaves it to the server
+                size = min(self._objects.length(index, subindex), 4)
+            self._objects.write(index, subindex, request[4 : 4 + size])
+        else:
+            (size,) = struct.unpack_from("<I", request, 4)
+            data = request[_SDO_HEADER_SIZE : _SDO_HEADER_SIZE + size]
+            self._objects.check_download(index, subindex, size)
+            if len(data) < size:
+                self._transfer = _Transfer(index, subindex, False, bytearray(data), size)
+            else:
+                self._objects.write(index, subindex, data)
+        return struct.pack("<BHBI", _DOWNLOADED << 5, index, subindex, 0)
+
+    def _download_segment(self, transfer: _Transfer, request: bytes) -> bytes:
+        command, data = request[0], request[1:]
+        if len(data) <= _SEGMENT_MINIMUM:
+            data = data[: _SEGMENT_MINIMUM - (command >> 1 & 7)]
+        transfer.data += data
+        if len(transfer.data) > transfer.size:
+            raise SdoAbortError(AbortCode.TOO_LONG)
+        if command & 1:
+            self._transfer = None
+            if len(transfer.data) != transfer.size:
+                raise SdoAbortError(AbortCode.LENGTH_MISMATCH)
+            self._objects.write(transfer.index, transfer.subindex, bytes(transfer.data))
+        reply = bytes([_DOWNLOAD << 5 | transfer.toggle]) + bytes(_SEGMENT_MINIMUM)
+        transfer.toggle ^= _TOGGLE
+        return reply
+
+
+_INFO_HEADER: Final = struct.Struct("<BBH")
+_LIST, _OBJECT, _ENTRY, _INFO_ERROR = 1, 3, 5, 7  # requests; a response is one more
+_INCOMPLETE: Final = 0x80
+_LIST_LENGTHS, _LIST_ALL, _LIST_RXPDO, _LIST_TXPDO, _LIST_BACKUP, _LIST_SETTINGS = range(6)
+_VARIABLE, _ARRAY, _RECORD = 7, 8, 9
+# Data types of the objects whose structure the standard names.
+_TYPE_RECORD_OF: Final = {0x1018: 0x0023, 0x1600: 0x0021, 0x1A00: 0x0021, 0x1A01: 0x0021}
+_READ_ALWAYS = 0x07
+_WRITE: Final = {Access.RO: 0, Access.RW: 0x38, Access.RW_PREOP: 0x08}
+_RXPDO_MAPPABLE, _TXPDO_MAPPABLE = 0x40, 0x80
+
+
+_NAMES: Final = {
+    **TITLES,
+    0x1600: "Outputs mapping",
+    0x1A00: "Inputs mapping",
+    0x1A01: "Inputs mapping",
+    0x1C00: "Sync manager communication type",
+    0x1C12: "Outputs assignment",
+    0x1C13: "Inputs assignment",
+}
+
+
+class SdoInformation:
+    """Tells a master which objects there are: lists of objects, descriptions of objects and entries.
+
+    A list too long for the mailbox goes out in fragments.
+    """
+
+    def __init__(self, objects: ObjectTable, device: Device) -> None:
+        self._objects = objects
+        self._outputs, self._inputs = device.output_entries, device.input_entries
+
+    def answer(self, request: bytes, room: int) -> list[bytes]:
+        """The replies to one request, `room` bytes at most each; MailboxError if it is too short."""
+        if len(request) < _INFO_HEADER.size:
+            raise MailboxError(TOO_SHORT)
+        operation, body, room = (
+            request[0] & ~_INCOMPLETE,
+            request[_INFO_HEADER.size :],
+            room - _INFO_HEADER.size,
+        )
+        try:
+            if operation not in (_LIST, _OBJECT, _ENTRY):
+                raise SdoAbortError(AbortCode.UNKNOWN_COMMAND)
+            if len(body) < (4 if operation == _ENTRY else 2):
+                raise MailboxError(TOO_SHORT)
+            (index,) = struct.unpack_from("<H", body)
+            if operation == _LIST:
+                return self._fragments(self._list(index), room & ~1)
+            described = self._object(index) if operation == _OBJECT else self._entry(index, body[2])
+            return [_INFO_HEADER.pack(operation + 1, 0, 0) + described[:room]]
+        except SdoAbortError as abort:
+            return [_INFO_HEADER.pack(_INFO_ERROR, 0, 0) + struct.pack("<I", abort.code)]
+
+    @staticmethod
+    def _fragments(data: bytes, room: int) -> list[bytes]:
+        parts = [data[at : at + room] for at in range(0, len(data), room)]
+        last = len(parts) - 1
+        return [
+            _INFO_HEADER.pack(_LIST + 1 | (_INCOMPLETE if number < last else 0), 0, last - number) + part
+            for number, part in enumerate(parts)
+        ]
+
+    def _list(self, kind: int) -> bytes:
+        rows = self._objects.entries.values()
+        stored = [row for row in rows if row.access is not Access.RO and row.index >= 0x8000]
+        listed = {
+            _LIST_ALL: rows,
+            _LIST_RXPDO: self._outputs,
+            _LIST_TXPDO: self._inputs,
+            _LIST_BACKUP: stored,
+            _LIST_SETTINGS: [row for row in stored if row.access is Access.RW_PREOP],
+        }
+        lists = {kind: sorted({row.index for row in rows}) for kind, rows in listed.items()}
+        if kind == _LIST_LENGTHS:
+            return struct.pack("<H5H", kind, *(len(found) for found in lists.values()))
+        if kind not in lists:
+            raise SdoAbortError(AbortCode.UNSUPPORTED_ACCESS)
+        return struct.pack(f"<H{len(lists[kind])}H", kind, *lists[kind])
+
+    def _object(self, index: int) -> bytes:
+        rows = [row for (known, _), row in self._objects.entries.items() if known == index]
+        if not rows:
+            raise SdoAbortError(AbortCode.NO_OBJECT)
+        parts = [row for row in rows if row.subindex]
+        if not parts:
+            kind, code, name = rows[0].type.coe_code, _VARIABLE, rows[0].name
+        else:
+            types = {row.type for row in parts}
+            code = _ARRAY if len(types) == 1 and index not in _TYPE_RECORD_OF else _RECORD
+            kind = _TYPE_RECORD_OF.get(index, parts[0].type.coe_code if code == _ARRAY else 0)
+            name = _NAMES.get(index, parts[0].name)
+        highest = max(row.subindex for row in rows)
+        return struct.pack("<HHBB", index, kind, highest, code) + name.encode("ascii")
+
+    def _entry(self, index: int, subindex: int) -> bytes:
+        row = self._objects.entry(index, subindex)
+        access = _READ_ALWAYS | _WRITE[row.access]
+        access |= _RXPDO_MAPPABLE if row in self._outputs else 0
+        access |= _TXPDO_MAPPABLE if row in self._inputs else 0
+        bits = self._objects.size(row) * 8
+        head = struct.pack("<HBBHHH", index, subindex, 0, row.type.coe_code, bits, access)
+        return head + row.name.encode("ascii")

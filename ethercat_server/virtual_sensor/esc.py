@@ -1,0 +1,581 @@
+"""The EtherCAT slave controller: registers, memory, sync managers, FMMUs, and what datagrams do to it.
+
+Source: ETG.1000.4. What only the firmware can do goes through the process data interface behind the
+controller, which is `application.Application`.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from ethercat_server.ethercat.wire import BYTE_NS, Command, Datagram
+from ethercat_server.virtual_sensor import registers as reg
+from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, DistributedClock
+
+_U16, _AL_STATUS = struct.Struct("<H"), struct.Struct("<HHH")
+_REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_TIMES, reg.DC_END
+_DC_SYSTEM_TIME, _DC_RECEIVE_TIME, _DC_ECAT_EVENT = reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME, reg.DC_ECAT_EVENT
+_LINE_GOES_ON, _LINE_ENDS = 0x5A33, 0x5613  # DL status: ports 0 and 1 have a link, or only port 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fmmu:
+    """One active FMMU: which logical bits are which bits of the slave's memory.
+
+    Nearly always it maps whole bytes; then a mapping is one copy.
+    """
+
+    logical: int  # first logical byte
+    length: int  # logical bytes that it touches
+    first_bit: int
+    last_bit: int
+    physical: int
+    physical_bit: int
+    reads: bool
+    writes: bool
+    bitwise: bool  # it maps anything but whole bytes onto whole bytes
+
+    @classmethod
+    def decode(cls, memory: bytearray, number: int) -> Fmmu | None:
+        """FMMU `number` from the registers; None if it is not active or maps nothing."""
+        logical, length, first, last, physical, bit, kind, active = reg.FMMU_LAYOUT.unpack_from(
+            memory, reg.FMMU + number * reg.FMMU_SIZE
+        )
+        if not active & 1 or length == 0 or not kind & 3:
+            return None
+        first, last, bit = first & 7, last & 7, bit & 7
+        reads, writes = bool(kind & reg.FMMU_READ), bool(kind & reg.FMMU_WRITE)
+        return cls(
+            logical, length, first, last, physical, bit, reads, writes, (first, last, bit) != (0, 7, 0)
+        )
+
+    def overlap(self, address: int, length: int) -> tuple[int, int, int] | None:
+        """The part of a logical command that it maps; None if none.
+
+        Returns: offset in the command's data, bytes there, first physical address.
+        """
+        start = max(address, self.logical)
+        end = min(address + length, self.logical + self.length)
+        # A bit-wise unit is small: it is always taken whole, or not at all.
+        if start >= end or (self.bitwise and end - start != self.length):
+            return None
+        return start - address, end - start, self.physical + start - self.logical
+
+    @property
+    def _bits(self) -> int:
+        return max((self.length - 1) * 8 + self.last_bit + 1 - self.first_bit, 0)
+
+    def span(self, length: int) -> int:
+        """Physical bytes touched for `length` logical bytes."""
+        return (self.physical_bit + self._bits + 7) // 8 if self.bitwise else length
+
+    def put(self, source: bytes | bytearray, from_bit: int, current: bytes | bytearray, to_bit: int) -> bytes:
+        """`current` with the mapped bits of `source` put in, logical ones into physical ones or back."""
+        mask = (1 << self._bits) - 1
+        value = int.from_bytes(source, "little") >> from_bit & mask
+        kept = int.from_bytes(current, "little") & ~(mask << to_bit)
+        inside = (1 << len(current) * 8) - 1  # the end of memory cuts it off
+        return ((kept | value << to_bit) & inside).to_bytes(len(current), "little")
+
+
+class SyncManager:
+    """A view of one sync manager's eight registers, and the state of its buffer.
+
+    A buffer is opened by an access to its first byte and handed over by one to its last; an access out of
+    turn is refused and changes nothing. A mailbox is read when it is full, and written when it is not.
+    """
+
+    def __init__(self, memory: bytearray, number: int) -> None:
+        self._memory = memory
+        self.number = number
+        self.registers = reg.SYNC_MANAGER + number * reg.SYNC_MANAGER_SIZE
+        self._status, self._activate, self._pdi_control = (
+            self.registers + offset for offset in (reg.SM_STATUS, reg.SM_ACTIVATE, reg.SM_PDI_CONTROL)
+        )
+        self.open = False
+        self.reload()
+
+    def reload(self) -> None:
+        """Take over what the registers say."""
+        self.start, self.length, self.control = struct.unpack_from("<HHB", self._memory, self.registers)
+        self.end = self.start + self.length
+        self.mailbox = self.control & 0x03 == reg.SM_MAILBOX
+        self.master_writes = self.control & 0x0C == reg.SM_WRITE
+        self.watched = bool(self.control & 0x40)  # writes to it trigger the process data watchdog
+        activate = self._memory[self._activate]
+        self.enabled = bool(activate & 1)
+        self.latches_ecat = bool(activate & reg.SM_LATCH_ECAT)
+        self.latches_pdi = bool(activate & reg.SM_LATCH_PDI)
+        self._refresh(self.enabled)
+
+    def allow(self, allowed: bool) -> None:
+        """Let the firmware (not the master) switch the sync manager on or off."""
+        self._set(self._pdi_control, 1, not allowed)
+        self._refresh(allowed)
+
+    def _refresh(self, on: bool) -> None:
+        # Switched off by the firmware, a sync manager goes on guarding its memory: nobody gets in.
+        self.locked = bool(self._memory[self._pdi_control] & 1)
+        inside = self.start >= reg.REGISTERS_END and self.end <= reg.MEMORY_END
+        self.active = self.enabled and self.length > 0 and inside
+        if not on:
+            self.full = self.open = False
+
+    def _set(self, register: int, bit: int, on: bool) -> None:
+        self._memory[register] = self._memory[register] & ~bit | (bit if on else 0)
+
+    def repeat_asked(self) -> bool:
+        """Whether the master has newly asked for the last mailbox again, by a toggle bit; acknowledges it."""
+        asked = self._memory[self._activate] & reg.REPEAT
+        if asked == self._memory[self._pdi_control] & reg.REPEAT:
+            return False
+        self._set(self._pdi_control, reg.REPEAT, bool(asked))
+        return True
+
+    @property
+    def full(self) -> bool:
+        """Whether the mailbox holds a message that its reader has not taken."""
+        return bool(self._memory[self._status] & reg.MAILBOX_FULL)
+
+    @full.setter
+    def full(self, value: bool) -> None:
+        self._set(self._status, reg.MAILBOX_FULL, value)
+
+    def access(self, offset: int, length: int) -> bool:
+        """The master accesses the buffer; False if it may not now."""
+        if self.locked or (self.mailbox and self.full == self.master_writes):
+            return False
+        may = self.open or offset == 0
+        self.open = may and offset + length < self.length
+        return may
+
+    def load(self, message: bytes) -> None:
+        """The firmware fills the read mailbox."""
+        self._memory[self.start : self.end] = message.ljust(self.length, b"\0")[: self.length]
+        self.open = False
+        self.full = True
+
+    def content(self) -> bytes:
+        """The whole buffer, as the firmware sees it."""
+        return bytes(self._memory[self.start : self.end])
+
+
+_EIGHT_BYTE_READS, _BUSY, _ERROR_COMMAND, _ERROR_WRITE_ENABLE = 0x0040, 0x8000, 0x2000, 0x4000
+_NO_OPERATION, _READ, _WRITE, _RELOAD = 0, 1, 2, 4
+
+
+class SiiInterface:
+    """The registers 0x0500 to 0x050F, through which a master reads the EEPROM (SII).
+
+    Reading takes `read_ns`; other commands are done at once. It is read-only: a write command is not
+    acknowledged by the EEPROM, which is bit 13; one without the write enable bit in the same frame never gets
+    there, which is bit 14.
+    """
+
+    # Error bits by name: an EEPROM that works, that returns an error, that stays busy.
+    FAULTS: Final = {"ok": 0, "error": _ERROR_COMMAND, "busy": _BUSY}
+
+    def __init__(self, memory: bytearray, image: bytes, clock: Callable[[], int], read_ns: int) -> None:
+        self._memory = memory
+        self.image = image
+        self._clock = clock
+        self._read_ns = read_ns
+        self._word = 0  # what is being read
+        self._faults = 0
+        self._end(0)
+
+    def _show(self, bits: int) -> None:
+        _U16.pack_into(self._memory, reg.SII_CONTROL, bits | _EIGHT_BYTE_READS)
+
+    def _end(self, bits: int) -> None:
+        self._done_at: int | None = None
+        self._show(bits)
+
+    def fail(self, bits: int) -> None:
+        """End every read with these bits of the control register; 0: no fault."""
+        self._faults = bits
+        self._end(0)
+
+    def advance(self) -> None:
+        """The registers are about to be read: what was being read may be there."""
+        if self._done_at is not None and self._clock() >= self._done_at:
+            at = self._word * 2
+            self._memory[reg.SII_DATA : reg.SII_DATA + 8] = self.image[at : at + 8].ljust(8, b"\xff")
+            self._end(0)
+
+    def command(self) -> None:
+        """Execute the command in the control register at the word in the address register."""
+        control, word = struct.unpack_from("<HI", self._memory, reg.SII_CONTROL)
+        self.advance()
+        operation = control >> 8 & 0x07
+        if self._done_at is not None:  # it takes no command meanwhile
+            self._show(_BUSY)
+            struct.pack_into("<I", self._memory, reg.SII_ADDRESS, self._word)
+        elif self._memory[reg.SII_OWNER] & 0x01:  # the firmware's until the master takes it back
+            self._show(_ERROR_COMMAND)
+        elif operation == _READ and self._faults:
+            self._show(self._faults)
+        elif operation == _READ:
+            self._done_at, self._word = self._clock() + self._read_ns, word
+            self._show(_BUSY)
+            self.advance()
+        elif operation == _WRITE:
+            self._show(_ERROR_COMMAND if control & 0x01 else _ERROR_WRITE_ENABLE)
+        else:
+            self._show(0 if operation in (_NO_OPERATION, _RELOAD) else _ERROR_COMMAND)
+
+
+class _Pdi(Protocol):
+    """The firmware behind the controller: see `Application`."""
+
+    clock: Callable[[], int]
+
+    def al_control(self, control: int) -> None: ...
+    def sync_managers_changed(self) -> None: ...
+    def mailbox_exchanged(self) -> None: ...
+    def repeat_requested(self) -> None: ...
+    def inputs(self) -> bytes: ...
+    def outputs(self, data: bytes) -> None: ...
+
+
+class Esc:
+    """Registers and memory of one controller."""
+
+    def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
+        """`sii_read_ns` is how long reading from the EEPROM takes."""
+        self._pdi = pdi
+        self.memory = reg.power_on_values()
+        self.memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = sii_image[8:10]
+        self._write_mask = reg.write_mask()
+        self.sii = SiiInterface(self.memory, sii_image, pdi.clock, sii_read_ns)
+        self.clock = DistributedClock(self.memory, self._write_mask, pdi.clock)
+        self.sync_managers = [SyncManager(self.memory, n) for n in range(reg.SYNC_MANAGER_COUNT)]
+        self.fmmus: list[Fmmu] = []  # the active ones
+        # What each logical command copies, by address and length; emptied when an FMMU changes.
+        self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
+        self.has_lrw = True
+        self.into_ns = 0  # from the start of a datagram until the bytes that are being copied pass
+        self.record: Callable[[int, bytes], None] | None = None  # gets all that a master writes, and where
+        self._events = 0
+
+    def take_lrw_away(self) -> None:
+        """Be a controller that does not know LRW."""
+        self.has_lrw = False
+        features = _U16.unpack_from(self.memory, reg.FEATURES)[0]
+        _U16.pack_into(self.memory, reg.FEATURES, features | reg.NO_LRW)
+
+    def count(self, counter: int) -> None:
+        """Add one to the error counter at this register; it stays at 255."""
+        self.memory[counter] = min(self.memory[counter] + 1, 0xFF)
+
+    def set_line(self, before: int, behind: int) -> None:
+        """So many slaves are before it and behind it. Port 0 is always open; port 1 if one is behind."""
+        self.clock.way_ns, self.clock.behind_ns = before * HOP_NS, 2 * behind * HOP_NS
+        status = _LINE_GOES_ON if behind else _LINE_ENDS
+        was = _U16.unpack_from(self.memory, reg.DL_STATUS)[0]
+        if was == _LINE_GOES_ON and not behind:
+            self.count(reg.LOST_LINKS + 1)
+        if was != status:
+            _U16.pack_into(self.memory, reg.DL_STATUS, status)
+            self._events |= reg.EVENT_DL_STATUS
+
+    def set_al_status(self, status: int, code: int) -> bool:
+        """Show AL status (state and error bit) and AL status code; False if they are as before."""
+        was, _, code_was = _AL_STATUS.unpack_from(self.memory, reg.AL_STATUS)
+        if (was, code_was) == (status, code):
+            return False
+        _AL_STATUS.pack_into(self.memory, reg.AL_STATUS, status, 0, code)
+        self._events |= reg.EVENT_AL_STATUS
+        return True
+
+    @property
+    def events(self) -> int:
+        """The event request register, before the mask."""
+        events = self._events
+        for manager in self.sync_managers:
+            if manager.mailbox and manager.full and not manager.master_writes:
+                events |= reg.EVENT_SYNC_MANAGER << manager.number
+        return events
+
+    def read(self, address: int, current: bytes | bytearray) -> bytes | bytearray | None:
+        """`len(current)` bytes from `address` on, as a master reads them; None if it may read none of them.
+
+        Bytes that may not be read stay as they are in `current`.
+        """
+        length = len(current)
+        end = address + length
+        if end <= _REGISTERS_END:
+            return self._read_registers(address, end) if length else None
+        for manager in self.sync_managers:
+            if manager.active and manager.start == address and manager.length == length:
+                return self._read_manager(manager, 0, length)
+        result, any_read = bytearray(current), False
+        part: bytes | bytearray | None
+        for start, stop, owner in self._regions(address, end):
+            if owner is not None:
+                part = self._read_manager(owner, start - owner.start, stop - start)
+            elif start < _REGISTERS_END:
+                part = self._read_registers(start, stop)
+            else:
+                part = self.memory[start:stop]
+            if part is not None:
+                result[start - address : stop - address] = part
+                any_read = True
+        return result if any_read else None
+
+    def write(self, address: int, data: bytes) -> bool:
+        """Write `data` as a master does; False if it may write none of it."""
+        if self.record is not None:
+            self.record(address, data)
+        end, any_written = address + len(data), False
+        for manager in self.sync_managers:
+            if manager.active and manager.start == address and manager.end == end:
+                return self._write_manager(manager, 0, data)
+        for start, stop, owner in self._regions(address, end):
+            part = data[start - address : stop - address]
+            if owner is not None:
+                any_written |= self._write_manager(owner, start - owner.start, part)
+            elif start < _REGISTERS_END:
+                any_written |= self._write_registers(start, part)
+            else:
+                self.memory[start:stop] = part
+                any_written = True
+        return any_written
+
+    def _regions(self, start: int, end: int) -> list[tuple[int, int, SyncManager | None]]:
+        """Split an access into registers, what each active sync manager guards, and free memory."""
+        end = min(end, reg.MEMORY_END)
+        regions: list[tuple[int, int, SyncManager | None]] = []
+        if start < _REGISTERS_END:
+            regions.append((start, min(end, _REGISTERS_END), None))
+            start = _REGISTERS_END
+        if start < end:
+            for manager in sorted((m for m in self.sync_managers if m.active), key=lambda m: m.start):
+                if manager.end <= start or manager.start >= end:
+                    continue
+                if manager.start > start:
+                    regions.append((start, manager.start, None))
+                    start = manager.start
+                stop = min(manager.end, end)
+                regions.append((start, stop, manager))
+                start = stop
+            regions.append((start, end, None))
+        return [region for region in regions if region[0] < region[1]]
+
+    def _read_manager(self, manager: SyncManager, offset: int, length: int) -> bytes | None:
+        if manager.master_writes or not manager.access(offset, length):
+            return None
+        if offset == 0 and not manager.mailbox:  # the newest of three buffers
+            newest = self._pdi.inputs()[: manager.length].ljust(manager.length, b"\0")
+            self.memory[manager.start : manager.end] = newest
+        data = bytes(self.memory[manager.start + offset : manager.start + offset + length])
+        if not manager.open:
+            self._exchanged(manager)
+        return data
+
+    def _write_manager(self, manager: SyncManager, offset: int, data: bytes) -> bool:
+        if not manager.master_writes or not manager.access(offset, len(data)):
+            return False
+        self.memory[manager.start + offset : manager.start + offset + len(data)] = data
+        if not manager.open:
+            self._exchanged(manager)
+        return True
+
+    def _exchanged(self, manager: SyncManager) -> None:
+        """The master has read or written the last byte of a buffer."""
+        if manager.latches_ecat and self.clock.present:
+            self.clock.events.taken(self.clock.frame_start + self.clock.way_ns, reg.DC_ECAT_EVENT)
+        if manager.mailbox:
+            manager.full = manager.master_writes
+            self._pdi.mailbox_exchanged()
+        elif manager.master_writes:
+            self._pdi.outputs(manager.content())
+
+    def _read_registers(self, start: int, end: int) -> bytes | bytearray:
+        if end > _DC_SYSTEM_TIME and start < _DC_END and self.clock.present:
+            if start < _DC_RECEIVE_TIME:
+                self.clock.show_system_time()
+            if end > _DC_ECAT_EVENT:
+                self.clock.events.update(self._pdi.clock() + self.clock.way_ns)
+        if start > _DC_RECEIVE_TIMES:
+            return self.memory[start:end]
+        if start <= reg.EVENT_REQUEST + 1 and end > reg.EVENT_REQUEST:
+            _U16.pack_into(self.memory, reg.EVENT_REQUEST, self.events)
+        if start < reg.SII_DATA and end > reg.SII_CONTROL:
+            self.sii.advance()
+        data = bytes(self.memory[start:end])
+        if start <= reg.AL_STATUS < end:
+            self._events &= ~reg.EVENT_AL_STATUS
+        if start <= reg.DL_STATUS < end:
+            self._events &= ~reg.EVENT_DL_STATUS
+        return data
+
+    def _write_registers(self, address: int, data: bytes) -> bool:
+        end = address + len(data)
+        if not any(self._write_mask[address:end]):
+            return False
+        locked = [m.registers for m in self.sync_managers if m.enabled]
+        for at, value in enumerate(data, address):
+            mask = self._write_mask[at]
+            if not mask or any(first <= at < first + reg.SM_STATUS for first in locked):
+                continue  # a sync manager's area can be changed only while it is disabled
+            self.memory[at] = self.memory[at] & ~mask | value & mask
+        for counters in reg.CLEARED_BY_WRITE:
+            if address < counters.stop and end > counters.start:
+                self.memory[counters.start : counters.stop] = bytes(len(counters))
+        self._after_write(address, end)
+        return True
+
+    def _after_write(self, start: int, end: int) -> None:
+        """Set in motion what a write to registers `start` to `end` causes."""
+
+        def touched(first: int, length: int) -> bool:
+            return start < first + length and end > first
+
+        if touched(reg.SII_CONTROL, 2):
+            self.sii.command()
+        if touched(reg.FMMU, reg.FMMU_COUNT * reg.FMMU_SIZE):
+            self.plans.clear()
+            every = (Fmmu.decode(self.memory, n) for n in range(reg.FMMU_COUNT))
+            self.fmmus = [fmmu for fmmu in every if fmmu is not None]
+        if touched(reg.SYNC_MANAGER, reg.SYNC_MANAGER_COUNT * reg.SYNC_MANAGER_SIZE):
+            for manager in self.sync_managers:
+                manager.reload()
+            self._pdi.sync_managers_changed()
+            if self.sync_managers[1].repeat_asked():
+                self._pdi.repeat_requested()
+        if self.clock.present and end > reg.DC_RECEIVE_TIMES and start < reg.DC_END:
+            if touched(reg.DC_RECEIVE_TIMES, 4):
+                self.clock.latch()
+            if touched(reg.DC_SPEED_START, 2):
+                self.clock.reset()
+            if touched(reg.DC_SYSTEM_TIME, 1):
+                self.clock.compare()
+        if touched(reg.AL_CONTROL, 2):
+            self._pdi.al_control(_U16.unpack_from(self.memory, reg.AL_CONTROL)[0])
+
+
+# Datagrams. A successful read counts 1, a write 1, and in a read-write command a read 1 and a write 2.
+_LOGICAL = frozenset({Command.LRD, Command.LWR, Command.LRW})
+_READS = frozenset({Command.APRD, Command.FPRD, Command.BRD})
+_WRITES = frozenset({Command.APWR, Command.FPWR, Command.BWR})
+_BROADCAST = frozenset({Command.BRD, Command.BWR, Command.BRW})
+_ONE_BY_STATION = frozenset({Command.FPRD, Command.FPWR, Command.FPRW})
+_READ_MULTIPLE_WRITE = frozenset({Command.ARMW, Command.FRMW})
+# Their position is, by every slave.
+_COUNTED_UP = _BROADCAST | {Command.APRD, Command.APWR, Command.APRW, Command.ARMW}
+_KNOWN = frozenset(Command) - {Command.NOP}
+_PLANS_KEPT: Final = 64
+_FPRD: Final = int(Command.FPRD)
+_STATION_ADDRESS, _EVENT_MASK = reg.STATION_ADDRESS, reg.EVENT_MASK
+
+
+def pass_through(escs: Sequence[Esc], frame: bytearray, datagram: Datagram) -> None:
+    """Process one datagram in place as it passes these slaves, in their order.
+
+    Those that it is not meant for only show their events, if they have a mask for them.
+    """
+    command, at = datagram.command, datagram.header + 2
+    if command in _ONE_BY_STATION:
+        low = frame[at]  # which suffices to pass nearly all others
+        for esc in escs:
+            memory = esc.memory
+            if memory[_EVENT_MASK] or memory[_EVENT_MASK + 1]:
+                execute(esc, frame, datagram)
+            elif memory[_STATION_ADDRESS] == low and memory[_STATION_ADDRESS + 1] == frame[at + 1]:
+                if command == _FPRD:
+                    _read(esc, frame, datagram)
+                else:
+                    execute(esc, frame, datagram)
+    else:
+        for esc in escs:
+            execute(esc, frame, datagram)
+
+
+def _read(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
+    """Process an FPRD for this slave, which shows no events: the same as `execute`, in less time."""
+    start, end = datagram.data, datagram.end
+    read = esc.read(datagram.ado, frame[start:end])
+    if read is not None:
+        frame[start:end] = read
+        _U16.pack_into(frame, end, (_U16.unpack_from(frame, end)[0] + 1) & 0xFFFF)
+
+
+def execute(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
+    """Process one datagram in place as it passes one slave."""
+    command = datagram.command
+    if command not in _KNOWN:
+        return
+    counted = (_logical if command in _LOGICAL else _physical)(esc, frame, datagram)
+    mask = _U16.unpack_from(esc.memory, _EVENT_MASK)[0]
+    if mask and (events := esc.events & mask):
+        at = datagram.data - 2
+        _U16.pack_into(frame, at, _U16.unpack_from(frame, at)[0] | events)
+    if counted:
+        at = datagram.end
+        _U16.pack_into(frame, at, (_U16.unpack_from(frame, at)[0] + counted) & 0xFFFF)
+
+
+def _physical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
+    command, address = datagram.command, datagram.ado
+    position_or_station = _U16.unpack_from(frame, datagram.header + 2)[0]
+    if command in _COUNTED_UP:  # the one it reaches as 0 is meant
+        _U16.pack_into(frame, datagram.header + 2, (position_or_station + 1) & 0xFFFF)
+        meant = command in _BROADCAST or position_or_station == 0
+    else:
+        meant = position_or_station == _U16.unpack_from(esc.memory, _STATION_ADDRESS)[0]
+    reads, writes = command not in _WRITES, command not in _READS
+    if command in _READ_MULTIPLE_WRITE:
+        reads, writes = meant, not meant
+    elif not meant:
+        return 0
+    start, end = datagram.data, datagram.end
+    incoming = bytes(frame[start:end])
+    counted = 0
+    if reads and (read := esc.read(address, incoming)) is not None:
+        counted = 1
+        if command in _BROADCAST:
+            read = bytes(a | b for a, b in zip(read, incoming, strict=True))
+        frame[start:end] = read
+    if writes and esc.write(address, incoming):
+        counted += 2 if reads else 1
+    return counted
+
+
+def _logical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
+    key = address, length = datagram.ado << 16 | datagram.adp, datagram.length
+    command = datagram.command
+    if command == Command.LRW and not esc.has_lrw:
+        return 0
+    plan = esc.plans.get(key)
+    if plan is None:
+        found = ((fmmu, fmmu.overlap(address, length)) for fmmu in esc.fmmus)
+        plan = [(fmmu, *overlap) for fmmu, overlap in found if overlap is not None]
+        if len(esc.plans) >= _PLANS_KEPT:
+            esc.plans.clear()
+        esc.plans[key] = plan
+    read = written = False
+    base = datagram.data
+    incoming = bytes(frame[base : datagram.end])
+    reads, writes = command != Command.LWR, command != Command.LRD
+    for fmmu, offset, size, at in plan:
+        start, end = base + offset, base + offset + size
+        esc.into_ns = (start - datagram.header) * BYTE_NS
+        if writes and fmmu.writes:
+            data = incoming[offset : offset + size]
+            if fmmu.bitwise:
+                physical = esc.memory[at : at + fmmu.span(size)]
+                data = fmmu.put(data, fmmu.first_bit, physical, fmmu.physical_bit)
+            written |= esc.write(at, data)
+        if reads and fmmu.reads:
+            current = esc.read(at, bytes(fmmu.span(size)) if fmmu.bitwise else frame[start:end])
+            if current is not None:
+                if fmmu.bitwise:
+                    current = fmmu.put(current, fmmu.physical_bit, frame[start:end], fmmu.first_bit)
+                frame[start:end] = current
+                read = True
+    esc.into_ns = 0
+    return read + (2 * written if command == Command.LRW else written)

@@ -1,1 +1,0 @@
-"""The slave controller (ESC) of a virtual sensor: registers, memory, frames."""

@@ -1,1 +1,0 @@
-"""Fault injection: one table of commands, a module for each subject."""

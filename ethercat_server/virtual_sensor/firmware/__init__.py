@@ -1,1 +1,0 @@
-"""Firmware of the sensor: object dictionary, flash, process data."""

@@ -1,0 +1,306 @@
+"""Slaves of other vendors on the virtual bus, and chains as other masters leave them.
+
+Vendor, product code and process data of the Beckhoff slaves are public; the drive is nobody's. It follows the
+CiA 402 drive profile (IEC 61800-7-201), its motor the target velocity at once.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from enum import IntEnum
+from typing import Any, Final
+
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.slave.sii import MailboxProtocol
+from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry, ObjectType
+from ethercat_server.virtual_sensor import registers as reg
+from ethercat_server.virtual_sensor.application import Application, al_statistics
+from ethercat_server.virtual_sensor.coe import ObjectTable
+from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
+from ethercat_server.virtual_sensor.options import (
+    EEPROM_MS,
+    ForeignOptions,
+    SensorOptions,
+    SlaveOptions,
+    UsageError,
+)
+
+_RO, _RW = Access.RO, Access.RW
+_ERROR_CODE = ObjectEntry(0x603F, 0, "Error code", ObjectType.U16, _RO)
+_CONTROLWORD = ObjectEntry(0x6040, 0, "Controlword", ObjectType.U16, _RW)
+_STATUSWORD = ObjectEntry(0x6041, 0, "Statusword", ObjectType.U16, _RO)
+_POSITION = ObjectEntry(0x6064, 0, "Position actual value", ObjectType.I32, _RO)  # increments
+_VELOCITY = ObjectEntry(0x60FF, 0, "Target velocity", ObjectType.I32, _RW)  # increments per second
+
+
+def _channel(number: int, value: int) -> Pdo:
+    entries = (
+        ObjectEntry(0x3100 + number, 1, "Status", ObjectType.U8, _RO, 0),
+        ObjectEntry(0x3100 + number, 2, "Value", ObjectType.I16, _RO, value),
+    )
+    return Pdo(0x1A00 + number - 1, f"Channel {number}", entries)
+
+
+_DRIVE: Final = Device(
+    "DRIVE", "Servo drives", 0x7E57, 402, 1, 0,
+    (Pdo(0x1600, "Outputs", (_CONTROLWORD, _VELOCITY)),),
+    (Pdo(0x1A00, "Inputs", (_STATUSWORD, _POSITION)),),
+    MailboxProtocol.CoE, watchdog=True, device_type=0x00020192,
+)  # fmt: skip
+_DEVICES: Final = (
+    Device("EK1100", "System couplers", 2, 0x044C2C52, 0x00110000, bus_current_ma=-2000),
+    Device(
+        "EL3102", "Analog input terminals", 2, 0x0C1E3052, 0x00100000, 0,
+        (), (_channel(1, 0x4000), _channel(2, -0x2000)),  # 5 V and -2.5 V, of 10 V
+        MailboxProtocol.CoE, device_type=0x00001389, bus_current_ma=130,
+    ),
+    _DRIVE,
+)  # fmt: skip
+KINDS: Final = {device.name: device for device in _DEVICES}  # by the name in `--chain`
+
+
+def _objects_of(device: Device) -> ObjectTable:
+    u32 = ObjectType.U32
+    rows = [
+        ObjectEntry(0x1000, 0, "Device type", u32, _RO, device.device_type),
+        ObjectEntry(0x1008, 0, "Device name", ObjectType.STRING, _RO, device.name),
+        ObjectEntry(0x1018, 1, "Vendor ID", u32, _RO, device.vendor),
+        ObjectEntry(0x1018, 2, "Product code", u32, _RO, device.product),
+        ObjectEntry(0x1018, 3, "Revision", u32, _RO, device.revision),
+        ObjectEntry(0x1018, 4, "Serial number", u32, _RO, device.serial),
+        *device.output_entries,
+        *device.input_entries,
+        *((_ERROR_CODE,) if device is _DRIVE else ()),
+    ]
+    entries = entries_of(device, rows)
+    return ObjectTable(entries, {a: row.type.pack(row.default) for a, row in entries.items()})
+
+
+_ENABLE: Final = 0x000F  # controlword in normal operation
+_SWITCH_ON, _VOLTAGE, _NO_QUICK_STOP, _ENABLE_OPERATION, _FAULT_RESET = 0x01, 0x02, 0x04, 0x08, 0x80
+_VOLTAGE_ENABLED, _REMOTE = 0x0010, 0x0200
+_COMMUNICATION_LOST: Final = 0x8130
+
+
+class DriveState(IntEnum):
+    """States, as bits of the statusword."""
+
+    SWITCH_ON_DISABLED = 0x0040
+    READY_TO_SWITCH_ON = 0x0021
+    SWITCHED_ON = 0x0023
+    OPERATION_ENABLED = 0x0027
+    QUICK_STOP_ACTIVE = 0x0007
+    FAULT = 0x0008
+
+
+class Drive(Application):
+    """A servo drive: its state machine and position."""
+
+    def __init__(self, clock: Callable[[], int], eeprom_ms: float) -> None:
+        self.drive_state = DriveState.SWITCH_ON_DISABLED
+        self._error = self._controlword = self._velocity = 0
+        self._position = 0.0
+        self._since = clock()
+        super().__init__(_DRIVE, clock, _objects_of(_DRIVE), eeprom_ms)
+
+    @property
+    def turning(self) -> bool:
+        """Whether the motor moves."""
+        return self.drive_state is DriveState.OPERATION_ENABLED and self._velocity != 0
+
+    def take_outputs(self, data: bytes) -> None:
+        """See `Application`."""
+        super().take_outputs(data)
+        self._obey_objects()
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """See `Application`."""
+        super().write(index, subindex, data)
+        self._obey_objects()
+
+    def _obey_objects(self) -> None:
+        word, velocity = (int(self.objects.number(row.address)) for row in (_CONTROLWORD, _VELOCITY))
+        self._command(word, velocity)
+
+    def _command(self, controlword: int, velocity: int) -> None:
+        self._move()
+        reset = controlword & ~self._controlword & _FAULT_RESET
+        self._controlword, self._velocity = controlword, velocity
+        if self.drive_state is not DriveState.FAULT:
+            self.drive_state = self._next(controlword)
+        elif reset:
+            self.drive_state, self._error = DriveState.SWITCH_ON_DISABLED, 0
+
+    def state_changed(self) -> None:
+        """The motor stops when process data ends, with an error if the master did not say so."""
+        if self.state is AlState.OP:
+            return
+        self._move()
+        energized = self.drive_state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+        if self.error and energized:
+            self.drive_state, self._error = DriveState.FAULT, _COMMUNICATION_LOST
+        elif self.drive_state is not DriveState.FAULT:
+            self.drive_state = DriveState.SWITCH_ON_DISABLED
+
+    def work(self) -> None:
+        """Be at work in OP: the other master has enabled it, and it turns."""
+        for controlword in (_ENABLE & ~_SWITCH_ON, _ENABLE, _ENABLE):
+            self._command(controlword, _VELOCITY_AT_WORK)
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """See `Application`; some objects the drive itself changes."""
+        self._move()
+        powered = self.drive_state not in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
+        live = {
+            _ERROR_CODE.address: self._error,
+            _STATUSWORD.address: self.drive_state | _REMOTE | (_VOLTAGE_ENABLED if powered else 0),
+            _POSITION.address: (round(self._position) + 2**31) % 2**32 - 2**31,
+        }
+        value = live.get((index, subindex))
+        if value is None:
+            return super().read(index, subindex)
+        return self.objects.entry(index, subindex).type.pack(value)
+
+    def _move(self) -> None:
+        now = self.clock()
+        if self.drive_state is DriveState.OPERATION_ENABLED:
+            self._position += self._velocity * (now - self._since) * 1e-9
+        self._since = now
+
+    def _next(self, word: int) -> DriveState:
+        state = self.drive_state
+        if not word & _VOLTAGE:
+            return DriveState.SWITCH_ON_DISABLED
+        if state in (DriveState.SWITCH_ON_DISABLED, DriveState.QUICK_STOP_ACTIVE):
+            ready = state is DriveState.SWITCH_ON_DISABLED and word & _NO_QUICK_STOP and not word & _SWITCH_ON
+            return DriveState.READY_TO_SWITCH_ON if ready else state
+        if not word & _NO_QUICK_STOP:
+            stops = state is DriveState.OPERATION_ENABLED
+            return DriveState.QUICK_STOP_ACTIVE if stops else DriveState.SWITCH_ON_DISABLED
+        if not word & _SWITCH_ON:
+            return DriveState.READY_TO_SWITCH_ON
+        if word & _ENABLE_OPERATION and state is not DriveState.READY_TO_SWITCH_ON:
+            return DriveState.OPERATION_ENABLED
+        return DriveState.SWITCHED_ON
+
+
+_WRITES_REMEMBERED: Final = 1000
+_VELOCITY_AT_WORK: Final = 1000
+
+
+class ForeignSlave:
+    """A foreign slave, powered or not. `clock` gives the time in ns."""
+
+    def __init__(self, options: ForeignOptions, clock: Callable[[], int]) -> None:
+        self.options = options
+        self._clock = clock
+        # Address and data of the latest register and memory writes that reached it; the number of all.
+        self.writes: deque[tuple[int, bytes]] = deque(maxlen=_WRITES_REMEMBERED)
+        self.write_count = 0
+        self.life: Application | None = None  # from power-on to power-off
+        self.power(True)
+
+    def power(self, on: bool) -> None:
+        """Switch it off or on; no effect if it already is."""
+        if not on:
+            self.life = None
+        elif self.life is None:
+            device, eeprom_ms = KINDS[self.options.kind], self.options.eeprom_ms
+            self.life = (
+                Drive(self._clock, eeprom_ms)
+                if device is _DRIVE
+                else Application(device, self._clock, _objects_of(device), eeprom_ms)
+            )
+            self.life.esc.record = self._remember
+
+    def _remember(self, address: int, data: bytes) -> None:
+        self.writes.append((address, bytes(data)))
+        self.write_count += 1
+
+    def left_at_work(self) -> None:
+        """Another master has left it in the AL state it is in: record from now on."""
+        if isinstance(self.life, Drive) and self.life.state is AlState.OP:
+            self.life.work()
+        self.writes.clear()
+        self.write_count = 0
+
+    @property
+    def turning(self) -> bool:
+        """Whether it is a drive whose motor moves."""
+        return isinstance(self.life, Drive) and self.life.turning
+
+    def statistics(self) -> dict[str, Any]:
+        """Its part of what the command `stats` reports."""
+        return {
+            "kind": self.options.kind,
+            **al_statistics(self.life),
+            "drive": self.life.drive_state.name if isinstance(self.life, Drive) else None,
+            "write_count": self.write_count,
+        }
+
+
+def leave_in(life: Application, state: AlState, station: int, outputs_at: int, inputs_at: int) -> None:
+    """Take it to `state`, with its process data at these logical addresses, as a master does.
+
+    Its process data watchdog waits for the first outputs.
+    """
+    write, rows = life.esc.write, life.device.sync_managers
+    write(reg.STATION_ADDRESS, struct.pack("<H", station))
+    write(reg.SII_OWNER, b"\x01")  # the firmware
+    used = rows[:2] if state is AlState.PREOP else rows
+    write(reg.SYNC_MANAGER, b"".join(reg.pack_sync_manager(*row[:3]) for row in used))
+    mapped = ((outputs_at, reg.FMMU_WRITE), (inputs_at, reg.FMMU_READ))
+    units = [
+        reg.FMMU_LAYOUT.pack(at, row.length, 0, 7, row.start, 0, kind, 1)
+        for row, (at, kind) in zip(used[2:], mapped, strict=False)
+        if row.length
+    ]
+    write(reg.FMMU, b"".join(units))
+    for step in (AlState.PREOP, AlState.SAFEOP, AlState.OP):
+        if step <= state:
+            write(reg.AL_CONTROL, step.request())
+    assert life.state is state
+
+
+SENSOR: Final = "BOTA"
+MOST_SLAVES: Final = 16
+_STATES: Final = ("INIT", "PREOP", "SAFEOP", "OP")
+
+
+def parse_chain(text: str) -> list[tuple[str, AlState]]:
+    """Kind and initial AL state of each slave, such as `EK1100,BOTA,DRIVE:OP`, in wire order.
+
+    UsageError if one is unknown.
+    """
+    found = []
+    for word in text.split(","):
+        kind, _, state = word.strip().upper().partition(":")
+        if kind != SENSOR and kind not in KINDS:
+            raise UsageError(f"no slave {word[:40]!r}: available: {', '.join((SENSOR, *KINDS))}")
+        if state and state not in _STATES:
+            raise UsageError(f"no AL state in {word[:40]!r}: available: {', '.join(_STATES)}")
+        found.append((kind, AlState[state or "INIT"]))
+    if len(found) > MOST_SLAVES:
+        raise UsageError(f"{len(found)} slaves in the chain: at most {MOST_SLAVES}")
+    return found
+
+
+def slaves_in(
+    chain: Iterable[tuple[str, AlState]],
+    sensors: Sequence[SensorOptions] = (),
+    eeprom_ms: float = EEPROM_MS,
+) -> tuple[SlaveOptions, ...]:
+    """The options of the slaves in a parsed chain; `sensors` are its sensors, the default ones if too few."""
+    slaves: list[SlaveOptions] = []
+    given, number = iter(sensors), 0
+    for kind, state in chain:
+        if kind == SENSOR:
+            number += 1
+            sensor = next(given, SensorOptions(serial=number, eeprom_ms=eeprom_ms))
+            slaves.append(replace(sensor, state=state))
+        else:
+            slaves.append(ForeignOptions(kind, state, eeprom_ms))
+    return tuple(slaves)

@@ -1,1 +1,0 @@
-"""Slaves of other vendors on the virtual bus, and chains as other masters leave them."""

@@ -1,1 +1,0 @@
-"""What a virtual sensor measures: its clock, signals, and process data."""

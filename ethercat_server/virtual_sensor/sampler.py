@@ -1,0 +1,251 @@
+"""The sensor's newest sample as process data at any time, with its measurement faults.
+
+Samples follow the sensor's own clock. Only those that are read are computed.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+from typing import Final
+
+from bota_ethercat.pdo import layout_for
+from bota_ethercat.sensor.warnings_register import WarningFlag
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
+from ethercat_server.virtual_sensor.dictionary import Dictionary
+from ethercat_server.virtual_sensor.distributed_clock import scattered
+from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.signals import FORMULAS, MOTIONS, Formula, Reading, Scene, reading_of
+
+_PPM_SCALE = 10**12  # ppm in steps of one millionth
+
+
+class SampleClock:
+    """The sensor's own clock: sample numbers and their instants, independent of the master.
+
+    The instant of sample k is the anchor plus (k - k0) * T, with T = SINC / 51200 s / (1 + ppm * 1e-6).
+    In whole nanoseconds, without accumulating rounding errors.
+    """
+
+    def __init__(self, now: int, sinc_length: int, ppm: float = 0.0) -> None:
+        self._anchor, self._anchor_number = now, 0
+        self._set(sinc_length, ppm)
+
+    def _set(self, sinc_length: int, ppm: float) -> None:
+        self.sinc_length, self.ppm = sinc_length, ppm
+        # T in ns as a fraction.
+        self._numerator = sinc_length * 10**9 * _PPM_SCALE
+        self._denominator = BASE_SAMPLING_RATE_HZ * (_PPM_SCALE + round(ppm * 1e6))
+
+    def number_at(self, now: int) -> int:
+        """Number of the newest sample at the time `now`, ns."""
+        elapsed = now - self._anchor
+        if elapsed < 0:
+            return self._anchor_number
+        return self._anchor_number + ((elapsed + 1) * self._denominator - 1) // self._numerator
+
+    def instant(self, number: int) -> int:
+        """Instant of sample `number`, ns."""
+        return self._anchor + (number - self._anchor_number) * self._numerator // self._denominator
+
+    def change(self, now: int, *, sinc_length: int | None = None, ppm: float | None = None) -> None:
+        """Change the rate from the newest sample on, without skipping or repeating one."""
+        newest = self.number_at(now)
+        self._anchor, self._anchor_number = self.instant(newest), newest
+        self._set(self.sinc_length if sinc_length is None else sinc_length, self.ppm if ppm is None else ppm)
+
+
+# As the fields of the process data are named, in their order.
+CHANNELS: Final[tuple[str, ...]] = tuple(
+    f"{vector}.{axis}" for vector in ("force", "torque", "acceleration", "angular_rate") for axis in "xyz"
+)
+# Channels that are saturated, as bits, and the warning of each of the three saturation fields.
+_SATURATION: Final = (
+    (0o0077, WarningFlag.FORCE_TORQUE_SATURATED),
+    (0o0700, WarningFlag.ACCELERATION_SATURATED),
+    (0o7000, WarningFlag.ANGULAR_RATE_SATURATED),
+)
+MOST_SKIPPED: Final = 90.0  # %
+_SKIP_STEPS: Final = 1 << 32
+
+
+# Raw counts without the calibration matrix, per N and per Nm. A real sensor mixes its channels; this one
+# only scales.
+_COUNTS: Final = (10_000.0,) * 3 + (500_000.0,) * 3
+_LARGEST_REAL32 = 3.4e38
+
+
+def _measured(
+    values: tuple[float, ...], offsets: tuple[float, ...], limit: float
+) -> tuple[tuple[float, ...], int]:
+    """`values` plus offsets, cut off at the range, and a bit for each axis that was."""
+    x, y, z = values[0] + offsets[0], values[1] + offsets[1], values[2] + offsets[2]
+    if -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit:
+        return (x, y, z), 0
+    bits = sum(1 << axis for axis, value in enumerate((x, y, z)) if abs(value) > limit)
+    return (max(-limit, min(limit, x)), max(-limit, min(limit, y)), max(-limit, min(limit, z))), bits
+
+
+class Sampler:
+    """Computes samples from power-on to power-off, with the settings in the dictionary.
+
+    `now` gives the time in ns. Faults of channels act on the measured values, before the offsets are added.
+    """
+
+    def __init__(self, options: SensorOptions, dictionary: Dictionary, now: Callable[[], int]) -> None:
+        self._dictionary = dictionary
+        self._now = now
+        self._layout = layout_for(options.pdo_size)
+        self.clock = SampleClock(now(), dictionary.sinc_in_effect, options.ppm)
+        self.made = 0  # number of samples computed
+        self.stuck = b""  # process data to be repeated until it is empty again: a fault
+        # Faults of channels by position, in their units; call `changed` after changing them: standard
+        # deviation of Gaussian noise, saturation at ± this, standing still at this (None: at the next value).
+        self.noise: dict[int, float] = {}
+        self.limits: dict[int, float] = {}
+        self.frozen: dict[int, float | None] = {}
+        self._gauss = random.Random(options.seed ^ 0x9E3779B97F4A7C15).gauss
+        self._seed = options.seed
+        self._warnings, self._warnings_until = 0, -1
+        self._skipped, self._skip_after = 0, 0
+        self._number, self._data = -1, b""
+        self._prepared_number, self._prepared = -1, b""
+        self._measure(options, now())
+
+    def _measure(self, options: SensorOptions, start: int) -> None:
+        motion = MOTIONS.get(options.signal)
+        self._signal: Scene | Formula = (
+            FORMULAS[options.signal] if motion is None else Scene(options.seed, options.noise, motion)
+        )
+        self._signal_start = start
+        self.exact = self._signal.exact  # unaffected by settings, offsets and noise
+        self.settings_changed()
+
+    def number_at(self, instant: int) -> int:
+        """Number of the newest sample at an instant that is not skipped."""
+        number = self.clock.number_at(instant)
+        if self._skipped:
+            while number > self._skip_after and scattered(number, self._seed) % _SKIP_STEPS < self._skipped:
+                number -= 1
+        return number
+
+    def newest(self, later: int = 0) -> bytes:
+        """The newest process data, `later` ns from now."""
+        if self.stuck:
+            return self.stuck
+        number = self.number_at(self._now() + later)
+        if number != self._number:
+            self._data = self._prepared if number == self._prepared_number else self._make(number)
+            self._number = number
+        return self._data
+
+    def prepare(self, expected: int) -> None:
+        """Compute the sample that a frame at the time `expected` will read, while there is time."""
+        number = self.number_at(expected)
+        if number not in (self._number, self._prepared_number) and not self.stuck:
+            self._prepared = self._make(number)
+            self._prepared_number = number
+
+    def _make(self, number: int) -> bytes:
+        self.made += 1
+        instant = self.clock.instant(number)
+        reading = self._signal.reading(number, instant, (instant - self._signal_start) * 1e-9)
+        saturated = 0
+        if not self.exact:
+            reading, saturated = self._disturb(reading)
+        warnings = self._warnings if number < self._warnings_until else 0
+        return self._pack(reading, warnings, saturated)
+
+    def _disturb(self, reading: Reading) -> tuple[Reading, int]:
+        """The reading with every fault in it, and which channels are saturated, as bits."""
+        if not (self.noise or self.limits or self.frozen):
+            return reading, 0
+        values = [*reading.force_torque, *reading.acceleration, *reading.angular_rate]
+        for position, deviation in self.noise.items():
+            values[position] += self._gauss(0.0, deviation)
+        bits = 0
+        for position, limit in self.limits.items():
+            if abs(values[position]) > limit:
+                values[position] = math.copysign(limit, values[position])
+                bits |= 1 << position
+        for position, kept in self.frozen.items():
+            self.frozen[position] = values[position] = values[position] if kept is None else kept
+        return reading_of(values, reading.temperature, reading.orientation), bits
+
+    def _pack(self, reading: Reading, warnings: int, saturated: int) -> bytes:
+        """Process data of one sample, as the settings have it.
+
+        Offsets are added; values beyond the range are clipped and set the saturation fields and warnings; the
+        IMU and the orientation estimate can be off; without the calibration matrix force and torque are raw
+        counts. `warnings` is ORed into the register, `saturated` (channels as bits) into the fields.
+        """
+        load, acceleration, rate, temperature, quaternion = reading
+        if not self.exact:
+            load = tuple(a + b for a, b in zip(load, self._offset, strict=True))
+            if not self._calibrated:
+                load = tuple(float(round(a * s)) for a, s in zip(load, _COUNTS, strict=True))
+            load = tuple(
+                a if -_LARGEST_REAL32 < a < _LARGEST_REAL32 else math.copysign(math.inf, a) for a in load
+            )
+            if self._imu:
+                acceleration, beyond = _measured(
+                    acceleration, self._acceleration_offset, self._acceleration_range
+                )
+                rate, rate_beyond = _measured(rate, self._angular_rate_offset, self._angular_rate_range)
+                saturated |= beyond << 6 | rate_beyond << 9
+            else:
+                acceleration = rate = (0.0, 0.0, 0.0)
+                saturated &= 0x3F
+        if saturated:
+            warnings |= sum(flag for mask, flag in _SATURATION if saturated & mask)
+        tail: tuple[float, ...] = ()
+        if self._layout.has_orientation:
+            tail = quaternion if self._orientation else (0.0, 0.0, 0.0, 0.0)
+        return self._layout.struct.pack(
+            0, warnings, *load, saturated & 0x3F, *acceleration, saturated >> 6 & 7, *rate, saturated >> 9,
+            temperature, *tail,
+        )  # fmt: skip
+
+    def changed(self) -> None:
+        """Something has: it takes effect from the next sample on, the newest may have been read already."""
+        self._prepared_number = -1
+
+    def settings_changed(self) -> None:
+        """Settings or offsets in the dictionary have changed."""
+        sinc_length = self._dictionary.sinc_in_effect
+        if sinc_length != self.clock.sinc_length:
+            self.clock.change(self._now(), sinc_length=sinc_length)
+        if isinstance(self._signal, Scene):
+            self._signal.set_sinc_length(sinc_length)
+        settings = self._dictionary.settings()
+        self._offset, self._acceleration_offset, self._angular_rate_offset = (
+            self._dictionary.offsets(index) for index in (0x8000, 0x8001, 0x8002)
+        )
+        self._calibrated = bool(settings["calibration_matrix"])
+        self._imu = settings["imu_active"] != 0
+        self._orientation = bool(settings["orientation_estimation"])
+        self._acceleration_range = float(settings["acceleration_range_g"])
+        self._angular_rate_range = float(settings["angular_rate_range_dps"])
+        self.changed()
+
+    def set_signal(self, options: SensorOptions) -> None:
+        """Measure the signal in `options`, which begins with the next sample."""
+        self._measure(options, self.clock.instant(self.clock.number_at(self._now()) + 1))
+
+    def set_ppm(self, ppm: float) -> None:
+        """Set the error of the clock from the newest sample on."""
+        self.clock.change(self._now(), ppm=ppm)
+        self.changed()
+
+    def set_warnings(self, bits: int, samples: int | None) -> None:
+        """OR `bits` into the warnings of the next `samples` samples, or of all."""
+        self._warnings = bits
+        self._warnings_until = 2**63 if samples is None else self.clock.number_at(self._now()) + 1 + samples
+        self.changed()
+
+    def set_skip(self, percent: float) -> None:
+        """Skip this percentage of the samples after the newest one at random; 0 ends it."""
+        self._skipped = round(percent / 100 * _SKIP_STEPS)
+        self._skip_after = self.clock.number_at(self._now())
+        self.changed()
