@@ -56,8 +56,8 @@ def extended(error: BusError, addition: str) -> BusError:
     return SdoAbortError(text, error.abort_code) if isinstance(error, SdoAbortError) else type(error)(text)
 
 
+# Abort codes of an object or sub-index that this firmware does not have.
 OBJECT_MISSING = frozenset({0x06020000, 0x06090011})
-"""Abort codes of an object or sub-index that this firmware does not have."""
 
 
 class ForbiddenWriteError(ServerError):

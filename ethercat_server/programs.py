@@ -5,8 +5,8 @@ from pathlib import PurePath
 
 from bota_ethercat.program import start
 
+# What is missing after `pip install --no-deps .`, and on other systems.
 _NEEDED = frozenset({"pysoem", "pyroute2", "fcntl", "grp", "pwd", "resource"})
-"""What is missing after `pip install --no-deps .`, and on other systems."""
 
 
 def run(module: str) -> int:

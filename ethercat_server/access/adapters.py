@@ -1,40 +1,67 @@
-"""The network interfaces of this machine, as the kernel describes them by pyroute2."""
+"""The network interfaces of this machine, as the kernel describes them by pyroute2; and which process uses
+one as an EtherCAT master, with the TCP port it listens on.
+
+See `packet_sockets`; listening TCP sockets are in /proc/net too. Of another user's process neither is
+visible: then the server that programs use by default is asked which interface it uses.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import socket
-from collections.abc import Iterator
+import struct
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from ethercat_server.access.holder import Holder, find_holder
-from ethercat_server.ethercat.nic import Routes, find_routes
+from bota_ethercat.address import Address
+from bota_ethercat.client import Client
+from bota_ethercat.errors import ProtocolError
+from bota_ethercat.program.server_choice import default_server
+from ethercat_server.ethercat.nic import Routes, find_routes, master_sockets, table, users_of
 from ethercat_server.process.signals import signals_held_back
 
 _IFF_UP, _IFF_LOOPBACK, _IFF_PROMISC = 0x1, 0x8, 0x100
 _ETHERNET: Final = 1
+# Kinds that a sensor can be connected to: network cards, and what tests use for one.
 _CARDS: Final = frozenset({"", "veth"})
-"""Kinds that a sensor can be connected to: network cards, and what tests use for one."""
+_LISTEN: Final = 0x0A
+
+
+class Holder(NamedTuple):
+    """A process that uses an interface."""
+
+    pid: int | None  # None if it is not visible to this user
+    name: str
+    address: Address | None  # the TCP address it listens on; None if it does not, or if that is not visible
+
+    def __str__(self) -> str:
+        """Its description in messages."""
+        if self.pid is not None:
+            return f"process {self.pid} ({self.name})"
+        return "another EtherCAT master" if self.address is None else self.name
 
 
 class Adapter(NamedTuple):
     """A network interface."""
 
     name: str
-    kind: str = ""
-    """Of a virtual one, such as veth or bridge; empty for a network card."""
+    ifindex: int = 0
+    kind: str = ""  # of a virtual one, such as veth or bridge; empty for a network card
     address: str | None = None
     up: bool = True
     carrier: bool = True
     loopback: bool = False
-    ethernet: bool = True
-    """Wired Ethernet, or a virtual interface like it."""
-    part_of_others: bool = False
-    """It belongs to a bridge or bond, or carries VLANs."""
+    promiscuous: bool = False
+    ethernet: bool = True  # wired Ethernet, or a virtual interface like it
+    master: str = ""  # bridge or bond that it is a part of
+    upper: tuple[str, ...] = ()  # interfaces that stand on it, such as VLANs
+    parent: str = ""  # device behind it, by the kernel's name, such as 0000:00:1f.6 or virtio2
+    counters: Mapping[str, int] = {}
+    carrier_changes: int | None = None
     routes: Routes = Routes()
-    holder: Holder | None = None
-    """The EtherCAT master that uses it."""
+    holder: Holder | None = None  # the EtherCAT master that uses it
 
     @property
     def state(self) -> str:
@@ -48,7 +75,7 @@ class Adapter(NamedTuple):
             return "loopback"
         if not self.ethernet or self.kind not in _CARDS:
             return self.kind or "no wired Ethernet"
-        if self.part_of_others:
+        if self.master or self.upper:
             return "part of a bridge, bond or VLAN"
         if not self.up or not self.carrier:
             return self.state if self.up else f"down ('sudo ip link set {self.name} up' to have it looked at)"
@@ -56,52 +83,56 @@ class Adapter(NamedTuple):
 
 
 def adapters() -> list[Adapter]:
-    """All interfaces of this machine. Nothing is sent on them."""
+    """All interfaces of this machine, with their routes and users. Nothing is sent on them."""
+    return [row._replace(routes=_routes(row.name), holder=find_holder(row.name)) for row in links()]
+
+
+def _routes(ifname: str) -> Routes:
+    try:
+        return find_routes(ifname)
+    except OSError:  # it has just gone
+        return Routes()
+
+
+def links() -> list[Adapter]:
+    """All interfaces of this machine, without their routes and users."""
     with open_routes() as route:
         rows = list(route.get_links())
-    carrying = {row.get_attr("IFLA_LINK") for row in rows if is_local(row)}
-    return [_adapter(row, carrying) for row in rows]
+    names = {row["index"]: row.get_attr("IFLA_IFNAME") for row in rows}
+    upper: dict[int, list[str]] = {}
+    for row in rows:
+        below = row.get_attr("IFLA_LINK")
+        # A veth's other end, or an interface of another namespace, is not below it.
+        if below != row["index"] and row.get_attr("IFLA_LINK_NETNSID") is None and _kind(row) != "veth":
+            upper.setdefault(below, []).append(names[row["index"]])
+    return [_link(row, names, upper.get(row["index"], ())) for row in rows]
 
 
-def _adapter(row: Any, carrying: set[int]) -> Adapter:
+def _link(row: Any, names: Mapping[int, str], upper: Iterable[str]) -> Adapter:
     name, up = row.get_attr("IFLA_IFNAME"), bool(row["flags"] & _IFF_UP)
-    try:
-        routes = find_routes(name)
-    except OSError:  # it has just gone
-        routes = Routes()
+    stats = row.get_attr("IFLA_STATS64") or row.get_attr("IFLA_STATS") or {}
     wireless = any(Path(f"/sys/class/net/{name}/{mark}").exists() for mark in ("wireless", "phy80211"))
     return Adapter(
         name,
-        kind=kind(row),
+        ifindex=row["index"],
+        kind=_kind(row),
         address=row.get_attr("IFLA_ADDRESS"),
         up=up,
         carrier=up and row.get_attr("IFLA_CARRIER") == 1,
         loopback=bool(row["flags"] & _IFF_LOOPBACK),
+        promiscuous=bool(row["flags"] & _IFF_PROMISC),
         ethernet=row["ifi_type"] == _ETHERNET and not wireless,
-        part_of_others=bool(row.get_attr("IFLA_MASTER")) or row["index"] in carrying,
-        routes=routes,
-        holder=find_holder(name),
+        master=names.get(row.get_attr("IFLA_MASTER"), ""),
+        upper=tuple(upper),
+        parent=row.get_attr("IFLA_PARENT_DEV_NAME") or "",
+        counters={key: int(stats[key]) for key in stats.keys() if isinstance(stats[key], int)},  # noqa: SIM118
+        carrier_changes=row.get_attr("IFLA_CARRIER_CHANGES"),
     )
 
 
-@contextlib.contextmanager
-def promiscuity_kept(ifname: str) -> Iterator[None]:
-    """Restore promiscuous mode to off afterwards if it was off before: SOEM switches it on and leaves it."""
-
-    def is_promiscuous() -> bool | None:
-        with open_routes() as route:
-            flags = {row.get_attr("IFLA_IFNAME"): row["flags"] for row in route.get_links()}.get(ifname)
-        return None if flags is None else bool(flags & _IFF_PROMISC)
-
-    before = is_promiscuous()
-    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - loaded by now
-
-    try:
-        yield
-    finally:
-        if before is False and is_promiscuous():
-            with open_routes() as route, contextlib.suppress(NetlinkError, OSError):
-                route.link("set", index=socket.if_nametoindex(ifname), flags=0, change=_IFF_PROMISC)
+def _kind(row: Any) -> str:
+    info = row.get_attr("IFLA_LINKINFO")
+    return (info.get_attr("IFLA_INFO_KIND") if info else None) or ""
 
 
 @contextlib.contextmanager
@@ -114,12 +145,64 @@ def open_routes() -> Iterator[Any]:
             yield route
 
 
-def kind(row: Any) -> str:
-    """Of a virtual interface, such as veth or bridge; empty for a network card."""
-    info = row.get_attr("IFLA_LINKINFO")
-    return (info.get_attr("IFLA_INFO_KIND") if info else None) or ""
+@contextlib.contextmanager
+def promiscuity_kept(ifname: str) -> Iterator[None]:
+    """Restore promiscuous mode to off afterwards if it was off before: SOEM switches it on and leaves it."""
+
+    def is_promiscuous() -> bool | None:
+        return {row.name: row.promiscuous for row in links()}.get(ifname)
+
+    before = is_promiscuous()
+    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - loaded by now
+
+    try:
+        yield
+    finally:
+        if before is False and is_promiscuous():
+            with open_routes() as route, contextlib.suppress(NetlinkError, OSError):
+                route.link("set", index=socket.if_nametoindex(ifname), flags=0, change=_IFF_PROMISC)
 
 
-def is_local(row: Any) -> bool:
-    """Whether what it stands on is an interface of this namespace: a veth's other end is not below it."""
-    return row.get_attr("IFLA_LINK_NETNSID") is None and kind(row) != "veth"
+def find_holder(ifname: str) -> Holder | None:
+    """The process with the EtherCAT socket on `ifname`; None if there is none, or no such interface."""
+    if not (inodes := master_sockets(ifname)):
+        return None
+    return next(owners(inodes), None) or Holder(None, "ethercat-server", _default_server(ifname))
+
+
+def owners(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Holder]:
+    """The visible processes that have one of these sockets."""
+    for process in users_of(inodes, processes):
+        yield Holder(process.pid, process.name, _listening(processes / str(process.pid), process.sockets))
+
+
+def _default_server(ifname: str) -> Address | None:
+    """The server that is used where none is given, if it uses this interface."""
+    with contextlib.suppress(ValueError, ProtocolError):
+        address = default_server()
+        with Client(address.port, address.host, stream=False).connect() as client:
+            if client.description.get("interface") == ifname:
+                return address
+    return None
+
+
+def _listening(process: Path, sockets: set[int]) -> Address | None:
+    found = []
+    for name in ("tcp", "tcp6"):
+        with contextlib.suppress(OSError):
+            for columns in table(process / "net" / name):
+                if int(columns[3], 16) == _LISTEN and int(columns[9]) in sockets:
+                    host, _, port = columns[1].partition(":")
+                    found.append(Address(_host(host), int(port, 16)))
+    # Prefer loopback: only local clients may control the server.
+    return min(found, key=lambda row: not ipaddress.ip_address(row.host).is_loopback, default=None)
+
+
+def _host(text: str) -> str:
+    """The host of an address in /proc/net/tcp: 32-bit words in native byte order."""
+    raw = bytes.fromhex(text)
+    words = struct.unpack(f">{len(raw) // 4}I", raw)
+    address = ipaddress.ip_address(struct.pack(f"={len(words)}I", *words))
+    if address.is_unspecified:
+        return "127.0.0.1" if address.version == 4 else "::1"
+    return str(address)

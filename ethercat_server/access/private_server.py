@@ -12,22 +12,31 @@ import os
 import signal
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Final
 
 from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
-from bota_ethercat.errors import UnreachableError
-from ethercat_server.access.raw import open_interface
 from ethercat_server.acquisition.start_up import AsFound
 from ethercat_server.errors import BusError
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.transport import SocketStream, SocketTransport
+from ethercat_server.virtual_sensor.virtual_bus import VIRTUAL_INTERFACE, VirtualBus
 
 STOPPED: Final = BusError("stopped before it was done")
-_ENDED: Final = "it has ended"
 _END_S: Final = 5.0
+
+
+@contextlib.contextmanager
+def open_interface(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
+    """The open bus on `ifname`, or on a virtual bus for `virtual`."""
+    with contextlib.ExitStack() as cleanup:
+        if ifname == VIRTUAL_INTERFACE:
+            ifname = cleanup.enter_context(VirtualBus()).ifname
+        yield cleanup.enter_context(open_bus(ifname, allow_ip=allow_ip))
 
 
 class PrivateServer:
@@ -96,22 +105,11 @@ class _PairTransport(SocketTransport):
 
     def __init__(self, sock: socket.socket) -> None:
         super().__init__((), 0)
-        self._sock: socket.socket | None = sock
+        self._listeners = {sock.fileno(): sock}
 
-    def listening(self) -> Sequence[int]:
+    def accept(self, fd: int) -> SocketStream | None:
         """See `Transport`."""
-        return () if self._sock is None else (self._sock.fileno(),)
-
-    def accept(self, fd: int) -> SocketStream | None:  # noqa: ARG002
-        """See `Transport`."""
-        sock, self._sock = self._sock, None
-        return None if sock is None else _PairStream(sock, None)
-
-    def close(self) -> None:
-        """See `Transport`."""
-        super().close()
-        if self._sock is not None:
-            self._sock.close()
+        return _PairStream(self._listeners.pop(fd), None) if fd in self._listeners else None
 
 
 class _PairStream(SocketStream):
@@ -125,13 +123,7 @@ class _PairChannel(TcpChannel):
 
     def __init__(self, sock: socket.socket) -> None:
         super().__init__("", 0)
-        self._pair: socket.socket | None = sock
-        self.is_near = True
+        self._sock, self.is_near = sock, True
 
-    def connect(self, timeout_s: float) -> bool:  # noqa: ARG002
-        """See `Channel`."""
-        if self._pair is None:
-            raise UnreachableError(_ENDED)
-        self._sock, self._pair = self._pair, None
-        self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-        return True
+    def _prepare(self, sock: socket.socket) -> None:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
@@ -22,7 +23,7 @@ from bota_ethercat.program.server_choice import default_server, is_address
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.access.holder import find_holder
+from ethercat_server.access.adapters import find_holder
 from ethercat_server.access.private_server import PrivateServer
 from ethercat_server.errors import BusError, InterfaceError, SdoAbortError, ServerError, UsageError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
@@ -34,35 +35,22 @@ from ethercat_server.sensor.set_up import NO_SETTINGS, read_in_force
 from ethercat_server.sensor.tare import LATER
 
 _ANSWER_TIMEOUT_S: Final = 30.0
+# Upper bound for the time per sample of a tare: CHOP may divide 25 Hz by 8, and a tare takes two windows.
 _SLOWEST_SAMPLE_S: Final = 1.0
-"""Upper bound for the time per sample of a tare: CHOP may divide 25 Hz by 8, and a tare takes two windows."""
 _BACK_S: Final = 10.0
 _IDLE_S: Final = 0.05
-_SETTLED_WITHIN_S: Final = 10.0
-"""Timeout for what settles."""
+_SETTLED_WITHIN_S: Final = 10.0  # timeout for what settles
 _READ_ATTEMPTS: Final = 3
 _READ_PAUSE_S: Final = 0.1
 
 
-OnFrame = Callable[[DataMessage], bool]
-"""Receives a DATA message; returns whether to continue."""
-
-
-class SettledFrames:
-    """Hands frames to `on_frame` but for the samples of settling sensors, whose GAP the next frame gets."""
-
-    def __init__(self, on_frame: OnFrame) -> None:
-        self._on_frame = on_frame
-        self._gaps: dict[int, int] = {}
-
-    def take(self, frame: DataMessage, settling: bool) -> bool:
-        """A frame of a sensor that is or is not `settling`; returns whether to continue."""
-        if settling and not frame.flags & NOT_NEW:
-            self._gaps[frame.sensor] = self._gaps.get(frame.sensor, 0) | frame.flags & DataFlag.GAP
-            return True
-        if self._gaps and (gap := self._gaps.pop(frame.sensor, 0)):
-            frame = frame._replace(flags=frame.flags | gap)
-        return self._on_frame(frame)
+# What is told of a watched sensor, unless the event has a message of its own.
+_TOLD: Final[Mapping[str, str]] = {
+    Event.SENSOR_LOST: "sensor {sensor} is lost",
+    Event.SENSOR_BACK: "sensor {sensor} is back after {lost_s} s",
+    Event.EMERGENCY: "sensor {sensor} reports an emergency",
+    Event.RECONFIGURED: "the settings of sensor {sensor} have changed",
+}
 
 
 class Sensors:
@@ -81,7 +69,10 @@ class Sensors:
         self._client, self._name, self._private = client, name, private
         self.used = used
         self.restores = private is None
-        self.sensors = [_found(row) for row in client.description["sensors"]]
+        self.sensors = [
+            Found(row["sensor"], Identity(row["name"], row["serial"], row["hardware"], row["firmware"]))
+            for row in client.description["sensors"]
+        ]
 
     @classmethod
     def through(cls, address: Address, used: str | None = None) -> Sensors:
@@ -157,42 +148,34 @@ class Sensors:
         """The object dictionary of a sensor."""
         return GuardedSdo(_ServerSdo(self, number))
 
-    def sii(self, number: int, word: int, words: int) -> bytes:
-        """`words` words of a sensor's SII from `word` on."""
-        return bytes.fromhex(self.ask("sii_read", sensor=number, word=word, words=words)["hex"])
-
     def configure(self, number: int, settings: Mapping[str, SettingValue], save: bool) -> None:
         """Change `settings` and verify them; on failure the former ones are restored."""
         with signals_held_back():
             self.ask("configure", sensor=number, settings=dict(settings), save=save)
 
     def tare(self, number: int, samples: int, target: Sequence[float]) -> dict[str, Any]:
-        """Set the force/torque offset; returns the reply of the action `tare`."""
-        timeout_s = _ANSWER_TIMEOUT_S + samples * _SLOWEST_SAMPLE_S
-        with signals_call(self._interrupted()):
+        """Set the force/torque offset; returns the reply of the action `tare`.
+
+        On a signal a private server undoes it, another one completes it in any case.
+        """
+        timeout_s, signals = _ANSWER_TIMEOUT_S + samples * _SLOWEST_SAMPLE_S, itertools.count()
+
+        def interrupt() -> None:
+            if self._private is not None:
+                self._private.interrupt()
+            elif next(signals):
+                raise ServerError(f"interrupted before {self._name} replied: it may still tare the sensor")
+            else:
+                waits = "waiting for its result; Ctrl-C again leaves without it"
+                note(f"{self._name} continues the tare: {waits}")
+
+        with signals_call(interrupt):
             try:
                 return self.ask("tare", timeout_s, sensor=number, samples=samples, target=list(target))
             except BusError as error:
                 if self._private is None or not str(error).endswith(LATER):
                     raise
                 raise BusError(f"{str(error).removesuffix(LATER)}{self._wait_back(number)}") from None
-
-    def _interrupted(self) -> Callable[[], None]:
-        """Signal handler during a tare: a private server undoes it, another one completes it in any case."""
-        signals: list[None] = []
-
-        def handle() -> None:
-            if self._private is not None:
-                self._private.interrupt()
-            elif signals:
-                raise ServerError(f"interrupted before {self._name} replied: it may still tare the sensor")
-            else:
-                note(
-                    f"{self._name} continues the tare: waiting for its result; Ctrl-C again leaves without it"
-                )
-            signals.append(None)
-
-        return handle
 
     def _wait_back(self, number: int) -> str:
         """Give a sensor that was lost in a tare the time to come back; what became of its offset."""
@@ -204,33 +187,43 @@ class Sensors:
             self.clock.sleep(_IDLE_S)
         return "; it is back with its old offset"
 
-    def watch(self, numbers: Sequence[int], on_frame: OnFrame, on_idle: Callable[[], bool]) -> None:
+    def watch(
+        self, numbers: Sequence[int], on_frame: Callable[[DataMessage], bool], on_idle: Callable[[], bool]
+    ) -> None:
         """Stream until `on_frame` or the periodic `on_idle` returns False.
 
-        Samples of settling sensors are left out; it begins when they have settled.
+        Samples of settling sensors are left out, and their GAP is the next frame's; it begins when they have
+        settled.
         """
         self.wait_settled(numbers)
         self.ask("subscribe", sensors=list(numbers))
-        settled, settling, asked = SettledFrames(on_frame), set[int](), Deadline(self.clock, 0.0)
+        gaps, settling, asked = dict[int, int](), set[int](), Deadline(self.clock, 0.0)
         while on_idle():
             later = settling
             if settling and asked.passed:
                 later, asked = self._settling(numbers), Deadline(self.clock, _IDLE_S)
-            try:
-                frames = self._client.poll(_IDLE_S)
-            except ConnectionFailedError as error:
-                raise self._closed(error) from None
+            frames = self._poll()
             for event in self._events():
                 if event["event"] == Event.SHUTTING_DOWN:
                     raise ServerError(f"{self._name} is shutting down")
-                if event.get("sensor") in numbers:
-                    _tell(event)
+                told = _TOLD.get(str(event["event"]))
+                if told is not None and event.get("sensor") in numbers:
+                    note(str(event.get("message") or told.format_map({"lost_s": None, **event})))
                     if event["event"] in (Event.SENSOR_BACK, Event.RECONFIGURED):
                         settling = later = later | {event["sensor"]}
             for frame in frames:  # those on the way while it was asked are judged by what it said before
-                if not settled.take(frame, frame.sensor in settling):
+                gap = gaps.pop(frame.sensor, 0) | frame.flags & DataFlag.GAP
+                if frame.sensor in settling and not frame.flags & NOT_NEW:
+                    gaps[frame.sensor] = gap
+                elif not on_frame(frame._replace(flags=frame.flags | gap)):
                     return
             settling = later
+
+    def _poll(self) -> list[DataMessage]:
+        try:
+            return self._client.poll(_IDLE_S)
+        except ConnectionFailedError as error:
+            raise self._closed(error) from None
 
     @property
     def real_time(self) -> bool:
@@ -247,10 +240,7 @@ class Sensors:
         self.ask("subscribe", fresh_only=False)
         end = Deadline(self.clock, seconds)
         while not end.passed:
-            try:
-                on_frames(self._client.poll(_IDLE_S))
-            except ConnectionFailedError as error:
-                raise self._closed(error) from None
+            on_frames(self._poll())
         self.ask("unsubscribe")
         return self._events()
 
@@ -298,42 +288,11 @@ class _ServerSdo:
         self._sensors.ask("sdo_write", sensor=self._number, index=index, subindex=subindex, hex=data.hex())
 
 
-def _tell(event: JsonObject) -> None:
-    """Print an event of a watched sensor."""
-    number = event["sensor"]
-    if event.get("event") == Event.SENSOR_LOST:
-        note(str(event.get("message", f"sensor {number} is lost")))
-    elif event.get("event") == Event.SENSOR_BACK:
-        note(f"sensor {number} is back after {event.get('lost_s')} s")
-    elif event.get("event") == Event.EMERGENCY:
-        note(str(event.get("message", f"sensor {number} reports an emergency")))
-    elif event.get("event") == Event.RECONFIGURED:
-        note(f"the settings of sensor {number} have changed")
-
-
-def _found(row: Mapping[str, Any]) -> Found:
-    return Found(row["sensor"], Identity(row["name"], row["serial"], row["hardware"], row["firmware"]))
-
-
-def open_sensors(
-    ifname: str | None, server: str | None, *, force: bool = False, allow_ip: bool = False
-) -> Sensors:
-    """Those on `ifname`, or behind `server`; UsageError if both are given.
-
-    If a server uses the interface, through that server, with a note. With `force` a bus in use is taken over,
-    with `allow_ip` an interface of the machine's network is used.
-    """
-    found = find_server(ifname, server)
-    if found is None:
-        assert ifname is not None
-        found = Sensors.on_interface(ifname, force=force, allow_ip=allow_ip)
-    return found
-
-
 def find_server(ifname: str | None, server: str | None) -> Sensors | None:
-    """The named server, or the one that uses the interface; None if the interface is not in use.
+    """The named server, or with a note the one that uses the interface; None if the interface is not in use.
 
-    With neither, the default server; an `ifname` such as localhost:12001 is a server too.
+    With neither, the default server; an `ifname` such as localhost:12001 is a server too. UsageError if both
+    are given.
     """
     if ifname is not None and server is not None:
         raise UsageError("name either an interface, such as ens5, or a server with --server HOST:PORT")
@@ -385,8 +344,3 @@ def choose(sensors: Sequence[Found], wanted: str | None) -> Found:
 def note(text: str) -> None:
     """One line for people on standard error."""
     sys.stderr.write(f"ethercat-sensor: {text}\n")
-
-
-def failed_change(error: BusError) -> BusError:
-    """The same, with the addition that nothing has changed."""
-    return BusError(f"{error}; the former settings are in force")

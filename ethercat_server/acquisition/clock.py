@@ -39,7 +39,7 @@ _UNLIKELY_RUN: Final = 7.0
 _CONTRADICTS: Final = 3.0
 # So many in a row mean that the sensor's clock started anew.
 _CONTRADICTIONS: Final = 4
-# Beyond so many standard deviations a bit that is as expected teaches nothing.
+# Beyond so many standard deviations nothing is learned from a bit that is as expected.
 _CERTAIN: Final = 5.0
 # Standard deviation of a phase of which nothing is known, in periods: 1/sqrt(12).
 _UNKNOWN: Final = 0.3
@@ -59,8 +59,8 @@ _LOSS_PERIODS: Final = 10.0
 # There is none if a round trip takes more than this part of a period.
 _NO_TIME: Final = 0.5
 _LARGEST_MARGIN: Final = 0.4
-# By this factor an early look costs more where it teaches nothing, for events date the samples.
-_TEACHES_NOTHING: Final = 1.2
+# By this factor an early look costs more where nothing is learned from it, for events date the samples.
+_NOTHING_LEARNED: Final = 1.2
 # The clock
 # The clock is followed while the phase is known to this part of a period (standard deviation).
 _LOCKED: Final = 0.125
@@ -77,19 +77,19 @@ SILENT_PERIODS: Final = 3
 # Part of the samples whose first poll is to be early.
 _EARLY_POLLS: Final = 0.11
 _CAUTION_GAIN: Final = 0.05
-# The margin is derived anew every so many lessons, and when the variance has changed by this factor.
+# The margin is derived anew every so many calls of `learn`, and when the variance has changed by this factor.
 _TURNS: Final = 3
 _CHANGED: Final = 1.25
 # A steady clock is learned from one sample in this time: by its event, and by polls.
-_LESSON_BY_EVENT_NS: Final = 10e6
-_LESSON_BY_POLL_NS: Final = 5e6
+_LEARN_BY_EVENT_EVERY_NS: Final = 10e6
+_LEARN_BY_POLL_EVERY_NS: Final = 6.25e6
 # A phase known so well needs no probes, however well polls could tell it.
 _PROBE_BELOW: Final = 5_000.0**2
 # After so many samples without an early look it is tried whether the phase is still what it was.
 _UNPROBED: Final = 500
 # The sensor looks at its data within this part of a period after the frame usually has reached it.
 _LONGEST_LOOK: Final = 0.5
-# A sample so much before the expected one, in periods, is the one that was watched for before.
+# A sample that comes so much early, in periods, is the one expected before it.
 _EARLY: Final = -0.25
 _BIAS_GAIN: Final = 1 / 64
 # Only one sample can have come in this part of a period; more may have in this.
@@ -108,20 +108,16 @@ class Estimate:
         """`period_ns` is the nominal period."""
         self._nominal_ns = period_ns
         self.period_ns = period_ns
-        self.phase_ns = 0.0
-        """When the next sample comes to be."""
-        self.variance = (_UNKNOWN * period_ns) ** 2
-        """Of the phase."""
+        self.phase_ns = 0.0  # when the next sample comes to be
+        self.variance = (_UNKNOWN * period_ns) ** 2  # of the phase
         self._covariance = 0.0
         self._period_variance = (_FIRST_PULL * period_ns) ** 2
         self._pull = _FIRST_PULL
         self._jitter = _JITTER_NS**2
-        self._wander = (_WANDER * period_ns) ** 2
-        """Variances that phase and period gain with each sample."""
+        self._wander = (_WANDER * period_ns) ** 2  # variances that phase and period gain with each sample
+        # Logarithm of how much more the clock wanders than a crystal: a program that sleeps does.
         self.restless = 0.0
-        """Logarithm of how much more the clock wanders than a crystal: a program that sleeps does."""
-        self._run = 0.0
-        """Negative log-likelihood of the looks since the last that was early."""
+        self._run = 0.0  # negative log-likelihood of the looks since the last that was early
         self._contradictions = 0
 
     @property
@@ -265,7 +261,7 @@ def margin_ns(
     single = has_no_time_for_two(timing, period_ns)
     cost_ns = _LOSS_PERIODS * period_ns if single else timing.usual_ns + _PRICE_NS
     if by_events:
-        cost_ns *= _TEACHES_NOTHING
+        cost_ns *= _NOTHING_LEARNED
     deviation_ns = math.sqrt(phase_variance + timing.variance)
     ratio = cost_ns / (deviation_ns * _ROOT_2_PI)
     if ratio <= 1:
@@ -636,5 +632,5 @@ class SampleClock:
                         self._caution = min(self._caution, 1.0)
                     self._hits = 0
         self._settle()
-        every_ns = _LESSON_BY_EVENT_NS if self.by_events else _LESSON_BY_POLL_NS
+        every_ns = _LEARN_BY_EVENT_EVERY_NS if self.by_events else _LEARN_BY_POLL_EVERY_NS
         self._skips = round(every_ns / estimate.period_ns) - 1 if self._steady and fresh else 0

@@ -17,7 +17,7 @@ from ethercat_server.acquisition.health import RoundTripHealth
 from ethercat_server.acquisition.histogram import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
-from ethercat_server.acquisition.stream import Made, SensorStream
+from ethercat_server.acquisition.stream import OutgoingFrame, SensorStream
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.exchange import DUPLICATE, LATCHED, Exchange
 from ethercat_server.sensor.sensor import Sensor, SensorState
@@ -45,13 +45,11 @@ _LONGEST_LEAD_NS: Final = 200_000.0
 class Outlet(Protocol):
     """Where the samples go: the server's `Hub`, or a tool that wants them in its own process."""
 
-    def publish(self, made: Sequence[Made], now_ns: int) -> None:
+    def publish(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
         """Take the DATA frames that an exchange made, one for a sensor; `now_ns` is when it was back."""
-        ...
 
     def serve(self, until_ns: int) -> None:
         """Do what else there is to do, or wait, until CLOCK_MONOTONIC is `until_ns`."""
-        ...
 
 
 class Watchdog(Protocol):
@@ -60,11 +58,9 @@ class Watchdog(Protocol):
     @property
     def feed_every_ns(self) -> int:
         """The longest time between two calls of `feed`."""
-        ...
 
     def feed(self) -> None:
         """The loop runs."""
-        ...
 
 
 class Schedule:
@@ -121,8 +117,7 @@ class Cycle:
         watchdog: Watchdog,
     ) -> None:
         self.stopping = False
-        self.every_second: Callable[[], None] = lambda: None
-        """Called once a second."""
+        self.every_second: Callable[[], None] = lambda: None  # called once a second
         self._jobs = jobs
         self._watchdog = watchdog
         self._bus = bus
@@ -235,7 +230,8 @@ class Cycle:
         timing.in_flight, timing.unanswered = True, timing.unanswered + 1
         if slept:
             self._wake.record(sent - due)
-            timing.woke_late_ns = sent - due
+            if timing.woke_late_ns is None:
+                timing.woke_late_ns = sent - due
         if now >= self._idle_at_ns:
             self._show_silence(now)
         if frame is None:
@@ -276,7 +272,7 @@ class Cycle:
         """Hand out what an exchange brought."""
         _, back, frame, wkc, which = exchange
         self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
-        new: list[Made] = []
+        new: list[OutgoingFrame] = []
         for start, end, untouched, at, sensor, stream in self._carried[which]:
             if back < stream.clock.estimate.phase_ns - stream.clock.quiet_ns:
                 continue  # the poll was for another sensor
@@ -295,8 +291,8 @@ class Cycle:
         timing = self._timing
         timing.in_flight, timing.unanswered = sent < timing.sent_ns, 0
         self._exchange.record(back - sent)
-        lessons = [row[-1].clock for row in self._carried[which] if row[-1].finish(exchange)]
-        if not lessons and timing.short_ns < back - sent < timing.usual_ns + self._schedule.shortest_ns:
+        learners = [row[-1].clock for row in self._carried[which] if row[-1].finish(exchange)]
+        if not learners and timing.short_ns < back - sent < timing.usual_ns + self._schedule.shortest_ns:
             return
         arrived = self._bus.backend.arrived_ns()
         if not sent < arrived < back:  # the kernel does not say, or CLOCK_REALTIME was set
@@ -305,9 +301,9 @@ class Cycle:
             self._missed_deadlines += int(late // self._schedule.shortest_ns)
             self._recovery.causes.stood_still(back - arrived, back)
         arrived = max(sent, arrived - self._wire_ns[which])
-        if lessons:
+        if learners:
             timing.took(sent, arrived, back)
-            for clock in lessons:
+            for clock in learners:
                 clock.learn(arrived)
             self._schedule.cost(self._bus.clock.monotonic_ns() - back)
         else:

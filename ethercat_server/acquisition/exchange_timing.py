@@ -39,26 +39,19 @@ class ExchangeTiming:
     )  # fmt: skip
 
     def __init__(self, now_ns: int = 0) -> None:
-        self.sent_ns = now_ns
-        """When the last exchange was sent."""
-        # How late the loop woke for it, if it slept before it.
+        self.sent_ns = now_ns  # when the last exchange was sent
+        # How late the loop woke when it first slept after `took`. Not the last time: late wake-ups have it
+        # learn at once, and would count for too much.
         self.woke_late_ns: float | None = None
-        self.in_flight = False
-        """Whether it is not back."""
-        self.unanswered = 0
-        """Exchanges that were sent since one was back."""
-        self.unanswered_since_ns = now_ns
-        """When the first of them was sent, if there are several."""
-        self.least_ns = math.inf
-        """The shortest recent round trip."""
+        self.in_flight = False  # whether it is not back
+        self.unanswered = 0  # exchanges that were sent since one was back
+        self.unanswered_since_ns = now_ns  # when the first of them was sent, if there are several
+        self.least_ns = math.inf  # the shortest recent round trip
+        # By how much instants less the outward part of it are later than they were at first.
         self.moved_ns = 0.0
-        """By how much instants less the outward part of it are later than they were at first."""
-        self.wire_ns = 0
-        """What the bytes of the longest frame take on the wire."""
-        self.late_ns = 0.0
-        """Usual lateness of a wake-up."""
-        self.excess_ns = _FIRST_EXCESS_NS
-        """What an exchange usually takes beyond the shortest."""
+        self.wire_ns = 0  # what the bytes of the longest frame take on the wire
+        self.late_ns = 0.0  # usual lateness of a wake-up
+        self.excess_ns = _FIRST_EXCESS_NS  # what an exchange usually takes beyond the shortest
         self._excess_square = 2 * _FIRST_EXCESS_NS**2
         self._late_variance = _FIRST_LATE_NS**2
         # An exchange that is back sooner is a short one, of which somebody wants to know when it arrived.
@@ -70,19 +63,19 @@ class ExchangeTiming:
         self._derive()
 
     def _derive(self) -> None:
+        # Usual delay of the slaves' look at their data by what an exchange takes beyond the shortest.
         self.look_ns = self.excess_ns / 2
-        """Usual delay of the slaves' look at their data by what an exchange takes beyond the shortest."""
         # Uniform within the excess: E[(x·e)²] = E[e²]/3.
         self.look_variance = max(self._excess_square / 3 - self.look_ns * self.look_ns, _LEAST_VARIANCE)
+        # Of the difference between the instant aimed at and that of the look.
         self.variance = self.look_variance + self._late_variance
-        """Of the difference between the instant aimed at and that of the look."""
         least_ns = self.least_ns if self.least_ns < math.inf else _FIRST_GUESS_NS
+        # What an exchange usually takes until its answer is there.
         self.usual_ns = least_ns + self.excess_ns + self.wire_ns
-        """What an exchange usually takes until its answer is there."""
         self._most_excess_ns = _OUTLIER * math.sqrt(self._excess_square) + _ROOM_NS
         self._most_late_ns = _OUTLIER * math.sqrt(self._late_variance) + _ROOM_NS
+        # After this time an answer is overdue.
         self.patience_ns = self.usual_ns + 3 * self.excess_ns + _PATIENCE_NS
-        """After this time an answer is overdue."""
 
     def took(self, sent_ns: int, arrived_ns: int, back_ns: int) -> None:
         """Learn from an exchange whose answer began to arrive, and was there, then; from a wake-up, too."""

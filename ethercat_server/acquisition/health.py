@@ -70,12 +70,10 @@ class Causes:
 
     def __init__(self, ifname: str) -> None:
         self._ifname = ifname
-        self._frames = self._frames_checked = 0
-        """Of other masters."""
+        self._frames = self._frames_checked = 0  # of other masters
+        # When the last one came, when this computer stood still last.
         self._frame_ns = self._stall_ns = -_RECENT_NS
-        """When the last one came, when this computer stood still last."""
-        self._stalled_ns = 0
-        """For how long, all in all, without longer breaks in between."""
+        self._stalled_ns = 0  # for how long, all in all, without longer breaks in between
         self._gone_s = _GONE_S
 
     def stray(self, frame: bytes, now_ns: int) -> None:
@@ -155,15 +153,13 @@ class SampleHealth:
 
     def __init__(self, number: int) -> None:
         self._number = number
-        self.not_finite = 0
-        """New samples with a number that is NaN or infinite."""
-        self._checked = (0, 0, 0)
-        """The counts of the last check: fresh, repeated, not finite."""
+        self.not_finite = 0  # new samples with a number that is NaN or infinite
+        self._checked = (0, 0, 0)  # the counts of the last check: fresh, repeated, not finite
         self._silent_s = 0
         self._finite_s = _FINITE_SECONDS
         self._rate_reported = False
+        # Whether it was reported last that event times date the samples; that they do not.
         self._trusted = self._distrusted = False
-        """Whether it was reported last that event times date the samples; that they do not."""
         self._deviating_s = 0
 
     def check(self, fresh: int, repeated: int, clock: SampleClock) -> None:

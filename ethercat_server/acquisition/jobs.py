@@ -46,8 +46,7 @@ class Jobs:
         self._queues: list[deque[_Job]] = [deque() for _ in sensors]
         self._turn = 0
         self._stepped_ns = 0
-        self.waiting = 0
-        """Jobs that are not done."""
+        self.waiting = 0  # jobs that are not done
         self._interrupted: BusError | None = None
 
     def start(

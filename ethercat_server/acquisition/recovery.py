@@ -200,15 +200,13 @@ class Recovery:
         self._changing: dict[int, _Reconfiguration] = {}
         self._short = 0
         self._watch_ns = 0
-        self.attend_at_ns = 0
-        """`attend` need not be called before if all sensors took part."""
+        self.attend_at_ns = 0  # `attend` need not be called before if all sensors took part
         self._watched = 0
         # Or at the mailboxes: in turns, so that no exchange has to wait for both.
         self._looks_at_states = False
+        # The working counter of each frame if all sensors that are not lost take part.
         self.alive_wkc: list[int]
-        """The working counter of each frame if all sensors that are not lost take part."""
-        self.all_lost: bool
-        """Whether no sensor is left to be read."""
+        self.all_lost: bool  # whether no sensor is left to be read
         self._count_alive()
 
     def reconfigure(self, number: int, change: Change, done: Callable[[BusError | None], None]) -> None:

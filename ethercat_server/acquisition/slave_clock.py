@@ -188,10 +188,8 @@ class Verdict(Enum):
 class Evidence(NamedTuple):
     """What is known of the local clock, and of the events, when a trial begins or ends."""
 
-    restarts: int
-    """How often the clock was found to be another."""
-    moved: int
-    """Number of samples with an event of their own."""
+    restarts: int  # how often the clock was found to be another
+    moved: int  # number of samples with an event of their own
 
 
 class Trust:
@@ -204,12 +202,9 @@ class Trust:
 
     def __init__(self) -> None:
         self.verdict = Verdict.TRIAL
-        self.why = ""
-        """What was wrong with them last: part of a sentence."""
-        self.is_final = False
-        """Whether they are refused for good: the controller has never shown any."""
-        self.was_trusted = False
-        """Whether this controller's ever were: then they are not refused for good."""
+        self.why = ""  # what was wrong with them last: part of a sentence
+        self.is_final = False  # whether they are refused for good: the controller has never shown any
+        self.was_trusted = False  # whether this controller's ever were: then they are not refused for good
         self._failures = self._again_ns = 0
         self._pause_ns = _FIRST_PAUSE_NS
         self.contradictions = 0.0
@@ -326,24 +321,19 @@ class EventTimes:
         """
         self.local_clock = LocalClock(timing)
         self.trust = Trust()
-        self.are_trusted = False
-        """Whether samples are dated by them."""
+        self.are_trusted = False  # whether samples are dated by them
+        # CLOCK_MONOTONIC of the new sample of the newest exchange; 0 if its event does not say.
         self.instant_ns = 0.0
-        """CLOCK_MONOTONIC of the new sample of the newest exchange; 0 if its event does not say."""
         self._timing = timing
         self._use(clock)
         self._passing_ns = passing_ns
         # Local times of the newest sample's event, and of the newest one that was on trial.
         self._event = self._compared_event = 0
-        self._took_ns = 0
-        """By the newest exchange."""
-        self.is_doubtful = False
-        """Whether samples may have been lost before it that nobody knows of."""
-        self._is_next = False
-        """Whether that event is the next sample's, which came while the frame passed."""
+        self._took_ns = 0  # by the newest exchange
+        self.is_doubtful = False  # whether samples may have been lost before it that nobody knows of
+        self._is_next = False  # whether that event is the next sample's, which came while the frame passed
         self._moved = 0
-        self._answers = False
-        """Whether the controller knows the registers."""
+        self._answers = False  # whether the controller knows the registers
 
     def _use(self, clock: DistributedClock) -> None:
         self._offset = clock.offset

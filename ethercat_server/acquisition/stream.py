@@ -28,7 +28,7 @@ from ethercat_server.sensor.sensor import Sensor
 DISCARDED_AT_START: Final = 3
 
 # A DATA frame, the number of its sensor, its flags.
-Made = tuple[bytes, int, int]
+OutgoingFrame = tuple[bytes, int, int]
 
 REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))
 
@@ -56,17 +56,15 @@ class SensorStream:
         self._timing = timing
         self._passing_ns = passing_ns
         self.clock = self._new_clock(period_ns, latching)
-        self.process_data = b""
-        """The newest valid process data."""
-        self._handed_out = b""
-        """What the last frame carried: a REPEATED or INVALID one carries it again."""
+        self.process_data = b""  # the newest valid process data
+        self._handed_out = b""  # what the last frame carried: a REPEATED or INVALID one carries it again
         self.sequence = 0
         self.repeated = 0
         self.invalid_frames = 0
         self.lost_samples = 0
         self.recoveries = 0
+        # From the estimated instant of a sample to its hand-out, while locked.
         self.age = RecentDistribution()
-        """From the estimated instant of a sample to its hand-out, while locked."""
         self.health = SampleHealth(number)
         self._discard = DISCARDED_AT_START
         # So many new samples to come have GAP.
@@ -77,10 +75,8 @@ class SensorStream:
         self._exchange, self._fresh = DUPLICATE, False
         # The working counter of an exchange since then that was not valid; 0 for none.
         self._short_wkc = 0
-        self._moment_ns = 0
-        """Of the newest sample."""
-        self.idle_at_ns = 0.0
-        """`idle` is to be called from then on."""
+        self._moment_ns = 0  # of the newest sample
+        self.idle_at_ns = 0.0  # `idle` is to be called from then on
 
     def _new_clock(self, period_ns: float, latching: DistributedClock | None) -> SampleClock:
         events = latching and EventTimes(latching, self._timing, self._passing_ns)
@@ -91,7 +87,7 @@ class SensorStream:
         """Frames that brought a new sample."""
         return self.sequence - self.repeated - self.invalid_frames
 
-    def take(self, data: bytes, exchange: Exchange, latched: Latched | None = None) -> Made | None:
+    def take(self, data: bytes, exchange: Exchange, latched: Latched | None = None) -> OutgoingFrame | None:
         """The frame that a valid exchange gives; None if it gives none.
 
         `finish` must follow. `latched` is what the slave controller has latched.
@@ -137,7 +133,7 @@ class SensorStream:
         """An exchange brought nothing of this sensor."""
         self._short_wkc = wkc
 
-    def idle(self, now_ns: int) -> Made | None:
+    def idle(self, now_ns: int) -> OutgoingFrame | None:
         """The frame that shows the sensor's silence; None before its first sample."""
         if not self.process_data:
             return None

@@ -4,15 +4,15 @@ for the sensors."""
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import ipaddress
-import math
 import shlex
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from bota_ethercat.errors import SettingError
 from bota_ethercat.program.completion import add_completion
@@ -29,10 +29,10 @@ from ethercat_server import __version__
 from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import realtime
+from ethercat_server.sensor.sensor import Identity
 
 DEFAULTS: Final = "defaults"
 KEEP: Final = "keep"
-DEFAULT_RT_PRIORITY: Final = realtime.DEFAULT_PRIORITY
 
 
 class ServerSetting(NamedTuple):
@@ -41,15 +41,11 @@ class ServerSetting(NamedTuple):
     name: str
     metavar: str
     meaning: str
-    parse: Callable[[str], Any]
-    """Parses a value; ValueError says what it must be."""
+    parse: Callable[[str], Any]  # ValueError says what a value must be
     default: Any
-    many: bool = False
-    """Takes several values: a repeatable flag, a list in the file."""
-    at_once: bool = False
-    """A reload (SIGHUP) applies a change; others need a restart."""
-    text: bool = False
-    """A single string."""
+    many: bool = False  # takes several values: a repeatable flag, a list in the file
+    at_once: bool = False  # a reload (SIGHUP) applies a change; others need a restart
+    text: bool = False  # a single string
 
     @property
     def flag(self) -> str:
@@ -57,97 +53,88 @@ class ServerSetting(NamedTuple):
         name = self.name.removesuffix("s") if self.many else self.name.removesuffix("_s")
         return "--" + name.replace("_", "-")
 
+    def parse_argument(self, text: str) -> Any:
+        """A value on the command line; argparse's error says what it must be."""
+        try:
+            return self.parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(f"{text!r} must be {error}") from None
+
     def check(self, value: object) -> Any:
         """The value in a configuration file, checked; ValueError says what it must be."""
         if self.many:
-            if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-                raise ValueError('a list of strings, such as ["a", "b"]')
-            return tuple(self.parse(item) for item in value)
-        if self.text:
-            if not isinstance(value, str):
-                raise ValueError('a string, such as "a"')
-            return self.parse(value)
-        if isinstance(value, bool) or not isinstance(value, int | float):
+            if isinstance(value, list) and all(isinstance(item, str) for item in value):
+                return tuple(map(self.parse, value))
+            raise ValueError('a list of strings, such as ["a", "b"]')
+        if self.text and not isinstance(value, str):
+            raise ValueError('a string, such as "a"')
+        if not self.text and (isinstance(value, bool) or not isinstance(value, int | float)):
             raise ValueError("a number")
         return self.parse(str(value))
 
 
-def whole(low: int, high: int) -> Callable[[str], int]:
-    """Parses a whole number from `low` to `high`."""
+def _checked(
+    convert: Callable[[str], Any], holds: Callable[[Any], object], what: str
+) -> Callable[[str], Any]:
+    """Parses what `convert` takes and `holds` is true of; ValueError says `what` it must be."""
 
-    def parse(text: str) -> int:
-        if text.isdecimal() and low <= int(text) <= high:
-            return int(text)
-        raise ValueError(f"a whole number from {low} to {high}")
+    def parse(text: str) -> Any:
+        with contextlib.suppress(ValueError):
+            if holds(value := convert(text)):
+                return value
+        raise ValueError(what)
 
     return parse
 
 
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if 0.1 <= seconds <= 1e6:
-        return seconds
-    raise ValueError("seconds, from 0.1 to 1000000")
+def _whole(high: int) -> Callable[[str], Any]:
+    what = f"a whole number from 0 to {high}"
+    return _checked(lambda text: int(text) if text.isdecimal() else -1, range(high + 1).__contains__, what)
 
 
-def _address(text: str) -> str:
-    try:
-        return str(ipaddress.ip_address(text))
-    except ValueError:
-        raise ValueError("an IP address of this machine, such as 127.0.0.1 or 0.0.0.0") from None
-
-
-def _unset(text: str) -> str:
-    if text in (DEFAULTS, KEEP):
-        return text
-    raise ValueError(f"'{DEFAULTS}' or '{KEEP}'")
-
-
-def _name(text: str) -> str:
-    if text and text.isprintable():
-        return text
-    raise ValueError("a name")
-
-
+_ADDRESS: Final = _checked(
+    lambda text: str(ipaddress.ip_address(text)), bool,
+    "an IP address of this machine, such as 127.0.0.1 or 0.0.0.0",
+)  # fmt: skip
+_NAME: Final = _checked(str, lambda text: text and text.isprintable(), "a name")
+_SECONDS: Final = _checked(float, lambda s: 0.1 <= s <= 1e6, "seconds, from 0.1 to 1000000")
+_UNSET: Final = _checked(str, (DEFAULTS, KEEP).__contains__, f"'{DEFAULTS}' or '{KEEP}'")
 _ROWS: Final = (
     ServerSetting(
         "hosts", "ADDRESS", "address to listen on; remote clients are read-only "
         "(default 127.0.0.1 and ::1)",
-        _address, ("127.0.0.1", "::1"), many=True,
+        _ADDRESS, ("127.0.0.1", "::1"), many=True,
     ),
     ServerSetting(
         "control_users", "NAME", "user who may configure the sensors and shut the server down, besides root, "
         "the server's own user and the user who ran sudo",
-        _name, (), many=True, at_once=True,
+        _NAME, (), many=True, at_once=True,
     ),
     ServerSetting(
-        "control_groups", "NAME", "group whose members may do so as well", _name, (), many=True, at_once=True,
+        "control_groups", "NAME", "group whose members may do so as well", _NAME, (), many=True, at_once=True,
     ),
     ServerSetting(
         "user", "NAME", "user that a server started by root becomes before it serves clients (default: who "
         "ran sudo; 'root' to stay root)",
-        _name, None, text=True,
+        _NAME, None, text=True,
     ),
     ServerSetting(
         "unset_settings", "WHAT", f"what settings that nobody set become at start: '{DEFAULTS}' writes the "
         f"server's, '{KEEP}' leaves the sensor's",
-        _unset, DEFAULTS, at_once=True, text=True,
+        _UNSET, DEFAULTS, at_once=True, text=True,
     ),
     ServerSetting(
         "rt_priority", "N", "SCHED_FIFO priority, if permitted; 0 for ordinary scheduling",
-        whole(0, 99), DEFAULT_RT_PRIORITY,
+        _whole(99), realtime.DEFAULT_PRIORITY,
     ),
-    ServerSetting("cpu", "N", "pin the server to this CPU, if permitted", whole(0, 4095), None),
+    ServerSetting("cpu", "N", "pin the server to this CPU, if permitted", _whole(4095), None),
     ServerSetting(
         "stall_timeout_s", "S", "timeout in seconds for a client that does not read what is queued for it",
-        _seconds, 10.0, at_once=True,
+        _SECONDS, 10.0, at_once=True,
     ),
     ServerSetting(
         "idle_timeout_s", "S", "timeout in seconds for a client that is not subscribed and sends no request",
-        _seconds, 300.0, at_once=True,
+        _SECONDS, 300.0, at_once=True,
     ),
 )  # fmt: skip
 
@@ -157,15 +144,12 @@ SERVER_SETTINGS: Final[Mapping[str, ServerSetting]] = {row.name: row for row in 
 class ConfigFile(NamedTuple):
     """A file's content, checked."""
 
-    server: dict[str, Any]
-    """By the names of SERVER_SETTINGS."""
-    common: dict[str, SettingValue]
-    """Settings for every sensor."""
-    by_sensor: dict[SensorChoice, dict[str, SettingValue]]
-    """Settings for single sensors."""
+    server: dict[str, Any]  # by the names of SERVER_SETTINGS
+    common: dict[str, SettingValue]  # for every sensor
+    by_sensor: dict[SensorChoice, dict[str, SettingValue]]  # for single sensors; these override the others
 
 
-EMPTY = ConfigFile({}, {}, {})
+EMPTY: Final = ConfigFile({}, {}, {})
 
 
 def read_config(path: Path) -> ConfigFile:
@@ -218,11 +202,11 @@ def _sensors(
     return check_settings(common), by_sensor
 
 
-if TYPE_CHECKING:
-    from ethercat_server.sensor.sensor import Identity
+VIRTUAL_INTERFACE: Final = "virtual"  # means a virtual bus with a virtual sensor on it
 
-VIRTUAL_INTERFACE: Final = "virtual"
-"""Interface name that means a virtual bus with a virtual sensor on it."""
+
+def _defaults() -> dict[str, Any]:
+    return {name: setting.default for name, setting in SERVER_SETTINGS.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,27 +217,12 @@ class ServerOptions:
     port: int
     sensor_name: str | None = None
     virtual_arguments: str = ""
-    config: Path | None = None
-    """The configuration file."""
-    force: bool = False
-    """Whether to take over a bus that is in use."""
-    allow_ip: bool = False
-    """Whether to use an interface of the machine's network."""
-    server: Mapping[str, Any] = field(
-        default_factory=lambda: {name: setting.default for name, setting in SERVER_SETTINGS.items()}
-    )
-    """The server's own settings, by the names of SERVER_SETTINGS."""
-    common_settings: dict[str, SettingValue] = field(default_factory=dict)
-    """From the file, for every sensor."""
-    sensor_settings: dict[SensorChoice, dict[str, SettingValue]] = field(default_factory=dict)
-    """From the file, for single sensors; these override the ones above."""
-    assigned_settings: dict[str, SettingValue] = field(default_factory=dict)
-    """From the command line; these override both."""
-
-    @property
-    def is_virtual(self) -> bool:
-        """Whether to start a virtual bus."""
-        return self.ifname == VIRTUAL_INTERFACE
+    config: Path | None = None  # the configuration file
+    file: ConfigFile = EMPTY  # its content
+    force: bool = False  # whether to take over a bus that is in use
+    allow_ip: bool = False  # whether to use an interface of the machine's network
+    server: Mapping[str, Any] = field(default_factory=_defaults)  # by the names of SERVER_SETTINGS
+    assigned: Mapping[str, SettingValue] = field(default_factory=dict)  # settings from the command line
 
     @property
     def keep_unset(self) -> bool:
@@ -269,7 +238,7 @@ class ServerOptions:
 
     def wanted_settings(self, number: int, name: str, serial: int) -> dict[str, SettingValue]:
         """The start-up defaults, unless kept, overridden by these; UsageError if that is inconsistent."""
-        wanted = {**self._defaults, **self.asked_settings(number, name, serial)}
+        wanted = self._unset() | self.asked_settings(number, name, serial)
         try:
             check_combination(wanted)
         except SettingError as error:
@@ -280,18 +249,18 @@ class ServerOptions:
             ) from None
         return wanted
 
-    @property
-    def _defaults(self) -> dict[str, SettingValue]:
+    def _unset(self) -> dict[str, SettingValue]:
+        """What settings that nobody set become."""
         return {} if self.keep_unset else start_up_defaults()
 
-    def _sources(self, number: int, name: str, serial: int) -> list[tuple[str, dict[str, SettingValue]]]:
+    def _sources(self, number: int, name: str, serial: int) -> list[tuple[str, Mapping[str, SettingValue]]]:
         """Where settings for this sensor come from, and which; later ones override earlier ones."""
-        single = [choice for choice in self.sensor_settings if choice.matches(number, name, serial)]
+        single = [choice for choice in self.file.by_sensor if choice.matches(number, name, serial)]
         single.sort(key=lambda choice: choice.precedence)
         sources = [
-            ("[sensor]", self.common_settings),
-            *((f"[sensor.{choice}]", self.sensor_settings[choice]) for choice in single),
-            ("--set", self.assigned_settings),
+            ("[sensor]", self.file.common),
+            *((f"[sensor.{choice}]", self.file.by_sensor[choice]) for choice in single),
+            ("--set", self.assigned),
         ]
         return [(source, settings) for source, settings in sources if settings]
 
@@ -299,7 +268,7 @@ class ServerOptions:
         """UsageError if there are settings for a sensor that is not among those `found`, by number."""
         missing = [
             str(choice)
-            for choice in self.sensor_settings
+            for choice in self.file.by_sensor
             if not any(choice.matches(number, who.name, who.serial) for number, who in found.items())
         ]
         if missing:
@@ -311,8 +280,8 @@ class ServerOptions:
 
     def check(self) -> None:
         """SettingError if the settings of any sensor are inconsistent."""
-        for own in ({}, *self.sensor_settings.values()):
-            check_combination({**self._defaults, **self.common_settings, **own, **self.assigned_settings})
+        for own in ({}, *self.file.by_sensor.values()):
+            check_combination({**self._unset(), **self.file.common, **own, **self.assigned})
 
 
 @functools.cache
@@ -351,7 +320,7 @@ def build_parser() -> argparse.ArgumentParser:
             text += f" (default {setting.default if setting.text else format(setting.default, 'g')})"
         parser.add_argument(
             setting.flag, dest=setting.name, metavar=setting.metavar, help=text,
-            type=_parse_with(setting), action="append" if setting.many else "store",
+            type=setting.parse_argument, action="append" if setting.many else "store",
         )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     add_completion(parser)
@@ -371,29 +340,26 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
             f"{problem}: usage is ethercat-server IFACE [SENSOR_NAME] PORT, for example "
             "'ethercat-server ens5 12001'"
         )
-    config = read_config(parsed.config) if parsed.config else EMPTY
-    assigned = parse_assignments(parsed.assignments)
+    file = read_config(parsed.config) if parsed.config else EMPTY
+    given = {name: value for name in SERVER_SETTINGS if (value := getattr(parsed, name)) is not None}
+    many = {name: tuple(value) for name, value in given.items() if SERVER_SETTINGS[name].many}
     options = ServerOptions(
         ifname=arguments[0],
         port=_port(arguments[-1]),
         sensor_name=arguments[1] if len(arguments) == 3 else None,
         config=parsed.config,
+        file=file,
         force=parsed.force,
         allow_ip=parsed.allow_ip,
         virtual_arguments=parsed.virtual,
-        server={
-            name: _first_given(getattr(parsed, name), config.server.get(name), setting)
-            for name, setting in SERVER_SETTINGS.items()
-        },
-        common_settings=config.common,
-        sensor_settings=config.by_sensor,
-        assigned_settings=assigned,
+        server=_defaults() | file.server | given | many,
+        assigned=parse_assignments(parsed.assignments),
     )
     try:
         shlex.split(options.virtual_arguments)
     except ValueError as error:
         raise UsageError(f"--virtual {options.virtual_arguments}: {str(error).lower()}") from None
-    if options.virtual_arguments and not options.is_virtual:
+    if options.virtual_arguments and options.ifname != VIRTUAL_INTERFACE:
         raise UsageError(f"--virtual requires the interface 'virtual', not {options.ifname}")
     try:
         options.check()
@@ -418,22 +384,6 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, SettingValue]:
         except SettingError as error:
             raise UsageError(f"--set {assignment}: {error}") from None
     return values
-
-
-def _parse_with(setting: ServerSetting) -> Callable[[str], Any]:
-    def parse(text: str) -> Any:
-        try:
-            return setting.parse(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(f"{text!r} must be {error}") from None
-
-    return parse
-
-
-def _first_given(on_command_line: Any, in_file: Any, setting: ServerSetting) -> Any:
-    if on_command_line is not None:
-        return tuple(on_command_line) if setting.many else on_command_line
-    return setting.default if in_file is None else in_file
 
 
 def _port(text: str) -> int:

@@ -8,11 +8,10 @@ import logging
 import os
 from collections.abc import Sequence
 
-from ethercat_server.daemon.options import ServerOptions, parse_options
-from ethercat_server.daemon.service import Policy, Service
-from ethercat_server.ethercat.open_bus import open_bus
+from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, parse_options
+from ethercat_server.daemon.service import Notifier, Policy, Service
+from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
-from ethercat_server.process.notify import Notifier
 from ethercat_server.process.privileges import User, become, user_to_become
 from ethercat_server.process.signals import Signals
 from ethercat_server.server import Server
@@ -32,8 +31,10 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         hub = Hub(SocketTransport(options.server["hosts"], options.port))
         cleanup.callback(hub.close)
         ifname, priority = options.ifname, options.server["rt_priority"]
-        if options.is_virtual:
-            ifname = cleanup.enter_context(_virtual_bus(options)).ifname
+        if options.ifname == VIRTUAL_INTERFACE:
+            # By the port two such servers have different sensors, each the same every time.
+            virtual = VirtualBus(options.virtual_arguments, priority, options.server["user"], options.port)
+            ifname = cleanup.enter_context(virtual).ifname
         bus = cleanup.enter_context(open_bus(ifname, allow_ip=options.allow_ip))
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)
         _give_up_root(user, options)
@@ -60,12 +61,6 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         finally:
             notifier.stopping()
         log.info("shutting down: the sensors go to INIT")
-
-
-def _virtual_bus(options: ServerOptions) -> VirtualBus:
-    # By the port two such servers have different sensors, each the same every time.
-    server = options.server
-    return VirtualBus(options.virtual_arguments, server["rt_priority"], server["user"], options.port)
 
 
 def _give_up_root(user: User | None, options: ServerOptions) -> None:

@@ -1,4 +1,4 @@
-"""What a service needs besides its loop: readiness, a status line, reload.
+"""What a service needs besides its loop: readiness, a status line, a watchdog's food, reload.
 
 SIGHUP reads command line and file again in a thread, because looking up user names can require a directory
 server; the loop applies the result within a second.
@@ -6,8 +6,10 @@ server; the loop applies the result within a second.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import socket
 import threading
 from collections.abc import Sequence
 from typing import Final
@@ -17,7 +19,6 @@ from bota_ethercat.settings import SettingValue
 from ethercat_server.daemon.options import SERVER_SETTINGS, ServerOptions, parse_options
 from ethercat_server.errors import UsageError
 from ethercat_server.process import realtime
-from ethercat_server.process.notify import Notifier
 from ethercat_server.sensor.sensor import Sensor
 from ethercat_server.server import Server
 from ethercat_server.serving.connection import Limits
@@ -27,6 +28,57 @@ from ethercat_server.serving.permissions import controlling_uids, local_names
 log = logging.getLogger(__name__)
 
 _NANO: Final = 1e9
+_NEVER_NS: Final = 1 << 62
+
+
+class Notifier:
+    """The service manager's socket (sd_notify(3)); sending never blocks and never fails.
+
+    Without systemd it does nothing.
+    """
+
+    def __init__(self) -> None:
+        name = os.environ.pop("NOTIFY_SOCKET", "")
+        self._status = ""
+        self._socket: socket.socket | None = None
+        self.feed_every_ns = _watchdog_ns() // 3  # a third of the watchdog's timeout
+        if name:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            self._socket.setblocking(False)
+            with contextlib.suppress(OSError):
+                # A name that starts with @ is in the abstract namespace.
+                self._socket.connect("\0" + name[1:] if name.startswith("@") else name)
+
+    def ready(self) -> None:
+        """The server is streaming."""
+        self._send("READY=1")
+
+    def feed(self) -> None:
+        """The acquisition loop is running."""
+        self._send("WATCHDOG=1")
+
+    def status(self, text: str) -> None:
+        """One line for `systemctl status`; sent only if it has changed."""
+        if text != self._status:
+            self._status = text
+            self._send(f"STATUS={text}")
+
+    def stopping(self) -> None:
+        """The server is shutting down."""
+        self._send("STOPPING=1")
+
+    def _send(self, text: str) -> None:
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.send(text.encode())
+
+
+def _watchdog_ns() -> int:
+    """Timeout of the watchdog."""
+    microseconds, process = os.environ.get("WATCHDOG_USEC", ""), os.environ.get("WATCHDOG_PID", "")
+    if not microseconds.isdecimal() or process not in {"", str(os.getpid())}:
+        return _NEVER_NS
+    return int(microseconds) * 1000
 
 
 class Policy:
@@ -50,21 +102,15 @@ class Service:
     """The running server as systemd and its administrator see it."""
 
     def __init__(
-        self,
-        argv: Sequence[str] | None,
-        policy: Policy,
-        server: Server,
-        notifier: Notifier,
+        self, argv: Sequence[str] | None, policy: Policy, server: Server, notifier: Notifier
     ) -> None:
-        self._argv = argv
-        self._policy = policy
-        self._server = server
-        self._notifier = notifier
+        self._argv, self._policy = argv, policy
+        self._server, self._notifier = server, notifier
         self._fresh: Policy | UsageError | None = None
         self._reading: threading.Thread | None = None
         self._again = False
+        # By number: settings that a reload could not apply; the next one tries again.
         self._pending: list[dict[str, SettingValue]] = [{} for _ in server.sensors]
-        """By number: settings that a reload could not apply; the next one tries again."""
 
     def ready(self) -> None:
         """The server streams."""
@@ -108,10 +154,8 @@ class Service:
         changed = [name for name in SERVER_SETTINGS if was.server[name] != now.server[name]]
         later = [f"[server] {name}" for name in changed if not SERVER_SETTINGS[name].at_once]
         at_once = [name for name in changed if SERVER_SETTINGS[name].at_once]
-        log.info(
-            "configuration reloaded: [server]: %s",
-            f"changed {', '.join(at_once)}" if at_once else "no changes",
-        )
+        told = f"changed {', '.join(at_once)}" if at_once else "no changes"
+        log.info("configuration reloaded: [server]: %s", told)
         if later:
             log.warning("a change of %s requires a restart", ", ".join(later))
         try:

@@ -1,18 +1,107 @@
-"""Output of the doctor: text, or one JSON object."""
+"""Findings: the result of a check, with its severity, effect and remedy; and their output as text or JSON."""
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, TextIO
 
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.text.untrusted import visible
-from ethercat_server.doctor.finding import NAMES, Finding
+from ethercat_server.errors import ServerError
+
+# As the doctor calls the levels.
+NAMES: Final = {
+    Level.GOOD: "ok",
+    Level.NOT_POSSIBLE: "skipped",
+    Level.NOTE: "note",
+    Level.LOOK: "warning",
+    Level.TROUBLE: "bad",
+}
+EXIT_CODES: Final = {Level.GOOD: 0, Level.NOT_POSSIBLE: 0, Level.NOTE: 0, Level.LOOK: 0, Level.TROUBLE: 1}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the report."""
+
+    level: Level
+    found: str
+    why: str = ""  # its effect, and the remedy where no command is one
+    commands: tuple[str, ...] = ()  # that fix it
+    values: dict[str, Any] = field(default_factory=dict)  # details for the JSON output
+    subject: str = ""
+    check: str = ""
+
+    def as_json(self) -> dict[str, Any]:
+        """Its JSON form."""
+        names = ("subject", "check", "level", "found", "why", "commands", "values")
+        return {name: getattr(self, name) for name in names} | {"level": NAMES[self.level]}
+
+
+def finding(level: Level, found: str, why: str = "", /, *commands: str, **values: Any) -> Finding:
+    """A finding of any level."""
+    return Finding(level, found, why, commands, values)
+
+
+ok = functools.partial(finding, Level.GOOD)  # nothing to fix
+note = functools.partial(finding, Level.NOTE)  # little effect, or only under load
+warning = functools.partial(finding, Level.LOOK)  # loses samples or increases their age
+bad = functools.partial(finding, Level.TROUBLE)  # sensors cannot be read, or not reliably
+
+
+def skipped(why: str) -> Finding:
+    """Not checked."""
+    return finding(Level.NOT_POSSIBLE, f"not checked: {why}")
+
+
+class CannotLookError(Exception):
+    """A check is impossible here; the text says why."""
+
+
+def examine(
+    subject: str, check: str, look: Callable[..., Finding | Iterable[Finding]], *arguments: object
+) -> Iterator[Finding]:
+    """What `look(*arguments)` finds, with the check's name; an error in the check is a finding too."""
+    try:
+        found = look(*arguments)
+        for each in (found,) if isinstance(found, Finding) else found:
+            yield replace(each, subject=subject, check=check)
+        return
+    except CannotLookError as error:
+        failed = skipped(str(error))
+    except ServerError as error:
+        failed = bad(str(error))
+    except OSError as error:
+        failed = skipped(error.strerror or str(error))
+    except Exception as error:  # noqa: BLE001 - a check that fails must not stop the others
+        failed = skipped(f"{type(error).__name__}: {error}; an error in ethercat-doctor, please report it")
+    yield replace(failed, subject=subject, check=check)
+
+
+def worst(findings: Iterable[Finding]) -> Level:
+    """The worst level, skipped checks aside."""
+    return max((f.level for f in findings if f.level is not Level.NOT_POSSIBLE), default=Level.GOOD)
+
+
+def verdict(findings: Iterable[Finding]) -> Level:
+    """What all findings come to; notes are nothing to look at."""
+    found = worst(findings)
+    return found if found >= Level.LOOK else Level.GOOD
+
+
+def as_json(header: Mapping[str, Any], findings: Sequence[Finding]) -> str:
+    """The whole report as one object."""
+    found = {**header, "verdict": verdict(findings).key, "worst": NAMES[worst(findings)]}
+    found |= {"findings": [f.as_json() for f in findings]}
+    return json.dumps(found, indent=2, ensure_ascii=False, default=str)
+
 
 _COLORS: Final = {
     Level.GOOD: "\x1b[32m", Level.NOT_POSSIBLE: "\x1b[2m", Level.NOTE: "\x1b[36m", Level.LOOK: "\x1b[33m",
@@ -26,20 +115,7 @@ _NAME_WIDTH: Final = 20
 _INDENT: Final = " " * (2 + _LEVEL_WIDTH + 2 + _NAME_WIDTH + 2)
 _USUAL_WIDTH: Final = 120
 _LEAST_TEXT: Final = 30
-EXIT_CODES: Final = {Level.GOOD: 0, Level.NOT_POSSIBLE: 0, Level.NOTE: 0, Level.LOOK: 0, Level.TROUBLE: 1}
-_MOST_REPEATED: Final = 8
-"""Findings that the end repeats: with the verdict they fit 80 x 24."""
-
-
-def worst(findings: Iterable[Finding]) -> Level:
-    """The worst level, skipped checks aside."""
-    return max((f.level for f in findings if f.level is not Level.NOT_POSSIBLE), default=Level.GOOD)
-
-
-def verdict(findings: Iterable[Finding]) -> Level:
-    """What all findings come to; notes are nothing to look at."""
-    found = worst(findings)
-    return found if found in {Level.LOOK, Level.TROUBLE} else Level.GOOD
+_MOST_REPEATED: Final = 8  # findings that the end repeats: with the verdict they fit 80 x 24
 
 
 def wants_color(stream: TextIO, environment: Mapping[str, str]) -> bool:
@@ -48,21 +124,21 @@ def wants_color(stream: TextIO, environment: Mapping[str, str]) -> bool:
 
 
 class Report:
-    """Writes findings as text, as they come."""
+    """Writes findings as text, as they come. Devices and files put no control character into it."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stdout
         self._color = wants_color(self._stream, os.environ)
-        width = (
-            shutil.get_terminal_size((_USUAL_WIDTH, 24)).columns if self._stream.isatty() else _USUAL_WIDTH
-        )
+        width = _USUAL_WIDTH
+        if self._stream.isatty():
+            width = shutil.get_terminal_size((_USUAL_WIDTH, 24)).columns
         self._width = max(_LEAST_TEXT, width - len(_INDENT))
         self._subject = ""
         self._waiting = False
 
     def heading(self, text: str) -> None:
         """The first line."""
-        self._say(text + "\n")
+        self._say(visible(text) + "\n")
 
     def wait(self, text: str) -> None:
         """Show progress on a terminal, until the next line."""
@@ -76,36 +152,34 @@ class Report:
         if finding.subject != self._subject:
             self._say(("\n" if self._subject else "") + self._painted(finding.subject, _BOLD))
             self._subject = finding.subject
-        level = NAMES[finding.level].ljust(_LEVEL_WIDTH)
         first, *rest = self._lines(finding.found)
-        head = self._painted(level, _COLORS[finding.level])
-        self._say(f"  {head}  {finding.check.ljust(_NAME_WIDTH)}  {first}")
+        level = self._painted(NAMES[finding.level].ljust(_LEVEL_WIDTH), _COLORS[finding.level])
+        self._say(f"  {level}  {finding.check.ljust(_NAME_WIDTH)}  {first}")
         for line in (*rest, *self._lines(finding.why)) if finding.why else rest:
             self._say(_INDENT + line)
         for command in finding.commands:
-            self._say(f"{_INDENT}$ {command}")
+            self._say(f"{_INDENT}$ {visible(command)}")
 
     def summary(self, findings: Sequence[Finding]) -> None:
         """The verdict, with what matters once more, for the rest may have scrolled away."""
         counts = {level: sum(f.level is level for f in findings) for level in reversed(NAMES)}
         text = ", ".join(f"{count} {_counted(level, count)}" for level, count in counts.items() if count)
-        level = worst(findings)
-        self._say(f"\n{self._painted(verdict(findings).words.capitalize(), _COLORS[level])}: {text}")
-        matters = [f for f in findings if f.level >= Level.LOOK]
-        matters.sort(key=lambda finding: -finding.level)
-        width = self._width + len(_INDENT)
-        for finding in matters[:_MOST_REPEATED]:
-            name = NAMES[finding.level].ljust(_LEVEL_WIDTH)
-            text = f"  {name}  {finding.subject}, {finding.check}: {finding.found}"
+        words = self._painted(verdict(findings).words.capitalize(), _COLORS[worst(findings)])
+        self._say(f"\n{words}: {text}")
+        matters = sorted((f for f in findings if f.level >= Level.LOOK), key=lambda f: -f.level)
+        for each in matters[:_MOST_REPEATED]:
+            name = NAMES[each.level].ljust(_LEVEL_WIDTH)
             lines = textwrap.wrap(
-                text, width, subsequent_indent=" " * (4 + _LEVEL_WIDTH), max_lines=2, placeholder=" ..."
-            )
-            self._say("\n".join(lines))
+                f"  {name}  {each.subject}, {each.check}: {each.found}", self._width + len(_INDENT),
+                subsequent_indent=" " * (4 + _LEVEL_WIDTH), max_lines=2, placeholder=" ...",
+            )  # fmt: skip
+            self._say("\n".join(map(visible, lines)))
         if len(matters) > _MOST_REPEATED:
             self._say(f"  and {len(matters) - _MOST_REPEATED} more above")
 
     def _lines(self, text: str) -> list[str]:
-        return textwrap.wrap(text, self._width, break_on_hyphens=False, break_long_words=False) or [""]
+        found = textwrap.wrap(text, self._width, break_on_hyphens=False, break_long_words=False)
+        return [visible(line) for line in found] or [""]
 
     def _painted(self, text: str, color: str) -> str:
         return f"{color}{text}{_END}" if self._color else text
@@ -114,33 +188,9 @@ class Report:
         if self._waiting:
             self._stream.write(_CLEAR_LINE)
             self._waiting = False
-        self._stream.write(printable(text) + "\n")
+        self._stream.write(text + "\n")
         self._stream.flush()
 
 
 def _counted(level: Level, count: int) -> str:
-    name = NAMES[level]
-    return f"{name}s" if level in {Level.NOTE, Level.LOOK} and count != 1 else name
-
-
-def printable(text: str) -> str:
-    """Without control characters from a device or a file; our own colors stay."""
-    own = {*_COLORS.values(), _END, _BOLD}
-    parts = text.split("\x1b")
-    found = _lines(parts[0])
-    for part in parts[1:]:
-        color = next((c for c in own if ("\x1b" + part).startswith(c)), None)
-        kept = part[len(color) - 1 :] if color else "?" + part
-        found += (color or "") + _lines(kept)
-    return found
-
-
-def _lines(text: str) -> str:
-    return "\n".join(map(visible, text.split("\n")))
-
-
-def as_json(header: Mapping[str, Any], findings: Sequence[Finding]) -> str:
-    """The whole report as one object."""
-    found = {**header, "verdict": verdict(findings).key, "worst": NAMES[worst(findings)]}
-    found |= {"findings": [f.as_json() for f in findings]}
-    return json.dumps(found, indent=2, ensure_ascii=False, default=str)
+    return f"{NAMES[level]}s" if level in {Level.NOTE, Level.LOOK} and count != 1 else NAMES[level]

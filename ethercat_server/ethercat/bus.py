@@ -22,6 +22,7 @@ from ethercat_server.ethercat.slave.sii import Sii
 _MOST_EMERGENCIES: Final = 16
 _PAUSE_S: Final = 0.001
 _INIT_ATTEMPTS: Final = 5
+_DONE: Final = object()  # steps themselves yield None
 
 
 class Bus(Datagrams):
@@ -112,7 +113,7 @@ class Bus(Datagrams):
         while waiting:
             check_interrupt()
             self.process_data.send()
-            waiting = [steps for steps in waiting if not _is_done(steps)]
+            waiting = [steps for steps in waiting if next(steps, _DONE) is not _DONE]
             self.clock.sleep(_PAUSE_S)
         for slave in self.slaves:
             slave.attempts = 1
@@ -141,11 +142,3 @@ class Bus(Datagrams):
 
     def _run(self, steps: Steps[None], check_interrupt: CheckInterrupt) -> None:
         finish(steps, _PAUSE_S, self.clock, check_interrupt)
-
-
-def _is_done(steps: Steps[None]) -> bool:
-    try:
-        next(steps)
-    except StopIteration:
-        return True
-    return False

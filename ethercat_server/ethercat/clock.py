@@ -13,15 +13,12 @@ class Clock(Protocol):
 
     def monotonic_ns(self) -> int:
         """CLOCK_MONOTONIC, ns."""
-        ...
 
     def time_ns(self) -> int:
         """CLOCK_REALTIME, ns."""
-        ...
 
     def sleep(self, seconds: float, /) -> None:
         """Return `seconds` later, or a little after."""
-        ...
 
 
 class SystemClock:

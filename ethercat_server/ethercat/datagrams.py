@@ -12,15 +12,26 @@ from typing import Final, Protocol
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.clock import Clock
-from ethercat_server.ethercat.late_answers import LateAnswers
-from ethercat_server.ethercat.wire import FIRST_DATA, SHORTEST_FRAME, Command, build, is_answer
+from ethercat_server.ethercat.wire import (
+    DATAGRAM_INDEX,
+    FIRST_DATA,
+    SHORTEST_FRAME,
+    Command,
+    build,
+    is_answer,
+)
 
-# SOEM uses the indices below, and the exchange of process data those from `process_data.FIRST_INDEX` on.
+# SOEM uses the indices below, and the exchange of process data those from `exchange.FIRST_INDEX` on.
 FIRST_INDEX: Final = 0x80
 _INDICES: Final = 0x10
 _TIMEOUT_S: Final = 0.02
 _REGISTER_ATTEMPTS: Final = 20
 _U16: Final = struct.Struct("<H")
+_LONGEST_TIMEOUT_S: Final = 0.25
+# On a bus whose answers come late the timeout is this many times the longest recent round trip.
+_LATE_FACTOR: Final = 2.0
+# Below it, frames are in time.
+_SHORTEST_TIMEOUT_S: Final = 0.0003
 
 
 class Registers(Protocol):
@@ -37,6 +48,36 @@ class Registers(Protocol):
         """False if the slave did not do it."""
 
 
+class LateAnswers:
+    """The timeout of frames, of which `count` numbered from `first_index` on are told apart.
+
+    It grows while answers come late, so that a slow machine reads its sensors slowly, not never: an answer
+    that nobody waits for any more says how long a frame takes now.
+    """
+
+    def __init__(self, clock: Clock, first_index: int, count: int) -> None:
+        self.timeout_s = 0.0  # the timeout at least; 0 on a bus that is in time
+        self._first_index = first_index
+        self._monotonic_ns = clock.monotonic_ns
+        # By index less the first: when a frame was sent that is not back; else 0.
+        self.pending_ns = [0] * count
+
+    def note(self, answer: bytes) -> None:
+        """An answer, not the one that is waited for."""
+        index = answer[DATAGRAM_INDEX] - self._first_index if len(answer) > DATAGRAM_INDEX else -1
+        if 0 <= index < len(self.pending_ns) and self.pending_ns[index]:
+            self.timeout_s = min(max(self.timeout_s, _LATE_FACTOR * self._took_s(index)), _LONGEST_TIMEOUT_S)
+            self.pending_ns[index] = 0
+
+    def in_time(self, index: int) -> None:
+        """The answer that is waited for: wait less from now on, if it came sooner."""
+        timeout_s = min(max(self.timeout_s / 2, _LATE_FACTOR * self._took_s(index)), _LONGEST_TIMEOUT_S)
+        self.timeout_s = timeout_s if timeout_s > _SHORTEST_TIMEOUT_S else 0.0
+
+    def _took_s(self, index: int) -> float:
+        return (self._monotonic_ns() - self.pending_ns[index]) * 1e-9
+
+
 class Datagrams:
     """Single datagrams through `backend`. Used by one thread."""
 
@@ -49,11 +90,10 @@ class Datagrams:
         self._index = 0
         self._late = LateAnswers(backend.clock, FIRST_INDEX, _INDICES)
         self._pending_ns = self._late.pending_ns
+        # Returns the next frame before an instant in ns, None for none; the loop that exchanges process data
+        # puts its own here, and goes on meanwhile.
         self.next_frame = self.next_on_wire
-        """Returns the next frame before an instant in ns, None for none; the loop that exchanges process data
-        puts its own here, and goes on meanwhile."""
-        self.stations: list[int] = []
-        """Configured station addresses of the sensors, by number."""
+        self.stations: list[int] = []  # configured station addresses of the sensors, by number
 
     def next_on_wire(self, until_ns: int) -> bytes | None:
         """The next frame that arrives before `until_ns`; None if none does."""

@@ -51,12 +51,9 @@ LATCHED_SIZE: Final = DATAGRAM_HEADER + LATCHED.size
 class DistributedClock(NamedTuple):
     """Of one slave controller."""
 
-    offset: int
-    """System time less local time, modulo 2**32 ns."""
-    behind_ns: int
-    """Time from when a frame arrives at the slave until it is there again on its way back."""
-    reading_ns: int
-    """Time from when a frame arrives until it has read what is latched, at most."""
+    offset: int  # system time less local time, modulo 2**32 ns
+    behind_ns: int  # time from when a frame arrives at the slave until it is there again on its way back
+    reading_ns: int  # time from when a frame arrives until it has read what is latched, at most
 
 
 def latched_datagrams(station: int) -> tuple[tuple[int, int, int, bytes], ...]:
@@ -120,14 +117,12 @@ class Area(NamedTuple):
 class Inputs(NamedTuple):
     """Where the inputs of a sensor are in the frame that carries them."""
 
-    number: int
-    """Of the sensor."""
+    number: int  # of the sensor
     start: int
     end: int
-    untouched: bytes
-    """What is there after an exchange in which the sensor did not take part."""
+    untouched: bytes  # what is there after an exchange in which the sensor did not take part
+    # Where the times are that its controller latched (`LATCHED`); 0 if the frame does not read them.
     latched: int
-    """Where the times are that its controller latched (`LATCHED`); 0 if the frame does not read them."""
 
 
 class Frame(NamedTuple):
@@ -135,13 +130,10 @@ class Frame(NamedTuple):
 
     content: bytearray
     inputs: list[Inputs]
-    end: int
-    """Of the process data (at least the inputs): there is the working counter."""
-    written: int
-    """End of the outputs if they have a datagram of their own, else 0."""
+    end: int  # of the process data (at least the inputs): there is the working counter
+    written: int  # end of the outputs if they have a datagram of their own, else 0
     tag: int
-    counters: list[int]
-    """What each sensor adds to the working counter: 2 for its outputs, 1 for its inputs."""
+    counters: list[int]  # what each sensor adds to the working counter: 2 for its outputs, 1 for its inputs
 
 
 def make_frames(areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool) -> list[Frame]:
@@ -257,10 +249,8 @@ class Exchange(NamedTuple):
     sent_ns: int
     back_ns: int
     frame: bytes
-    wkc: int
-    """Working counter; 0xFFFF if it cannot be."""
-    which: int
-    """Number of the frame, of those that make up an exchange."""
+    wkc: int  # working counter; 0xFFFF if it cannot be
+    which: int  # number of the frame, of those that make up an exchange
 
 
 # An answer that was taken before.
@@ -283,32 +273,28 @@ class ProcessData:
         frames = make_frames(areas, stations or [None] * len(areas), lrw=lrw)
         self._lrw, self._command = lrw, int(Command.LRW if lrw else Command.LRD)
         self._frames = [frame.content for frame in frames]
+        # By frame: what its bytes take on the wire.
         self.wire_ns = [len(frame.content) * BYTE_NS for frame in frames]
-        """By frame: what its bytes take on the wire."""
         self._ends = [frame.end for frame in frames]
         self._written = [frame.written for frame in frames]
         self._tags = [frame.tag for frame in frames] or [0]
-        self.inputs = [frame.inputs for frame in frames]
-        """By frame: the sensors whose inputs it carries."""
+        self.inputs = [frame.inputs for frame in frames]  # by frame: the sensors whose inputs it carries
+        # What each sensor adds to the working counter of each frame.
         self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
-        """What each sensor adds to the working counter of each frame."""
+        # The highest working counter of each frame that there can be.
         self.most_wkc = [sum(frame.counters) for frame in frames]
-        """The highest working counter of each frame that there can be."""
+        # By frame: the highest counters of LRD and LWR.
         self._most = [
             (sum(each & 1 for each in frame.counters), sum(each >> 1 for each in frame.counters))
             for frame in frames
         ]
-        """By frame: the highest counters of LRD and LWR."""
         self._index, self._number = FIRST_INDEX, 0
         # By index: when a frame was sent that is not back, else 0; which it was; its tag, -1 once it is lost.
         self._sent = [_NOTHING] * _INDICES
-        self.in_flight = 0
-        """Frames in flight: not back, and not known to be lost."""
+        self.in_flight = 0  # frames in flight: not back, and not known to be lost
         self._lost = 0
-        self.duplicates = 0
-        """Answers that came once more."""
-        self.blocked_until_ns = 0
-        """Nothing can be sent before, as long as nothing comes back."""
+        self.duplicates = 0  # answers that came once more
+        self.blocked_until_ns = 0  # nothing can be sent before, as long as nothing comes back
 
     def read_latched(self, number: int, *, reads: bool) -> int | None:
         """Read what a sensor's controller latches, or no longer; where, or None if it latches nothing."""

@@ -65,10 +65,13 @@ def users_of(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Proc
     """The visible processes that have one of these sockets."""
     for process in processes.iterdir():
         if process.name.isdecimal() and (sockets := set(_sockets(process))) & inodes:
-            name = ""
-            with contextlib.suppress(OSError):  # it has just ended
-                name = (process / "comm").read_text(encoding="utf-8", errors="replace").strip()
-            yield Process(int(process.name), name, sockets)
+            yield Process(int(process.name), _name_of(process), sockets)
+
+
+def _name_of(process: Path) -> str:
+    with contextlib.suppress(OSError):  # it has just ended
+        return (process / "comm").read_text(encoding="utf-8", errors="replace").strip()
+    return ""
 
 
 def table(path: str | Path) -> Iterator[list[str]]:
@@ -318,7 +321,7 @@ def locked(ifname: str, index: int) -> Iterator[None]:
             yield
         return
     try:
-        place = (_network_namespace() & _NAMESPACE) << _INDEX_BITS | index
+        place = (Path("/proc/self/ns/net").stat().st_ino & _NAMESPACE) << _INDEX_BITS | index
         try:
             fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
         except OSError:
@@ -331,15 +334,9 @@ def locked(ifname: str, index: int) -> Iterator[None]:
 def in_use(ifname: str, process: int = 0) -> InterfaceError:
     """The error to be raised; `process` has the interface, 0 if that is not known."""
     who = "another EtherCAT master"
-    if process > 0:
-        with contextlib.suppress(OSError):  # it has just ended
-            name = Path(f"/proc/{process}/comm").read_text(encoding="utf-8", errors="replace").strip()
-            who += f", process {process} ({name})"
+    if process > 0 and (name := _name_of(Path(f"/proc/{process}"))):
+        who += f", process {process} ({name})"
     return InterfaceError(f"{ifname} is in use by {who}: stop that one first")
-
-
-def _network_namespace() -> int:
-    return Path("/proc/self/ns/net").stat().st_ino
 
 
 def _open(directory: Path) -> int:

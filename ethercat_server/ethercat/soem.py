@@ -6,19 +6,21 @@ close that must happen once, the scan that may take minutes, the mapping's error
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import pysoem
 
 from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt, Master
+from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.nic import check_present, why_silent
+from ethercat_server.ethercat.nic import check_present, claimed, why_silent
 from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
 from ethercat_server.ethercat.slave.abort_codes import abort_meaning
 
@@ -38,7 +40,7 @@ _UNEXPECTED: Final = "unexpected error"
 
 
 class SoemBackend:
-    """See `Backend` and `Master`: pysoem on an interface that `nic.claim.claimed` has checked."""
+    """See `Backend` and `Master`: pysoem on an interface that `nic.claimed` has checked."""
 
     def __init__(self, ifname: str) -> None:
         self.ifname = ifname
@@ -151,6 +153,16 @@ class SoemBackend:
         self._opened = False
         self._socket.close()
         self._master.close()
+
+
+@contextlib.contextmanager
+def open_bus(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
+    """The open bus on `ifname`; its sensors go to INIT at the end. Errors as `claimed`."""
+    with claimed(ifname, allow_ip=allow_ip):
+        backend = SoemBackend(ifname)
+        with contextlib.closing(Bus(backend)) as bus:
+            backend.open()
+            yield bus
 
 
 def _texts(errors: list[Any]) -> str:

@@ -65,16 +65,12 @@ class Datagram(NamedTuple):
     """Where one datagram lies in its frame, and its header as it was received."""
 
     command: int
-    number: int
-    """The master's own; slaves leave it alone."""
+    number: int  # the master's own; slaves leave it alone
     adp: int
     ado: int
-    header: int
-    """Offset of the first byte of the datagram in the frame."""
-    data: int
-    """Offset of its data."""
-    length: int
-    """Bytes of data."""
+    header: int  # offset of the first byte of the datagram in the frame
+    data: int  # offset of its data
+    length: int  # bytes of data
 
     @property
     def end(self) -> int:

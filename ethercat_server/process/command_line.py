@@ -13,7 +13,7 @@ from typing import Final
 
 from bota_ethercat.errors import ProtocolError
 from ethercat_server.errors import ServerError
-from ethercat_server.process.logs import PlainFormatter
+from ethercat_server.process.logs import OneLine
 
 FAILED: Final = 1
 
@@ -21,10 +21,8 @@ FAILED: Final = 1
 def begin(program: str) -> None:
     """What is logged appears as `PROGRAM: message`. Until `run`, SIGINT ends the program at once."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    formatter = PlainFormatter()
-    formatter.prefix = f"{program}: "
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(formatter)
+    handler.setFormatter(OneLine(program))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
 
 

@@ -16,10 +16,8 @@ from typing import Final
 
 from ethercat_server.process import realtime
 
-MOST_LINES: Final = 1000
-"""Lines that wait to be written; further ones are dropped and counted."""
-_FLUSH_S: Final = 1.0
-"""Longest time that the end of the process waits for what is still to be written."""
+MOST_LINES: Final = 1000  # lines that wait to be written; further ones are dropped and counted
+_FLUSH_S: Final = 1.0  # longest time that the end of the process waits for what is still to be written
 
 
 class QueuedHandler(logging.Handler):
@@ -85,8 +83,8 @@ class QueuedHandler(logging.Handler):
 _MOST_AT_ONCE: Final = 5
 _WINDOW_S: Final = 10.0
 _MOST_KINDS: Final = 1000
+# Levels of `logging` and their syslog priorities, as in sd-daemon(3).
 _PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.DEBUG, 7))
-"""Levels of `logging` and their syslog priorities, as in sd-daemon(3)."""
 
 
 def set_up_logging() -> None:
@@ -95,7 +93,7 @@ def set_up_logging() -> None:
         handler: logging.Handler = QueuedHandler(sys.stderr.fileno())
     except (AttributeError, OSError, ValueError):
         handler = logging.NullHandler()  # there is no standard error
-    handler.setFormatter(JournalFormatter() if goes_to_journal() else PlainFormatter())
+    handler.setFormatter(OneLine(None if goes_to_journal() else "ethercat-server"))
     handler.addFilter(Repetitions())
     logging.basicConfig(level=logging.INFO, handlers=[handler])
 
@@ -109,26 +107,21 @@ def goes_to_journal() -> bool:
     return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 
 
-class PlainFormatter(logging.Formatter):
-    """`ethercat-server: message`, with a traceback in the same line."""
+class OneLine(logging.Formatter):
+    """`PROGRAM: message`, with a traceback in the same line.
 
-    prefix = "ethercat-server: "
+    Without a program for journald, which knows its name and reads the priority from `<N>`.
+    """
 
-    def format(self, record: logging.LogRecord) -> str:
-        """The line of one event."""
-        text = super().format(record)
-        return self.prefix + " | ".join(line.strip() for line in text.splitlines())
-
-
-class JournalFormatter(PlainFormatter):
-    """The same for journald, which knows the program's name and reads the priority from `<N>`."""
-
-    prefix = ""
+    def __init__(self, program: str | None) -> None:
+        super().__init__()
+        self._program = program
 
     def format(self, record: logging.LogRecord) -> str:
         """The line of one event."""
+        text = " | ".join(line.strip() for line in super().format(record).splitlines())
         priority = next((number for level, number in _PRIORITIES if record.levelno >= level), 7)
-        return f"<{priority}>{super().format(record)}"
+        return f"{self._program}: {text}" if self._program else f"<{priority}>{text}"
 
 
 class Repetitions(logging.Filter):
@@ -140,8 +133,8 @@ class Repetitions(logging.Filter):
 
     def __init__(self) -> None:
         super().__init__()
+        # Start of the interval and events in it, by message template and the record's `kind`.
         self._seen: dict[object, tuple[float, int]] = {}
-        """Start of the interval and events in it, by message template and the record's `kind`."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether `record` is to be logged."""

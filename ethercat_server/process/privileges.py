@@ -18,8 +18,7 @@ class User(NamedTuple):
 
     uid: int
     gid: int
-    name: str
-    """Empty for one that this machine does not know."""
+    name: str  # empty for one that this machine does not know
 
     def __str__(self) -> str:
         """Its description in messages."""

@@ -15,16 +15,14 @@ import sys
 from pathlib import Path
 from typing import Final
 
-DEFAULT_PRIORITY: Final = 80
-"""SCHED_FIFO priority of the acquisition loop."""
+DEFAULT_PRIORITY: Final = 80  # SCHED_FIFO priority of the acquisition loop
+# MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT: pages stay in memory once they have been used.
 _MLOCK: Final = 1 | 2 | 4
-"""MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT: pages stay in memory once they have been used."""
 _TIMER_SLACK_NS: Final = "1000"
+# Longest time the loop waits for another thread of this process; Python's default of 5 ms loses samples.
 _SWITCH_S: Final = 0.0002
-"""Longest time the loop waits for another thread of this process; Python's default of 5 ms loses samples."""
 
-_ALL_CPUS: Final = frozenset(os.sched_getaffinity(0))
-"""The CPUs that this process may use, as of its start."""
+_ALL_CPUS: Final = frozenset(os.sched_getaffinity(0))  # the CPUs that this process may use, as of its start
 
 log = logging.getLogger(__name__)
 

@@ -31,8 +31,8 @@ class Change:
         self.wanted = {**sensor.wanted, **settings}
         check_combination(self.wanted)
         changed = {name for name in settings if sensor.settings.get(name) != settings[name]}
+        # In the order in which they are to be written.
         self.names = [name for name in dictionary.SETTING_WRITE_ORDER if name in changed]
-        """In the order in which they are to be written."""
 
     @property
     def needs_preop(self) -> bool:

@@ -160,8 +160,8 @@ class OtherSlaves:
     def __init__(self, bus: Bus, slaves: Sequence[Slave]) -> None:
         self._bus = bus
         self._slaves = slaves
+        # `others` of the `describe` reply; kept up to date.
         self.rows: list[dict[str, Any]] = [slave.as_json() for slave in slaves[:_MOST_LISTED]]
-        """`others` of the `describe` reply; kept up to date."""
         self._unanswered = [0] * len(self.rows)
         self._turn = -1
 

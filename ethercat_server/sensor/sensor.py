@@ -10,6 +10,7 @@ from enum import Enum, auto
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.sensor.meaning import value_meaning
+from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
 from ethercat_server.ethercat.clock import Clock, Deadline
 
@@ -92,6 +93,8 @@ class Sensor:
     settings: dict[str, SettingValue] = field(default_factory=dict)
     # What each of them means. Kept, so that telling it takes no time from the samples.
     meaning: dict[str, str] = field(default_factory=dict)
+    # The delay of each channel by its filters; likewise.
+    delay_ms: dict[str, float | None] = field(default_factory=dict)
     # The force/torque offset in force; written again when the sensor has lost it. None: it has none.
     offset: tuple[float, ...] | None = None
     # The SINC length is a guess from a rate that CHOP may have divided: not to be written for no reason.
@@ -129,6 +132,7 @@ class Sensor:
     def set_in_force(self, settings: Mapping[str, SettingValue]) -> None:
         """These settings are in force now."""
         self.settings = dict(settings)
+        self.delay_ms = delays_ms(settings, self.rate_hz)
         chop = settings.get("chop")
         self.meaning = {
             name: value_meaning(name, value, self.rate_hz, chop) for name, value in settings.items()
@@ -142,7 +146,12 @@ class Sensor:
 
     def in_force(self) -> dict[str, Any]:
         """What replies and events say of a change."""
-        return {"settings": dict(self.settings), "rate_hz": self.rate_hz, "offset": self.reported_offset}
+        return {
+            "settings": dict(self.settings),
+            "rate_hz": self.rate_hz,
+            "delay_ms": self.delay_ms,
+            "offset": self.reported_offset,
+        }
 
     def describe(self) -> dict[str, Any]:
         """The sensor's part of the `describe` reply."""
@@ -154,12 +163,10 @@ class Sensor:
             "hardware": self.identity.hardware,
             "firmware": self.identity.firmware,
             "pdo_size": self.pdo_size,
-            "rate_hz": self.rate_hz,
             "state": self.state.reported,
             "settling": self.settling,
-            "settings": self.settings,
             "meaning": self.meaning,
-            "offset": self.reported_offset,
+            **self.in_force(),
         }
 
 

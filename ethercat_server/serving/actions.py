@@ -29,11 +29,9 @@ class Producer(Protocol):
 
     def status(self) -> dict[str, Any]:
         """Its part of the `status` reply."""
-        ...
 
     def stop(self) -> None:
         """End soon."""
-        ...
 
 
 class Described(Protocol):
@@ -41,7 +39,6 @@ class Described(Protocol):
 
     def describe(self) -> dict[str, Any]:
         """Its part of the `describe` reply."""
-        ...
 
 
 class OnSensors(Protocol):
@@ -50,16 +47,13 @@ class OnSensors(Protocol):
     @property
     def sensors(self) -> Sequence[Described]:
         """All of them, by number."""
-        ...
 
     @property
     def handlers(self) -> Container[str]:
         """The actions it handles."""
-        ...
 
     def handle(self, connection: Connection, request: Request) -> None:
         """Start one and answer later through the hub; RequestError refuses it."""
-        ...
 
 
 class Actions:

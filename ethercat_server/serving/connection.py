@@ -11,8 +11,6 @@
            \\-> FLUSHING ------^              the client has closed its side: only what waits is sent
 
 From every state a connection that breaks goes to CLOSED at once.
-
-From every state a connection that breaks goes to CLOSED at once.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from bota_ethercat.errors import BadMessageError, RemoteProtocolError
 from bota_ethercat.framing import DATA_FLAGS_OFFSET, DataFlag, FrameDecoder, encode_json
 from bota_ethercat.text.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.acquisition.stream import Made
+from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.serving.transport import Stream
 
 MAX_REQUEST_LENGTH: Final = 4096
@@ -60,10 +58,10 @@ class State(Enum):
 
     def __init__(self, _meaning: str) -> None:
         # Read for every connection in each turn: an attribute costs less than looking a member up in a set.
+        # Whether to wait for bytes of the client.
         self.reads = self.name in {"READING", "CLOSING", "LINGERING"}
-        """Whether to wait for bytes of the client."""
+        # Whether no more requests are taken.
         self.ending = self.name in {"CLOSING", "FLUSHING", "LINGERING", "CLOSED"}
-        """Whether no more requests are taken."""
 
 
 _ENDINGS: Final = frozenset({State.CLOSING, State.FLUSHING, State.CLOSED})
@@ -84,10 +82,8 @@ TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
 class Limits(NamedTuple):
     """Timeouts after which a client is closed."""
 
-    stall_ns: float = 10e9
-    """While something waits to be sent: nothing of it was accepted."""
-    idle_ns: float = 300e9
-    """Without a subscription: no request."""
+    stall_ns: float = 10e9  # while something waits to be sent: nothing of it was accepted
+    idle_ns: float = 300e9  # without a subscription: no request
 
 
 class Unreadable(NamedTuple):
@@ -128,14 +124,11 @@ class Outbox:
         """`writers` has the descriptor of the stream while something waits."""
         self._send, self._fd, self._writers = stream.send, stream.fileno(), writers
         self._monotonic_ns = monotonic_ns
-        self.sent = 0
-        """DATA frames sent."""
-        self.withheld = 0
-        """DATA frames dropped because the client did not read."""
-        self.broken = False
-        """Sending has failed for good; everything is discarded from then on."""
+        self.sent = 0  # DATA frames sent
+        self.withheld = 0  # DATA frames dropped because the client did not read
+        self.broken = False  # sending has failed for good; everything is discarded from then on
+        # CLOCK_MONOTONIC when the socket last accepted something, while something is queued.
         self.progress_ns = 0
-        """CLOCK_MONOTONIC when the socket last accepted something, while something is queued."""
         self._queue: deque[tuple[bytes, int]] = deque()  # message, sensor's number or NO_SENSOR for JSON
         self._queued_data = 0
         self._queued_json_bytes = 0
@@ -282,10 +275,8 @@ class Connection:
         self._stream = stream
         self._monotonic_ns = monotonic_ns
         self._heard_ns = monotonic_ns()
-        self._begun_ns = 0
-        """Since when the rest of an unfinished message is awaited; 0 if there is none."""
-        self._ending_ns = 0
-        """Since when the connection is being closed."""
+        self._begun_ns = 0  # since when the rest of an unfinished message is awaited; 0 if there is none
+        self._ending_ns = 0  # since when the connection is being closed
 
     def __str__(self) -> str:
         """For the log. The user by number: looking up a name can require a directory server."""
@@ -438,7 +429,7 @@ class Connection:
             return
         self.outbox.send(encode_bare_json(message) if self.bare is not None else encode_json(message))
 
-    def offer(self, made: Sequence[Made], now_ns: int) -> None:
+    def offer(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
         """Send those DATA frames that the subscription wants, at once: one for a sensor."""
         if (wants := self.subscription) is None:
             return

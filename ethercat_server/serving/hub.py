@@ -18,7 +18,7 @@ from typing import Final
 from bota_ethercat.control import ErrorCode, error_reply
 from bota_ethercat.errors import RequestError
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.acquisition.stream import Made
+from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.serving.connection import Connection, Limits, State, Unreadable, Watched
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import Transport
@@ -46,8 +46,7 @@ class Hub:
     """All client connections. Not thread-safe: one thread does everything."""
 
     def __init__(self, transport: Transport, monotonic_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self.connections: dict[int, Connection] = {}
-        """By file descriptor."""
+        self.connections: dict[int, Connection] = {}  # by file descriptor
         self.limits = Limits()
         self.permissions = Permissions()
         self._transport = transport
@@ -55,8 +54,7 @@ class Hub:
         self._handler: Handler | None = None
         self._subscribers: list[Connection] = []
         self._watched = Watched(set(), set())
-        self._ready: deque[Connection] = deque()
-        """Those in State.READY, in the order of their turns."""
+        self._ready: deque[Connection] = deque()  # those in State.READY, in the order of their turns
         self._pause_ends_ns = 0
         self._sweep_at_ns = 0
 
@@ -65,7 +63,7 @@ class Hub:
         self._handler = handler
         self._watched.readers.update(self._transport.listening())
 
-    def publish(self, made: Sequence[Made], now_ns: int) -> None:
+    def publish(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
         """Send DATA frames to every subscriber that wants them."""
         for connection in self._subscribers:
             connection.offer(made, now_ns)

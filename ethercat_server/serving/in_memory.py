@@ -44,13 +44,11 @@ class InMemoryStream:
     def __init__(self, number: int, peer: str, uid: int | None, buffer_size: int = _BUFFER_SIZE) -> None:
         self.peer = peer
         self.uid = uid
-        self.other = self
-        """The other end."""
+        self.other = self  # the other end
         self._number = number
         self._received = bytearray()
         self._buffer_size = buffer_size
-        self._ended = False
-        """The other end sends nothing more."""
+        self._ended = False  # the other end sends nothing more
         self._reset = False
         self.closed = False
 

@@ -27,32 +27,25 @@ from ethercat_server.errors import ServerError, UsageError
 class Stream(Protocol):
     """One client's connection."""
 
-    peer: str
-    """The client's address and port."""
+    peer: str  # the client's address and port
 
     def recv(self, size: int, /) -> bytes:
         """Up to `size` bytes that have arrived; b"" once the peer has closed its side."""
-        ...
 
     def send(self, data: bytes | memoryview, /) -> int:
         """Send as much as can be sent now; returns the number of bytes."""
-        ...
 
     def fileno(self) -> int:
         """What `Transport.wait` calls it."""
-        ...
 
     def peer_uid(self) -> int | None:
         """The user who owns the other end, None if that cannot be established."""
-        ...
 
     def end_sending(self) -> None:
         """Close this side; the peer may still send."""
-        ...
 
     def close(self) -> None:
         """Close both sides."""
-        ...
 
 
 class Transport(Protocol):
@@ -60,25 +53,20 @@ class Transport(Protocol):
 
     def listening(self) -> Sequence[int]:
         """File descriptors that are readable when a client wants to connect."""
-        ...
 
     def accept(self, fd: int) -> Stream | None:
         """The next client that wants to connect to `fd`, None if there is none."""
-        ...
 
     def wait(
         self, readers: Collection[int], writers: Collection[int], seconds: float
     ) -> tuple[Sequence[int], Sequence[int]]:
         """Which of these can be read and written; waits up to `seconds` until there is at least one."""
-        ...
 
     def stop_listening(self) -> None:
         """Refuse new clients."""
-        ...
 
     def close(self) -> None:
         """Release everything but the connections."""
-        ...
 
 
 _NETLINK_SOCK_DIAG: Final = 4
@@ -89,14 +77,14 @@ _ALL_STATES: Final = 0xFFFFFFFF
 
 _HEADER: Final = struct.Struct("=IHHII")
 _REQUEST: Final = struct.Struct("=BBBBI")
+# Ports and addresses of a socket: its own, then the other end's.
 _CONNECTION: Final = struct.Struct("!HH16s16s")
-"""Ports and addresses of a socket: its own, then the other end's."""
 _INTERFACE_AND_COOKIE: Final = struct.Struct("=I8s")
+# Family, state, timer, retransmissions; connection; interface, cookie; expiry, queues, user, inode.
 _ANSWER: Final = struct.Struct("=BBBB36s12sIIIII")
-"""Family, state, timer, retransmissions; connection; interface, cookie; expiry, queues, user, inode."""
 
+# ESTABLISHED, FIN_WAIT1, FIN_WAIT2, CLOSE_WAIT, LAST_ACK, CLOSING: not LISTEN, not TIME_WAIT.
 _LIVE_STATES: Final = frozenset({1, 4, 5, 8, 9, 11})
-"""ESTABLISHED, FIN_WAIT1, FIN_WAIT2, CLOSE_WAIT, LAST_ACK, CLOSING: not LISTEN, not TIME_WAIT."""
 
 SocketAddress = tuple[str, int] | tuple[str, int, int, int]
 
@@ -165,12 +153,12 @@ def _owner(answer: bytes, connections: Collection[bytes]) -> int | None:
 
 
 _BACKLOG: Final = 128
+# Small, so that a client that reads on after a pause gets recent samples, not seconds of old ones.
 _SEND_BUFFER: Final = 65536
-"""Small, so that a client that reads on after a pause gets recent samples, not seconds of old ones."""
 
 
+# On Windows the second would share a port with another program; here it takes one in TIME_WAIT.
 _EXCLUSIVE: Final = getattr(socket, "SO_EXCLUSIVEADDRUSE", socket.SO_REUSEADDR)
-"""On Windows the second would share a port with another program; here it takes one in TIME_WAIT."""
 
 
 class SocketStream:

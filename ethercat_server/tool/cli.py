@@ -12,8 +12,8 @@ from bota_ethercat.program.completion import OPTION, add_completion
 from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server import __version__
 from ethercat_server.process import command_line
+from ethercat_server.tool import bus, objects, settings, watch
 from ethercat_server.tool.command import Command, say_json
-from ethercat_server.tool.commands import bus, find, objects, settings, snapshot, tare, watch
 
 _PROGRAM: Final = "ethercat-sensor"
 _EXIT_CODES: Final = (
@@ -21,9 +21,7 @@ _EXIT_CODES: Final = (
 )
 
 COMMANDS: Final[Mapping[str, Command]] = {
-    command.name: command
-    for module in (find, bus, watch, objects, settings, tare, snapshot)
-    for command in module.COMMANDS
+    command.name: command for module in (bus, watch, objects, settings) for command in module.COMMANDS
 }
 
 
@@ -62,28 +60,12 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def build_command_parser(command: Command) -> argparse.ArgumentParser:
-    """The command line of one subcommand."""
-    parser = _Parser(
-        prog=f"{_PROGRAM} {command.name}",
-        description=f"{command.summary[0].upper()}{command.summary[1:]}.",
-        epilog=_EXIT_CODES,
-    )
-    _add_arguments(parser, command)
-    return parser
-
-
-def _add_arguments(parser: argparse.ArgumentParser, command: Command) -> None:
-    command.add_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="machine-readable output")
-
-
 def _build_whole_parser() -> argparse.ArgumentParser:
     """All subcommands in one, for the shell's completion."""
     whole = _Parser(prog=_PROGRAM)
     commands = whole.add_subparsers()
     for command in COMMANDS.values():
-        _add_arguments(commands.add_parser(command.name, help=command.summary), command)
+        command.add_arguments(commands.add_parser(command.name, help=command.summary))
     return whole
 
 
@@ -98,7 +80,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         guess = did_you_mean(arguments[0], COMMANDS)
         parser.error(f"no command {arguments[0]!r}: there are {', '.join(COMMANDS)}{guess}")
     command = COMMANDS[parser.parse_args(arguments[: 2 if arguments[:1] == [OPTION] else 1]).command]
-    args = build_command_parser(command).parse_intermixed_args(arguments[1:])
+    description = f"{command.summary[0].upper()}{command.summary[1:]}."
+    parser = _Parser(prog=f"{_PROGRAM} {command.name}", description=description, epilog=_EXIT_CODES)
+    command.add_arguments(parser)
+    args = parser.parse_intermixed_args(arguments[1:])
     return command_line.run(_PROGRAM, lambda: command.run(args), as_json=args.json)
 
 

@@ -1,4 +1,4 @@
-"""Output of the subcommands: text in columns, or one JSON object."""
+"""What the subcommands share: their arguments, and their output as text in columns or one JSON object."""
 
 from __future__ import annotations
 
@@ -11,9 +11,71 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.program.server_choice import HELP
 from bota_ethercat.text.json_text import finite
-from ethercat_server.access.sensors import Sensors, open_sensors
+from ethercat_server.access.sensors import Sensors, find_server
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.sensor.sensor import Found
+
+DONE: Final = 0
+CHANGES: Final = 3  # exit code of `plan` when there is something to change
+
+
+Argument = Callable[[Any], object]  # adds it to a parser, or to a group of arguments
+
+
+def argument(name: str, help_text: str, **options: Any) -> Argument:
+    """An argument of a subcommand, as `add_argument` takes it; an option without a metavar is a switch."""
+    if name.startswith("--") and "metavar" not in options:
+        options["action"] = "store_true"
+    return lambda parser: parser.add_argument(name, help=help_text, **options)
+
+
+class Command(NamedTuple):
+    """One subcommand."""
+
+    name: str
+    summary: str
+    arguments: Sequence[Argument]
+    run: Callable[[argparse.Namespace], int]  # returns the exit code; raises ServerError
+    exclusive: Sequence[Argument] = ()  # of which one may be given
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add those of the command, and --json."""
+        for add in self.arguments:
+            add(parser)
+        if self.exclusive:
+            group = parser.add_mutually_exclusive_group()
+            for add in self.exclusive:
+                add(group)
+        parser.set_defaults(take_over=False)
+        parser.add_argument("--json", action="store_true", help="machine-readable output")
+
+
+def sensor_arguments(*, all_if_none: bool = False, take_over: bool = True) -> tuple[Argument, ...]:
+    """IFACE or --server, and --sensor; `--force` to take over a bus in use, unless it has another meaning."""
+    iface = "interface the sensors are connected to ('virtual' for a virtual sensor); through the "
+    force = "take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop"
+    default = "all" if all_if_none else "the only one"
+    which = f"number on the bus from 0, serial:1234, or name (default: {default})"
+    return (
+        argument("iface", f"{iface}server that uses it, if there is one", nargs="?", metavar="IFACE"),
+        argument("--server", f"connect to this server, as without IFACE {HELP}", metavar="HOST:PORT"),
+        *((argument("--force", force, dest="take_over"),) if take_over else ()),
+        argument(ALLOW_IP, ALLOW_IP_HELP),
+        argument("--sensor", which, metavar="WHICH"),
+    )
+
+
+@contextlib.contextmanager
+def sensors_of(args: argparse.Namespace) -> Iterator[Sensors]:
+    """The sensors given by the arguments; closed at the end.
+
+    If a server uses the interface, through that server, with a note.
+    """
+    found = find_server(args.iface, args.server)
+    if found is None:
+        found = Sensors.on_interface(args.iface, force=args.take_over, allow_ip=args.allow_ip)
+    with contextlib.closing(found):
+        yield found
 
 
 def say(text: str) -> None:
@@ -22,17 +84,17 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
+def say_json(value: dict[str, Any], *, indent: int | None = 2) -> None:
+    """One JSON object; infinite and NaN become null."""
+    say(json.dumps(finite(value), indent=indent, ensure_ascii=False, allow_nan=False))
+
+
 def report(as_json: bool, opened: Sensors, found: Found, values: dict[str, Any], *lines: str) -> None:
     """The result for one sensor: a JSON object with `values`, or the sensor's name and `lines`."""
     if as_json:
         say_json({"through": opened.used, **found.as_json(), **values})
     else:
         say("\n".join([str(found), *lines]))
-
-
-def say_json(value: dict[str, Any], *, indent: int | None = 2) -> None:
-    """One JSON object; infinite and NaN become null."""
-    say(json.dumps(finite(value), indent=indent, ensure_ascii=False, allow_nan=False))
 
 
 def columns(rows: Sequence[Sequence[str]], indent: int = 0) -> str:
@@ -52,53 +114,3 @@ def value_text(value: object) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     return "--" if value is None else str(value)
-
-
-DONE: Final = 0
-CHANGES: Final = 3
-"""Exit code of `plan` when there is something to change."""
-
-
-class Command(NamedTuple):
-    """One subcommand."""
-
-    name: str
-    summary: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], int]
-    """Returns the exit code; raises ServerError."""
-
-
-def add_sensor_arguments(
-    parser: argparse.ArgumentParser, *, all_if_none: bool = False, take_over: bool = True
-) -> None:
-    """IFACE or --server, and --sensor; `--force` to take over a bus in use, unless it has another meaning."""
-    parser.add_argument(
-        "iface", nargs="?", metavar="IFACE",
-        help="interface the sensors are connected to ('virtual' for a virtual sensor); "
-        "through the server that uses it, if there is one",
-    )  # fmt: skip
-    parser.add_argument(
-        "--server", metavar="HOST:PORT", help=f"connect to this server, as without IFACE {HELP}"
-    )
-    if take_over:
-        parser.add_argument(
-            "--force", action="store_true", dest="take_over",
-            help="take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop",
-        )  # fmt: skip
-    parser.set_defaults(take_over=False)
-    parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
-    default = "all" if all_if_none else "the only one"
-    parser.add_argument(
-        "--sensor",
-        metavar="WHICH",
-        help=f"number on the bus from 0, serial:1234, or name (default: {default})",
-    )
-
-
-@contextlib.contextmanager
-def sensors_of(args: argparse.Namespace) -> Iterator[Sensors]:
-    """The sensors given by the arguments (see `open_sensors`); closed at the end."""
-    found = open_sensors(args.iface, args.server, force=args.take_over, allow_ip=args.allow_ip)
-    with contextlib.closing(found):
-        yield found

@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-import atexit
-import functools
 import gzip
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bota_ethercat.health.verdict import Level
-from ethercat_server.doctor.finding import Finding
-from ethercat_server.doctor.machine import InterfaceFacts, Link, Machine
-from ethercat_server.doctor.machine_checks import CHECKS
+from ethercat_server.access.adapters import Adapter
+from ethercat_server.doctor.machine import Machine
+from ethercat_server.doctor.report import CannotLookError
 from ethercat_server.ethercat.nic import Routes
 
 CPUS = "/sys/devices/system/cpu"
-CARD = Link(index=7, parent="0000:00:1f.6", counters={"rx_packets": 100}, carrier_changes=2)
-FACTS = InterfaceFacts(
-    link=CARD,
-    names=("lo", "ens5"),
-    routes=Routes(),
-    settings=(100, "full"),
-    driver=("e1000e", "0000:00:1f.6"),
-    coalescing={"rx_coalesce_usecs": 0, "tx_coalesce_usecs": 0, "use_adaptive_rx_coalesce": 0},
-    offloads={"generic-receive-offload": False, "tcp-segmentation-offload": False},
-    eee=(False, False),
-)
+CARD = Adapter("ens5", ifindex=7, parent="0000:00:1f.6", counters={"rx_packets": 100}, carrier_changes=2)
+Facts = Mapping[str, Any]
+FACTS: Facts = {
+    "link": CARD,
+    "names": ("lo", "ens5"),
+    "routes": Routes(),
+    "settings": (100, "full"),
+    "driver": ("e1000e", "0000:00:1f.6"),
+    "coalescing": {"rx_coalesce_usecs": 0, "tx_coalesce_usecs": 0, "use_adaptive_rx_coalesce": 0},
+    "offloads": {"generic-receive-offload": False, "tcp-segmentation-offload": False},
+    "EEE": (False, False),
+}
 LIMITS = """Limit                     Soft Limit           Hard Limit           Units
 Max locked memory         8388608              8388608              bytes
 Max realtime priority     0                    0
@@ -77,62 +71,15 @@ def write(root: Path, files: Files) -> None:
             path.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-@functools.cache
-def good_root() -> Path:
-    """The good machine's files, written once."""
-    root = Path(tempfile.mkdtemp(prefix="ethercat-machine-"))
-    atexit.register(shutil.rmtree, root)
-    write(root, GOOD)
-    return root
-
-
-@dataclass
-class MadeUp(Machine):
-    """Its files are those below `root`, and where there is none, the good machine's."""
-
-    gone: frozenset[str] = frozenset()
-    """Files that are not there."""
-
-    def path(self, name: str) -> Path:
-        own = super().path(name)
-        return own if os.path.lexists(own) or name in self.gone else good_root() / name.lstrip("/")
-
-    def names(self, name: str) -> list[str]:
-        good = [
-            file.removeprefix(f"{name}/") for file in GOOD.keys() - self.gone if file.startswith(f"{name}/")
-        ]
-        return sorted({*super().names(name), *(file.partition("/")[0] for file in good)})
-
-
-def machine(
-    root: Path,
-    files: Files | None = None,
-    facts: InterfaceFacts = FACTS,
-    **more: Any,
-) -> Machine:
+def machine(root: Path, files: Files | None = None, facts: Facts = FACTS, **more: Any) -> Machine:
     """The good machine but for these files (None: not there), which are below `root`, and facts."""
-    files = files or {}
-    write(root, files)
-    gone = frozenset(name for name, content in files.items() if content is None)
-    return MadeUp("ens5", facts=facts, root=root, release="6.12.0-rt-amd64", gone=gone, **more)
+    write(root, {**GOOD, **(files or {})})
+    return Machine("ens5", facts=dict(facts), root=root, release="6.12.0-rt-amd64", **more)
 
 
-def but(**changes: Any) -> InterfaceFacts:
-    """The good facts but for these; `link` takes the changes of the link."""
+def but(**changes: Any) -> Facts:
+    """The good facts but for these: changes of the link; a sentence is why one is unknown."""
     if isinstance(changes.get("link"), dict):
-        changes["link"] = replace(CARD, **changes["link"])
-    return replace(FACTS, **changes)
-
-
-def looks(name: str, subject: Machine) -> Iterator[Finding]:
-    """What a check finds, without the net that catches its faults."""
-    (check,) = (check for check in CHECKS if check.name == name)
-    return check.look(subject)
-
-
-def only(name: str, subject: Machine) -> Finding:
-    """The same for a check with one finding. A warning says why it matters, and what is bad too."""
-    (finding,) = looks(name, subject)
-    if finding.level >= Level.NOTE:
-        assert finding.why
-    return finding
+        changes["link"] = CARD._replace(**changes["link"])
+    unknown = {name: CannotLookError(why) for name, why in changes.items() if isinstance(why, str)}
+    return {**FACTS, **changes, **unknown}

@@ -10,13 +10,11 @@ from typing import Any
 from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.bus_checks import Request, examine_bus
 from ethercat_server.doctor.cli import main
-from ethercat_server.doctor.finding import NAMES, Finding
-from ethercat_server.doctor.machine import InterfaceFacts
-from ethercat_server.doctor.report import worst
-from tests.doctor.made_up import FACTS, Files, machine
+from ethercat_server.doctor.report import NAMES, Finding, worst
+from tests import rights
+from tests.doctor.made_up import FACTS, Facts, Files, machine
 from tests.ended import Result, run, run_here
-from tests.server import readable
-from tests.server.as_another_user import NOBODY
+from tests.rights import NOBODY
 from tests.simulation import SimulatedBus
 
 MODULE = "ethercat_server.doctor.cli"
@@ -78,7 +76,7 @@ def examined(
     seconds: float = 0.2,
     *,
     files: Files | None = None,
-    facts: InterfaceFacts = FACTS,
+    facts: Facts = FACTS,
     announce: Callable[[str], None] = lambda _: None,
 ) -> BusFindings:
     """The doctor's examination of `bus` on a machine that is good but for `files` and `facts`."""
@@ -92,8 +90,8 @@ def examined(
 def doctor_of_nobody(*arguments: object) -> Examined:
     """Run `ethercat-doctor arguments...` as the user `nobody`."""
     become = ("setpriv", f"--reuid={NOBODY.pw_uid}", f"--regid={NOBODY.pw_gid}", "--clear-groups")
-    readable.need(*become)
-    return doctor(*arguments, under=(*readable.under(), *become), python=readable.PYTHON)
+    rights.need(*become)
+    return doctor(*arguments, under=(*rights.readable(), *become), python=rights.PYTHON)
 
 
 def levels(rows: dict[str, dict[str, Any]]) -> dict[str, str]:

@@ -16,16 +16,14 @@ from pathlib import Path
 import pytest
 
 from ethercat_server.doctor.cli import main
-from ethercat_server.doctor.machine import Link, collect
-from ethercat_server.ethercat.nic import Routes
+from ethercat_server.doctor.machine import Machine
+from tests import rights
 from tests.doctor.running import ATTEMPTS, MODULE, STARVED, doctor, doctor_here, doctor_of_nobody, levels
-from tests.server import readable
-from tests.server.as_another_user import NOBODY
-from tests.server.commands import command, stats
+from tests.rights import NOBODY
 from tests.server.running import (
     PATIENCE_S,
-    Program,
     Veth,
+    VirtualSensor,
     needs_bus,
     server,
     virtual_sensor,
@@ -33,7 +31,7 @@ from tests.server.running import (
 )
 
 pytestmark = [pytest.mark.bus, needs_bus]
-Bench = tuple[Veth, Program]
+Bench = tuple[Veth, VirtualSensor]
 QUICK = ("--json", "--seconds", "0.2")
 LOOK = ("--json", "--seconds", "0")
 
@@ -67,7 +65,7 @@ def test_the_whole_doctor(bench: Bench) -> None:
     assert others["addresses"]["level"] in {"ok", "note"}, "nothing but a link-local address"
     assert others["listeners"]["level"] in {"ok", "warning"}
     for position in range(2):
-        now = stats(sensor, position)
+        now = sensor.stats(position)
         assert (now["al_state"], now["al_error"], now["sdo_write_count"]) == ("INIT", False, 0)
     assert not promiscuous(veth), "SOEM leaves it so"
 
@@ -92,21 +90,15 @@ def test_a_terminal_gets_colour_and_is_told_what_takes_a_while(monkeypatch: pyte
     ("commands", "up", "carrier", "master", "addresses"),
     [
         ([], True, True, False, ()),
-        ([("link", "set", "{near}", "down")], False, False, False, ()),
-        ([("link", "set", "{far}", "down")], True, False, False, ()),
-        ([("address", "add", "192.0.2.77/32", "dev", "{near}")], True, True, False, ("192.0.2.77/32",)),
-        (
-            [("link", "add", "{bridge}", "type", "bridge"), ("link", "set", "{near}", "master", "{bridge}")],
-            True,
-            True,
-            True,
-            (),
-        ),
+        (["link set {near} down"], False, False, False, ()),
+        (["link set {far} down"], True, False, False, ()),
+        (["address add 192.0.2.77/32 dev {near}"], True, True, False, ("192.0.2.77/32",)),
+        (["link add {bridge} type bridge", "link set {near} master {bridge}"], True, True, True, ()),
     ],
     ids=["up", "down", "no carrier", "with an address", "in a bridge"],
 )
 def test_the_kernel_says_what_an_interface_is_used_for(
-    commands: list[tuple[str, ...]], up: bool, carrier: bool, master: bool, addresses: tuple[str, ...]
+    commands: list[str], up: bool, carrier: bool, master: bool, addresses: tuple[str, ...]
 ) -> None:
     """No frame is sent where there is an address or a bridge: the kernel says so in messages of its own."""
     with contextlib.ExitStack() as cleanup:
@@ -114,15 +106,12 @@ def test_the_kernel_says_what_an_interface_is_used_for(
         names = {"near": veth.near, "far": veth.far, "bridge": f"eb{os.getpid()}"}
         bridge = ["ip", "link", "del", names["bridge"]]
         cleanup.callback(subprocess.run, bridge, check=False, capture_output=True)
-        for words in commands:
-            veth.ip(*(word.format(**names) for word in words))
-        facts = collect(veth.near)
-        assert isinstance(facts.link, Link)
-        assert isinstance(facts.routes, Routes)
-        assert (facts.link.kind, facts.link.up, facts.link.carrier) == ("veth", up, carrier)
-        assert bool(facts.link.master) == master
-        assert facts.routes.addresses == addresses
-        assert not facts.routes.default
+        for command in commands:
+            veth.ip(*command.format(**names).split())
+        found = Machine(veth.near)
+        link, routes = found.link, found.fact("routes")
+        assert (link.kind, link.up, link.carrier, bool(link.master)) == ("veth", up, carrier, master)
+        assert (routes.addresses, routes.default) == (addresses, False)
 
 
 def test_another_master_is_not_disturbed(bench: Bench) -> None:
@@ -171,21 +160,21 @@ def test_stopped_while_it_measures_it_leaves_nothing_behind(bench: Bench) -> Non
     """A signal from outside, sockets, and another doctor's look at them."""
     veth, sensor = bench
     with measuring(veth.near) as (running, said):
-        wait_until(lambda: stats(sensor)["al_state"] == "OP", "its server")
+        wait_until(lambda: sensor.stats()["al_state"] == "OP", "its server")
         second = doctor_here(veth.near, *LOOK).findings("bus")["slaves"]
         running.send_signal(signal.SIGINT)
         _, err = running.communicate(timeout=PATIENCE_S)
     assert f"process {running.pid}" in second["found"]
     assert "2 slaves answer" in said
     assert (running.returncode, err) == (1, "ethercat-doctor: stopped\n")
-    assert stats(sensor)["al_state"] == "INIT"
+    assert sensor.stats()["al_state"] == "INIT"
     assert not promiscuous(veth)
 
 
 def test_without_rights_it_says_what_it_skipped(bench: Bench) -> None:
     """Another user's rights, as the kernel grants them."""
     veth, sensor = bench
-    before = command(sensor, "stats")
+    before = sensor.command("stats")
     ended = doctor_of_nobody(veth.near, "--json", "--seconds", "0.02")
     assert not ended.json["root"]
     assert ended.findings("bus")["slaves"]["found"] == (
@@ -194,7 +183,7 @@ def test_without_rights_it_says_what_it_skipped(bench: Bench) -> None:
     assert ended.findings("rights")["capabilities"]["level"] == "note"
     assert ended.findings("measurement")["all"]["level"] == "skipped"
     assert ended.findings("interface")["driver"]["values"]["driver"] == "veth", "this needs no rights"
-    assert before.partition("sensors")[0] == command(sensor, "stats").partition("sensors")[0], (
+    assert before.partition("sensors")[0] == sensor.command("stats").partition("sensors")[0], (
         "no frame was sent"
     )
 
@@ -202,10 +191,10 @@ def test_without_rights_it_says_what_it_skipped(bench: Bench) -> None:
 def test_another_user_sees_that_an_interface_is_in_use_but_not_by_whom(bench: Bench) -> None:
     """The kernel shows other users' sockets, but not whose they are."""
     become = ("setpriv", f"--reuid={NOBODY.pw_uid}", f"--regid={NOBODY.pw_gid}", "--clear-groups")
-    readable.need(*become)
-    script = f"from ethercat_server.access.holder import find_holder; print(find_holder({bench[0].far!r}))"
+    rights.need(*become)
+    script = f"from ethercat_server.access.adapters import find_holder; print(find_holder({bench[0].far!r}))"
     seen = subprocess.run(
-        [*readable.under(), *become, readable.PYTHON, "-c", script],
+        [*rights.readable(), *become, rights.PYTHON, "-c", script],
         capture_output=True,
         text=True,
         check=True,

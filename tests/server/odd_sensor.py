@@ -7,32 +7,30 @@ pysoem is in memory: see `tests.tool.odd_firmware`.
 
 from __future__ import annotations
 
+import functools
 import struct
 import sys
 
-from ethercat_server.virtual_sensor import cli
-from ethercat_server.virtual_sensor.faults import table
-from ethercat_server.virtual_sensor.faults.command import Call, FaultCommand
-from ethercat_server.virtual_sensor.slave.al import AlStateMachine
+from ethercat_server.virtual_sensor import cli, faults
+from ethercat_server.virtual_sensor.application import Application
+from ethercat_server.virtual_sensor.faults import Call
+from ethercat_server.virtual_sensor.options import Command
 
-request = AlStateMachine.request
+al_control = Application.al_control
 
 
-def ignore(call: Call) -> None:
-    state = int(call.arguments[0])
-
-    def request_or_ignore(self: AlStateMachine, control: int) -> None:
+def ignore(_call: Call, state: int) -> None:
+    def request_or_ignore(self: Application, control: int) -> None:
         if control & 0x0F == state:
             print("ignored", flush=True)
         else:
-            request(self, control)
+            al_control(self, control)
 
-    AlStateMachine.request = request_or_ignore  # type: ignore[method-assign]
+    Application.al_control = request_or_ignore  # type: ignore[method-assign]
 
 
-def report(call: Call) -> None:
-    index, subindex, before, after = (int(text, 0) for text in call.arguments)
-    mailbox, emergency = call.life.mailbox, struct.pack("<HHB5s", 1 << 12, 0x4210, 1, b"12345")
+def report(call: Call, index: int, subindex: int, before: int, after: int) -> None:
+    mailbox, emergency = call.application.mailbox, struct.pack("<HHB5s", 1 << 12, 0x4210, 1, b"12345")
     answer = mailbox._coe
 
     def report_and_answer(request: bytes, room: int) -> list[bytes]:
@@ -46,8 +44,9 @@ def report(call: Call) -> None:
     mailbox._coe = report_and_answer
 
 
-for name, run in (("ignore", ignore), ("report", report)):
-    table._BY_NAME[name] = FaultCommand(name, name, (1, 4), "", run)
+NUMBER = functools.partial(int, base=0)
+faults.BY_NAME["ignore"] = Command("ignore STATE", "", ignore, (NUMBER,))
+faults.BY_NAME["report"] = Command("report INDEX SUBINDEX BEFORE AFTER", "", report, (NUMBER,) * 4)
 
 if __name__ == "__main__":
     sys.exit(cli.main())

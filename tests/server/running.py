@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import random
 import signal
@@ -13,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 
@@ -21,7 +22,11 @@ from bota_ethercat.control import request
 from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from bota_ethercat.text.json_text import JsonObject
+from tests.rights import socket_of
 
+Test = TypeVar("Test", bound=Callable[..., None])
+OLD = int(DataFlag.REPEATED | DataFlag.INVALID)
+"""Flags of frames that carry no new sample."""
 START_TIMEOUT_S = 40.0
 PATIENCE_S = 30.0
 
@@ -47,6 +52,12 @@ def why_no_bus() -> str | None:
 
 NO_BUS = why_no_bus()
 needs_bus = pytest.mark.skipif(NO_BUS is not None, reason=NO_BUS or "")
+
+
+def on_a_bus(test: Test) -> Test:
+    """Marks a test that needs a bus over a veth pair."""
+    marked: Test = pytest.mark.bus(needs_bus(test))
+    return marked
 
 
 def has_ipv6() -> bool:
@@ -79,11 +90,13 @@ def free_port() -> int:
     raise AssertionError("unreachable")
 
 
-def wait_until(condition: Callable[[], object], what: str, seconds: float = PATIENCE_S) -> None:
+def wait_until(
+    condition: Callable[[], object], what: str, seconds: float = PATIENCE_S, step_s: float = 0.02
+) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, f"waited {seconds} s for {what}"
-        time.sleep(0.02)
+        time.sleep(step_s)
 
 
 _AWAY = "taken out of OP to be set up: ask again"
@@ -145,6 +158,42 @@ class Program:
         self.log.unlink(missing_ok=True)
 
 
+class Commanded:
+    """Virtual sensors that take fault commands."""
+
+    def command(self, line: str) -> str:
+        """Have a command obeyed now; returns the answer."""
+        raise NotImplementedError
+
+    def stats(self, position: int = 0) -> dict[str, Any]:
+        """What a virtual sensor says of itself."""
+        found: dict[str, Any] = json.loads(self.command("stats"))["sensors"][position]
+        return found
+
+    def stats_of_foreign(self, place: int) -> dict[str, Any]:
+        """What the foreign slave at this position says of itself."""
+        found: dict[str, Any] = json.loads(self.command("stats"))["foreign"][str(place)]
+        return found
+
+    def written(self, position: int = 0) -> list[tuple[str, int, str]]:
+        """The SDO writes so far: index, sub-index, data."""
+        return [(row["index"], row["subindex"], row["hex"]) for row in self.stats(position)["sdo_writes"]]
+
+
+class VirtualSensor(Program, Commanded):
+    """`ethercat-virtual-sensor`, which takes commands on its standard input."""
+
+    def command(self, line: str) -> str:
+        assert self.process.stdin is not None
+        before = len(self.said())
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+        wait_until(lambda: self.said()[before:].endswith("\n"), f"the answer to {line}", step_s=0.005)
+        answer = self.said()[before:].strip()
+        assert answer.startswith("ok"), answer
+        return answer[3:]
+
+
 class Server(Program):
     """A running server, on a free port unless it is told which."""
 
@@ -172,8 +221,8 @@ class Server(Program):
         self.wait_for("streaming")
         return self
 
-    def connect(self) -> Client:
-        return Client(self.port)
+    def connect(self, uid: int | None = None) -> Client:
+        return Client(self.port, uid)
 
 
 @contextlib.contextmanager
@@ -221,6 +270,44 @@ def _streaming(ifname: str, *arguments: str, port: int, under: Sequence[str]) ->
     raise AssertionError("unreachable")
 
 
+WATCHDOG_US = 600_000
+
+
+class Manager:
+    """Stands for systemd: the notify socket, in `directory`, and what came through it."""
+
+    def __init__(self, directory: Path) -> None:
+        self._path = str(directory / "notify")
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(self._path)
+        self._socket.setblocking(False)
+        self._told: list[str] = []
+
+    @contextlib.contextmanager
+    def environment(self) -> Iterator[None]:
+        """What is started within is its service."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("NOTIFY_SOCKET", self._path)
+            patch.setenv("WATCHDOG_USEC", str(WATCHDOG_US))
+            patch.delenv("WATCHDOG_PID", raising=False)
+            yield
+
+    @property
+    def told(self) -> list[str]:
+        """What it has been told so far. Until it looks the kernel keeps ten messages, and no more."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self._told.append(self._socket.recv(4096).decode())
+        return self._told
+
+    def wait(self, text: str) -> None:
+        """Until it is told this."""
+        wait_until(lambda: any(text in told for told in self.told), f"{text} in {self._told}")
+
+    def close(self) -> None:
+        self._socket.close()
+
+
 class Veth:
     """A veth pair of this test's own: `near` for the master, `far` for the sensor."""
 
@@ -246,10 +333,10 @@ class Veth:
 @contextlib.contextmanager
 def virtual_sensor(
     *arguments: str, module: str = "ethercat_server.virtual_sensor", first: tuple[str, ...] = ()
-) -> Iterator[tuple[Veth, Program]]:
+) -> Iterator[tuple[Veth, VirtualSensor]]:
     """A veth pair with a virtual sensor on its far end: `module first... IFACE arguments...`."""
     with Veth() as veth:
-        sensor = Program(module, [*first, veth.far, *arguments])
+        sensor = VirtualSensor(module, [*first, veth.far, *arguments])
         try:
             sensor.wait_for("ready")
             yield veth, sensor
@@ -267,18 +354,101 @@ def check_not_lost(client: Client, events: Sequence[JsonObject], lost_frames: in
     assert not lost or client.ask("status")["lost_frames"] > lost_frames, lost
 
 
-class Client:
-    """A framed connection that keeps everything, and looks into refused replies too."""
+class FramedClient:
+    """A framed connection that keeps everything; `wait` receives until something is so."""
 
-    def __init__(self, port: int) -> None:
-        try:
-            self.sock = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
-        except ConnectionError as error:
-            raise ConnectionFailedError(str(error)) from None
-        self._decoder = FrameDecoder()
-        self.events: list[JsonObject] = []
+    def __init__(
+        self, send_all: Callable[[bytes], object], wait: Callable[[Callable[[], object], str], None]
+    ) -> None:
+        self.send_all, self.wait = send_all, wait
         self.frames: list[DataMessage] = []
+        self.events: list[JsonObject] = []
+        """Those that `wait_event` has not returned."""
+        self.replies: list[JsonObject] = []
+        self._decoder = FrameDecoder()
         self._id = 0
+
+    def keep(self, message: JsonObject) -> None:
+        (self.events if "event" in message else self.replies).append(message)
+
+    def send(self, action: str, **keys: object) -> int:
+        """Send a request; returns its id."""
+        self._id += 1
+        self.send_all(encode_json(request(action, self._id, **keys)))
+        return self._id
+
+    def reply(self, number: int) -> dict[str, Any]:
+        """Wait for the reply to the request with this id."""
+
+        def found() -> list[JsonObject]:
+            return [reply for reply in self.replies if reply.get("id") == number]
+
+        self.wait(found, f"the reply to request {number}")
+        return found()[0]
+
+    def ask(self, action: str, **keys: object) -> dict[str, Any]:
+        """The reply to a request."""
+        return self.reply(self.send(action, **keys))
+
+    def refused(self, action: str, **keys: object) -> dict[str, Any]:
+        """The error of a request that is refused."""
+        reply = self.ask(action, **keys)
+        assert reply["ok"] is False, reply
+        error: dict[str, Any] = reply["error"]
+        return error
+
+    def described(self, sensor: int = 0) -> dict[str, Any]:
+        """What `describe` says of a sensor."""
+        row: dict[str, Any] = self.ask("describe")["sensors"][sensor]
+        return row
+
+    def wait_event(self, name: str, sensor: int | None = None) -> JsonObject:
+        """The first event of this name, of this sensor, that has not been returned yet."""
+
+        def found() -> list[JsonObject]:
+            named = [event for event in self.events if event["event"] == name]
+            return [event for event in named if sensor in (None, event.get("sensor", sensor))]
+
+        self.wait(found, name)
+        event = found()[0]
+        self.events.remove(event)
+        return event
+
+    def collect(self, count: int) -> list[DataMessage]:
+        """The next `count` frames."""
+        self.frames.clear()
+        self.wait(lambda: len(self.frames) >= count, f"{count} frames")
+        return self.frames[:count]
+
+    def fresh(self, count: int) -> list[DataMessage]:
+        """The next `count` frames that are new and valid samples."""
+        self.frames.clear()
+        found: list[DataMessage] = []
+        looked_at = 0
+
+        def enough() -> bool:
+            nonlocal looked_at
+            found.extend(frame for frame in self.frames[looked_at:] if not frame.flags & OLD)
+            looked_at = len(self.frames)
+            return len(found) >= count
+
+        self.wait(enough, f"{count} new samples")
+        return found[:count]
+
+
+class Client(FramedClient):
+    """On a real socket."""
+
+    def __init__(self, port: int, uid: int | None = None) -> None:
+        """`uid` is whose it is, if not of whom the tests are."""
+        self.sock = socket_of(uid)
+        super().__init__(self.sock.sendall, self._wait)
+        self.sock.settimeout(PATIENCE_S)
+        try:
+            self.sock.connect(("127.0.0.1", port))
+        except ConnectionError as error:
+            self.sock.close()
+            raise ConnectionFailedError(str(error)) from None
 
     def __enter__(self) -> Client:
         return self
@@ -286,8 +456,12 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self.sock.close()
 
-    def receive(self) -> JsonObject | None:
-        """Wait for one message; a reply is returned, frames and events are put by."""
+    def _wait(self, until: Callable[[], object], _what: str) -> None:
+        while not until():
+            self.receive()
+
+    def receive(self) -> None:
+        """Wait for one message."""
         while (message := self._decoder.next_message()) is None:
             try:
                 data = self.sock.recv(65536)
@@ -298,56 +472,26 @@ class Client:
             self._decoder.feed(data)
         if isinstance(message, DataMessage):
             self.frames.append(message)
-            return None
-        if "event" in message:
-            self.events.append(message)
-            return None
-        return message
+        else:
+            self.keep(message)
 
     def receive_all(self) -> None:
         """Receive until the server closes the connection."""
         with contextlib.suppress(ConnectionFailedError):
-            while True:
-                self.receive()
+            self.wait(lambda: False, "the end")
 
-    def ask(self, action: str, **values: object) -> dict[str, Any]:
-        """The reply to a request; asked again while a starved sensor is away for a moment."""
+    def ask(self, action: str, **keys: object) -> dict[str, Any]:
+        """Asked again while a starved sensor is away for a moment."""
         deadline = time.monotonic() + _AWAY_S
         while True:
-            reply = self.ask_once(action, **values)
+            reply = super().ask(action, **keys)
             if _AWAY not in reply.get("error", {}).get("message", "") or time.monotonic() > deadline:
                 return reply
             time.sleep(0.05)
 
-    def ask_once(self, action: str, **values: object) -> dict[str, Any]:
-        """The reply to a request, also where the sensor is lost on purpose."""
-        self._id += 1
-        self.sock.sendall(encode_json(request(action, self._id, **values)))
-        while True:
-            message = self.receive()
-            if message is not None:
-                assert message["id"] == self._id
-                return message
-
-    def wait_event(self, name: str) -> JsonObject:
-        """The first event of this name that has not been asked for yet."""
-        while not any(event["event"] == name for event in self.events):
-            self.receive()
-        found = next(event for event in self.events if event["event"] == name)
-        self.events.remove(found)
-        return found
-
-    def collect(self, count: int) -> list[DataMessage]:
-        """The next `count` frames."""
-        self.frames.clear()
-        while len(self.frames) < count:
-            self.receive()
-        return list(self.frames)
-
-    def fresh(self, count: int) -> list[DataMessage]:
-        """The next `count` frames that are new and valid samples."""
-        self.frames.clear()
-        old = DataFlag.REPEATED | DataFlag.INVALID
-        while sum(not frame.flags & old for frame in self.frames) < count:
-            self.receive()
-        return [frame for frame in self.frames if not frame.flags & old]
+    def answers(self, *messages: JsonObject) -> list[JsonObject]:
+        """To these requests."""
+        before = len(self.replies)
+        self.send_all(b"".join(map(encode_json, messages)))
+        self.wait(lambda: len(self.replies) == before + len(messages), "answers")
+        return self.replies[before:]

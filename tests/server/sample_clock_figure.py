@@ -35,15 +35,13 @@ class Phase(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """What a network card costs at a rate, with a round trip in µs."""
+    """What a network card costs at a rate, with a round trip in µs: ages, and the part of samples lost."""
 
     rate_hz: float
     round_trip_us: float
     median_us: float
     p99_us: float
-    """Ages."""
     lost: float
-    """Part of the samples."""
 
 
 def phases() -> list[Phase]:
@@ -58,8 +56,8 @@ def phases() -> list[Phase]:
         estimate = copy(simulation.clock.estimate)
         # Nothing is observed in the stop: the estimate is carried on, as it is when the machine is back.
         estimate.advance(max(0, math.ceil((time_s * SECOND - estimate.phase_ns) / estimate.period_ns)))
-        least_ns = simulation.timing.least_ns
-        estimates.append((time_s, estimate.phase_ns + least_ns / 2, math.sqrt(estimate.variance)))
+        phase_ns = estimate.phase_ns + simulation.timing.least_ns / 2
+        estimates.append((time_s, phase_ns, math.sqrt(estimate.variance)))
     instants, found = simulation.run(_END_S + 0.01).instants_ns, []
     for time_s, phase_ns, deviation_ns in estimates:
         after = bisect(instants, phase_ns)
@@ -74,9 +72,9 @@ def costs(round_trips_ns: Iterable[float]) -> list[Cost]:
     for rate_hz, round_trip_ns in product(RATES_HZ, round_trips_ns):
         card = Card(round_trip_ns, spread=0, jitter_ns=0.1 * round_trip_ns)
         shown = ClockSimulation(Sensor(rate_hz), card, Machine(), seed=1).run(8).outcome(2)
-        count = len(shown.samples)
-        ages = shown.ages_ns[count // 2] / 1e3, shown.ages_ns[count * 99 // 100] / 1e3
-        found.append(Cost(rate_hz, 1.05 * round_trip_ns / 1e3, *ages, shown.lost / count))
+        count, ages_us = len(shown.samples), [age_ns / 1e3 for age_ns in shown.ages_ns]
+        middle, p99 = ages_us[count // 2], ages_us[count * 99 // 100]
+        found.append(Cost(rate_hz, 1.05 * round_trip_ns / 1e3, middle, p99, shown.lost / count))
     return found
 
 
@@ -89,12 +87,11 @@ def draw(path: Path, held: Sequence[Phase], cost: Sequence[Cost]) -> None:
     mpl.rcParams["svg.hashsalt"] = "sample-clock"  # the same file every time
     figure = Figure(figsize=(12, 4))
     phase, age = figure.subplots(1, 2)
-    times = [each.time_s for each in held]
-    for sign in (-2, 2):
-        edge = [sign * each.deviation_us for each in held]
-        label = "± 2 standard deviations" if sign > 0 else None
+    times, errors, deviations = zip(*held, strict=True)
+    for sign, label in ((-2, None), (2, "± 2 standard deviations")):
+        edge = [sign * each for each in deviations]
         phase.plot(times, edge, color="tab:blue", linewidth=0.8, label=label)
-    phase.plot(times, [each.error_us for each in held], color="tab:red", linewidth=0.8, label="error")
+    phase.plot(times, errors, color="tab:red", linewidth=0.8, label="error")
     phase.axvspan(STOP_S, STOP_S + STOP_LENGTH_S, color="0.9", zorder=0)
     phase.set(xlabel="s", ylabel="phase, µs", ylim=(-25, 25))
     phase.set_title("Lock at 1600 Hz, and holdover while the machine stands still (grey)", fontsize=10)
@@ -102,13 +99,11 @@ def draw(path: Path, held: Sequence[Phase], cost: Sequence[Cost]) -> None:
     share = age.twinx()
     for rate_hz, color in zip(RATES_HZ, ("tab:blue", "tab:red"), strict=True):
         mine = [each for each in cost if each.rate_hz == rate_hz]
-        trips = [each.round_trip_us for each in mine]
-        age.plot(trips, [each.median_us for each in mine], color=color, label=f"{rate_hz:.0f} Hz, median")
-        p99 = [each.p99_us for each in mine]
+        _, trips, median, p99, lost = zip(*mine, strict=True)
+        age.plot(trips, median, color=color, label=f"{rate_hz:.0f} Hz, median")
         age.plot(trips, p99, color=color, linestyle="--", label=f"{rate_hz:.0f} Hz, p99")
-        lost = [100 * each.lost for each in mine]
-        share.plot(trips, lost, color=color, linestyle="none", marker=".", label=f"{rate_hz:.0f} Hz, lost")
-    trips = sorted({each.round_trip_us for each in cost})
+        percent, label = [100 * each for each in lost], f"{rate_hz:.0f} Hz, lost"
+        share.plot(trips, percent, color=color, linestyle="none", marker=".", label=label)
     age.plot(trips, [trip / 2 for trip in trips], color="0.5", linestyle=":", label="half a round trip")
     age.set(xlabel="round trip ± 5 %, µs", ylabel="age, µs", xscale="log", yscale="log")
     share.set(ylabel="lost, % (dots)", ylim=(-0.02, 1))

@@ -1,26 +1,37 @@
-"""Who owns the other end of a connection, and who may change something."""
+"""Who owns the other end of a connection, and who may change something: another user may look but not touch.
+
+Who a client is only the kernel knows, so these are real sockets.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import grp
+import itertools
+import json
 import os
-import pwd
 import shutil
 import socket
 import struct
 import subprocess
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from bota_ethercat.control import request
+from bota_ethercat.framing import encode_json
+from bota_ethercat.text.bare_json import encode_bare_json
 from ethercat_server.errors import UsageError
 from ethercat_server.serving.permissions import controlling_uids
 from ethercat_server.serving.transport import open_diagnostics, peer_uid
-from tests.server.as_another_user import NO_OTHER_USER
+from tests.rights import NOBODY, needs_another_user, socket_of
+from tests.server.running import Server, Veth, free_port, on_a_bus, server, wait_until
 
-NOBODY = pwd.getpwnam("nobody")
-AS_NOBODY = pytest.mark.skipif(NO_OTHER_USER is not None, reason=NO_OTHER_USER or "")
+RESET = struct.pack("ii", 1, 0)
+"""SO_LINGER with which a close resets the connection."""
 
 
 @pytest.fixture
@@ -30,11 +41,17 @@ def diagnostics() -> Iterator[socket.socket]:
 
 
 @contextlib.contextmanager
-def listener(host: str) -> Iterator[socket.socket]:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.create_server((host, 0), family=family) as opened:
-        opened.settimeout(10)
-        yield opened
+def accepted_from(
+    host: str = "127.0.0.1", uid: int | None = None, family: socket.AddressFamily | None = None, to: str = ""
+) -> Iterator[tuple[socket.socket, socket.socket]]:
+    """A connection that was accepted on `host`, and the client's end of it, which called it `to`."""
+    own = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.create_server((host, 0), family=own) as waiting, socket_of(uid, family or own) as client:
+        waiting.settimeout(10)
+        client.connect((to or host, waiting.getsockname()[1]))
+        accepted, _ = waiting.accept()
+        with accepted:
+            yield accepted, client
 
 
 def test_the_kernel_was_asked_before_there_is_a_loop(diagnostics: socket.socket) -> None:
@@ -44,59 +61,35 @@ def test_the_kernel_was_asked_before_there_is_a_loop(diagnostics: socket.socket)
         while True:
             answers.append(diagnostics.recv(4096))
     assert len(answers) == 2
-    with (
-        open_diagnostics() as asked_already,
-        listener("127.0.0.1") as waiting,
-        socket.create_connection(waiting.getsockname()),
-    ):
-        accepted, _ = waiting.accept()
-        with accepted:
-            assert peer_uid(asked_already, accepted) == os.geteuid(), "none of them is taken for its answer"
+    with open_diagnostics() as asked_already, accepted_from() as (accepted, _):
+        assert peer_uid(asked_already, accepted) == os.geteuid(), "none of them is taken for its answer"
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
-def test_the_owner_of_a_connection_is_found(diagnostics: socket.socket, host: str) -> None:
-    with listener(host) as waiting, socket.create_connection(waiting.getsockname()[:2]):
-        accepted, _ = waiting.accept()
-        with accepted:
-            assert peer_uid(diagnostics, accepted) == os.geteuid()
+@pytest.mark.parametrize(
+    "how",
+    [
+        {},
+        {"host": "::1"},
+        # What dual-stack clients connect to 127.0.0.1 with.
+        {"family": socket.AF_INET6, "to": "::ffff:127.0.0.1"},
+        pytest.param({"uid": NOBODY.pw_uid}, marks=needs_another_user),
+    ],
+    ids=str,
+)
+def test_the_owner_of_a_connection_is_found(diagnostics: socket.socket, how: dict[str, Any]) -> None:
+    with accepted_from(**how) as (accepted, _):
+        assert peer_uid(diagnostics, accepted) == how.get("uid", os.geteuid())
 
 
-def test_the_owner_of_a_socket_of_ipv6_with_an_address_of_ipv4_is_found(diagnostics: socket.socket) -> None:
-    """What dual-stack clients connect to 127.0.0.1 with."""
-    with listener("127.0.0.1") as waiting, socket.socket(socket.AF_INET6) as client:
-        client.connect(("::ffff:127.0.0.1", waiting.getsockname()[1]))
-        accepted, _ = waiting.accept()
-        with accepted:
-            assert peer_uid(diagnostics, accepted) == os.geteuid()
-
-
-@AS_NOBODY
-def test_another_user_is_told_apart(diagnostics: socket.socket) -> None:
-    bash = shutil.which("bash")
-    assert bash
-    with listener("127.0.0.1") as waiting:
-        port = waiting.getsockname()[1]
-        command = [bash, "-c", f"exec 3<>/dev/tcp/127.0.0.1/{port}; read -r line <&3"]
-        other = subprocess.Popen(command, user=NOBODY.pw_uid, group=NOBODY.pw_gid, extra_groups=[], cwd="/")
-        accepted, _ = waiting.accept()
-        with accepted:
-            assert peer_uid(diagnostics, accepted) == NOBODY.pw_uid
-        other.wait(timeout=10)
-
-
-def test_a_socket_that_nobody_holds_any_more_has_no_owner(diagnostics: socket.socket) -> None:
-    with listener("127.0.0.1") as waiting:
-        for linger in (b"", struct.pack("ii", 1, 0)):
-            client = socket.create_connection(waiting.getsockname())
-            if linger:
-                client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
-            client.sendall(b"x")
-            accepted, _ = waiting.accept()
-            with accepted:
-                assert peer_uid(diagnostics, accepted) == os.geteuid()
-                client.close()  # the kernel now shows it as root's, or not at all
-                assert peer_uid(diagnostics, accepted) is None
+@pytest.mark.parametrize("reset", [False, True])
+def test_a_socket_that_nobody_holds_any_more_has_no_owner(diagnostics: socket.socket, reset: bool) -> None:
+    with accepted_from() as (accepted, client):
+        if reset:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+        client.sendall(b"x")
+        assert peer_uid(diagnostics, accepted) == os.geteuid()
+        client.close()  # the kernel now shows it as root's, or not at all
+        assert peer_uid(diagnostics, accepted) is None
 
 
 def test_who_only_listens_on_the_port_is_not_the_owner(diagnostics: socket.socket) -> None:
@@ -116,18 +109,16 @@ def test_who_only_listens_on_the_port_is_not_the_owner(diagnostics: socket.socke
         def getsockname(self) -> tuple[str, int]:
             return ("127.0.0.1", 1)
 
-    with listener("0.0.0.0") as waiting:
-        fake = Elsewhere(waiting.getsockname()[1])
-        assert peer_uid(diagnostics, fake) is None  # type: ignore[arg-type]
+    with socket.create_server(("0.0.0.0", 0)) as waiting:
+        assert peer_uid(diagnostics, Elsewhere(waiting.getsockname()[1])) is None  # type: ignore[arg-type]
 
 
 def test_root_and_the_user_of_sudo_may_control(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SUDO_UID", raising=False)
     assert controlling_uids((), ()) == {0}
-    monkeypatch.setenv("SUDO_UID", "1234")
-    assert controlling_uids((), ()) == {0, 1234}
-    monkeypatch.setenv("SUDO_UID", "-1")
-    assert controlling_uids((), ()) == {0}
+    for uid, controlling in (("1234", {0, 1234}), ("-1", {0})):
+        monkeypatch.setenv("SUDO_UID", uid)
+        assert controlling_uids((), ()) == controlling
 
 
 def test_named_users_and_groups_may_control() -> None:
@@ -139,3 +130,178 @@ def test_named_users_and_groups_may_control() -> None:
         controlling_uids(("no-such-user",), ())
     with pytest.raises(UsageError, match="no-such-group: there is no such group"):
         controlling_uids((), ("no-such-group",))
+
+
+# -- at one server for all of these, which none may change but the last
+
+CONTROL: dict[str, dict[str, Any]] = {
+    "shutdown": {},
+    "configure": {"sensor": 0, "settings": {"fir": True}},
+    "tare": {"sensor": 0, "samples": 10},
+    "sdo_write": {"sensor": 0, "index": 0x8010, "subindex": 1, "hex": "00"},
+}
+"""What changes something, with everything it needs."""
+HERE, THERE = "10.77.12.1", "10.77.12.2"
+
+
+def with_server(test: Callable[..., None]) -> Callable[..., None]:
+    marked: Callable[..., None] = needs_another_user(test)
+    return on_a_bus(marked)
+
+
+@pytest.fixture(scope="module")
+def veth() -> Iterator[Veth]:
+    """The cable to another machine."""
+    with Veth() as found:
+        found.ip("address", "add", f"{HERE}/30", "dev", found.near)
+        yield found
+
+
+@pytest.fixture(scope="module")
+def shared(veth: Veth) -> Iterator[Server]:
+    with server("virtual", "--set", "sinc_length=512", "--host", "127.0.0.1", "--host", HERE) as running:
+        yield running
+
+
+def what_can_be_changed(running: Server) -> Any:
+    """The settings, once the sensor is in OP: one that is starved is away for a moment."""
+    settings: list[Any] = []
+
+    def in_op() -> bool:
+        with running.connect() as client:
+            sensors = client.ask("describe")["sensors"]
+        settings[:] = [sensor["settings"] for sensor in sensors]
+        return all(sensor["state"] == "OP" for sensor in sensors)
+
+    wait_until(in_op, "OP")
+    return settings
+
+
+@with_server
+def test_another_user_may_look(shared: Server) -> None:
+    with shared.connect(NOBODY.pw_uid) as stranger:
+        assert stranger.ask("describe")["sensors"][0]["name"] == "BFT-SENS-ECAT-M8"
+        assert stranger.ask("status")["cycles"] > 0
+        assert stranger.ask("subscribe")["ok"]
+        assert len(stranger.collect(20)) == 20
+
+
+@with_server
+def test_another_user_may_not_touch_whatever_they_claim_to_be(shared: Server) -> None:
+    before = what_can_be_changed(shared)
+    with shared.connect(NOBODY.pw_uid) as stranger:
+        for action, asked in CONTROL.items():
+            *denied, described = stranger.answers(
+                request(action, 1, **asked),
+                request(action, 1, **asked),
+                {"action": action, **asked, "user": "root"},
+                {"action": action, **asked, "uid": 0},
+                {"user": "root", "uid": 0, "euid": 0, "sudo": True, "action": action, **asked},
+                {"action": action, **asked, "id": {"user": "root", "uid": 0}},
+                request("describe", 2),
+            )
+            codes = [reply["error"]["code"] for reply in denied]
+            assert codes == ["denied"] * 2 + ["bad_request"] * 3 + ["denied"]
+            assert denied[0]["reply"] == action
+            seen = f"denied to {NOBODY.pw_name} (uid {NOBODY.pw_uid}): "
+            assert seen in denied[0]["error"]["message"], "it says as whom they were seen"
+            assert described["ok"]
+    assert what_can_be_changed(shared) == before
+    assert f"(uid {NOBODY.pw_uid}): " in shared.said(), "the administrator can see who tried"
+
+
+def reset(sock: socket.socket) -> None:
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+
+
+GOING: Sequence[Callable[[socket.socket], None]] = (
+    lambda _: None,
+    lambda _: None,
+    lambda sock: sock.shutdown(socket.SHUT_WR),
+    lambda sock: sock.shutdown(socket.SHUT_RD),
+    reset,
+)
+
+
+@with_server
+def test_asking_and_being_gone_at_once_changes_nothing(shared: Server) -> None:
+    """The kernel shows a socket that nobody holds any more as root's."""
+    before = what_can_be_changed(shared)
+    with shared.connect() as watcher:
+        watcher.ask("subscribe")
+        for number, (action, go, _) in enumerate(itertools.product(CONTROL, GOING, range(6))):
+            encode = encode_bare_json if number % 3 == 0 else encode_json
+            # The server may be rid of it already.
+            with socket_of(NOBODY.pw_uid) as sock, contextlib.suppress(OSError):
+                sock.connect(("127.0.0.1", shared.port))
+                sock.sendall(encode(request(action, **CONTROL[action])))
+                go(sock)
+        assert what_can_be_changed(shared) == before, "after all that it sent was read"
+        assert shared.process.poll() is None
+        told = {event["event"] for event in watcher.events}
+        assert told <= {"sensor_lost", "sensor_back"}, "a busy machine starves the sensor, nothing else"
+        watcher.fresh(10)
+
+
+@contextlib.contextmanager
+def another_machine(veth: Veth) -> Iterator[list[str]]:
+    """A network namespace with the far end of `veth` in it, and what runs a command there."""
+    keeper = subprocess.Popen(["unshare", "--net", "sleep", "1000"])
+    there = ["nsenter", f"--net=/proc/{keeper.pid}/ns/net"]
+    try:
+        own = Path("/proc/self/ns/net").readlink()
+        wait_until(lambda: Path(f"/proc/{keeper.pid}/ns/net").readlink() != own, "the namespace")
+        veth.ip("link", "set", veth.far, "netns", str(keeper.pid))
+        for command in (["address", "add", f"{THERE}/30", "dev", veth.far], ["link", "set", veth.far, "up"]):
+            subprocess.run([*there, "ip", *command], check=True)
+        yield there
+    finally:
+        keeper.kill()
+        keeper.wait()
+
+
+FROM_PORT = f"""
+import socket, sys
+own, port, count = map(int, sys.argv[1:4])
+sock = socket.socket()
+sock.bind(("{THERE}", own))
+sock.settimeout(30)
+sock.connect(("{HERE}", port))
+sock.sendall(sys.stdin.buffer.read())
+answers = sock.makefile()
+for _ in range(count):
+    print(answers.readline(), end="")
+"""
+
+
+@pytest.mark.skipif(not shutil.which("nsenter"), reason="no nsenter (util-linux) here")
+@with_server
+def test_root_of_another_machine_is_a_stranger(shared: Server, veth: Veth) -> None:
+    """Asked for a connection that it does not have, the kernel tells of who listens on the port."""
+    asked = [{"action": action, **keys} for action, keys in CONTROL.items()]
+    asked.append(request("describe"))
+    before = what_can_be_changed(shared)
+    with another_machine(veth) as there:
+        for port_is_heard in (False, True):
+            with contextlib.ExitStack() as stack:
+                own = free_port()
+                if port_is_heard:
+                    stack.enter_context(socket.create_server(("0.0.0.0", own)))
+                done = subprocess.run(
+                    [*there, sys.executable, "-c", FROM_PORT, str(own), str(shared.port), str(len(asked))],
+                    input=b"".join(map(encode_bare_json, asked)),
+                    check=False, capture_output=True, timeout=60,
+                )  # fmt: skip
+            assert done.returncode == 0, done.stderr
+            *denied, described = map(json.loads, done.stdout.splitlines())
+            assert [answer["error"]["code"] for answer in denied] == ["denied"] * (len(asked) - 1)
+            assert described["ok"], "they may look"
+    assert what_can_be_changed(shared) == before
+
+
+@with_server
+def test_root_may_still_touch(shared: Server) -> None:
+    """The last one: it ends the server."""
+    with shared.connect() as client:
+        assert client.ask("shutdown")["ok"]
+    assert shared.wait() == 0

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, cast
+import random
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import pytest
 
-from bota_ethercat.pdo import LAYOUTS
+from bota_ethercat.framing import DataFlag
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.datagrams import LateAnswers
 from ethercat_server.ethercat.exchange import DUPLICATE, FIRST_INDEX
 from ethercat_server.ethercat.exchange import Exchange as Taken
-from ethercat_server.ethercat.late_answers import LateAnswers
-from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build, parse, working_counter
+from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build, parse
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
-from ethercat_server.virtual_sensor.measurement.signals import decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.exchanging import Exchange
-from tests.simulation import Asked
+from tests.simulation import Asked, Exchange, Simulation, check_frames, fresh, life_of, more_if_long
 
 STATION = 0x1001
+LRW_OR_NOT = pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
 INDICES = 0x100 - FIRST_INDEX
 Answer = Callable[[bytearray], list[bytes]]
 
@@ -141,22 +141,13 @@ def operational(
 ) -> tuple[Bus, MemoryBackend]:
     backend = MemoryBackend(*sensors, machine=machine)
     if not lrw:
-        life = backend.sensors.sensors[-1].life
-        assert life is not None
-        life.esc.take_lrw_away()
+        life_of(backend, -1).esc.take_lrw_away()
     bus = Bus(backend)
     bring_up(bus, Asked(), lambda: None)
     return bus, backend
 
 
-def inputs(backend: MemoryBackend, position: int) -> bytes:
-    """The process data that a sensor has now."""
-    life = backend.sensors.sensors[position].life
-    assert life is not None
-    return life.inputs()
-
-
-@pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
+@LRW_OR_NOT
 def test_an_exchange_brings_every_sensors_process_data(lrw: bool) -> None:
     sensors = [
         SensorOptions(serial=n, pdo_size=size, signal="constant") for n, size in enumerate((61, 77, 61))
@@ -166,56 +157,8 @@ def test_an_exchange_brings_every_sensors_process_data(lrw: bool) -> None:
     assert exchange() == 9
     assert bus.process_data.counters == [(3,)] * 3
     for position, options in enumerate(sensors):
-        assert exchange.inputs[position] == inputs(backend, position)
+        assert exchange.inputs[position] == life_of(backend, position).inputs()
         assert len(exchange.inputs[position]) == options.pdo_size
-
-
-@pytest.mark.parametrize(("lrw", "frames"), [(True, 2), (False, 3)], ids=["LRW", "LRD and LWR"])
-def test_process_data_that_does_not_fit_one_frame_goes_in_several(lrw: bool, frames: int) -> None:
-    sensors = (SensorOptions(serial=n, pdo_size=77, signal="constant") for n in range(20))
-    bus, backend = operational(*sensors, lrw=lrw)
-    sent: list[int] = []
-    send = backend.send
-
-    def noted(frame: bytearray) -> None:
-        sent.append(len(frame))
-        send(frame)
-
-    cast(Any, bus.process_data)._send = noted
-    exchange = Exchange(bus)
-    assert exchange() == 60
-    assert len(sent) == frames
-    assert max(sent) <= 1514
-    for position in range(20):
-        assert exchange.inputs[position] == inputs(backend, position)
-
-
-def test_a_lost_frame_is_a_miss_and_the_data_stay_those_of_before() -> None:
-    bus, backend = operational(SensorOptions(signal="constant"))
-    exchange = Exchange(bus)
-    assert exchange() == 3
-    before = exchange.inputs[0]
-    backend.command("lose 1")
-    assert exchange() == -1
-    assert exchange.inputs[0] == before
-    assert exchange() == 3
-
-
-@pytest.mark.parametrize("late", [0.2, 0.9])
-def test_a_frame_that_comes_too_late_is_never_taken_for_the_next_ones(late: float) -> None:
-    bus, backend = operational(SensorOptions(signal="clock"))
-    backend.wire = type(backend.wire)(Machine(seed=5, late=late, late_ns=15_000_000, frame_jitter_ns=0))
-    seen: list[bytes] = []
-    exchange = Exchange(bus)
-    for _ in range(300):
-        sent_ns = backend.clock.now_ns
-        if exchange() == 3:
-            instant_ns = decode_clock(LAYOUTS[61].struct.unpack(exchange.inputs[0])[2:8]).instant_ns
-            assert sent_ns - 1_250_000 <= instant_ns <= backend.clock.now_ns
-            seen.append(exchange.inputs[0])
-        backend.clock.sleep(0.00125)
-    assert len(seen) > 10
-    assert len(set(seen)) > 0.9 * len(seen), "each brought what the sensor had then"
 
 
 def answers(bus: Bus, backend: MemoryBackend) -> bytes:
@@ -262,18 +205,6 @@ def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() 
     assert process_data.duplicates == 0, "it was given up, not taken"
 
 
-@pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
-def test_a_working_counter_that_cannot_be_is_above_the_highest(lrw: bool) -> None:
-    bus, backend = operational(SensorOptions(), SensorOptions(serial=2), lrw=lrw)
-    process_data = bus.process_data
-    assert process_data.most_wkc == [6]
-    for counters in [(7, 0), (0xFFFF, 0)] if lrw else [(6, 0), (0, 3), (4, 1), (0xFFFF, 0xFFFF), (2, 0xFFFF)]:
-        answer = bytearray(answers(bus, backend))
-        for datagram, counter in zip(parse(answer, len(answer)), counters, strict=False):
-            answer[datagram.end : datagram.end + 2] = counter.to_bytes(2, "little")
-        assert 6 < awaited(process_data.take(bytes(answer), 1)).wkc <= 0xFFFF
-
-
 def test_a_late_answer_makes_datagrams_wait_longer_but_never_long() -> None:
     late, pending = LateAnswers(clock := SimulatedClock(Machine()), 0x80, 16), 0x80 + 3
     for stall_s in (0.01, 10.0):
@@ -285,18 +216,122 @@ def test_a_late_answer_makes_datagrams_wait_longer_but_never_long() -> None:
         assert 0.02 <= late.timeout_s <= 0.25
 
 
-def test_a_frame_that_is_cut_short_is_a_miss() -> None:
-    bus, backend = operational(SensorOptions(signal="constant"))
-    receive = backend.receive
+# -- whatever comes from the wire the loop goes on
 
-    def cut(timeout_s: float) -> bytes | None:
-        frame = receive(timeout_s)
-        return frame[:40] if frame is not None else None
-
-    cast(Any, backend).receive = cut
-    assert Exchange(bus)() == -1
+Change = Callable[[bytes], list[bytes]]
 
 
-def test_working_counters_add_up() -> None:
-    frame = bytearray(done(build((Command.BRD, 0, 0, b"\0\0")), wkc=7))
-    assert working_counter(frame, parse(frame, len(frame))[0]) == 7
+class HostileWire(MemoryBackend):
+    """Makes of each frame that arrives what `change` makes of it; the program needs `read_ns` for each."""
+
+    change: Change = staticmethod(lambda frame: [frame])
+    read_ns = 0
+
+    def __init__(self, *sensors: SensorOptions) -> None:
+        super().__init__(*sensors)
+        self._waiting: list[bytes] = []
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        if not self._waiting and (frame := super().receive(timeout_s)) is not None:
+            self._waiting = self.change(frame)
+        if not self._waiting:
+            return None
+        self.clock.advance(self.clock.now_ns + self.read_ns)
+        return self._waiting.pop(0)
+
+
+@pytest.mark.parametrize(("copies", "read_us"), [(2, 20), (2, 400), (4, 20), (4, 100)])
+def test_of_frames_that_arrive_several_times_each_counts_once(copies: int, read_us: int) -> None:
+    wire = HostileWire(SensorOptions(signal="clock", ppm=170.0))
+    wire.change = lambda frame: [frame] * copies
+    wire.read_ns = read_us * 1000
+    running = Simulation(backend=wire)
+    client = running.connect()
+    running.run(2.0)
+    check_frames(running.frames)
+    assert len(fresh(running.frames)) >= 1595
+    status = running.status()
+    sensor = status["sensors"][0]
+    assert (sensor["invalid"], sensor["lost_samples"], sensor["recoveries"]) == (0, 0, 0)
+    assert status["duplicate_frames"] == pytest.approx((copies - 1) * status["cycles"], abs=2 * copies)
+    assert status["lost_frames"] == 0
+    assert running.events == []
+    assert status["exchange_us"]["p99"] < 2 * copies * read_us + 100
+    running.command("power cycle 0.1")
+    client.ask("subscribe")
+    client.wait_event("sensor_back")
+    assert client.ask("sdo_read", name="Sampling rate")["value"] == 800
+    client.fresh(20)
+
+
+@LRW_OR_NOT
+def test_a_working_counter_that_cannot_be_is_no_complete_exchange(lrw: bool) -> None:
+    wire = HostileWire(SensorOptions(signal="clock"))
+    if not lrw:
+        life_of(wire).esc.take_lrw_away()
+    running = Simulation(backend=wire)
+    running.run(0.3)
+    # One adds 1 for what is read, and 1 for what is written, twice in an LRW: these add up to 3, or more.
+    for counters in [(4,), (0xFFFF,)] if lrw else [(3, 0), (0, 2), (2, 1), (0xFFFF, 0xFFFF), (1, 0xFFFF)]:
+
+        def change(frame: bytes, counters: Sequence[int] = counters) -> list[bytes]:
+            changed = bytearray(frame)
+            if changed[DATAGRAM_INDEX] >= FIRST_INDEX:
+                for datagram, counter in zip(parse(frame, len(frame)), counters, strict=False):
+                    changed[datagram.end : datagram.end + 2] = counter.to_bytes(2, "little")
+            return [bytes(changed)]
+
+        wire.change = change
+        running.frames.clear()
+        running.run(0.1)
+        assert all(frame.flags & DataFlag.INVALID for frame in running.frames[5:])
+        assert 3 < running.frames[-1].wkc <= 0xFFFF
+        wire.change = HostileWire.change
+        running.run(0.1)
+        assert running.frames[-1].flags == 0
+        check_frames(running.frames)
+
+
+@LRW_OR_NOT
+@pytest.mark.parametrize("seed", more_if_long([1, 2], range(50)))
+def test_no_bytes_from_the_wire_end_the_loop(seed: int, lrw: bool, caplog: pytest.LogCaptureFixture) -> None:
+    chance = random.Random(seed)
+    wire = HostileWire(SensorOptions(), SensorOptions(serial=2))
+    if not lrw:
+        life_of(wire).esc.take_lrw_away()
+    running = Simulation(backend=wire)
+    running.run(0.7)  # until event times are in use
+
+    def change(frame: bytes) -> list[bytes]:
+        changed = bytearray(frame)
+        kind = chance.randrange(12)
+        if kind == 0:
+            del changed[chance.randrange(len(changed)) :]
+        elif kind == 1:
+            changed += chance.randbytes(chance.randrange(1, 100))
+        elif kind == 2:
+            changed = bytearray(chance.randbytes(chance.randrange(1515)))
+        elif kind < 6:
+            for _ in range(chance.randrange(1, 9)):
+                changed[chance.randrange(len(changed))] = chance.choice((0, 1, 0x7F, 0x80, 0xFF))
+        elif kind < 9:
+            for datagram in parse(frame, len(frame)):
+                if chance.random() < 0.5:
+                    changed[datagram.end : datagram.end + 2] = chance.randbytes(2)
+                if chance.random() < 0.5:
+                    changed[datagram.data : datagram.end] = chance.randbytes(datagram.length)
+        return [bytes(changed)] * chance.choice((0, 1, 1, 1, 2))
+
+    wire.change = change
+    client = running.subscribe()
+    for second in range(6):
+        for action in ("sdo_read", "status", "describe"):
+            client.send(action, **({"name": "Sampling rate"} if action == "sdo_read" else {}))
+        running.command(("power cycle 0.05", "safeop 0x1B")[second % 2])
+        running.run(1.0)
+    wire.change = HostileWire.change
+    running.command("power cycle 0.1 @0")
+    running.command("power cycle 0.1 @1")
+    running.run_until(lambda: all(sensor.streams for sensor in running.sensors), "both are back")
+    assert len(client.fresh(50)) == 50
+    assert not [record for record in caplog.records if record.exc_info]

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import random
 from collections.abc import Sequence
 
 import pytest
 
-from bota_ethercat.framing import DataFlag
-from ethercat_server.acquisition.stream import Made
+from bota_ethercat.framing import DataFlag, DataMessage
+from ethercat_server.acquisition import health
+from ethercat_server.acquisition.histogram import Distribution, RecentDistribution
+from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.simulation.machine import REALTIME_START_NS, START_NS, Machine, SimulatedClock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.simulation import OLD, Simulation, check_frames, fresh, more_if_long, reading
+from tests.simulation import Simulation, check_frames, fresh, more_if_long, reading
 
 PERIOD_NS = 1_250_000
 
@@ -22,9 +25,22 @@ def simulation(machine: Machine | None = None, **options: object) -> Simulation:
     return Simulation(sensor, machine=machine)
 
 
-def numbers(running: Simulation) -> list[int]:
+def numbers(frames: Sequence[DataMessage]) -> list[int]:
     """The sensor's own numbers of the samples that were handed out as new."""
-    return [reading(frame)[0] for frame in running.frames if not frame.flags & OLD]
+    return [reading(frame).number for frame in fresh(frames)]
+
+
+def lost(frames: Sequence[DataMessage]) -> int:
+    """Samples that are missing between the first and the last."""
+    got = numbers(frames)
+    assert got == sorted(set(got)), "none twice, none out of order"
+    return got[-1] - got[0] + 1 - len(got)
+
+
+def ages_ns(running: Simulation) -> list[int]:
+    """Of the samples when they were handed out."""
+    made = zip(running.frames, running.published_ns, strict=True)
+    return sorted(at_ns - reading(frame).instant_ns for frame, at_ns in made)
 
 
 def check_lost(running: Simulation, least: int = 1, off_by: int = 0) -> None:
@@ -32,19 +48,17 @@ def check_lost(running: Simulation, least: int = 1, off_by: int = 0) -> None:
     running.backend.become(Machine())
     running.run(0.1)
     check_frames(running.frames)
-    got = numbers(running)
-    lost = got[-1] + 1 - got[0] - len(got)
-    assert lost >= least
-    assert running.status()["sensors"][0]["lost_samples"] == pytest.approx(lost, abs=off_by)
+    assert lost(running.frames) >= least
+    counted = running.status()["sensors"][0]["lost_samples"]
+    assert counted == pytest.approx(lost(running.frames), abs=off_by)
 
 
 def test_every_sample_is_handed_out_once_and_its_stamp_is_its_instant() -> None:
     running = simulation()
     running.run(4.0)
-    got = numbers(running)
-    settled = got[800:]
-    assert settled == list(range(settled[0], settled[0] + len(settled)))
-    assert len(settled) > 2300
+    got = numbers(running.frames)
+    assert lost(running.frames[800:]) == 0
+    assert len(got) > 3100
     for frame in running.frames[800:]:
         assert abs(frame.monotonic_ns - reading(frame).instant_ns) < 60_000
     status = running.status()
@@ -53,9 +67,7 @@ def test_every_sample_is_handed_out_once_and_its_stamp_is_its_instant() -> None:
     assert status["cycles"] < 1.5 * len(got), "hardly more than one exchange a sample"
 
 
-def test_a_stamp_is_the_monotonic_moment_whatever_comes_between_two_clock_reads(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stamp_is_the_monotonic_moment_despite_preemption(monkeypatch: pytest.MonkeyPatch) -> None:
     time_ns, chance = SimulatedClock.time_ns, random.Random(1)
 
     def preempted(clock: SimulatedClock) -> int:
@@ -104,11 +116,9 @@ def test_a_stall_is_counted_and_followed_by_no_burst() -> None:
     status = running.status()
     assert status["missed_deadlines"] >= periods - 2
     check_lost(running, periods - 3)
-    got = numbers(running)
-    assert got == sorted(set(got)), "nothing twice, nothing out of order"
+    got = numbers(running.frames)
     after = next(n for n, pair in enumerate(itertools.pairwise(got)) if pair[1] - pair[0] > 5) + 1
-    new = [frame for frame in running.frames if not frame.flags & OLD]
-    assert new[after].flags & DataFlag.GAP
+    assert fresh(running.frames)[after].flags & DataFlag.GAP
 
 
 def test_lost_frames_cost_no_sample_when_the_next_exchange_comes_in_time() -> None:
@@ -118,9 +128,7 @@ def test_lost_frames_cost_no_sample_when_the_next_exchange_comes_in_time() -> No
         running.at(0.05 * n, "lose 1")
     running.run(1.25)
     assert running.status()["lost_frames"] >= 20
-    got = numbers(running)[1000:]
-    missing = got[-1] - got[0] + 1 - len(got)
-    assert missing <= 2
+    assert lost(running.frames[1000:]) <= 2
     assert running.events == []
 
 
@@ -156,23 +164,19 @@ def test_samples_that_pass_while_the_sensor_itself_is_held_up_are_counted(dc: st
 @pytest.mark.parametrize("dc", ["", "none"])
 @pytest.mark.parametrize("jitter_us", [300, 400, 700])
 @pytest.mark.parametrize("seed", range(6))
-def test_whatever_is_lost_is_counted_though_frames_take_long_and_unevenly(
-    seed: int, jitter_us: int, dc: str
-) -> None:
+def test_what_is_lost_is_counted_though_frames_take_unevenly_long(seed: int, jitter_us: int, dc: str) -> None:
     """A starved slave looks at its data anywhere within an exchange: of the first it is not sure."""
     running = simulation(Machine(seed=seed, frame_jitter_ns=jitter_us * 1e3, wake_ns=50e3), dc=dc)
     running.run(2.0)
     check_lost(running, off_by=1)
 
 
-def test_polls_of_several_sensors_are_merged_where_exchanges_cost_time(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_polls_of_several_sensors_are_merged_if_exchanges_cost_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """As they do on a real machine: without cost there is nothing to save."""
     running = Simulation(*(SensorOptions(serial=n, signal="clock", ppm=37.0 * n) for n in range(4)))
     publish = running.hub.publish
 
-    def busy(made: Sequence[Made], now_ns: int) -> None:
+    def busy(made: Sequence[OutgoingFrame], now_ns: int) -> None:
         publish(made, now_ns)
         running.clock.advance(running.clock.now_ns + 15_000 + 15_000 * len(made))
 
@@ -183,10 +187,7 @@ def test_polls_of_several_sensors_are_merged_where_exchanges_cost_time(
     running.frames.clear()
     running.run(1.0)
     assert running.status()["cycles"] - before < 0.8 * len(fresh(running.frames))
-    ages = sorted(
-        at_ns - reading(frame).instant_ns
-        for at_ns, frame in zip(running.published_ns, running.frames, strict=True)
-    )
+    ages = ages_ns(running)
     assert ages[len(ages) * 99 // 100] < 300_000
     assert sum(stream.lost_samples for stream in running.streams) == 0
 
@@ -239,3 +240,187 @@ def test_what_a_stuck_sensor_leaves_out_is_flagged() -> None:
         running.run(0.1)
     check_frames(running.frames)
     assert running.status()["sensors"][0]["lost_samples"] == 0, "what was not there cannot be lost"
+
+
+# -- slow network cards, and many sensors with clocks of their own: nothing is lost by it
+
+SETTLED_S = 3.0
+
+
+def card(milliseconds: float, jitter_us: float = 0.0) -> Machine:
+    """Round trips of this time, with up to so much more on either way."""
+    return Machine(frame_ns=milliseconds * 1e6, frame_jitter_ns=5e3, even_jitter_ns=jitter_us * 1e3)
+
+
+def run(machine: Machine, sinc_length: int, seconds: float = 3.0, ppm: float = -300.0) -> Simulation:
+    """Runs a sensor; `frames` has what came after it has settled."""
+    sensor = SensorOptions(signal="clock", ppm=ppm, sinc_length=sinc_length)
+    running = Simulation(sensor, machine=machine, settings={"sinc_length": sinc_length})
+    running.run(SETTLED_S)
+    running.frames.clear()
+    running.published_ns.clear()
+    running.run(seconds)
+    return running
+
+
+def of_each(running: Simulation) -> dict[int, list[DataMessage]]:
+    """The frames by sensor."""
+    by_sensor: dict[int, list[DataMessage]] = {}
+    for frame in running.frames:
+        by_sensor.setdefault(frame.sensor, []).append(frame)
+    return by_sensor
+
+
+CARDS = [
+    (64, 0.86, 0), (64, 2.0, 0), (64, 3.0, 0), (64, 2.8, 400),
+    (32, 0.44, 0), (32, 0.86, 0), (32, 2.0, 0), (32, 1.8, 400),
+]  # fmt: skip
+"""SINC length (64: 800 Hz), round trip in ms, jitter in µs."""
+
+
+@pytest.mark.parametrize(("sinc_length", "milliseconds", "jitter_us"), CARDS)
+def test_a_slow_card_costs_age_and_no_sample(
+    sinc_length: int, milliseconds: float, jitter_us: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, logger=health.__name__)
+    running = run(card(milliseconds, jitter_us), sinc_length)
+    assert running.events == []
+    check_frames(running.frames)
+    assert lost(running.frames) <= 0.001 * len(running.frames)
+    status = running.status()
+    clock = status["sensors"][0]["clock"]
+    assert clock["mode"] == "locked"
+    assert clock["uncertainty_us"] < 1000 * milliseconds
+    errors_us = [abs(f.monotonic_ns - reading(f).instant_ns) / 1000 for f in running.frames]
+    within = sum(error <= clock["uncertainty_us"] for error in errors_us)
+    assert within > 0.99 * len(errors_us)
+    ages = ages_ns(running)
+    assert ages[len(ages) // 2] <= 1e6 * milliseconds + 10_000
+    (message,) = [each for each in caplog.messages if each.startswith("frames take ")]
+    assert "older than through a PCIe network card" in message
+    assert status["round_trip"]["usual_us"] == pytest.approx(1000 * milliseconds + jitter_us / 2, rel=0.1)
+
+
+@pytest.mark.parametrize("milliseconds", [0.05, 2.0])
+def test_register_reads_cost_a_slow_card_no_sample(milliseconds: float) -> None:
+    running = run(card(milliseconds), 64)
+    client = running.connect()
+    running.frames.clear()
+    for _ in range(40):
+        assert client.ask("sdo_read", name="Sampling rate")["value"] == 800
+    assert len(running.frames) > 100
+    assert lost(running.frames) == 0
+
+
+def test_an_answer_that_was_overtaken_is_no_news() -> None:
+    running = run(Machine(frame_ns=1e6, late=0.05, late_ns=4e6), 64)
+    check_frames(running.frames)
+
+
+@pytest.mark.parametrize("seed", more_if_long([1], range(20)))
+@pytest.mark.parametrize("disturbance_ms", [20, 300, 700])
+def test_the_clock_holds_over_a_stop_of_the_machine(disturbance_ms: float, seed: int) -> None:
+    machine = Machine(seed=seed, wake_ns=30_000, frame_jitter_ns=40_000)
+    running = run(machine, 32, seconds=0.5)
+    for _ in range(3):
+        running.clock.stall(disturbance_ms * 1e6)
+        running.run(0.02)
+        assert running.streams[0].clock.locked
+        running.frames.clear()
+        running.run(0.6)
+        check_frames(running.frames)
+        assert lost(running.frames) <= 0.01 * len(running.frames)
+
+
+@pytest.mark.parametrize("count", more_if_long([8], [8, 16]))
+def test_many_sensors_with_clocks_of_their_own(count: int) -> None:
+    chance = random.Random(count)
+    sensors = [
+        SensorOptions(serial=n + 1, signal="clock", ppm=chance.uniform(-300, 300)) for n in range(count)
+    ]
+    running = Simulation(*sensors)
+    running.run(1.5)
+    running.frames.clear()
+    running.published_ns.clear()
+    before = running.status()["cycles"]
+    running.run(1.0)
+    by_sensor = of_each(running)
+    assert len(by_sensor) == count
+    for frames in by_sensor.values():
+        check_frames(frames)
+    assert sum(map(lost, by_sensor.values())) <= 0.001 * len(running.frames)
+    ages = ages_ns(running)
+    assert ages[int(0.99 * len(ages))] < 1_250_000
+    assert running.status()["cycles"] - before < 800 * count * 1.15
+
+
+@pytest.mark.parametrize("sinc_length", more_if_long([256], [64, 256]))
+def test_process_data_in_two_frames_is_as_complete(sinc_length: int) -> None:
+    sensors = [
+        SensorOptions(serial=n + 1, signal="clock", pdo_size=77, ppm=10.0 * n, sinc_length=sinc_length)
+        for n in range(20)
+    ]
+    running = Simulation(*sensors, settings={"sinc_length": sinc_length})
+    running.run(0.4)
+    running.frames.clear()
+    running.run(0.2)
+    by_sensor = of_each(running)
+    assert sorted(by_sensor) == list(range(20))
+    for frames in by_sensor.values():
+        check_frames(frames)
+        assert lost(frames) <= 1
+    running.command("power off @19")
+    running.run_until(lambda: running.events, "it is missed")
+    assert [(event["event"], event["sensor"]) for event in running.events] == [("sensor_lost", 19)]
+
+
+# -- the fixed-memory distribution against exact percentiles
+
+
+def test_percentiles_are_exact_to_a_few_percent() -> None:
+    noise = random.Random(0)
+    values = sorted(int(10 ** noise.uniform(0, 10)) for _ in range(50_000))
+    distribution = Distribution()
+    for value in values:
+        distribution.record(value)
+    fractions = (0.01, 0.5, 0.9, 0.99, 0.999)
+    for fraction, found in zip(fractions, distribution.percentiles_ns(fractions), strict=True):
+        exact = values[int(fraction * (len(values) - 1))]
+        assert exact <= found * 1.001
+        assert found <= exact * 1.05 + 1
+
+
+def test_extremes() -> None:
+    distribution = Distribution()
+    assert distribution.percentiles_ns((0.5,)) == [0]
+    distribution.record(-5)
+    distribution.record(10**15)
+    assert distribution.percentiles_ns((0.5,)) == [0]
+    assert distribution.summary_us()["max"] == pytest.approx(10**12)
+    assert distribution.count() == 2
+
+
+def test_recent_forgets_after_ten_rolls_but_everything_does_not() -> None:
+    recent = RecentDistribution()
+    recent.record(5_000_000)
+    for _ in range(9):
+        recent.roll()
+        recent.record(1_000)
+    assert recent.summaries_us()[1]["max"] == 5000
+    recent.roll()
+    recent.record(2_000)
+    everything, last = recent.summaries_us()
+    assert last["max"] == 2
+    assert last["p50"] == pytest.approx(1, rel=0.05)
+    assert everything["max"] == 5000
+
+
+def test_reading_a_distribution_takes_no_longer_with_time() -> None:
+    """It happens between two exchanges: what fills is the buckets that there are."""
+    noise, recent = random.Random(1), RecentDistribution()
+    for _ in range(60):
+        for _ in range(300):
+            recent.record(int(noise.gammavariate(4, 20_000)))
+        recent.roll()
+    assert len(recent._before._counts) < 300
+    assert len(recent._slots) == 10

@@ -1,42 +1,44 @@
 """Hundreds of hostile connections: an honest client notices nothing of them, and nothing of them remains.
 
-In simulated time, and some on real sockets.
+On streams that never block: in memory, in simulated time, and some on real sockets. Each kind is a generator
+that pauses for a turn where it waits: for the server's loop in memory, for a moment at a real server.
 """
 
 from __future__ import annotations
 
+import collections
 import contextlib
+import errno
 import gc
 import io
 import itertools
 import logging
 import os
+import random
 import signal
 import socket
 import struct
 import sys
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
-from random import Random
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from bota_ethercat.control import ACTIONS, request
 from bota_ethercat.framing import DataFlag, encode_json
+from bota_ethercat.text.bare_json import encode_bare_json
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.process import logs
 from ethercat_server.serving.connection import MAX_REQUEST_LENGTH, Connection
 from ethercat_server.serving.in_memory import InMemoryStream
 from ethercat_server.serving.permissions import MAX_CLIENTS_PER_USER
 from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.hostile_bytes import framed
-from tests.server import hostile_clients
-from tests.server.as_another_user import NO_OTHER_USER
-from tests.server.hostile_clients import KINDS, Siege, ask_without_pause, shut_it_down
-from tests.server.running import has_ipv6, needs_bus, server, wait_until
-from tests.simulation import OLD, Simulation, check_frames, reading
+from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, mutate
+from tests.rights import NO_OTHER_USER, socket_of
+from tests.server.running import OLD, has_ipv6, on_a_bus, server, wait_until
+from tests.simulation import Simulation, check_frames, reading
 
 SEED = int(os.environ.get("FUZZ_SEED", "20261121"))
 REQUEST_NS = 150_000
@@ -48,6 +50,268 @@ GROWTH_MB = 8
 """What as many connections again may add to a real server: others may hang at that time."""
 LOG_LIMIT = 20_000
 """Characters that hostile clients may make the server log in ten seconds."""
+
+# -- the hostile
+
+AT_ONCE, MOST_HELD = 10, 8
+"""Connections that act, and that are left hanging: together somewhat more than one user may have."""
+FIRST_UID, USERS, OF_ONE_USER = 60_000, 1_000, 20
+"""The connections come from many users, because one may not have many."""
+PATIENCE_TURNS = 50_000
+_SHUTDOWN = request("shutdown")
+
+Steps = Generator[None, None, None]
+
+
+class Hostile:
+    """A client that means no good."""
+
+    def __init__(self, stream: Any, chance: random.Random, answers: collections.Counter[str]) -> None:
+        self.stream, self.chance, self.answers = stream, chance, answers
+        self.is_held = False
+        """It stays open and says no more."""
+
+    def hold(self) -> None:
+        self.is_held = True
+
+    def send_some(self, data: bytes) -> int:
+        """As much as can be sent now."""
+        with contextlib.suppress(BlockingIOError):
+            sent: int = self.stream.send(data)
+            return sent
+        return 0
+
+    def send(self, data: bytes) -> Steps:
+        while data := data[self.send_some(data) :]:
+            yield
+
+    def hear_some(self) -> bytes | None:
+        """What has come, None if nothing has, b"" at the end."""
+        with contextlib.suppress(BlockingIOError):
+            data: bytes = self.stream.recv(65536)
+            self.answers["refusals"] += data.count(b'"ok":false')
+            self.answers["grants"] += data.count(b'"ok":true')
+            return data
+        return None
+
+    def hear(self, turns: int = 16, until: bytes = b"") -> Generator[None, None, bytes]:
+        """What the server says in so many turns, or before it ends the connection or has said `until`."""
+        found = b""
+        for _ in range(turns):
+            data = self.hear_some()
+            found += data or b""
+            if data == b"" or (until and until in found):
+                return found
+            yield
+        assert turns < PATIENCE_TURNS, f"neither {until!r} nor an end; it said {found!r}"
+        return found
+
+
+Kind = Callable[[Hostile], Steps]
+KINDS: list[Kind] = []
+
+
+def kind(function: Kind) -> Kind:
+    """One way to be a nuisance. The connection is closed afterwards unless it is held."""
+    KINDS.append(function)
+    return function
+
+
+def mutated(chance: random.Random) -> bytes:
+    good = chance.choice((FRAMED, BARE))
+    return b"".join(mutate(chance, chance.choice(good), good) for _ in range(chance.randint(1, 4)))
+
+
+def huge(chance: random.Random) -> bytes:
+    return struct.pack(">IB", chance.choice((16386, 2**24, 2**32 - 1)), 2) + b"{" * 1000
+
+
+def json_bomb(chance: random.Random) -> bytes:
+    text = chance.choice(HOSTILE_TEXTS)
+    return framed(text) if chance.random() < 0.5 else b"{" + text + b"\n"
+
+
+def noise(chance: random.Random) -> bytes:
+    return chance.randbytes(chance.choice((1, 4, 5, 100, 4000)))
+
+
+def saying(what: Callable[[random.Random], bytes]) -> Kind:
+    def say(client: Hostile) -> Steps:
+        yield from client.send(what(client.chance))
+        yield from client.hear()
+
+    say.__name__ = what.__name__
+    return say
+
+
+KINDS += map(saying, (noise, mutated, huge, json_bomb))
+
+
+def any_form(client: Hostile, message: dict[str, object]) -> bytes:
+    return client.chance.choice((encode_json, encode_bare_json))(message)
+
+
+@kind
+def connect_and_close(client: Hostile) -> Steps:
+    yield from ()
+
+
+@kind
+def half_close(client: Hostile) -> Steps:
+    yield from client.send(any_form(client, request("status")))
+    client.stream.end_sending()
+    if not (yield from client.hear(PATIENCE_TURNS)):
+        raise ConnectionAbortedError("one too many: not let in")
+    client.answers["heard after a half close"] += 1
+
+
+@kind
+def half_close_at_once(client: Hostile) -> Steps:
+    client.stream.end_sending()
+    assert (yield from client.hear(PATIENCE_TURNS)) == b""
+
+
+@kind
+def reset_with_a_request(client: Hostile) -> Steps:
+    yield from client.send(client.chance.choice(FRAMED[:-2]) * client.chance.randint(0, 3))
+    if client.chance.random() < 0.5:
+        yield
+    client.stream.reset()
+
+
+@kind
+def half_a_message_then_silence(client: Hostile) -> Steps:
+    whole = client.chance.choice((*FRAMED[:3], *BARE[:3]))
+    yield from client.send(whole[: client.chance.randrange(1, len(whole))])
+    client.hold()
+
+
+@kind
+def silence(client: Hostile) -> Steps:
+    client.hold()
+    yield from ()
+
+
+@kind
+def flood(client: Hostile) -> Steps:
+    client.send_some(any_form(client, request("status")) * client.chance.randint(50, 2000))
+    if client.chance.random() < 0.5:
+        client.hold()  # the answers wait for ever
+    yield
+
+
+@kind
+def asks_much_and_reads_nothing(client: Hostile) -> Steps:
+    client.send_some(encode_json(request("describe", "x" * (MAX_REQUEST_LENGTH - 60))) * 90)
+    client.hold()
+    yield
+
+
+@kind
+def subscribe_and_vanish(client: Hostile) -> Steps:
+    every = client.chance.choice((1, 7))
+    yield from client.send(encode_json(request("subscribe", every=every, fresh_only=False)))
+    if client.chance.random() < 0.5:
+        yield from client.hear()
+    client.chance.choice((client.stream.reset, client.hold, client.stream.close))()
+
+
+@kind
+def byte_by_byte(client: Hostile) -> Steps:
+    for byte in client.chance.choice((FRAMED[0], BARE[0])):
+        yield from client.send(bytes((byte,)))
+        if client.chance.random() < 0.1:
+            yield
+    if b'"ok":true' not in (yield from client.hear(PATIENCE_TURNS, until=b'"ok":true')):
+        raise ConnectionAbortedError("one too many: not let in")
+
+
+@kind
+def shut_it_down(client: Hostile) -> Steps:
+    message = client.chance.choice((_SHUTDOWN, {**_SHUTDOWN, "uid": 0, "user": "root"}))
+    yield from client.send(any_form(client, message) * client.chance.randint(1, 3))
+    if client.chance.random() < 0.5:
+        yield
+    how = client.chance.randrange(3)
+    if how == 2:
+        yield from client.hear()
+    else:
+        (client.stream.reset, client.stream.close)[how]()
+
+
+def ask_without_pause(client: Hostile) -> Steps:
+    """One of a crowd: asks as much as it can, all kinds of requests, and reads the answers. Without end."""
+    room = MAX_REQUEST_LENGTH - 60
+    plain = (request("status"), request("describe", "x" * room), request("no"), _SHUTDOWN)
+    asked = [encode_json(message) for message in plain]
+    asked.append(encode_json(request("sdo_read", index=0x1008)))
+    asked.append(framed(b'{"action":"describe","id":[' + b",".join([b"1e15"] * (room // 5)) + b"]}"))
+    while True:
+        for some in asked:
+            yield from client.send(some * 4)
+            if client.hear_some() == b"":
+                raise ConnectionAbortedError
+
+
+class Siege:
+    """`count` hostile connections of random kinds, some at a time; the first ones are of one kind each."""
+
+    def __init__(
+        self, connect: Callable[[int], Any], count: int, seed: int, kinds: Iterable[Kind] = KINDS
+    ) -> None:
+        """`connect` makes a connection of a user."""
+        self.done: collections.Counter[str] = collections.Counter()
+        self.answers: collections.Counter[str] = collections.Counter()
+        self._connect, self._count, self._kinds = connect, count, list(kinds)
+        self._chance = random.Random(seed)
+        self._acting: dict[Hostile, tuple[Kind, Steps]] = {}
+        self._held: collections.deque[Hostile] = collections.deque()
+        self._begun = 0
+
+    def act(self) -> None:
+        """A turn of each."""
+        if self._begun < self._count and len(self._acting) < AT_ONCE and self._chance.random() < 0.6:
+            self._begin()
+        for client, (nuisance, steps) in list(self._acting.items()):
+            try:
+                next(steps)
+                continue
+            except StopIteration:
+                pass
+            except OSError as error:
+                # One too many is closed at once, and then the socket is not connected any more.
+                if not isinstance(error, ConnectionError) and error.errno != errno.ENOTCONN:
+                    raise
+                self.answers["cut off"] += 1
+            del self._acting[client]
+            self.done[nuisance.__name__] += 1
+            self._held.append(client)
+            if not client.is_held or len(self._held) > MOST_HELD:
+                (self._held.popleft() if client.is_held else self._held.pop()).stream.close()
+        if self.is_over:
+            while self._held:
+                self._held.pop().stream.close()
+
+    def _begin(self) -> None:
+        chance, number = self._chance, self._begun
+        self._begun += 1
+        stream = self._connect(FIRST_UID + number // OF_ONE_USER % USERS)
+        nuisance = self._kinds[number] if number < len(self._kinds) else chance.choice(self._kinds)
+        client = Hostile(stream, chance, self.answers)
+        self._acting[client] = nuisance, nuisance(client)
+
+    @property
+    def is_over(self) -> bool:
+        return self._begun == self._count and not self._acting
+
+    def check(self) -> None:
+        """They were of all kinds."""
+        print(self.done, self.answers)
+        assert sum(self.done.values()) == self._count
+        assert all(self.done[nuisance.__name__] for nuisance in self._kinds)
+
+
+# -- the besieged
 
 
 class Besieged:
@@ -62,8 +326,7 @@ class Besieged:
         assert self.simulation.hub._handler is not None
         self._handle = self.simulation.hub._handler
         self.simulation.hub.start(self._handle_slowly)
-        self.listener, self.asking = self.simulation.connect(), self.simulation.connect()
-        self.listener.ask("subscribe")
+        self.listener, self.asking = self.simulation.subscribe(), self.simulation.connect()
         self.listener.fresh(200)
 
     def _handle_slowly(self, connection: Connection, message: JsonObject) -> JsonObject | None:
@@ -128,7 +391,7 @@ def besieged() -> Iterator[Besieged]:
     found = Besieged()
     clock = found.simulation.clock
     handler = logging.StreamHandler(found.log)
-    handler.setFormatter(logs.PlainFormatter())
+    handler.setFormatter(logs.OneLine("ethercat-server"))
     handler.addFilter(logs.Repetitions())
     logger = logging.getLogger("ethercat_server")
     with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as cleanup:
@@ -169,9 +432,11 @@ def test_fifty_thousand_hostile_connections_harm_nobody() -> None:
 
 def test_a_crowd_that_asks_without_pause_costs_no_samples() -> None:
     with besieged() as found:
-        answers: list[Counter[str]] = [Counter() for _ in range(MAX_CLIENTS_PER_USER + 4)]
+        answers: list[collections.Counter[str]] = [
+            collections.Counter() for _ in range(MAX_CLIENTS_PER_USER + 4)
+        ]
         crowd = {
-            number: ask_without_pause(hostile_clients.Client(found.connect(4711), Random(SEED), counted))
+            number: ask_without_pause(Hostile(found.connect(4711), random.Random(SEED), counted))
             for number, counted in enumerate(answers)
         }
 
@@ -201,7 +466,7 @@ def test_their_reading_does_not_keep_root_from_its_work() -> None:
         for client in pressing:
             for _ in range(20):
                 client.send("sdo_read", index=0x1008)
-        answered: Counter[bool] = Counter()
+        answered: collections.Counter[bool] = collections.Counter()
 
         def press(_: int) -> None:
             for client in pressing:
@@ -255,14 +520,7 @@ class Socket:
     """A client's end on a real socket."""
 
     def __init__(self, host: str, port: int, uid: int) -> None:
-        # A socket belongs to whoever its maker was at that moment.
-        if NO_OTHER_USER is None:
-            os.seteuid(uid)
-        try:
-            self._sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-        finally:
-            if NO_OTHER_USER is None:
-                os.seteuid(0)
+        self._sock = socket_of(uid, socket.AF_INET6 if ":" in host else socket.AF_INET)
         self._sock.connect((host, port))
         self._sock.setblocking(False)
         self.send, self.recv, self.close = self._sock.send, self._sock.recv, self._sock.close
@@ -304,8 +562,7 @@ def besiege_real(count: int) -> None:
         assert running.wait() == 0
 
 
-@pytest.mark.bus
-@needs_bus
+@on_a_bus
 def test_hostile_connections_to_a_real_server() -> None:
     """The kernel's resets, half-closed connections, full buffers and owners of sockets."""
     besiege_real(20)
@@ -313,7 +570,6 @@ def test_hostile_connections_to_a_real_server() -> None:
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-@pytest.mark.bus
-@needs_bus
+@on_a_bus
 def test_ten_thousand_hostile_connections_to_a_real_server() -> None:
     besiege_real(5_000)

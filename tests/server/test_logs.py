@@ -19,13 +19,12 @@ from bota_ethercat.errors import ConnectionFailedError
 from ethercat_server.process import logs
 from ethercat_server.process.logs import (
     MOST_LINES,
-    JournalFormatter,
-    PlainFormatter,
+    OneLine,
     QueuedHandler,
     Repetitions,
     goes_to_journal,
 )
-from tests.server.running import ATTEMPTS, PATIENCE_S, Client, free_port, needs_bus, wait_until
+from tests.server.running import ATTEMPTS, PATIENCE_S, Client, free_port, on_a_bus, wait_until
 
 
 def record(message: str, *arguments: object, level: int = logging.WARNING) -> logging.LogRecord:
@@ -38,7 +37,7 @@ def test_an_event_is_one_line_even_with_a_traceback() -> None:
     except ValueError:
         event = record("failed")
         event.exc_info = cast("tuple[type[BaseException], BaseException, None]", sys.exc_info())
-    text = PlainFormatter().format(event)
+    text = OneLine("ethercat-server").format(event)
     assert text.startswith("ethercat-server: failed | Traceback")
     assert "\n" not in text
     assert "ValueError: two" in text
@@ -49,7 +48,7 @@ def test_an_event_is_one_line_even_with_a_traceback() -> None:
     [(logging.ERROR, "<3>"), (logging.WARNING, "<4>"), (logging.INFO, "<6>"), (logging.DEBUG, "<7>")],
 )
 def test_journald_gets_the_priority(level: int, prefix: str) -> None:
-    assert JournalFormatter().format(record("a %d", 1, level=level)) == f"{prefix}a 1"
+    assert OneLine(None).format(record("a %d", 1, level=level)) == f"{prefix}a 1"
 
 
 def test_the_journal_is_recognised_by_its_stream(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,13 +120,11 @@ def pipe() -> Iterator[Pipe]:
         yield found
 
 
-def test_who_logs_does_not_wait_and_learns_what_was_dropped(
-    pipe: Pipe, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_logs_does_not_wait_but_learns_of_drops(pipe: Pipe, monkeypatch: pytest.MonkeyPatch) -> None:
     """A real pipe, because only that blocks. The first line may be with the writer already."""
     monkeypatch.setattr(logs, "_FLUSH_S", 0.01)
     handler = QueuedHandler(pipe.writing)
-    handler.setFormatter(PlainFormatter())
+    handler.setFormatter(OneLine("ethercat-server"))
     for number in range(MOST_LINES + 100):
         handler.handle(record("event %d", number))
     handler.flush()  # returns all the same
@@ -178,8 +175,7 @@ def connected(process: subprocess.Popen[bytes], port: int) -> Client | None:
     return clients[0] if clients else None
 
 
-@pytest.mark.bus
-@needs_bus
+@on_a_bus
 def test_the_server_streams_and_ends_while_nobody_reads_its_log(pipe: Pipe) -> None:
     """What blocks is the kernel's pipe, so it is a real server; it used to stop at its first line."""
     for _ in range(ATTEMPTS):  # on a busy machine the sensor may be starved

@@ -20,27 +20,24 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from bota_ethercat.control import request
 from ethercat_server import server as assembly
 from ethercat_server.daemon import server as daemon
 from ethercat_server.errors import ServerError, StopRequestedError, UsageError
 from ethercat_server.process import privileges, realtime
 from ethercat_server.process.privileges import User, user_to_become
 from ethercat_server.process.signals import Signals
-from tests.server.as_another_user import NO_OTHER_USER, NOBODY
-from tests.server.commands import command
+from tests.rights import IPC_LOCK, NOBODY, SYS_NICE, needs_another_user, without
 from tests.server.running import (
-    Program,
     Server,
     Veth,
+    VirtualSensor,
     free_port,
-    needs_bus,
+    on_a_bus,
     server,
     virtual_sensor,
     wait_until,
 )
 
-AS_NOBODY = pytest.mark.skipif(NO_OTHER_USER is not None, reason=NO_OTHER_USER or "")
 BY_SUDO = ("env", f"SUDO_UID={NOBODY.pw_uid}", f"SUDO_GID={NOBODY.pw_gid}")
 """As if nobody had started it with sudo."""
 
@@ -85,9 +82,7 @@ def test_only_root_becomes_somebody_else(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.usefixtures("as_root")
-def test_what_needs_root_is_done_first_and_all_before_a_frame_is_read(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_needs_root_is_done_before_a_frame_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[str] = []
 
     @contextlib.contextmanager
@@ -149,7 +144,7 @@ print(json.dumps([found, refused, os.sched_getscheduler(0), Path("/proc/self/sta
 """
 
 
-@AS_NOBODY
+@needs_another_user
 def test_it_cannot_go_back_and_keeps_what_it_has() -> None:
     """Priority and locked memory stay; memory and threads can be had as before."""
     done = subprocess.run([sys.executable, "-c", BECOME], capture_output=True, text=True, check=True)
@@ -185,14 +180,14 @@ def check_unprivileged(process: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def bench() -> Iterator[tuple[Veth, Program]]:
+def bench() -> Iterator[tuple[Veth, VirtualSensor]]:
     with virtual_sensor() as found:
         yield found
 
 
 @pytest.fixture(scope="module")
 def running(
-    bench: tuple[Veth, Program], tmp_path_factory: pytest.TempPathFactory
+    bench: tuple[Veth, VirtualSensor], tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Server, Path]]:
     """It finds its Python unreadable where that is root's: it must need nothing of it any more."""
     config = tmp_path_factory.mktemp("privileges") / "c.toml"
@@ -202,19 +197,10 @@ def running(
         yield found, config
 
 
-def as_nobody(port: int, *messages: dict[str, Any]) -> list[dict[str, Any]]:
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.server.stranger", "127.0.0.1", str(port), "ask", json.dumps(messages)],
-        check=True, capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    return [json.loads(line) for line in done.stdout.splitlines()]
-
-
-@AS_NOBODY
-@pytest.mark.bus
-@needs_bus
+@needs_another_user
+@on_a_bus
 def test_it_streams_and_recovers_without_privileges(
-    running: tuple[Server, Path], bench: tuple[Veth, Program]
+    running: tuple[Server, Path], bench: tuple[Veth, VirtualSensor]
 ) -> None:
     found, _ = running
     veth, sensor = bench
@@ -224,9 +210,9 @@ def test_it_streams_and_recovers_without_privileges(
     with found.connect() as client:
         assert client.ask("subscribe")["ok"]
         client.fresh(50)
-        command(sensor, "power off")
+        sensor.command("power off")
         client.wait_event("sensor_lost")
-        command(sensor, "power on")
+        sensor.command("power on")
         client.wait_event("sensor_back")
         veth.ip("link", "set", veth.near, "down")
         assert f"{veth.near} is down" in client.wait_event("sensor_lost")["reason"]
@@ -234,13 +220,12 @@ def test_it_streams_and_recovers_without_privileges(
         client.wait_event("sensor_back")
         client.fresh(50)
         assert client.ask("configure", settings={"fir": True})["ok"], "root may control it"
-    (answer,) = as_nobody(found.port, request("configure", 1, sensor=0, settings={"fir": False}))
-    assert answer["ok"], "and so may its own user"
+    with found.connect(NOBODY.pw_uid) as client:
+        assert client.ask("configure", settings={"fir": False})["ok"], "and so may its own user"
 
 
-@AS_NOBODY
-@pytest.mark.bus
-@needs_bus
+@needs_another_user
+@on_a_bus
 def test_only_the_loop_has_real_time_priority(running: tuple[Server, Path]) -> None:
     found, _ = running
     if "real-time priority" in found.said():
@@ -252,12 +237,9 @@ def test_only_the_loop_has_real_time_priority(running: tuple[Server, Path]) -> N
     assert set(policies.values()) == {os.SCHED_OTHER}, "the log's"
 
 
-@AS_NOBODY
-@pytest.mark.bus
-@needs_bus
-def test_a_file_that_its_user_cannot_read_is_known_at_start_and_refused_later(
-    running: tuple[Server, Path],
-) -> None:
+@needs_another_user
+@on_a_bus
+def test_a_file_that_its_user_cannot_read_is_known_and_refused_later(running: tuple[Server, Path]) -> None:
     found, config = running
     assert f"user nobody cannot read the configuration {config}: a reload will fail" in found.said()
     found.signal(signal.SIGHUP)
@@ -267,9 +249,8 @@ def test_a_file_that_its_user_cannot_read_is_known_at_start_and_refused_later(
         assert len(client.fresh(50)) == 50
 
 
-@AS_NOBODY
-@pytest.mark.bus
-@needs_bus
+@needs_another_user
+@on_a_bus
 @pytest.mark.parametrize("stuck", [False, True])
 def test_the_virtual_sensor_becomes_the_same_user_and_goes_with_the_server(stuck: bool) -> None:
     """A stopped process does not end by itself; that of another user could not be killed."""
@@ -290,8 +271,7 @@ def test_the_virtual_sensor_becomes_the_same_user_and_goes_with_the_server(stuck
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
-@pytest.mark.bus
-@needs_bus
+@on_a_bus
 def test_root_without_sudo_stays_root_and_is_told_how_not_to() -> None:
     with server("virtual") as found:
         assert rows_of(found.process.pid)["Uid"].split() == ["0"] * 4
@@ -307,3 +287,67 @@ def test_what_cannot_be_given_up_is_an_error(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(os, "initgroups", refuse)
     with pytest.raises(ServerError, match="cannot become user nobody: Operation not permitted"):
         privileges.become(User(NOBODY.pw_uid, NOBODY.pw_gid, pwd.getpwuid(NOBODY.pw_uid).pw_name))
+
+
+# -- what is asked of the kernel is granted where allowed, and said in one line where not
+
+PROBE = """
+import gc, json, logging, os, sys, threading
+from ethercat_server.process import realtime
+logging.basicConfig(format="%(message)s", stream=sys.stderr)
+realtime.prepare({priority}, {cpu})
+def scheduling():
+    return [os.sched_getscheduler(0), os.sched_getparam(0).sched_priority, sorted(os.sched_getaffinity(0))]
+def leave():
+    realtime.leave()
+    left.extend(scheduling())
+left = []
+thread = threading.Thread(target=leave)
+thread.start()
+thread.join()
+locked = next(l for l in open("/proc/self/status") if l.startswith("VmLck")).split()[1]
+slack = open("/proc/self/timerslack_ns").read().strip()
+print(json.dumps(dict(own=scheduling(), thread=left, locked=int(locked), slack=slack, gc=gc.isenabled())))
+"""
+
+
+def probe(priority: int, cpu: int | None, *, capable: bool = True) -> tuple[dict[str, Any], str]:
+    """What the process then has, and what it said."""
+    drop = None if capable else without(IPC_LOCK, SYS_NICE)
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE.format(priority=priority, cpu=cpu)],
+        capture_output=True, text=True, check=True, preexec_fn=drop,
+    )  # fmt: skip
+    return json.loads(done.stdout), done.stderr.strip()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root to be granted real-time scheduling")
+def test_what_is_granted_a_thread_can_leave() -> None:
+    cpus = sorted(os.sched_getaffinity(0))
+    found, said = probe(40, cpus[0])
+    if said:
+        pytest.skip(
+            f"root may not do everything here (a user namespace or container: run it as real root): {said}"
+        )
+    assert found["own"] == [os.SCHED_FIFO, 40, [cpus[0]]], "the loop keeps its own"
+    assert found["thread"] == [os.SCHED_OTHER, 0, cpus]
+    assert found["locked"] > 0
+    assert found["gc"] is False
+
+
+def test_not_granted_is_one_line_and_it_runs_on() -> None:
+    limit = os.sysconf("SC_NPROCESSORS_CONF") + 5
+    found, said = probe(40, limit, capable=False)
+    assert found["own"][0] == os.SCHED_OTHER
+    assert len(said.splitlines()) == 1
+    assert said.startswith("not granted: ")
+    assert f"CPU {limit}" in said
+    assert "real-time priority 40 (CAP_SYS_NICE)" in said
+    assert found["gc"] is False
+    assert found["slack"] == "1000", "then at least the timer is made finer"
+
+
+def test_ordinary_scheduling_is_a_choice() -> None:
+    found, said = probe(0, None)
+    assert found["own"][0] == os.SCHED_OTHER
+    assert not said

@@ -1,46 +1,73 @@
-"""What only a real interface shows: pysoem, raw sockets, links that go down, processes that are stopped.
+"""What only a real interface, processes and signals show: pysoem, raw sockets, links that go down.
 
-Each kind of recovery once, to see that the real backend does what the one in memory does; everything else
-about recovery is in test_recovery.py. One server for all; the last test ends it.
+What the server does with samples and requests, and everything else about recovery, is tested in memory.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
+import socket
+import threading
 from collections.abc import Callable, Iterator
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
 
-from tests.server.commands import command, stats
-from tests.server.running import Client, Program, Server, Veth, needs_bus, server, virtual_sensor, wait_until
-from tests.simulation import reading
+from ethercat_server.acquisition.start_up import bring_up
+from ethercat_server.errors import BusError, StopRequestedError
+from ethercat_server.ethercat import soem
+from ethercat_server.ethercat.backend import CheckInterrupt
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.nic import claimed
+from ethercat_server.ethercat.raw_socket import packet_sockets
+from ethercat_server.ethercat.slave.sii import decode
+from ethercat_server.ethercat.soem import SoemBackend
+from ethercat_server.sensor.sensor import Sensor
+from tests.server.running import (
+    ATTEMPTS,
+    PATIENCE_S,
+    Client,
+    Manager,
+    Server,
+    Veth,
+    VirtualSensor,
+    has_ipv6,
+    needs_bus,
+    server,
+    starved,
+    virtual_sensor,
+    wait_until,
+)
+from tests.simulation import Asked, check_frames, fresh, reading
+from tests.tool.running import one_sentence, tool
 
 pytestmark = [pytest.mark.bus, needs_bus]
 
+# -- one server for all of these, the last of which ends it
 
-class RealBench:
+
+class Bench(NamedTuple):
     """A server on a veth pair, a virtual sensor that takes commands on its other end."""
 
-    def __init__(self, veth: Veth, sensor: Program, running: Server) -> None:
-        self.veth, self.sensor, self.running = veth, sensor, running
-
-    def command(self, text: str) -> str:
-        return command(self.sensor, text)
+    veth: Veth
+    sensor: VirtualSensor
+    running: Server
 
 
 @pytest.fixture(scope="module")
-def bench() -> Iterator[RealBench]:
+def bench() -> Iterator[Bench]:
     with (
         virtual_sensor("--signal", "clock", "--ppm", "150") as (veth, sensor),
         server(veth.near, "--set", "acceleration_range_g=8") as running,
     ):
-        yield RealBench(veth, sensor, running)
+        yield Bench(veth, sensor, running)
 
 
 @pytest.fixture
-def client(bench: RealBench) -> Iterator[Client]:
+def client(bench: Bench) -> Iterator[Client]:
     with bench.running.connect() as client:
         client.ask("subscribe")
         client.fresh(50)
@@ -48,52 +75,51 @@ def client(bench: RealBench) -> Iterator[Client]:
         yield client
 
 
-def pull_cable(bench: RealBench, client: Client) -> None:
+def pull_cable(bench: Bench, client: Client) -> None:
     bench.veth.ip("link", "set", bench.veth.far, "down")
     assert f"{bench.veth.near} has no carrier" in client.wait_event("sensor_lost")["reason"]
     bench.veth.ip("link", "set", bench.veth.far, "up")
 
 
-def be_deaf(bench: RealBench, client: Client) -> None:
-    bench.command("deaf")
+def be_deaf(bench: Bench, client: Client) -> None:
+    bench.sensor.command("deaf")
     client.wait_event("sensor_lost")
-    bench.command("hear")
+    bench.sensor.command("hear")
 
 
-def cut_power(bench: RealBench, client: Client) -> None:
-    bench.command("power off")
+def cut_power(bench: Bench, client: Client) -> None:
+    bench.sensor.command("power off")
     client.wait_event("sensor_lost")
-    bench.command("power on")
+    bench.sensor.command("power on")
 
 
-def drop_to_safeop(bench: RealBench, client: Client) -> None:
-    bench.command("safeop 0x1B")
+def drop_to_safeop(bench: Bench, client: Client) -> None:
+    bench.sensor.command("safeop 0x1B")
     client.wait_event("sensor_lost")
 
 
-def stop_server(bench: RealBench, _: Client) -> None:
+def stop_server(bench: Bench, _: Client) -> None:
     """The sensor falls to SAFEOP meanwhile; the server takes it back to OP."""
     bench.running.signal(signal.SIGSTOP)
-    bench.command("safeop 0x1B")
+    bench.sensor.command("safeop 0x1B")
     bench.running.signal(signal.SIGCONT)
 
 
 @pytest.mark.parametrize("fault", [pull_cable, be_deaf, cut_power, drop_to_safeop, stop_server])
 def test_samples_flow_again_on_the_same_connection(
-    bench: RealBench, client: Client, fault: Callable[[RealBench, Client], None]
+    bench: Bench, client: Client, fault: Callable[[Bench, Client], None]
 ) -> None:
     """With the kernel's links and timers: a link that is down fails the sending, a process that was stopped
     finds frames of before."""
     fault(bench, client)
     assert client.wait_event("sensor_back")["settings"]["acceleration_range_g"] == 8
-    frames = client.fresh(100)
-    instants = [reading(frame).instant_ns for frame in frames]
+    instants = [reading(frame).instant_ns for frame in client.fresh(100)]
     assert instants == sorted(set(instants)), "nothing old as new"
     wait_until(lambda: client.ask("describe")["sensors"][0]["state"] == "OP", "OP")
-    assert stats(bench.sensor)["calibration_writes"] == 0
+    assert bench.sensor.stats()["calibration_writes"] == 0
 
 
-def test_settings_change_by_way_of_preop(bench: RealBench, client: Client) -> None:
+def test_settings_change_by_way_of_preop(bench: Bench, client: Client) -> None:
     """The mailbox by single datagrams over the raw socket, while pysoem's own are not used any more."""
     for settings in ({"chop": True, "imu_active": 3}, {"chop": False, "imu_active": 1}):
         wait_until(lambda new=settings: client.ask("configure", settings=new)["ok"], "it takes")  # type: ignore[misc]
@@ -101,24 +127,7 @@ def test_settings_change_by_way_of_preop(bench: RealBench, client: Client) -> No
     assert len(client.fresh(20)) == 20
 
 
-def test_a_second_master_on_the_interface_is_kept_away(bench: RealBench, client: Client) -> None:
-    """Two processes."""
-    second = Server(bench.veth.near)
-    try:
-        assert second.wait() == 1
-        assert f"{bench.veth.near} is in use by another EtherCAT master" in second.said()
-    finally:
-        second.close()
-    assert len(client.fresh(100)) == 100
-
-
-def test_a_client_that_has_said_all_still_gets_its_samples(client: Client) -> None:
-    """The kernel's half-closed connection."""
-    client.sock.shutdown(1)
-    assert len(client.fresh(100)) == 100
-
-
-def test_an_interface_that_disappears_ends_the_server_with_a_sentence(bench: RealBench) -> None:
+def test_an_interface_that_disappears_ends_the_server_with_a_sentence(bench: Bench) -> None:
     """The kernel's error for a raw socket whose interface is gone."""
     veth, running = bench.veth, bench.running
     veth.ip("link", "del", veth.near)
@@ -127,40 +136,333 @@ def test_an_interface_that_disappears_ends_the_server_with_a_sentence(bench: Rea
     assert "Traceback" not in running.said()
 
 
+# -- beside other devices
+
+
 @pytest.mark.parametrize("text", ["EK1100,BOTA,EL3102,DRIVE", "DRIVE:PREOP,BOTA,BOTA"])
 def test_sensors_among_other_devices(text: str) -> None:
     """The master by single datagrams on a raw socket that pysoem opened."""
+    others = [at for at, kind in enumerate(text.split(",")) if kind != "BOTA"]
     with (
         virtual_sensor("--chain", text, "--signal", "clock") as (veth, sensor),
         server(veth.near) as running,
         running.connect() as client,
     ):
-        described = client.ask("subscribe")
-        assert [row["position"] for row in described["others"]] == [
-            at for at, kind in enumerate(text.split(",")) if kind != "BOTA"
-        ]
+        assert [row["position"] for row in client.ask("subscribe")["others"]] == others
         assert len(client.fresh(200)) == 200
-        before = foreign(sensor)
-        pull_cable(RealBench(veth, sensor, running), client)
+        before = [sensor.stats_of_foreign(at) for at in others]
+        pull_cable(Bench(veth, sensor, running), client)
         client.wait_event("sensor_back")
         assert len(client.fresh(200)) == 200
-        assert foreign(sensor) == before
+        assert [sensor.stats_of_foreign(at) for at in others] == before
         assert {row["al_state"] for row in before} <= {"INIT", "PREOP"}
 
 
 def test_a_drive_at_work_is_not_touched() -> None:
     """pysoem opens the interface; nothing is written."""
-    with virtual_sensor("--chain", "BOTA:OP,DRIVE:OP") as (veth, sensor):
-        refused = Server(veth.near)
-        try:
-            assert refused.wait() == 1
-            assert "no Bota sensors (position 1 in OP)" in refused.said()
-        finally:
-            refused.close()
-        assert [row["write_count"] for row in foreign(sensor)] == [0]
+    with (
+        virtual_sensor("--chain", "BOTA:OP,DRIVE:OP") as (veth, sensor),
+        contextlib.closing(Server(veth.near)) as refused,
+    ):
+        assert refused.wait() == 1
+        assert "no Bota sensors (position 1 in OP)" in refused.said()
+        assert sensor.stats_of_foreign(1)["write_count"] == 0
 
 
-def foreign(sensor: Program) -> list[dict[str, Any]]:
-    """What the slaves that are no sensors say of themselves."""
-    answer = command(sensor, "stats").removeprefix("ok ")
-    return list(json.loads(answer)["foreign"].values())
+# -- a service on a chain of two sensors, with a configuration file; the last of these ends it
+
+CONFIG = "[sensor]\nfir = true\nsinc_length = 512\n[sensor.1]\nsinc_length = 1024\n"
+"""Low rates, which take little of the machine."""
+
+
+def interface_exists(name: str) -> bool:
+    return name in {name for _, name in socket.if_nameindex()}
+
+
+class Shared(NamedTuple):
+    running: Server
+    manager: Manager
+    config: Path
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
+    directory = tmp_path_factory.mktemp("service")
+    config = directory / "chain.toml"
+    config.write_text(CONFIG)
+    arguments = ("--config", str(config), "--virtual", "--sensors 2 --signal clock --ppm 200,-300")
+    with contextlib.closing(Manager(directory)) as manager, contextlib.ExitStack() as stack:
+        with manager.environment():
+            running = stack.enter_context(server("virtual", *arguments))
+        yield Shared(running, manager, config)
+
+
+def test_samples_of_a_chain_arrive_in_order_with_settings_of_their_own(shared: Shared) -> None:
+    """Two slaves in one frame, as pysoem maps them."""
+    with shared.running.connect() as client:
+        described = client.ask("subscribe")["sensors"]
+        assert [(s["sensor"], s["rate_hz"], s["pdo_size"]) for s in described] == [(0, 100, 61), (1, 50, 61)]
+        assert [s["serial"] - 100 * shared.running.port for s in described] == [0, 1], "of this server alone"
+        assert all(s["settings"]["fir"] and s["name"] == "BFT-SENS-ECAT-M8" for s in described)
+        frames = client.collect(90)
+        for _ in range(20):  # a starved sensor may be away for a moment
+            if {frame.sensor for frame in frames if frame.wkc == 6} == {0, 1}:
+                break
+            frames += client.collect(30)
+        else:
+            pytest.fail("no frame with both sensors' data")
+        status = client.ask("status")
+        withheld = sum(each["withheld"] for each in status["clients"])
+        for counters in status["sensors"]:
+            own = [frame for frame in frames if frame.sensor == counters["sensor"]]
+            check_frames(own, complete=False)
+            numbers = [reading(frame).number for frame in fresh(own)]
+            missing = numbers[-1] - numbers[0] + 1 - len(numbers)
+            assert missing <= counters["lost_samples"] + withheld or counters["recoveries"]
+
+
+def test_status_counts_what_happened(shared: Shared) -> None:
+    """By the kernel's clock."""
+    with shared.running.connect() as client:
+        client.ask("subscribe")
+        client.fresh(30)
+        status = client.ask("status")
+        assert status["cycles"] >= max(counters["fresh"] for counters in status["sensors"]) >= 15
+        for distribution in (status["wake_us"], status["exchange_us"]):
+            values = [distribution[name] for name in ("p50", "p99", "p999", "max")]
+            assert values[0] > 0
+            assert values == sorted(values)
+        (me,) = [c for c in status["clients"] if c["peer"].endswith(f":{client.sock.getsockname()[1]}")]
+        assert me["sent"] >= 30
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_bare_json_works_with_a_plain_socket(shared: Shared, host: str) -> None:
+    if host == "::1" and not has_ipv6():
+        pytest.skip("no IPv6 on this machine")
+    with socket.create_connection((host, shared.running.port), timeout=30) as sock:
+        sock.sendall(b'{"action":"subscribe"}{"action":"status","id":"me"}')
+        lines = sock.makefile("rb")
+        refused, status = json.loads(lines.readline()), json.loads(lines.readline())
+        assert refused["error"]["code"] == "bad_request"
+        assert "framed" in refused["error"]["message"]
+        assert (status["id"], status["ok"]) == ("me", True)
+
+
+def test_systemd_is_told_and_the_watchdog_is_fed(shared: Shared) -> None:
+    """The process sends to the socket in its environment."""
+    told, wait = shared.manager, shared.manager.wait
+    wait("READY=1")
+    assert "streaming" in shared.running.said(), "not before it streams"
+    wait("STATUS=streaming 2 of 2 sensors; 0 clients")
+    fed = told.told.count("WATCHDOG=1")
+    wait_until(lambda: told.told.count("WATCHDOG=1") >= fed + 2, "the watchdog is fed on")
+    with shared.running.connect():
+        wait("1 clients")
+
+
+def test_sighup_reloads_the_configuration(shared: Shared) -> None:
+    """A real signal, and a thread beside the loop."""
+    running = shared.running
+    with running.connect() as client:
+        client.ask("subscribe")
+        shared.config.write_text(CONFIG + "imu_active = 3\n[server]\nidle_timeout_s = 299\n")
+        applied, before = "sensor 1: applied imu_active = 3", len(running.said())
+        while applied not in running.said():
+            at = len(running.said())
+            running.signal(signal.SIGHUP)
+            # Again if a starved sensor was away in this very moment.
+            wait_until(lambda n=at: "imu_active = 3" in running.said()[n:], applied)  # type: ignore[misc]
+        assert "changed idle_timeout_s" in running.said()[before:]
+        assert len(client.fresh(10)) == 10
+
+
+def test_killed_and_started_again_at_once_on_the_same_port_beside_another(shared: Shared) -> None:
+    """What the kernel does with the processes, interfaces and sockets that a killed server leaves."""
+    with contextlib.ExitStack() as stack:
+        bystander = stack.enter_context(shared.running.connect())
+        bystander.ask("subscribe")
+        killed = stack.enter_context(server("virtual"))
+        client = stack.enter_context(killed.connect())
+        client.ask("subscribe")
+        assert len(client.fresh(20)) == 20
+        left = [stack.enter_context(socket.create_connection(("127.0.0.1", killed.port))) for _ in range(30)]
+        for sock in left[:20]:
+            sock.sendall(b'{"action":"describe"}')
+            assert sock.recv(65536)
+        killed.signal(signal.SIGKILL)
+        killed.wait()
+        client.receive_all()
+
+        again = stack.enter_context(server("virtual", port=killed.port))
+        wait_until(lambda: not interface_exists(killed.ifname), "the virtual bus to be gone")
+        with Client(killed.port) as client:
+            assert client.ask("subscribe")["ok"]
+            assert len(client.fresh(20)) == 20
+            assert len(client.ask("status")["clients"]) == 1
+        assert interface_exists(again.ifname)
+        with socket.create_connection(("127.0.0.1", again.port), timeout=30) as sock:
+            sock.sendall(b'{"action": "shutdown"}')  # no newline, as the note's client does it
+            said = json.loads(sock.recv(4096))
+            assert said == {"reply": "shutdown", "ok": True}, "it knows whose connections these are"
+        assert again.wait() == 0
+        wait_until(lambda: not interface_exists(again.ifname), "the virtual bus to be gone")
+        with socket.socket() as sock:
+            assert sock.connect_ex(("127.0.0.1", again.port)) != 0
+        assert len(bystander.fresh(20)) == 20
+
+
+def test_sigterm_ends_it(shared: Shared) -> None:
+    """A real signal and exit code; the last test of this server."""
+    running = shared.running
+    with running.connect() as client:
+        assert client.ask("describe")["ok"]
+        assert "STOPPING=1" not in shared.manager.told
+        running.signal(signal.SIGTERM)
+        shared.manager.wait("STOPPING=1")
+        client.receive_all()
+        assert [event["event"] for event in client.events] == ["shutting_down"]
+    assert running.wait() == 0
+    wait_until(lambda: not interface_exists(running.ifname), "the virtual bus to be gone")
+
+
+# -- the master in this process: what pysoem makes of odd slaves, and of its interface
+
+Odd = tuple[Veth, VirtualSensor]
+LAST_READ = "0x8000 6"
+"""The object that is read last before the mapping."""
+
+
+@pytest.fixture(scope="module")
+def odd() -> Iterator[Odd]:
+    with virtual_sensor(module="tests.server.odd_sensor") as found:
+        yield found
+
+
+@pytest.fixture
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scan takes its time on a busy machine."""
+    monkeypatch.setattr(soem, "_SCAN_TIMEOUT_S", PATIENCE_S)
+
+
+@contextlib.contextmanager
+def opened(ifname: str) -> Iterator[Bus]:
+    """A bus, closed when SOEM does not use it any more."""
+    threads = threading.active_count()
+    backend = SoemBackend(ifname)
+    bus = Bus(backend)
+    backend.open()
+    try:
+        yield bus
+    finally:
+        bus.close()
+        wait_until(lambda: threading.active_count() == threads, "the end of SOEM's scan")
+        backend._abandoned = False
+        backend.close()
+
+
+def start(
+    veth: Veth, sensor: VirtualSensor, text: str, check_interrupt: CheckInterrupt = lambda: None
+) -> list[Sensor]:
+    """Start and end, after a command; again where the sensor's process had to wait for too long."""
+    for attempt in range(ATTEMPTS):
+        sensor.command(text)
+        with opened(veth.near) as bus:
+            try:
+                return bring_up(bus, Asked(), check_interrupt).sensors
+            except BusError as error:
+                if not starved(str(error)) or attempt == ATTEMPTS - 1:
+                    raise
+    raise AssertionError("unreachable")
+
+
+class Gone:
+    """SOEM, whose interface is taken away the moment it is open."""
+
+    def __init__(self, master: Any, veth: Veth) -> None:
+        self._master, self._veth = master, veth
+
+    def open(self, ifname: str) -> None:
+        self._master.open(ifname)
+        self._veth.ip("link", "del", ifname)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._master, name)
+
+
+def test_an_interface_that_goes_away_while_it_is_opened() -> None:
+    with Veth() as veth:
+        before = packet_sockets()
+        backend = SoemBackend(veth.near)
+        backend._master = Gone(backend._master, veth)
+        with (
+            contextlib.closing(backend),
+            pytest.raises(BusError, match=f"the interface {veth.near} went away"),
+        ):
+            backend.open()
+        assert packet_sockets() == before
+
+
+@pytest.mark.usefixtures("patience")
+@pytest.mark.parametrize("report", ["0x1008 0 6 0", f"{LAST_READ} 0 12", "0x1C12 0 1 0", "0x1C12 0 15 0"])
+def test_emergencies_among_the_answers_are_no_failure_and_are_said_in_words(
+    odd: Odd, caplog: pytest.LogCaptureFixture, report: str
+) -> None:
+    """0x1C12 is read by SOEM's mapping, and pysoem tells nothing of those: it costs a retry."""
+    assert start(*odd, f"report {report}")[0].pdo_size
+    said = " ".join(record.getMessage() for record in caplog.records)
+    by_soem = report.startswith("0x1C12")
+    assert ("an emergency, or" if by_soem else "emergency 0x4210") in said
+    assert ("trying again" in said) is by_soem, said
+    assert "unexpected" not in said
+
+
+def test_a_slave_that_vanishes_does_not_hang_the_scan(odd: Odd, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SOEM would try on for two minutes, in its thread, until the slave is there again."""
+    veth, sensor = odd
+    monkeypatch.setattr(soem, "_SCAN_TIMEOUT_S", 1.0)
+    with opened(veth.near) as bus:
+        for _ in range(ATTEMPTS):
+            sensor.command("hear")
+            sensor.command("deaf-after 40")  # in the middle of reading the SII
+            with pytest.raises(BusError) as info:
+                bus.scan([0], [decode(bytes(256))], lambda: None)
+            if "no EtherCAT slave answers" not in str(info.value):
+                break
+        bus.close()  # not from under SOEM
+        sensor.command("hear")
+    assert f"the scan of {veth.near} does not end: a slave stopped answering" in str(info.value)
+
+
+@pytest.mark.usefixtures("patience")
+@pytest.mark.parametrize("state", [2, 4, 8])
+def test_a_start_is_given_up_while_a_sensor_does_not_change_its_state(odd: Odd, state: int) -> None:
+    """Without waiting until the sensor has had its time and is blamed."""
+    veth, sensor = odd
+    before, threads, sockets = len(sensor.said()), threading.active_count(), packet_sockets()
+
+    def check_interrupt() -> None:
+        if "ignored" in sensor.said()[before:] and threading.active_count() == threads:  # the scan has ended
+            raise StopRequestedError
+
+    with pytest.raises(StopRequestedError):
+        start(veth, sensor, f"ignore {state}", check_interrupt)
+    sensor.command("ignore 0")
+    assert packet_sockets() == sockets
+    wait_until(lambda: sensor.stats()["al_state"] == "INIT", "INIT")
+
+
+def test_whoever_was_first_keeps_all_others_out_before_it_has_opened_the_bus(odd: Odd) -> None:
+    veth, _ = odd
+    with claimed(veth.near):
+        said = one_sentence(tool("objects", veth.near, code=1))
+        assert f"{veth.near} is in use by another EtherCAT master" in said
+    with server(veth.near) as running:
+        with contextlib.closing(Server(veth.near)) as second:
+            assert second.wait() == 1
+            assert f"{veth.near} is in use by another EtherCAT master" in second.said()
+        running.process.kill()
+        running.wait()
+        with server(veth.near):
+            pass
+    assert tool("objects", veth.near).code == 0

@@ -1,6 +1,6 @@
 """Readiness, watchdog, reload: what systemd and an administrator see of a server, in simulated time.
 
-Of a real one, with real signals: see test_end_to_end.py.
+Of a real one, with real signals: see test_real_bus.py.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ from pathlib import Path
 import pytest
 
 from ethercat_server.daemon.options import parse_options
-from ethercat_server.daemon.service import Policy, Service
-from ethercat_server.process.notify import Notifier
-from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.server.manager import WATCHDOG_US, Manager
-from tests.simulation import Simulation
+from ethercat_server.daemon.service import Notifier, Policy, Service
+from tests.server.running import WATCHDOG_US, Manager
+from tests.simulation import Bench
 
 
 @pytest.fixture
@@ -25,20 +23,16 @@ def manager(tmp_path: Path) -> Iterator[Manager]:
         yield found
 
 
-class Administered:
-    """A server with a configuration file and a log, and a client that has subscribed."""
+class Administered(Bench):
+    """With a configuration file and a log."""
 
     def __init__(self, directory: Path, caplog: pytest.LogCaptureFixture) -> None:
-        self.simulation = simulation = Simulation(SensorOptions(signal="rest"))
+        super().__init__()
         self._file, self._log = directory / "c.toml", caplog
         self._file.write_text("[server]\n")
         arguments = ["memory", "1", "--config", str(self._file)]
-        self.notifier = Notifier()
-        policy = Policy(parse_options(arguments))
-        self.service = Service(arguments, policy, simulation.server, self.notifier)
-        self.client = simulation.connect()
-        self.client.ask("subscribe")
-        simulation.cycle._watchdog = self.notifier
+        self.notifier = self.cycle._watchdog = Notifier()
+        self.service = Service(arguments, Policy(parse_options(arguments)), self.server, self.notifier)
         caplog.set_level("INFO")
         self.service.ready()
 
@@ -52,7 +46,7 @@ class Administered:
         assert reading is not None, "the loop does not wait for it"
         reading.join()
         self.service.every_second()
-        self.simulation.run_until(lambda: all(words in self._log.text for words in expected), str(expected))
+        self.run_until(lambda: all(words in self._log.text for words in expected), str(expected))
         assert "Traceback" not in self._log.text
 
 
@@ -65,29 +59,27 @@ def server(tmp_path: Path, caplog: pytest.LogCaptureFixture, manager: Manager) -
 
 
 def test_systemd_is_told_ready_and_a_status_that_changes(server: Administered, manager: Manager) -> None:
-    assert manager.told == ["READY=1", "STATUS=streaming 1 of 1 sensors; 1 clients"]
+    assert manager.told == ["READY=1", "STATUS=streaming 1 of 1 sensors; 2 clients"]
     server.service.every_second()
     assert len(manager.told) == 2, "it has not changed"
-    server.simulation.connect().ask("describe")
-    server.simulation.command("power off")
-    server.client.wait_event("sensor_lost")
+    server.connect().ask("describe")
+    server.command("power off")
+    server.listener.wait_event("sensor_lost")
     server.service.every_second()
-    assert "STATUS=streaming 0 of 1 sensors, lost: 0; 2 clients" in manager.told
+    assert "STATUS=streaming 0 of 1 sensors, lost: 0; 3 clients" in manager.told
     server.notifier.stopping()
     assert manager.told[-1] == "STOPPING=1"
 
 
-def test_the_watchdog_is_fed_by_the_loop_and_starves_when_that_is_stuck(
-    server: Administered, manager: Manager
-) -> None:
+def test_the_watchdog_starves_when_the_loop_is_stuck(server: Administered, manager: Manager) -> None:
     feed_s = WATCHDOG_US * 1e-6 / 3
     for _ in range(4):
         fed = manager.told.count("WATCHDOG=1")
-        server.simulation.run(3 * feed_s)
+        server.run(3 * feed_s)
         assert 2 <= manager.told.count("WATCHDOG=1") - fed <= 4
     fed = manager.told.count("WATCHDOG=1")
-    server.simulation.on_serve = lambda _: server.simulation.clock.stall(20 * feed_s * 1e9)
-    server.simulation.run(20 * feed_s)
+    server.on_serve = lambda _: server.clock.stall(20 * feed_s * 1e9)
+    server.run(20 * feed_s)
     assert manager.told.count("WATCHDOG=1") <= fed + 2
 
 
@@ -103,7 +95,7 @@ def test_without_systemd_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_a_reload_puts_in_force_what_can_be_and_names_the_rest(server: Administered) -> None:
     server.reload("[server]\n", "configuration reloaded: [server]: no changes")
-    idle = server.simulation.connect()
+    idle = server.connect()
     server.reload(
         "[server]\nidle_timeout_s = 0.2\nrt_priority = 3\n[sensor]\nfir = true\n",
         "changed idle_timeout_s",
@@ -111,14 +103,14 @@ def test_a_reload_puts_in_force_what_can_be_and_names_the_rest(server: Administe
         "sensor 0: applied fir = True",
         "has sent no request for 0.2 s",
     )
-    server.simulation.run_until(lambda: idle.at_end, "the idle client closed")
-    assert not server.client.at_end, "this one has subscribed"
-    assert server.client.ask("describe")["sensors"][0]["settings"]["fir"] is True
+    server.run_until(lambda: idle.at_end, "the idle client closed")
+    assert not server.listener.at_end, "this one has subscribed"
+    assert server.listener.ask("describe")["sensors"][0]["settings"]["fir"] is True
 
 
 def test_a_reload_that_fails_changes_nothing(server: Administered) -> None:
     unchanged = "reload failed, the configuration is unchanged: "
-    hub = server.simulation.hub
+    hub = server.hub
     before = hub.limits, hub.permissions.control_uids
     server.reload(
         "[server]\ncontrol_users = ['no-such-user']\n", unchanged, "no-such-user: there is no such user"
@@ -130,15 +122,15 @@ def test_a_reload_that_fails_changes_nothing(server: Administered) -> None:
         unchanged + "the settings for sensor 0",
     )
     assert (hub.limits, hub.permissions.control_uids) == before
-    settings = server.client.ask("describe")["sensors"][0]["settings"]
+    settings = server.listener.ask("describe")["sensors"][0]["settings"]
     assert (settings["fir"], settings["imu_active"]) == (False, 1)
-    assert len(server.client.fresh(50)) == 50, "the stream goes on"
+    assert len(server.listener.fresh(50)) == 50, "the stream goes on"
     server.reload("[server]\nidle_timeout_s = 5\n", "changed idle_timeout_s")
     assert hub.limits.idle_ns == 5e9
 
 
 def test_a_reload_gives_rights_and_takes_them(server: Administered) -> None:
-    nobody = server.simulation.connect(4711)
+    nobody = server.connect(4711)
     assert nobody.ask("configure", settings={"fir": True})["error"]["code"] == "denied"
     server.reload("[server]\ncontrol_users = ['4711']\n", "changed control_users")
     assert nobody.ask("configure", settings={"imu_active": 3})["ok"]
@@ -147,18 +139,18 @@ def test_a_reload_gives_rights_and_takes_them(server: Administered) -> None:
 
 
 def test_a_reload_tries_again_what_could_not_be_put_in_force(server: Administered) -> None:
-    server.simulation.command("power off")
-    server.client.wait_event("sensor_lost")
+    server.command("power off")
+    server.listener.wait_event("sensor_lost")
     server.reload(
         "[sensor]\nsinc_length = 128\n",
         "sensor 0: could not apply sinc_length = 128, the next reload tries again",
     )
     wanted = "[sensor]\nsinc_length = 256\nfir = true\n"
     server.reload(wanted, "sensor 0: could not apply sinc_length = 256, fir = True, the")
-    server.simulation.command("power on")
-    server.client.wait_event("sensor_back")
+    server.command("power on")
+    server.listener.wait_event("sensor_back")
     server.reload(wanted, "sensor 0: applied sinc_length = 256, fir = True")
-    found = server.client.ask("describe")["sensors"][0]
+    found = server.listener.ask("describe")["sensors"][0]
     assert (found["rate_hz"], found["settings"]["fir"]) == (200, True)
     server.reload("[sensor]\nsinc_length = 256\n", "sensor 0: applied fir = False\n")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.server import readable
+from tests import rights
 from tests.server.running import ATTEMPTS, Server, Veth, needs_bus, starved, virtual_sensor
 from tests.systemd.staging import CAPABILITIES, SERVER_UNIT, values
 
@@ -32,9 +32,9 @@ def with_capabilities(capabilities: Iterable[str]) -> list[str]:
 
 def confined(ifname: str, capabilities: Iterable[str]) -> Server:
     """The server with no more than `capabilities`; skips where it cannot be started like this at all."""
-    readable.need(*with_capabilities(CAPABILITIES))
-    under = [*readable.under(), *with_capabilities(capabilities)]
-    return Server(ifname, under=under, python=readable.PYTHON)
+    rights.need(*with_capabilities(CAPABILITIES))
+    under = [*rights.readable(), *with_capabilities(capabilities)]
+    return Server(ifname, under=under, python=rights.PYTHON)
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.server import readable
+from tests import rights
 from tests.server.running import Client, Veth, free_port, needs_bus, virtual_sensor, wait_until
 from tests.systemd.staging import SERVER_UNIT
 
@@ -52,7 +52,7 @@ def service(veth: Veth, config: str = "", *, starts: bool = True) -> Iterator[Se
     template = f"ethercat-test-{os.getpid()}"
     running = Service(template, veth.near, free_port())
     text = SERVER_UNIT.read_text()
-    program = f"{readable.PYTHON} -m ethercat_server.daemon.cli"
+    program = f"{rights.PYTHON} -m ethercat_server.daemon.cli"
     text = text.replace("/opt/ethercat-server/bin/ethercat-server", program)
     # ProtectHome=yes shows nothing below home directories, not even what is bound there.
     text = text.replace("ProtectHome=yes", "ProtectHome=tmpfs").replace("User=ethercat", f"User={USER}")
@@ -60,11 +60,11 @@ def service(veth: Veth, config: str = "", *, starts: bool = True) -> Iterator[Se
     unit, settings = RUNTIME / f"{template}@.service", RUNTIME / f"{template}.toml"
     settings.write_text(config)
     shown = " ".join(
-        str(path) for path in (readable.python_prefix(), readable.copy()) if not path.is_relative_to("/usr")
+        str(path) for path in (rights.python_prefix(), rights.copy()) if not path.is_relative_to("/usr")
     )
     drop_in = f"""
 [Service]
-Environment=PORT={running.port} CONFIG={settings} PYTHONPATH={readable.copy()} PYTHONDONTWRITEBYTECODE=1
+Environment=PORT={running.port} CONFIG={settings} PYTHONPATH={rights.copy()} PYTHONDONTWRITEBYTECODE=1
 BindReadOnlyPaths={shown}
 """
     unit.write_text(text + drop_in)

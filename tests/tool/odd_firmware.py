@@ -8,11 +8,11 @@ from collections.abc import Collection
 import pytest
 
 from ethercat_server.ethercat.slave.abort_codes import AbortCode
-from ethercat_server.virtual_sensor.firmware import dictionary, firmware
-from ethercat_server.virtual_sensor.slave import application, image
-from ethercat_server.virtual_sensor.slave.al import AlState
-from ethercat_server.virtual_sensor.slave.device import Device
-from ethercat_server.virtual_sensor.slave.objects import SdoAbortError
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.virtual_sensor import application, device, dictionary
+from ethercat_server.virtual_sensor.coe import SdoAbortError
+from ethercat_server.virtual_sensor.device import Device
+from ethercat_server.virtual_sensor.sensor import Firmware
 
 REFUSED = {(0x8006, 1): b"\x80\0", (0x8000, 5): struct.pack("<f", 0.5)}
 FEWER = frozenset({(0x8010, 4), (0x8010, 5)})
@@ -81,7 +81,7 @@ def other_product(patch: pytest.MonkeyPatch) -> None:
 def no_mailbox(patch: pytest.MonkeyPatch) -> None:
     """No mailbox at all, as a simple slave."""
     _change_eeprom(patch, _MAILBOXES, bytes(10))
-    patch.setattr(firmware.Firmware, "_mailbox_fault", lambda _: 0)
+    patch.setattr(Firmware, "_fault_in", lambda *_: 0)
 
 
 def _lack(patch: pytest.MonkeyPatch, addresses: Collection[tuple[int, int]], code: AbortCode) -> None:
@@ -96,10 +96,10 @@ def _lack(patch: pytest.MonkeyPatch, addresses: Collection[tuple[int, int]], cod
 
 
 def _change_eeprom(patch: pytest.MonkeyPatch, where: slice, data: bytes) -> None:
-    build = image.build_image
+    build = device.build_image
 
-    def changed(device: Device) -> bytes:
-        built = build(device)
+    def changed(kind: Device) -> bytes:
+        built = build(kind)
         return built[: where.start] + data + built[where.stop :]
 
     patch.setattr(application, "build_image", changed)

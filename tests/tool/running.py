@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from ethercat_server.tool.cli import main
 from tests.ended import Result, run, run_here
 from tests.server.running import ATTEMPTS, starved
@@ -37,3 +39,19 @@ def one_sentence(result: Result) -> str:
     assert len(lines) == 1, result
     assert lines[0].startswith("ethercat-sensor: ")
     return lines[0]
+
+
+def refused(*arguments: object, code: int = 1) -> str:
+    """The error of a command that must fail, in this process."""
+    return one_sentence(tool_here(*arguments, code=code))
+
+
+def told(*arguments: object, code: int | None = 0) -> dict[str, Any]:
+    """The JSON object of a command in this process."""
+    return tool_here(*arguments, "--json", code=code).json
+
+
+def offset(*where: object) -> list[float]:
+    """The force/torque offset of a sensor."""
+    rows = told("read", *where, "Force/Torque Offset")["sensors"][0]["objects"]
+    return [row["value"] for row in rows[1:]]

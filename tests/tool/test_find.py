@@ -8,24 +8,22 @@ from collections.abc import Iterator
 import pytest
 
 from bota_ethercat.address import Address
-from ethercat_server.access import raw
-from ethercat_server.access.adapters import Adapter
-from ethercat_server.access.holder import Holder
+from ethercat_server.access import private_server
+from ethercat_server.access.adapters import Adapter, Holder
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.nic import Routes
 from ethercat_server.simulation.backend import MemoryBackend
-from ethercat_server.tool.commands import find
+from ethercat_server.tool import bus as find
 from tests.json_schema import problems
-from tests.simulated_links import chain, registers, simulated_bus, simulated_server
-from tests.simulation import SimulatedBus
-from tests.tool.running import tool_here
+from tests.simulation import SimulatedBus, chain, registers, simulated_bus, simulated_server
+from tests.tool.running import told, tool_here
 
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedBus]:
     """Two sensors behind whatever is opened."""
-    monkeypatch.setattr(raw, "promiscuity_kept", lambda _: contextlib.nullcontext())
+    monkeypatch.setattr(find, "promiscuity_kept", lambda _: contextlib.nullcontext())
     with simulated_bus("--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", "--serial", "10,20") as bus:
         yield bus
 
@@ -33,7 +31,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedBus]:
 def found(patch: pytest.MonkeyPatch, *adapters: Adapter, code: int = 0) -> dict[str, dict[str, object]]:
     """What `find --json` says on a machine with these interfaces, by name."""
     patch.setattr(find, "adapters", lambda: list(adapters))
-    said = tool_here("find", "--json", code=code).json
+    said = told("find", code=code)
     assert not problems("sensor", said, "find")
     rows = said["interfaces"]
     return {row["name"]: row for row in rows}
@@ -66,7 +64,7 @@ def test_the_interface_with_the_sensors_is_found(
         (Adapter("x", carrier=False), "no carrier"),
         (Adapter("x", kind="bridge"), "bridge"),
         (Adapter("x", ethernet=False), "no wired Ethernet"),
-        (Adapter("x", part_of_others=True), "part of a bridge, bond or VLAN"),
+        (Adapter("x", master="br0"), "part of a bridge, bond or VLAN"),
         (Adapter("x", holder=Holder(77, "codesys", None)), "in use by process 77 (codesys)"),
     ],
 )
@@ -76,7 +74,7 @@ def test_what_is_no_candidate_is_not_even_opened(
     def fail(*_: object, **__: object) -> None:
         pytest.fail("it was opened")
 
-    monkeypatch.setattr(raw, "open_bus", fail)
+    monkeypatch.setattr(private_server, "open_bus", fail)
     row = found(monkeypatch, adapter, code=1)["x"]
     assert why in str(row["found"])
     assert not row["looked"]
@@ -96,7 +94,7 @@ def test_other_interfaces_without_a_sensor_are_told_apart(
 
     before = registers(at_work)
     with monkeypatch.context() as patch:  # undone before that of the bench
-        patch.setattr(raw, "open_bus", open_bus)
+        patch.setattr(private_server, "open_bus", open_bus)
         rows = found(monkeypatch, *(Adapter(name) for name in (*buses, "denied")))
     assert rows["empty"]["found"] == "no EtherCAT slave answers"
     assert rows["foreign"]["found"] == "another EtherCAT slave"

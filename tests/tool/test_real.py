@@ -13,23 +13,22 @@ from collections.abc import Iterator
 import pytest
 
 from ethercat_server.access.adapters import adapters
-from ethercat_server.tool.commands import find
-from tests.server.commands import stats, written
+from ethercat_server.tool import bus as find
 from tests.server.running import (
     ATTEMPTS,
     PATIENCE_S,
-    Program,
     Veth,
+    VirtualSensor,
     needs_bus,
     server,
     starved,
     virtual_sensor,
     wait_until,
 )
-from tests.tool.running import MODULE, complaints, one_sentence, tool, tool_here
+from tests.tool.running import MODULE, complaints, one_sentence, refused, told, tool, tool_here
 
 pytestmark = [pytest.mark.bus, needs_bus]
-Bench = tuple[Veth, Program]
+Bench = tuple[Veth, VirtualSensor]
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +38,13 @@ def bench() -> Iterator[Bench]:
     options = ("--model", models, "--serial", "10,20", "--pdo", "77", "--sinc", "512", "--signal", "rest")
     with virtual_sensor(*options) as (veth, sensor):
         yield veth, sensor
-        assert [stats(sensor, position)["calibration_writes"] for position in (0, 1)] == [0, 0]
+        assert [sensor.stats(position)["calibration_writes"] for position in (0, 1)] == [0, 0]
 
 
 def test_adapters_say_what_state_they_are_in(bench: Bench) -> None:
     """The states are the kernel's, and who uses an interface is found in its tables of sockets."""
     veth, sensor = bench
-    found = {row["name"]: row for row in tool_here("adapters", "--json").json["adapters"]}
+    found = {row["name"]: row for row in told("adapters")["adapters"]}
     near, far = found[veth.near], found[veth.far]
     assert (near["up"], near["carrier"], near["held_by"]) == (True, True, None)
     assert f"process {sensor.process.pid}" in far["held_by"]
@@ -59,7 +58,7 @@ def test_find_looks_where_it_may(bench: Bench, monkeypatch: pytest.MonkeyPatch) 
     veth, sensor = bench
     own = (veth.near, veth.far)
     monkeypatch.setattr(find, "adapters", lambda: [row for row in adapters() if row.name in own])
-    found = {row["name"]: row for row in tool_here("find", "--json").json["interfaces"]}
+    found = {row["name"]: row for row in told("find")["interfaces"]}
     assert [row["serial"] for row in found[veth.near]["sensors"]] == [10, 20]
     assert f"process {sensor.process.pid}" in found[veth.far]["found"]
     assert "PROMISC" not in veth.ip("link", "show", veth.near)
@@ -68,7 +67,7 @@ def test_find_looks_where_it_may(bench: Bench, monkeypatch: pytest.MonkeyPatch) 
 def test_a_master_that_is_no_server_is_named(bench: Bench) -> None:
     """Which process has a socket is known to the kernel alone."""
     veth, sensor = bench
-    said = one_sentence(tool_here("objects", veth.far, code=1))
+    said = refused("objects", veth.far)
     assert f"{veth.far} is in use by process {sensor.process.pid}" in said
 
 
@@ -78,10 +77,10 @@ def test_a_whole_command_on_the_interface(bench: Bench) -> None:
     changed = ("--sensor", "20", "--set", "fir=on")
     assert tool("apply", veth.near, *changed, "--json").json["settings"]["fir"] is True
     assert '"serial": 20' in tool("snapshot", veth.near, "/dev/stdout", "--sensor", "20").out
-    assert ("0x8006", 2, "00") in written(sensor, 1), "FIR had been switched on"
-    assert {row[0] for row in written(sensor, 1)} == {"0x8006"}
-    assert written(sensor, 0) == []
-    assert stats(sensor)["al_state"] == "INIT"
+    assert ("0x8006", 2, "00") in sensor.written(1), "FIR had been switched on"
+    assert {row[0] for row in sensor.written(1)} == {"0x8006"}
+    assert sensor.written(0) == []
+    assert sensor.stats()["al_state"] == "INIT"
 
 
 def test_the_eeproms_of_a_chain(bench: Bench) -> None:
@@ -113,7 +112,7 @@ def test_watch_ends_with_ctrl_c_and_leaves_the_bus(bench: Bench) -> None:
     assert watching.returncode == 0
     assert not [line for line in complaints(err) if not starved(line) and "is back" not in line]
     assert "sensor 1: " in out.splitlines()[-1]
-    wait_until(lambda: stats(sensor)["al_state"] == "INIT", "INIT")
+    wait_until(lambda: sensor.stats()["al_state"] == "INIT", "INIT")
 
 
 def test_a_server_that_holds_the_interface_is_found_and_said(bench: Bench) -> None:
@@ -124,7 +123,7 @@ def test_a_server_that_holds_the_interface_is_found_and_said(bench: Bench) -> No
         used = f"the server at 127.0.0.1:{running.port}, process {running.process.pid}"
         assert used in one_sentence(ended)
         assert used in ended.json["through"]
-        held = {row["name"]: row["held_by"] for row in tool_here("adapters", "--json").json["adapters"]}
+        held = {row["name"]: row["held_by"] for row in told("adapters")["adapters"]}
         assert f"process {running.process.pid}" in held[veth.near]
         where = ("--server", f"localhost:{running.port}")
         assert "samples" in tool_here("watch", *where, "--sensor", 20, "--samples", 5).out
@@ -133,5 +132,5 @@ def test_a_server_that_holds_the_interface_is_found_and_said(bench: Bench) -> No
 @pytest.mark.parametrize("where", ["localhost:1", "[::1]:1"])
 def test_a_port_where_no_server_is(where: str) -> None:
     """Refused by the kernel; no address but a real one is."""
-    said = one_sentence(tool_here("objects", "--server", where, "--json", code=1))
+    said = refused("objects", "--server", where, "--json")
     assert f"no server at {where} " in said

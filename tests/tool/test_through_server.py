@@ -8,9 +8,15 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.simulated_links import RATE_HZ, SINC_LENGTH, SimulatedServer, simulated_bus, simulated_server
-from tests.simulation import SimulatedBus
-from tests.tool.running import one_sentence, tool_here
+from tests.simulation import (
+    RATE_HZ,
+    SINC_LENGTH,
+    SimulatedBus,
+    SimulatedServer,
+    simulated_bus,
+    simulated_server,
+)
+from tests.tool.running import refused, told, tool_here
 
 Bench = tuple[SimulatedBus, SimulatedServer]
 SERVER = ("--server", SimulatedServer.address)
@@ -18,25 +24,14 @@ SERVER = ("--server", SimulatedServer.address)
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    options = (
-        "--sensors",
-        "2",
-        "--serial",
-        "10,20",
-        "--pdo",
-        "77",
-        "--signal",
-        "rest",
-        "--sinc",
-        SINC_LENGTH,
-    )
-    with simulated_bus(*options) as bus, simulated_server(bus) as server:
+    options = ["--sensors", "2", "--serial", "10,20", "--pdo", "77", "--signal", "rest", "--sinc"]
+    with simulated_bus(*options, SINC_LENGTH) as bus, simulated_server(bus) as server:
         yield bus, server
 
 
 def test_the_eeprom_is_read_while_the_server_streams(bench: Bench) -> None:
     _, server = bench
-    found = tool_here("eeprom", *SERVER, "--json").json["slaves"]
+    found = told("eeprom", *SERVER)["slaves"]
     assert [(row["serial"], row["check_byte_right"]) for row in found] == [(10, True), (20, True)]
     assert [row["name"] for row in found] == ["BFT-SENS-ECAT-M8"] * 2
     assert [row["sync_managers"][3]["size"] for row in found] == [77, 77]
@@ -49,26 +44,26 @@ def test_the_eeprom_is_read_while_the_server_streams(bench: Bench) -> None:
 
 @pytest.mark.usefixtures("bench")
 def test_objects_are_read_by_name() -> None:
-    found = tool_here("read", *SERVER, "Sampling Rate", "Force/Torque Offset", "--json").json["sensors"]
+    found = told("read", *SERVER, "Sampling Rate", "Force/Torque Offset")["sensors"]
     assert [row["serial"] for row in found] == [10, 20]
     rows = [(row["index"], row["subindex"]) for row in found[0]["objects"]]
     assert rows == [("0x8011", 0), *(("0x8000", sub) for sub in range(7))]
-    assert "did you mean Sampling rate" in one_sentence(tool_here("read", *SERVER, "sampling rte", code=2))
+    assert "did you mean Sampling rate" in refused("read", *SERVER, "sampling rte", code=2)
 
 
 @pytest.mark.usefixtures("bench")
 def test_the_first_name_is_no_interface(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BOTA_SERVER", SimulatedServer.address)
-    found = tool_here("read", "Sampling rate", "fir", "--json").json["sensors"][0]["objects"]
+    found = told("read", "Sampling rate", "fir")["sensors"][0]["objects"]
     assert [row["name"] for row in found] == ["Sampling rate", "FIR disable"]
-    assert len(tool_here("read", "fir", "--json").json["sensors"][0]["objects"]) == 1
+    assert len(told("read", "fir")["sensors"][0]["objects"]) == 1
 
 
 def test_plan_apply_save(bench: Bench) -> None:
     bus, server = bench
     asked = ("--sensor", "20", "--set", "sinc_length=128", *SERVER)
-    assert tool_here("plan", *asked, "--json", code=3).json["changes"][0]["then"] == 128
-    applied = tool_here("apply", *asked, "--json").json
+    assert told("plan", *asked, code=3)["changes"][0]["then"] == 128
+    applied = told("apply", *asked)
     assert (applied["rate_hz"], applied["settings"]["sinc_length"]) == (400, 128)
     assert "nothing to change" in tool_here("plan", *asked).out
     tool_here("save", "--sensor", 1, *SERVER)
@@ -112,12 +107,12 @@ def test_a_sensor_that_is_out_does_not_hide_the_other(bench: Bench) -> None:
     bus, server = bench
     bus.command("power off @1")
     server.run_until(lambda: [event["event"] for event in server.events] == ["sensor_lost"], "the event")
-    found = tool_here("eeprom", *SERVER, "--sensor", 0, "--json").json
+    found = told("eeprom", *SERVER, "--sensor", 0)
     assert found["slaves"][0]["serial"] == 10
     tool_here("eeprom", *SERVER, "--sensor", 10)
     for words, key in ((("eeprom",), "slaves"), (("read", "Force/Torque Offset"), "sensors")):
         assert "sensor 1 is lost" in tool_here(*words, *SERVER, code=1).err
-        rows = tool_here(*words, *SERVER, "--json", code=1).json[key]
+        rows = told(*words, *SERVER, code=1)[key]
         assert ("error" in rows[0], "error" in rows[1]) == (False, True)
         assert rows[0]["serial"] == 10
 
@@ -133,5 +128,5 @@ def test_watch_tells_of_a_sensor_that_is_lost_and_comes_back(bench: Bench) -> No
 def test_a_server_that_does_not_reply_or_ends_is_one_sentence(bench: Bench) -> None:
     bus, server = bench
     bus.at(1.0, server.hub.close)
-    said = one_sentence(tool_here("watch", *SERVER, code=1))
+    said = refused("watch", *SERVER)
     assert f"the server at {server.address} closed the connection" in said

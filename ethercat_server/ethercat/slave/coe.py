@@ -49,15 +49,12 @@ class Sdo(Protocol):
     @property
     def clock(self) -> Clock:
         """The time that passes meanwhile."""
-        ...
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """Upload an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
-        ...
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """Download an object; raises as `read`."""
-        ...
 
 
 def finish(

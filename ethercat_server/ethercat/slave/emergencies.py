@@ -101,12 +101,9 @@ class _OfSensor:
         self.count = 0
         self.last: Emergency | None = None
         self.at_ns = 0
-        self.logged_ns: dict[int, int] = {}
-        """When each code was logged, within `_LOG_EVERY_NS`."""
-        self.told = (-1, 0)
-        """The last code that was told, and when."""
-        self.told_until_ns = 0
-        """What was told takes up the time until then, at one each `_TELL_EVERY_NS`."""
+        self.logged_ns: dict[int, int] = {}  # when each code was logged, within `_LOG_EVERY_NS`
+        self.told = (-1, 0)  # the last code that was told, and when
+        self.told_until_ns = 0  # what was told takes up the time until then, at one each `_TELL_EVERY_NS`
 
 
 class Emergencies:
@@ -115,8 +112,8 @@ class Emergencies:
     def __init__(self, clock: Clock) -> None:
         self._monotonic_ns = clock.monotonic_ns
         self._sensors: defaultdict[int, _OfSensor] = defaultdict(_OfSensor)
+        # Told of them, except of a flood: number of the sensor, emergency, how many the sensor has sent.
         self.tell: Callable[[int, Emergency, int], None] = lambda _number, _emergency, _count: None
-        """Told of them, except of a flood: number of the sensor, emergency, how many the sensor has sent."""
 
     def note(self, number: int, emergency: Emergency) -> None:
         """The sensor `number` has sent it."""

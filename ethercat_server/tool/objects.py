@@ -1,0 +1,231 @@
+"""`objects` and `read`: read and decode all objects of the dictionary, or some by name."""
+
+from __future__ import annotations
+
+import argparse
+import struct
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+from bota_ethercat.pdo import INPUT_OBJECT
+from bota_ethercat.sensor.meaning import value_meaning
+from ethercat_server.access.private_server import open_interface
+from ethercat_server.access.sensors import find_server, note
+from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError, UsageError
+from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.datagrams import ByPosition
+from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.slave.coe import MailboxSdo, Sdo, Steps, finish
+from ethercat_server.process.command_line import FAILED
+from ethercat_server.sensor.guard import GuardedSdo
+from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION, ObjectEntry
+from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, find_objects, similar_names
+from ethercat_server.sensor.scan import look_safely
+from ethercat_server.sensor.sensor import Found, Identity
+from ethercat_server.sensor.set_up import read_sinc
+from ethercat_server.tool.command import (
+    DONE,
+    Command,
+    argument,
+    columns,
+    say,
+    say_json,
+    sensor_arguments,
+    sensors_of,
+    value_text,
+)
+
+_MOST_SILENT: Final = 3  # number of consecutive timeouts after which the other objects are skipped
+_STANDARD: Final = range(0x1000, 0x1019)  # objects that a slave of any vendor may have
+_HEAD: Final = ("object", "name", "value", "access", "meaning")
+
+
+def read_object(sdo: Sdo, row: ObjectEntry) -> Steps[dict[str, Any]]:
+    """One object: `hex`, `value` and `meaning`, or `error`."""
+    try:
+        data = yield from sdo.read(*row.address)
+    except SdoAbortError as error:
+        if error.abort_code in OBJECT_MISSING:
+            return {"error": f"this firmware does not have it (abort 0x{error.abort_code:08X})"}
+        return {"error": str(error)}
+    try:
+        value = row.type.unpack(data)
+    except struct.error:
+        why = f"{len(data)} bytes do not fit type {row.type.name}: {data.hex()}"
+        return {"hex": data.hex(), "error": why}
+    meaning = _meaning(row, value)
+    if row.setting == "sinc_length":
+        _, rate_hz, chop = yield from read_sinc(sdo)
+        if rate_hz:  # what it reads back may not be what is in force, nor what it may be set to
+            meaning = value_meaning(row.setting, int(value), rate_hz, chop)
+    return {"hex": data.hex(), "value": value, "meaning": meaning}
+
+
+def _meaning(row: ObjectEntry, value: float | str) -> str:
+    if isinstance(row.allowed, range):
+        return value_meaning(row.setting or "", int(value)) if value in row.allowed else "out of range"
+    if row.index == FACTORY_CALIBRATION:
+        return "factory calibration, never written"
+    if row.allowed is None:
+        return row.unit
+    return row.allowed.get(int(value), "" if row.setting is None else "undefined value")
+
+
+class _Sensor(NamedTuple):
+    """The objects that could be read, and the error that ended reading."""
+
+    found: Found
+    objects: list[tuple[ObjectEntry, dict[str, Any]]]
+    error: BusError | None
+
+    def as_json(self) -> dict[str, Any]:
+        """Its JSON form."""
+        objects = [{**_row_as_json(row), **read} for row, read in self.objects]
+        error = {"error": str(self.error)} if self.error else {}
+        return {**self.found.as_json(), "objects": objects, **error}
+
+    def lines(self) -> list[str]:
+        """For people."""
+        table = [_HEAD, *(_line(row, read) for row, read in self.objects)]
+        objects = [columns(table, indent=2)] if self.objects else []
+        return [str(self.found), *objects, *([f"  {self.error}"] if self.error else [])]
+
+
+def _read_sensor(sdo: Sdo, found: Found, rows: Sequence[ObjectEntry]) -> _Sensor:
+    objects: list[tuple[ObjectEntry, dict[str, Any]]] = []
+    silent = 0
+    for row in rows:
+        try:
+            objects.append((row, finish(read_object(sdo, row))))
+            silent = 0
+        except BusError as error:
+            silent += 1
+            if silent == _MOST_SILENT:
+                return _Sensor(found, objects, error)
+            objects.append((row, {"error": str(error)}))
+    return _Sensor(found, objects, None)
+
+
+def _open_slave(bus: Bus, wanted: str) -> tuple[Found, GuardedSdo]:
+    """The slave POSITION:NAME and its objects, through the mailboxes that its own master has set up.
+
+    Nothing is written but its mailbox. UsageError if there is no such slave, BusError if it is in INIT.
+    """
+    place, _, name = wanted.partition(":")
+    slaves = look_safely(bus, lambda: None)
+    there = "; ".join(f"{slave.position}:{slave.name}" for slave in slaves)
+    slave = next((each for each in slaves if (str(each.position), each.name) == (place, name)), None)
+    if slave is None:
+        raise UsageError(f"no slave is {wanted!r}, as POSITION:NAME: there are {there}")
+    if not slave.has_coe:
+        raise UsageError(f"slave {wanted} has no CoE mailbox, and so no objects")
+    if slave.status.state in (AlState.INIT, AlState.BOOT):
+        raise BusError(
+            f"slave {wanted} is in {slave.status.state.name}, where its objects cannot be read: have its own "
+            "master take it to PREOP"
+        )
+    rows = bus.read_surely_at(slave.position, reg.SYNC_MANAGER, 2 * reg.SYNC_MANAGER_SIZE)
+    out, back = struct.unpack_from("<HH", rows), struct.unpack_from("<HH", rows, reg.SYNC_MANAGER_SIZE)
+    serial = slave.sii["serial"] if slave.sii else 0
+    found = Found(slave.position, Identity(slave.name, serial, "", ""), "slave")
+    return found, GuardedSdo(MailboxSdo(ByPosition(bus), slave.position, (out, back)))
+
+
+def _read(args: argparse.Namespace) -> int:
+    names: list[str] = args.names
+    if args.server is None and args.iface is None and not find_objects(names[0]):
+        raise UsageError(
+            f"a NAME is missing, or the interface beside {names[0]!r}: for example read ens5 'Sampling rate'"
+        )
+    if args.iface is not None and (args.server is not None or find_objects(args.iface)):
+        # No interface, but the first name: of the server that was given, or the default one.
+        names, args.iface = [args.iface, *names], None
+    rows: dict[tuple[int, int], ObjectEntry] = {}
+    for name in names:
+        found = find_objects(name)
+        if not found:
+            near = " or ".join(similar_names(name))
+            hint = f"did you mean {near}?" if near else "the command objects lists all"
+            raise UsageError(f"no object is called {name!r}: {hint}")
+        rows |= {row.address: row for row in found}
+    return _show(args, list(rows.values()), all_wanted=True)
+
+
+def _objects(args: argparse.Namespace) -> int:
+    # Calibration last: 87 rows that nobody sets.
+    rows = sorted(KNOWN_OBJECTS, key=lambda row: row.index == FACTORY_CALIBRATION)
+    if args.slave is not None:
+        rows = [row for row in rows if row.index in _STANDARD]
+    return _show(args, rows, slave=args.slave)
+
+
+def _show(
+    args: argparse.Namespace,
+    rows: Sequence[ObjectEntry],
+    *,
+    all_wanted: bool = False,
+    slave: str | None = None,
+) -> int:
+    """`all_wanted`: an object that cannot be read is a failure, also where the firmware does not have it."""
+    if slave is not None:
+        if find_server(args.iface, args.server) is not None:
+            raise UsageError("a server reads the objects of sensors only: stop it to read those of a slave")
+        used = f"the interface {args.iface}"
+        with open_interface(args.iface, allow_ip=args.allow_ip) as bus:
+            found, sdo = _open_slave(bus, slave)
+            sensors = [_read_sensor(sdo, found, rows)]
+    else:
+        with sensors_of(args) as opened:
+            used, chosen = opened.used, opened.chosen(args.sensor)
+            if any(row.index == INPUT_OBJECT for row in rows):
+                opened.wait_settled([found.number for found in chosen])
+            sensors = [_read_sensor(opened.sdo(found.number), found, rows) for found in chosen]
+    errors = [sensor.error for sensor in sensors if sensor.error]
+    if len(errors) == len(sensors):
+        raise errors[0]
+    if args.json:
+        say_json({"through": used, "sensors": [sensor.as_json() for sensor in sensors]})
+    else:
+        say("\n".join(line for sensor in sensors for line in sensor.lines()))
+    failed = [str(error) for error in errors]
+    for sensor in sensors if all_wanted else []:
+        rows_unread = [f"{row.name}: {read['error']}" for row, read in sensor.objects if "error" in read]
+        if rows_unread:
+            more = f"; and {len(rows_unread) - 1} more" if len(rows_unread) > 1 else ""
+            failed.append(f"sensor {sensor.found.number} gave no value of {rows_unread[0]}{more}")
+    for sentence in failed:
+        note(sentence)
+    return FAILED if failed else DONE
+
+
+def _row_as_json(row: ObjectEntry) -> dict[str, Any]:
+    allowed: Any = row.allowed
+    if isinstance(allowed, range):
+        allowed = {"from": allowed[0], "to": allowed[-1]}
+    return {
+        "index": f"0x{row.index:04X}", "subindex": row.subindex, "name": row.name, "type": row.type.name,
+        "access": row.access.value, "write_states": row.access.write_states, "unit": row.unit,
+        "allowed": allowed, "default": row.default,
+    }  # fmt: skip
+
+
+def _line(row: ObjectEntry, read: dict[str, Any]) -> tuple[str, ...]:
+    value = value_text(read["value"]) if "value" in read else "--"
+    where, access = f"0x{row.index:04X}:{row.subindex:<2}", row.access.value.removesuffix(" only")
+    return where, row.name, value, access, read.get("error") or read["meaning"]
+
+
+_SENSORS: Final = sensor_arguments(all_if_none=True)
+_SLAVE: Final = "the standard objects of a slave that is no sensor, such as 1:EL3102, in the state it is in"
+_NAME: Final = "object: a name such as 'Sampling rate' or 'Force/Torque Offset', a setting, or 0x8006:1"
+COMMANDS: Final = (
+    Command(
+        "objects", "read and decode every object of the dictionary",
+        (*_SENSORS, argument("--slave", _SLAVE, metavar="POSITION:NAME")), _objects,
+    ),
+    Command(
+        "read", "read and decode some objects by name",
+        (*_SENSORS, argument("names", _NAME, nargs="+", metavar="NAME")), _read,
+    ),
+)  # fmt: skip

@@ -1,0 +1,486 @@
+"""`plan`, `apply`, `save`, `tare`, `snapshot` and `restore`: everything that is written to a sensor, and the
+file that has all readable objects of one.
+
+What cannot be done as a whole is taken back: the former settings and offsets are in force then.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import datetime
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from bota_ethercat.control import ACTIONS, MAX_TARE_SAMPLES
+from bota_ethercat.errors import SettingError
+from bota_ethercat.program.new_file import NewFile
+from bota_ethercat.program.tare_memory import former, remember
+from bota_ethercat.sensor.meaning import meaning, value_meaning
+from bota_ethercat.settings import SETTINGS, SettingValue, check_settings
+from bota_ethercat.text.json_text import finite
+from ethercat_server.access.sensors import Sensors, note
+from ethercat_server.daemon.options import EMPTY, ServerOptions, parse_assignments, read_config
+from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
+from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
+from ethercat_server.process.signals import signals_held_back
+from ethercat_server.sensor.configuration import Change, save
+from ethercat_server.sensor.objects import dictionary
+from ethercat_server.sensor.objects.dictionary import OBJECTS, Access, ObjectEntry
+from ethercat_server.sensor.objects.search import BY_ADDRESS, KNOWN_OBJECTS
+from ethercat_server.sensor.sensor import Found, Identity, Sensor
+from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
+from ethercat_server.tool.command import (
+    CHANGES,
+    DONE,
+    Command,
+    argument,
+    columns,
+    report,
+    sensor_arguments,
+    sensors_of,
+    value_text,
+)
+from ethercat_server.tool.objects import read_object
+
+_UNSAVED: Final = "in force until the sensor is powered off: use --save, or the command save, to keep it"
+_UNSAVED_IN_SERVER: Final = (
+    "in force until the server is started again, also after the sensor was powered off: set the same in the "
+    "server's configuration to keep it"
+)
+_SAVED: Final = (
+    "saved to the sensor's flash; a server writes its own settings at start: set the same there, or "
+    "--unset-settings keep"
+)
+
+
+# -- plan, apply, save
+
+
+def _changes(sensor: Sensor, settings: Mapping[str, SettingValue]) -> list[dict[str, Any]]:
+    """What `settings` would change: `name`, `now`, `then`, `meaning`, `preop_only`, in the order of writing.
+
+    UsageError if they contradict others, BusError if the sensor lacks one.
+    """
+    try:
+        names = Change(sensor, settings).names
+    except SettingError as error:
+        raise UsageError(str(error)) from None
+    for name in names:
+        if name not in sensor.settings:
+            index, subindex = dictionary.BY_SETTING[name].address
+            raise BusError(
+                f"sensor {sensor.number} has no setting {name}: object 0x{index:04X}:{subindex} cannot be "
+                "read or has an undefined value"
+            )
+    return [
+        {
+            "name": name, "now": sensor.settings[name], "then": settings[name],
+            "meaning": value_meaning(name, settings[name]), "preop_only": SETTINGS[name].preop_only,
+        }
+        for name in names
+    ]  # fmt: skip
+
+
+def _change_lines(found: list[dict[str, Any]]) -> str:
+    """The changes as a table."""
+    if not found:
+        return "  nothing to change: all requested settings are in force"
+    rows = [("setting", "now", "then", "meaning")]
+    rows += [(row["name"], value_text(row["now"]), value_text(row["then"]), row["meaning"]) for row in found]
+    return columns(rows, indent=2)
+
+
+def _saving_lines(opened: Sensors, changed: bool, saved: bool) -> list[str]:
+    """How long a change lasts."""
+    unsaved = _UNSAVED_IN_SERVER if opened.restores else _UNSAVED
+    return [_SAVED] if saved else [unsaved] if changed else []
+
+
+def _verify(sensor: Sensor, settings: Mapping[str, SettingValue]) -> None:
+    """BusError unless `settings` are in force."""
+    for name, value in settings.items():
+        if (held := sensor.settings.get(name)) != value:
+            raise BusError(
+                f"sensor {sensor.number} reads back {name} = {value_text(held)} although it accepted "
+                f"{value_text(value)}: power it off and on, then try again"
+            )
+
+
+def _asked(args: argparse.Namespace) -> ServerOptions:
+    """The requested settings, parsed as the server does."""
+    if not args.assignments and args.config is None:
+        raise UsageError("no settings given: use --set NAME=VALUE or --config FILE.toml")
+    config = read_config(args.config) if args.config else EMPTY
+    return ServerOptions(args.iface or "", 0, file=config, assigned=parse_assignments(args.assignments))
+
+
+def _look(
+    args: argparse.Namespace, opened: Sensors, options: ServerOptions
+) -> tuple[Found, dict[str, SettingValue], Sensor]:
+    """The chosen sensor, the settings requested for it, and those in force."""
+    found = opened.choose(args.sensor)
+    options.check_sensors({sensor.number: sensor.identity for sensor in opened.sensors})
+    asked = options.asked_settings(found.number, found.identity.name, found.identity.serial)
+    if not asked:
+        raise UsageError(f"{args.config} has no settings for {found}: correct its tables, or use --set")
+    return found, asked, opened.in_force(found, asked)
+
+
+def _plan(args: argparse.Namespace) -> int:
+    asked = _asked(args)
+    with sensors_of(args) as opened:
+        found, settings, sensor = _look(args, opened, asked)
+    changed = _changes(sensor, settings)
+    now = meaning(sensor.settings, sensor.rate_hz)
+    changes = {row["name"]: row["then"] for row in changed}
+    rate_hz = None if changes.keys() & {"sinc_length", "chop"} else sensor.rate_hz
+    then = meaning({**sensor.settings, **changes}, rate_hz)
+    lines = [_change_lines(changed)]
+    if changed:
+        lines.append("settings afterwards:\n  " + "\n  ".join(then.lines()))
+    if any(row["preop_only"] for row in changed):
+        lines.append("written in PREOP only: a stream through a server pauses for about 50 ms")
+    values = {"changes": changed, "now": now.as_json(), "then": then.as_json()}
+    report(args.json, opened, found, values, *lines)
+    return CHANGES if changed else DONE
+
+
+def _apply(args: argparse.Namespace) -> int:
+    asked = _asked(args)
+    with sensors_of(args) as opened:
+        found, settings, before = _look(args, opened, asked)
+        changed = _changes(before, settings)
+        if changed or args.save:
+            opened.configure(found.number, settings, args.save)
+        after = opened.in_force(found, settings) if changed else before
+    _verify(after, settings)
+    in_force = meaning(after.settings, after.rate_hz)
+    values = {
+        "changes": changed, "saved": args.save, "settings": after.settings, "rate_hz": after.rate_hz,
+        "meaning": in_force.as_json(),
+    }  # fmt: skip
+    lines = [_change_lines(changed), "in force:\n  " + "\n  ".join(in_force.lines())]
+    report(args.json, opened, found, values, *lines, *_saving_lines(opened, bool(changed), args.save))
+    return DONE
+
+
+def _save_now(opened: Sensors, found: Found) -> None:
+    """Store the sensor's parameters in its flash."""
+    with signals_held_back():
+        finish(save(opened.sdo(found.number), Sensor(found.number, found.identity, {})), clock=opened.clock)
+
+
+def _save(args: argparse.Namespace) -> int:
+    with sensors_of(args) as opened:
+        found = opened.choose(args.sensor)
+        _save_now(opened, found)
+    report(args.json, opened, found, {"saved": True}, f"  {_SAVED}")
+    return DONE
+
+
+# -- tare
+
+_AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+_TARE_UNSAVED: Final = _UNSAVED.replace("--save, or the command save,", "the command save")
+_TARE_UNSAVED_IN_SERVER: Final = (
+    "in force while the server runs, then until the sensor is powered off: use the command save to keep it"
+)
+
+
+def _tare(args: argparse.Namespace) -> int:
+    if not 1 <= args.samples <= MAX_TARE_SAMPLES:
+        raise UsageError(f"--samples {args.samples}: it must be from 1 to {MAX_TARE_SAMPLES}")
+    if not all(map(math.isfinite, args.target)):
+        raise UsageError("--target must be six finite numbers: Fx Fy Fz in N, Mx My Mz in Nm")
+    try:
+        pack_offset(args.target)
+    except ValueError as error:
+        raise UsageError(f"--target: {error}") from None
+    keys = ["old_offset", "new_offset"]
+    with sensors_of(args) as opened:
+        found = opened.choose(args.sensor)
+        if args.undo or args.clear:
+            tared: Mapping[str, Sequence[float]] = _taken_back(opened, found, undo=args.undo)
+        else:
+            tared = opened.tare(found.number, args.samples, args.target)
+            keys += ["residual", "deviation"]
+    try:
+        remember(found.identity.serial, tared["old_offset"], tared["new_offset"])
+    except OSError as error:
+        note(f"--undo will not know this tare: {error.strerror or error}")
+    rows: list[tuple[str, ...]] = [("", *(key.replace("_", " ") for key in keys), "")]
+    for n, axis in enumerate(_AXES):
+        rows.append((axis, *(f"{tared[key][n]:.4f}" for key in keys), "N" if n < 3 else "Nm"))
+    lasts = _TARE_UNSAVED_IN_SERVER if opened.restores else _TARE_UNSAVED
+    report(args.json, opened, found, {key: tared[key] for key in keys}, columns(rows, indent=2), lasts)
+    return DONE
+
+
+def _taken_back(opened: Sensors, found: Found, *, undo: bool) -> dict[str, Sequence[float]]:
+    """Write the offset of before the last tare, or zeros, and verify it.
+
+    BusError unless what is in force is of that tare.
+    """
+    sdo = opened.sdo(found.number)
+    before, after = finish(read_offset(sdo), clock=opened.clock), [0.0] * 6
+    if undo:
+        try:
+            after = former(found.identity.serial, before, str(found))
+        except ValueError as error:
+            raise BusError(f"{error}: use --clear, or tare again") from None
+    with signals_held_back():
+        try:
+            finish(write_offset(sdo, after), clock=opened.clock)
+        except BusError as error:
+            finish(write_offset(sdo, before), clock=opened.clock)
+            raise BusError(f"{error}; the old offset is in force") from None
+    return {"old_offset": list(before), "new_offset": list(after)}
+
+
+# -- snapshot, restore
+
+_FORMAT: Final = "ethercat-sensor snapshot"
+_VERSION: Final = 1
+# Objects of the configuration: not the factory calibration, outputs or commands.
+_CONFIGURATION: Final = range(0x8000, 0x8011)
+# Objects that are restored as they are; settings are restored as settings.
+RESTORABLE: Final[tuple[ObjectEntry, ...]] = tuple(
+    row for row in OBJECTS if row.access is not Access.RO and row.index in _CONFIGURATION and not row.setting
+)
+# Not `--force`, which is for the file: replacing one must not stop a machine.
+_TAKE_OVER: Final = "--take-over"
+
+Address = tuple[int, int]
+
+
+class Snapshot(NamedTuple):
+    """The content of a file, validated."""
+
+    identity: Identity
+    settings: dict[str, SettingValue]
+    objects: dict[Address, bytes]  # only those that can be restored
+
+
+def read_snapshot(path: Path) -> Snapshot:
+    """Read and validate a file; UsageError if it is no snapshot."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}") from None
+    except (ValueError, RecursionError):
+        raise UsageError(f"{path} is not a snapshot: it is not valid JSON") from None
+    kind = (content.get("format"), content.get("version")) if isinstance(content, dict) else None
+    if kind != (_FORMAT, _VERSION):
+        raise UsageError(
+            f"{path} is not a snapshot of version {_VERSION}: make one with ethercat-sensor snapshot"
+        )
+    try:
+        identity = Identity(
+            str(content["model"]), int(content["serial"]), str(content["hardware"]), str(content["firmware"])
+        )
+        settings = check_settings(dict(content["settings"]))
+        rows = [(int(row["index"], 16), row["subindex"], row.get("hex")) for row in content["objects"]]
+        held = {(index, sub): bytes.fromhex(text) for index, sub, text in rows if text is not None}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UsageError(f"the snapshot {path} is damaged ({error!r}): make a new one") from None
+    except SettingError as error:
+        raise UsageError(f"the snapshot {path}: {error}") from None
+    wanted = {row.address: held[row.address] for row in RESTORABLE if row.address in held}
+    for (index, sub), data in wanted.items():
+        if len(data) != BY_ADDRESS[index, sub].type.size:
+            raise UsageError(f"the snapshot {path} is damaged: object 0x{index:04X}:{sub} has the wrong size")
+    return Snapshot(identity, settings, wanted)
+
+
+@contextlib.contextmanager
+def _opened(args: argparse.Namespace) -> Iterator[Sensors]:
+    """As `sensors_of`; an error advises the option that these commands have."""
+    try:
+        with sensors_of(args) as opened:
+            yield opened
+    except BusError as error:
+        if "; --force " not in str(error):
+            raise
+        raise BusError(str(error).replace("; --force ", f"; {_TAKE_OVER} ")) from None
+
+
+def _snapshot(args: argparse.Namespace) -> int:
+    with NewFile(args.file, force=args.force) as file, _opened(args) as opened:
+        found = opened.choose(args.sensor)
+        sensor, sdo = opened.in_force(found), opened.sdo(found.number)
+        read = [(row, finish(read_object(sdo, row))) for row in KNOWN_OBJECTS]
+        content = {
+            "format": _FORMAT,
+            "version": _VERSION,
+            "taken": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "model": found.identity.name,
+            "serial": found.identity.serial,
+            "hardware": found.identity.hardware,
+            "firmware": found.identity.firmware,
+            "settings": sensor.settings,
+            "objects": [_as_json(row.address, values) for row, values in read],
+        }
+        file.write(json.dumps(finite(content), indent=1, allow_nan=False) + "\n")
+        file.finish()
+    readable = sum("hex" in values for _, values in read)
+    line = f"  {readable} objects written to {args.file}, {len(read) - readable} could not be read"
+    report(args.json, opened, found, {"file": str(args.file), "objects": readable}, line)
+    return DONE
+
+
+def _as_json(address: Address, values: dict[str, Any]) -> dict[str, Any]:
+    name = BY_ADDRESS[address].name
+    return {"index": f"0x{address[0]:04X}", "subindex": address[1], "name": name, **values}
+
+
+def _restore(args: argparse.Namespace) -> int:
+    snapshot = read_snapshot(args.file)
+    with _opened(args) as opened:
+        found = opened.choose(args.sensor)
+        _check_whose(found.identity, snapshot.identity, args)
+        sensor = opened.in_force(found, snapshot.settings)
+        lacking = sorted(snapshot.settings.keys() - sensor.settings.keys())
+        settings = {name: value for name, value in snapshot.settings.items() if name not in lacking}
+        changed = _changes(sensor, settings)
+        differing, unreadable = finish(_differing(opened.sdo(found.number), snapshot))
+        if changed or differing:
+            with signals_held_back():
+                _put_back(opened, found, sensor, settings, differing)
+        if args.save:
+            _save_now(opened, found)
+    missing = [*lacking, *(f"0x{index:04X}:{sub}" for index, sub in unreadable)]
+    lines = [_change_lines(changed)] if changed else []
+    if differing:
+        lines.append(columns([_object_line(address, *pair) for address, pair in differing.items()], indent=2))
+    if missing:
+        lines.append(f"  skipped, this sensor does not have them: {', '.join(missing)}")
+    if not changed and not differing:
+        lines.append("  nothing to restore: the sensor already matches the file")
+    written = [
+        _as_json(address, {"now": old.hex(), "then": new.hex()}) for address, (old, new) in differing.items()
+    ]
+    values = {"changes": changed, "objects": written, "left_alone": missing, "saved": args.save}
+    lines += _saving_lines(opened, bool(changed or differing), args.save)
+    report(args.json, opened, found, values, *lines)
+    return DONE
+
+
+def _check_whose(sensor: Identity, file: Identity, args: argparse.Namespace) -> None:
+    if (sensor.name, sensor.serial) != (file.name, file.serial) and not args.force:
+        raise ServerError(
+            f"{args.file} belongs to the {file}, but this is the {sensor}: connect that one, or use --force"
+        )
+    if sensor.firmware != file.firmware:
+        note(f"{args.file} was taken with firmware {file.firmware}, the sensor now has {sensor.firmware}")
+
+
+def _differing(
+    sdo: Sdo, snapshot: Snapshot
+) -> Steps[tuple[dict[Address, tuple[bytes, bytes]], list[Address]]]:
+    """Present and saved value of the objects that differ; the objects that the sensor does not have."""
+    differing, unreadable = {}, []
+    for address, wanted in snapshot.objects.items():
+        try:
+            held = yield from sdo.read(*address)
+        except SdoAbortError:
+            unreadable.append(address)
+            continue
+        if held != wanted:
+            differing[address] = held, wanted
+    return differing, unreadable
+
+
+def _put_back(
+    opened: Sensors,
+    found: Found,
+    sensor: Sensor,
+    settings: Mapping[str, SettingValue],
+    objects: Mapping[Address, tuple[bytes, bytes]],
+) -> None:
+    """Write everything and verify it; on failure restore the former values."""
+    sdo, before = opened.sdo(found.number), dict(sensor.settings)
+    if any(before.get(name) != value for name, value in settings.items()):
+        opened.configure(found.number, settings, save=False)
+    written = []
+    try:
+        _verify(opened.in_force(found, settings), settings)
+        for address, (_, wanted) in objects.items():
+            written.append(address)
+            finish(_write(sdo, address, wanted))
+    except BusError as error:
+        try:
+            for address in written:
+                finish(_write(sdo, address, objects[address][0]))
+            opened.configure(found.number, before, save=False)
+        except BusError as again:
+            raise BusError(
+                f"{error}; the former values could not be restored ({again}): power the sensor off and on"
+            ) from None
+        raise BusError(f"{error}; the former settings are in force") from None
+
+
+def _write(sdo: Sdo, address: Address, data: bytes) -> Steps[None]:
+    yield from sdo.write(*address, data)
+    held = yield from sdo.read(*address)
+    if held != data:
+        raise BusError(
+            f"object 0x{address[0]:04X}:{address[1]} reads back {held.hex()} after writing {data.hex()}"
+        )
+
+
+def _object_line(address: Address, held: bytes, wanted: bytes) -> tuple[str, ...]:
+    row = BY_ADDRESS[address]
+    now, then = (value_text(row.type.unpack(data)) for data in (held, wanted))
+    return f"0x{address[0]:04X}:{address[1]}", row.name, now, then, row.unit
+
+
+_SENSOR: Final = sensor_arguments()
+_SET: Final = "a setting; may be given more than once: " + "; ".join(
+    f"{row.name} ({row.meaning})" for row in SETTINGS.values()
+)
+_SETTINGS: Final = (
+    *_SENSOR,
+    argument("--set", _SET, action="append", default=[], metavar="NAME=VALUE", dest="assignments"),
+    argument("--config", "settings from [sensor] or [sensor.0] of a file", type=Path, metavar="FILE.toml"),
+)
+_SAVE: Final = argument("--save", "store it in the sensor's flash")
+_FILE: Final = (
+    *sensor_arguments(take_over=False),
+    argument("file", "JSON file", type=Path, metavar="FILE"),
+    argument(_TAKE_OVER, "take over a bus in use, as --force elsewhere"),
+)
+_SAMPLES: Final = f"number of samples to average, 1 to {MAX_TARE_SAMPLES} (default %(default)s)"
+_DEFAULT_SAMPLES: Final = ACTIONS["tare"].parameters["samples"].default
+_TARGET: Final = "wrench the sensor is to read, in N and Nm (default: zeros)"
+
+
+COMMANDS: Final = (
+    Command("plan", "show what a change of settings would do, without doing it", _SETTINGS, _plan),
+    Command("apply", "change settings, all or none, and verify them", (*_SETTINGS, _SAVE), _apply),
+    Command("save", "store the sensor's parameters in its flash", _SENSOR, _save),
+    Command(
+        "tare", "set the force/torque offset so that the mean reading becomes zero",
+        (
+            *_SENSOR,
+            argument("--samples", _SAMPLES, type=int, default=_DEFAULT_SAMPLES, metavar="N"),
+            argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=_AXES),
+        ),
+        _tare,
+        exclusive=(
+            argument("--undo", "restore the offset of before the last tare"),
+            argument("--clear", "set the offset to zero"),
+        ),
+    ),
+    Command(
+        "snapshot", "write all readable objects to a file",
+        (*_FILE, argument("--force", "replace an existing file")), _snapshot,
+    ),
+    Command(
+        "restore", "write back what differs from a snapshot",
+        (*_FILE, _SAVE, argument("--force", "accept a file of another sensor")), _restore,
+    ),
+)  # fmt: skip

@@ -1,0 +1,429 @@
+"""The checks of machine and interface on made-up machines: a table of what is different and what is said."""
+
+from __future__ import annotations
+
+import gzip
+import socket
+import struct
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from bota_ethercat.health.verdict import Level
+from ethercat_server.doctor.machine import FACTS, Machine, as_list, processor_list
+from ethercat_server.doctor.machine_checks import CHECKS, examine_machine, rising
+from ethercat_server.doctor.report import CannotLookError, Finding, bad, examine, ok
+from ethercat_server.errors import BusError
+from ethercat_server.ethercat.nic import Routes
+from tests.doctor.made_up import CPUS, GOOD, Facts, Files, but, machine
+
+SKIP, FINE, NOTE, LOOK, BAD = Level.NOT_POSSIBLE, Level.GOOD, Level.NOTE, Level.LOOK, Level.TROUBLE
+
+
+class Case(NamedTuple):
+    """A machine that is good but for `files`, `facts` and `more`, and the only finding of a check there."""
+
+    check: str
+    level: Level
+    files: Mapping[str, str | bytes | None] = {}
+    facts: Facts = but()
+    said: str = ""
+    """Part of what is found, or of the effect."""
+    commands: Sequence[str] | None = None
+    values: Mapping[str, Any] = {}
+    """Among those of the finding."""
+    more: Mapping[str, Any] = {}
+
+
+def config(*options: str) -> bytes:
+    return gzip.compress("".join(f"CONFIG_{option}\n" for option in options).encode())
+
+
+# -- kernel
+
+SWITCH = "/sys/kernel/debug/sched/preempt"
+FULL = [f"echo full | sudo tee {SWITCH}"]
+ORDINARY: Files = {
+    "/sys/kernel/realtime": None, "/proc/version": "Linux version 6.1.0-amd64 #1 SMP PREEMPT_DYNAMIC",
+    "/proc/config.gz": None,
+}  # fmt: skip
+FIXED: Files = {
+    **ORDINARY, "/proc/version": "Linux version 6.1 #1 SMP",
+    "/boot/config-6.12.0-rt-amd64": "CONFIG_PREEMPT_VOLUNTARY=y\n",
+    "/etc/os-release": 'NAME="Ubuntu"\nID=ubuntu\n',
+}  # fmt: skip
+OLD = {"/proc/version": "Linux version 5.4 #1 SMP PREEMPT", "/boot/config-6.12.0-rt-amd64": None}
+BUILT: Files = {**ORDINARY, "/proc/config.gz": config("PREEMPT_DYNAMIC=y", "PREEMPT_VOLUNTARY=y")}
+MOUNT = "sudo mount -t debugfs none /sys/kernel/debug"
+DEBIANS = "sudo apt install linux-image-rt-amd64"
+
+
+def switched(text: str, model: str, level: Level, commands: list[str] | None = None) -> Case:
+    """Where the kernel's preemption can be switched, and is."""
+    values = {"model": model, "certain": True}
+    return Case("preemption", level, {**ORDINARY, SWITCH: text}, values=values, commands=commands)
+
+
+CLOCKS = "/sys/devices/system/clocksource/clocksource0"
+HPET = {f"{CLOCKS}/current_clocksource": "hpet"}
+GROUPED = {"/proc/config.gz": config("RT_GROUP_SCHED=y")}
+KERNEL = [
+    Case("preemption", FINE),
+    Case("preemption", FINE, {"/proc/version": "Linux version 5.15"}, values={"model": "rt"}),
+    Case("preemption", FINE, {"/sys/kernel/realtime": None}),
+    switched("none voluntary (full)", "full", NOTE),
+    switched("none voluntary full (lazy)", "lazy", NOTE),
+    switched("none (voluntary) full", "voluntary", LOOK, FULL),
+    switched("(none) voluntary full", "none", LOOK, FULL),
+    # Where the switch is hidden, the command line or the build tells.
+    Case("preemption", LOOK, {**ORDINARY, "/proc/cmdline": "preempt=none"},
+         values={"model": "none", "dynamic": True, "certain": True}),
+    Case("preemption", LOOK, BUILT, said="cannot be read", commands=[MOUNT, *FULL],
+         values={"model": "voluntary", "dynamic": True, "certain": False}),
+    Case("preemption", LOOK, FIXED, values={"certain": True},
+         commands=["sudo pro attach && sudo pro enable realtime-kernel"]),
+    Case("preemption", LOOK, {**FIXED, "/etc/os-release": "ID=debian\n"}, commands=[DEBIANS]),
+    Case("preemption", NOTE, {**FIXED, **OLD}, values={"model": "full"}),
+    Case("tick", FINE, values={"hz": 1000}),
+    Case("tick", BAD, said="4 ms", more={"timer_resolution_s": 0.004}),
+    Case("tick", FINE, {"/proc/config.gz": b"no gzip"}, values={"hz": None}),
+    Case("clock source", FINE),
+    Case("clock source", LOOK, HPET, commands=[f"echo tsc | sudo tee {CLOCKS}/current_clocksource"]),
+    Case("clock source", NOTE, {**HPET, f"{CLOCKS}/available_clocksource": "hpet acpi_pm"}),
+    *(
+        Case("real-time throttling", level, {"/proc/sys/kernel/sched_rt_runtime_us": runtime}, said=share,
+             commands=[] if level is FINE else ["sudo sysctl kernel.sched_rt_runtime_us=950000"])
+        for runtime, level, share in (("950000", FINE, "95 %"), ("-1", NOTE, "off"), ("0", BAD, "0 %"),
+                                      ("100000", BAD, "10 %"))
+    ),
+    Case("real-time groups", FINE),
+    Case("real-time groups", NOTE, GROUPED),
+    Case("real-time groups", FINE, {**GROUPED, "/proc/cmdline": "rt_group_sched=0"}),
+    Case("real-time groups", FINE,
+         {"/proc/config.gz": config("RT_GROUP_SCHED=y", "RT_GROUP_SCHED_DEFAULT_DISABLED=y")}),
+    Case("real-time groups", SKIP, {"/proc/config.gz": None}, said="config"),
+]  # fmt: skip
+
+# -- rights and processors
+
+NO_RIGHTS = {"/proc/self/status": "CapEff:\t0000000000000000\n"}
+ENOUGH = "Max locked memory  unlimited unlimited bytes\nMax realtime priority 99 99\n"
+NAMES = ["CAP_NET_ADMIN", "CAP_NET_RAW", "CAP_IPC_LOCK", "CAP_SYS_NICE"]
+GOVERNOR = f"{CPUS}/cpu*/cpufreq/scaling_governor"
+IDLE = f"{CPUS}/cpu1/cpuidle"
+DEEP: Files = {
+    f"{IDLE}/state2/latency": "40", f"{IDLE}/state2/name": "C3",
+    f"{IDLE}/state3/latency": "170", f"{IDLE}/state3/name": "C8",
+}  # fmt: skip
+TOO_DEEP = [f"echo 1 | sudo tee {CPUS}/cpu*/cpuidle/state{n}/disable" for n in (2, 3)]
+DMA = "/dev/cpu_dma_latency"
+PROCESSORS = [
+    Case("capabilities", FINE),
+    Case("capabilities", NOTE, NO_RIGHTS, values={"missing": NAMES}, commands=["sudo ethercat-doctor ens5"]),
+    Case("capabilities", NOTE, {"/proc/self/status": f"CapEff:\t{3 << 12:016x}\n"}, said="less steady cycle"),
+    Case("capabilities", SKIP, {"/proc/self/status": "Name: x\n"}),
+    Case("limits", FINE),  # they matter only without the capabilities
+    Case("limits", NOTE, NO_RIGHTS, said="rtprio 0 and memlock 8192 KiB"),
+    Case("limits", FINE, {**NO_RIGHTS, "/proc/self/limits": ENOUGH}),
+    Case("governor", FINE),
+    Case("governor", LOOK, {GOVERNOR.replace("*", "2"): "powersave"}, said="performance on 3, powersave on 1",
+         commands=[f"echo performance | sudo tee {GOVERNOR}"]),
+    Case("governor", FINE, {GOVERNOR.replace("*", str(n)): None for n in range(4)}, values={"governors": []}),
+    Case("idle states", FINE, values={"latency_us": 2}),
+    Case("idle states", LOOK, DEEP, said="C8, 170 µs to wake", commands=TOO_DEEP),
+    Case("idle states", NOTE, {**DEEP, f"{IDLE}/state3/disable": "1"}, said="C3, 40 µs"),
+    # A program may limit the latency.
+    Case("idle states", FINE, {**DEEP, DMA: struct.pack("=i", 0)}, values={"limit_us": 0, "latency_us": 0}),
+    Case("idle states", LOOK, {**DEEP, DMA: struct.pack("=i", 2_000_000_000)}),
+    Case("idle states", LOOK, {**DEEP, DMA: b"\0"}),
+    Case("isolation", FINE, values={"isolated": [3]}),
+    Case("isolation", NOTE, {f"{CPUS}/isolated": "\n", f"{CPUS}/nohz_full": "(null)\n"},
+         said="isolcpus=managed_irq,domain,3", values={"nohz_full": ""}),
+    Case("isolation", NOTE, {f"{CPUS}/cpu3/topology/thread_siblings_list": "1,3"}, said="1 shares a core"),
+    Case("isolation", LOOK, {f"{CPUS}/online": "0"}),
+    Case("virtualization", FINE),
+    Case("virtualization", LOOK, {"/proc/cpuinfo": "flags\t: fpu hypervisor sse\n"}, said="Dell Inc."),
+    Case("virtualization", LOOK, {"/sys/hypervisor/type": "xen\n"}, said="xen"),
+    Case("virtualization", LOOK, {"/sys/class/dmi/id/product_name": "KVM Virtual Machine\n"},
+         said="KVM Virtual Machine"),
+    Case("virtualization", NOTE, {"/proc/1/environ": "PATH=/bin\0container=lxc\0"},
+         values={"container": "lxc"}),
+    Case("virtualization", NOTE, {"/run/systemd/container": "systemd-nspawn\n"},
+         values={"container": "systemd-nspawn"}),
+    Case("virtualization", NOTE, {"/.dockerenv": ""}, values={"container": "docker"}),
+]  # fmt: skip
+
+# -- interface
+
+UNSUPPORTED = "the driver does not support it"
+VETH = {"kind": "veth", "parent": ""}
+HELD = {"rx_coalesce_usecs": 3, "tx_coalesce_usecs": 0, "use_adaptive_rx_coalesce": 0}
+OFFLOADS = {"generic-receive-offload": True, "tcp-segmentation-offload": True, "rx-checksumming": True}
+ELSEWHERE = {"/proc/irq/130/effective_affinity_list": "0"}
+BELOW = {"/proc/77/stat": "77 (irq/130-ens5) S " + " ".join(["0"] * 36) + " 50 1 0\n"}
+
+
+def counted(**counters: int) -> Facts:
+    return but(link={"counters": {"rx_packets": 9, **counters}})
+
+
+def interrupt(line: str) -> Files:
+    return {"/proc/interrupts": line + "\n", "/proc/irq/41/smp_affinity_list": "3"}
+
+
+INTERFACE = [
+    Case("link", FINE),
+    Case("link", BAD, facts=but(link={"up": False, "carrier": False}), said="down",
+         commands=["sudo ip link set ens5 up"]),
+    Case("link", BAD, facts=but(link={"carrier": False}), said="up, no carrier",
+         commands=["ip -br link show ens5"]),
+    Case("link", BAD, facts=but(link={"loopback": True}), said="the loopback interface",
+         commands=["ethercat-sensor adapters"]),
+    Case("link", BAD, facts={"link": None, "names": ("lo", "eth1")}, said="lo, eth1"),
+    *(
+        Case("speed", level, facts=but(settings=found))
+        for found, level in (((100, "full"), FINE), ((100, "half"), BAD), ((10, "full"), BAD),
+                             ((1000, "full"), LOOK), ((None, None), FINE))
+    ),
+    Case("speed", FINE, facts=but(settings=(10000, "full"), link=VETH)),
+    Case("speed", SKIP, facts=but(link={"carrier": False}), said="carrier"),
+    Case("speed", SKIP, facts=but(settings="went wrong"), said="went wrong"),
+    Case("driver", FINE, said="e1000e on 0000:00:1f.6"),
+    Case("driver", LOOK, facts=but(driver=("r8152", "usb-0000:00:14.0-2")), said="PCIe"),
+    Case("driver", LOOK, facts=but(driver=("virtio_net", "0000:00:03.0"))),
+    Case("driver", BAD, {"/sys/class/net/ens5/wireless/status": ""}),
+    Case("coalescing", FINE),
+    Case("coalescing", LOOK, facts=but(coalescing=HELD), said="rx 3 µs",
+         commands=["sudo ethtool -C ens5 rx-usecs 0 tx-usecs 0"]),
+    Case("coalescing", LOOK, facts=but(coalescing={**HELD, "use_adaptive_rx_coalesce": 1}),
+         commands=["sudo ethtool -C ens5 adaptive-rx off adaptive-tx off rx-usecs 0 tx-usecs 0"]),
+    Case("coalescing", FINE, facts=but(coalescing=UNSUPPORTED)),
+    Case("coalescing", SKIP, facts=but(coalescing="Operation not permitted")),
+    Case("offloads", NOTE, facts=but(offloads=OFFLOADS), commands=["sudo ethtool -K ens5 gro off tso off"]),
+    Case("offloads", FINE, facts=but(offloads=OFFLOADS, link=VETH)),
+    *(
+        Case("EEE", level, facts=but(EEE=found),
+             commands=["sudo ethtool --set-eee ens5 eee off"] if level is not FINE else [])
+        for found, level in (((True, True), LOOK), ((True, False), NOTE), ((False, False), FINE),
+                             (UNSUPPORTED, FINE))
+    ),
+    Case("counters", FINE, facts=counted()),
+    Case("counters", LOOK, facts=counted(rx_crc_errors=1)),
+    Case("counters", NOTE, facts=counted(rx_dropped=5)),
+    Case("counters", NOTE, facts=but(link={"carrier_changes": 90})),
+    Case("counters", SKIP, facts=but(link={"counters": {}})),
+    Case("interrupts", FINE, values={"irqs": [130], "processors": [3]}),
+    Case("interrupts", NOTE, ELSEWHERE, commands=["echo 3 | sudo tee /proc/irq/130/smp_affinity_list"]),
+    Case("interrupts", NOTE, {"/proc/99/comm": "irqbalance\n"}, said="irqbalance runs"),
+    Case("interrupts", FINE, {**ELSEWHERE, f"{CPUS}/isolated": ""}),
+    Case("interrupts", FINE, {"/proc/interrupts": ""}, but(link=VETH)),
+    # Which interrupts are the card's.
+    *(
+        Case("interrupts", FINE if ours else SKIP, interrupt(line), values={"irqs": [41]} if ours else {})
+        for line, ours in (
+            (" 41: 0 PCI-MSIX-0000:00:03.0 1-edge ens5-rx-0", True),
+            (" 41: 0 PCI-MSIX-0000:00:03.0 1-edge ens5", True),
+            (" 41: 0 IR-PCI-MSI 1-edge mlx5_comp0@pci:0000:00:1f.6", True),
+            (" 41: 0 PCI-MSIX-0000:00:03.0 1-edge ens51", False),
+            (" 41: 0 PCI-MSIX-0000:00:03.0 1-edge ens50-rx-0", False),
+            ("NMI: 0 ens5", False),
+        )
+    ),
+    Case("interrupt threads", FINE, values={"threads": {77: 85}}),
+    Case("interrupt threads", FINE, {"/proc/interrupts": ""}, but(link=VETH)),
+    Case("interrupt threads", NOTE, BELOW, commands=["sudo chrt -f -p 85 77"]),
+    Case("interrupt threads", FINE, BELOW, more={"rt_priority": 40}),
+    Case("interrupt threads", FINE, {"/proc/77/comm": None}, said="not threaded"),
+]  # fmt: skip
+
+# -- other software
+
+PACKETS = "sk RefCnt Type Proto Iface R Rmem User Inode\n"
+DHCP = {"/proc/55/comm": "dhclient\n"}
+SOFTWARE = [
+    Case("managers", LOOK, {"/run/NetworkManager/devices/7": "[device]\nmanaged=true\n"},
+         said="NetworkManager", commands=["sudo nmcli device set ens5 managed no"]),
+    Case("managers", LOOK, {"/run/systemd/netif/links/7": "ADMIN_STATE=configured\n"},
+         said="systemd-networkd", commands=["sudo scripts/install-service ens5"]),
+    Case("managers", LOOK, {"/etc/network/interfaces.d/a": "auto ens5\niface ens5 inet dhcp\n"},
+         said="ifupdown", commands=["sudoedit /etc/network/interfaces"]),
+    Case("managers", LOOK, {**DHCP, "/proc/55/cmdline": "dhclient\0-v\0ens5\0"}, said="dhclient (55)",
+         commands=["sudo kill 55"]),
+    Case("managers", FINE, {"/run/NetworkManager/devices/7": "[device]\nmanaged=false\n"}),
+    Case("managers", FINE, {"/run/NetworkManager/devices/8": "[device]\nmanaged=true\n"}),
+    Case("managers", FINE, {"/run/systemd/netif/links/7": "ADMIN_STATE=unmanaged\n"}),
+    Case("managers", FINE, {"/etc/network/interfaces": "iface ens5 inet manual\niface ens50 inet dhcp\n"}),
+    Case("managers", FINE, {**DHCP, "/proc/55/cmdline": "dhclient\0eth0\0"}),
+    *(
+        Case("addresses", level, facts=but(routes=routes))
+        for routes, level in (
+            (Routes(("10.0.0.2/24",), (), True), BAD),
+            (Routes(("10.0.0.2/24",), leased=("10.0.0.2/24",)), BAD),
+            (Routes(("10.0.0.2/24",)), LOOK),
+            (Routes(others=("10.1.0.0/16",)), LOOK),
+            (Routes(link_local=("fe80::1/64",)), NOTE),
+            (Routes(), FINE),
+        )
+    ),
+    Case("membership", BAD, facts=but(link={"master": "br0"}), commands=["sudo ip link set ens5 nomaster"]),
+    Case("membership", LOOK, facts=but(link={"upper": ("ens5.10",)}),
+         commands=["sudo ip link delete ens5.10"]),
+    *(
+        Case("listeners", level, {"/proc/self/net/packet": f"{PACKETS}{row}\n", "/proc/66/comm": "tcpdump\n"},
+             values={"listeners": ["tcpdump (66)"] if level is not FINE else []})
+        for row, level in (
+            ("ffff 3 3 0003 7 1 0 0 4242", LOOK),
+            ("ffff 3 3 0003 0 1 0 0 4242", LOOK),
+            ("ffff 3 3 88cc 7 1 0 0 4242", NOTE),
+            ("ffff 3 3 88cc 0 1 0 0 4242", FINE),
+            ("ffff 3 3 0003 8 1 0 0 4242", FINE),
+            ("ffff 3 3 88a4 7 1 0 0 4242", FINE),
+        )
+    ),
+    Case("listeners", LOOK, {"/proc/self/net/packet": PACKETS + "ffff 3 3 0003 7 1 0 0 99\n"},
+         said="only root can see"),
+    Case("listeners", SKIP, {"/proc/self/net/packet": PACKETS + "hello\n"}),
+]  # fmt: skip
+
+
+def looks(name: str, subject: Machine) -> list[Finding]:
+    """What a check finds."""
+    (check,) = (check for check in CHECKS if check.name == name)
+    found = list(examine(*check, subject))
+    assert not faults(found)
+    return found
+
+
+def faults(findings: Sequence[Finding]) -> list[Finding]:
+    return [finding for finding in findings if "error in ethercat-doctor" in finding.found]
+
+
+@pytest.mark.parametrize("case", [*KERNEL, *PROCESSORS, *INTERFACE, *SOFTWARE], ids=lambda case: case.check)
+def test_what_is_said(case: Case, tmp_path: Path) -> None:
+    descriptors = tmp_path / "proc/66/fd"
+    descriptors.mkdir(parents=True)
+    (descriptors / "3").symlink_to("socket:[4242]")
+    (found,) = looks(case.check, machine(tmp_path, case.files, case.facts, **case.more))
+    assert found.level is case.level
+    assert case.said in f"{found.found}\n{found.why}"
+    assert case.commands is None or [*found.commands] == case.commands
+    assert {**found.values, **case.values} == found.values
+    assert found.why or found.level < Level.NOTE, "a warning says why it matters"
+
+
+def test_nothing_is_wrong_with_a_good_machine(tmp_path: Path) -> None:
+    found = list(examine_machine(machine(tmp_path)))
+    assert [finding for finding in found if finding.level is not FINE] == []
+    assert {finding.check for finding in found} == {check.name for check in CHECKS}
+
+
+def test_without_the_interface_the_machine_is_looked_at_all_the_same(tmp_path: Path) -> None:
+    found = list(examine_machine(machine(tmp_path, facts={"link": None, "names": ("lo", "eth1")})))
+    assert [(f.check, f.level) for f in found if f.level is not FINE] == [("link", BAD), ("the rest", SKIP)]
+
+
+def test_a_container_in_a_virtual_machine_is_both(tmp_path: Path) -> None:
+    both = machine(tmp_path, {"/.dockerenv": "", "/proc/cpuinfo": "flags : hypervisor\n"})
+    assert [finding.level for finding in looks("virtualization", both)] == [NOTE, LOOK]
+
+
+def test_names_of_interfaces_are_quoted_in_commands(tmp_path: Path) -> None:
+    here = machine(tmp_path, facts=but(link={"up": False}))
+    here.ifname = "a;reboot"
+    assert looks("link", here)[0].commands == ("sudo ip link set 'a;reboot' up",)
+
+
+def test_counters_that_rise_while_the_doctor_looks() -> None:
+    before = {"rx_crc_errors": 7, "rx_dropped": 2, "rx_packets": 1}
+    assert rising(before, {**before, "rx_packets": 900}).level is FINE
+    assert rising(before, {**before, "rx_crc_errors": 9}) == bad(
+        "rx_crc_errors 2",
+        "frames are being corrupted: check cable, connectors, shield and sources of interference",
+        rx_crc_errors=2,
+    )
+    assert rising(before, {**before, "rx_dropped": 3}).level is NOTE
+    with pytest.raises(CannotLookError):
+        rising(before, {})
+
+
+def test_the_facts_of_a_real_interface() -> None:
+    lo = Machine("lo")
+    assert (lo.link.loopback, lo.link.ifindex) == (True, socket.if_nametoindex("lo"))
+    assert isinstance(lo.fact("routes"), Routes)
+    for fact in ("settings", "EEE"):
+        with pytest.raises(CannotLookError, match=UNSUPPORTED):
+            lo.fact(fact)
+    assert isinstance(lo.fact("offloads"), dict)
+    assert Machine("nosuch0").fact("link") is None
+
+
+def test_lists_of_processors() -> None:
+    assert (processor_list("0-2,5\n"), processor_list("")) == ([0, 1, 2, 5], [])
+    assert (as_list([5, 0, 2, 1, 1]), as_list([])) == ("0-2,5", "")
+    for text in ("x", "1-", "-1", "0-99999999999"):
+        with pytest.raises(CannotLookError):
+            processor_list(text)
+
+
+# -- whatever the files hold, and whichever are not there: each check says something, and none fails
+
+GARBAGE = ("", "\0\0", "-", "99999999999999999999", "x" * 5000, "1 2 3\n" * 50, b"\xff\xfe\x80", "(", "0-")
+
+
+@pytest.mark.parametrize("number", range(len(GARBAGE)))
+def test_garbage_in_every_file(tmp_path: Path, number: int) -> None:
+    assert not faults(list(examine_machine(machine(tmp_path, dict.fromkeys(GOOD, GARBAGE[number])))))
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.dictionaries(st.sampled_from(sorted(GOOD)), st.one_of(st.text(max_size=40), st.binary(max_size=40)))
+)
+def test_any_text_in_any_file(tmp_path: Path, files: dict[str, str | bytes]) -> None:
+    with tempfile.TemporaryDirectory(dir=tmp_path) as folder:
+        assert not faults(list(examine_machine(machine(Path(folder), files))))
+
+
+def test_no_files_at_all(tmp_path: Path) -> None:
+    unknown = but(**dict.fromkeys(FACTS, "no") | {"link": {"parent": "", "counters": {}}})
+    found = list(examine_machine(Machine("ens5", facts=dict(unknown), root=tmp_path)))
+    assert {finding.check for finding in found} == {check.name for check in CHECKS}
+    assert {finding.level for finding in found} <= {FINE, SKIP}
+    skipped = [finding.found for finding in found if finding.level is SKIP]
+    assert len(skipped) > len(CHECKS) // 2
+    assert all(said.startswith("not checked: ") for said in skipped)
+    assert any("/proc/interrupts: No such file" in said for said in skipped)
+
+
+def test_files_that_are_folders_or_endless(tmp_path: Path) -> None:
+    for name in GOOD:
+        (tmp_path / "folders" / name.lstrip("/")).mkdir(parents=True)
+    assert not faults(list(examine_machine(Machine("ens5", facts=dict(but()), root=tmp_path / "folders"))))
+    endless = machine(tmp_path / "endless", dict.fromkeys(("/proc/version", "/proc/config.gz")))
+    for name in ("version", "config.gz"):
+        (tmp_path / "endless/proc" / name).symlink_to("/dev/zero")
+    assert not faults(list(examine_machine(endless)))
+
+
+@pytest.mark.parametrize(
+    ("error", "level", "said"),
+    [
+        (CannotLookError("why"), SKIP, "not checked: why"),
+        (PermissionError(13, "Permission denied"), SKIP, "not checked: Permission denied"),
+        (BusError("slave 0 does not answer"), BAD, "slave 0 does not answer"),
+        (ZeroDivisionError("oh"), SKIP, "an error in ethercat-doctor"),
+    ],
+)
+def test_a_check_that_fails_is_one_finding_more(error: Exception, level: Level, said: str) -> None:
+    def look() -> Iterator[Finding]:
+        yield ok("first")
+        raise error
+
+    first, second = examine("bus", "slaves", look)
+    assert (first.found, first.subject, first.check) == ("first", "bus", "slaves")
+    assert (second.level, second.check, said in second.found) == (level, "slaves", True)

@@ -1,0 +1,201 @@
+"""The command line, the checks of this very machine, and how findings are written."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from bota_ethercat.health.verdict import Level
+from ethercat_server.doctor.cli import main
+from ethercat_server.doctor.machine import Machine
+from ethercat_server.doctor.machine_checks import CHECKS
+from ethercat_server.doctor.report import (
+    EXIT_CODES,
+    Finding,
+    Report,
+    as_json,
+    bad,
+    note,
+    ok,
+    skipped,
+    wants_color,
+    warning,
+    worst,
+)
+from tests.doctor.running import MODULE, doctor_here
+from tests.ended import run_here
+from tests.server.running import PATIENCE_S
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([], "usage: ethercat-doctor"),
+        (["a", "b"], "usage: ethercat-doctor"),
+        (["ens5", "--colour"], "usage: ethercat-doctor"),
+        (["ens5", "--seconds", "soon"], "invalid number value"),
+        (["ens5", "--seconds", "-1"], "from 0 to 3600"),
+        (["ens5", "--seconds", "nan"], "from 0 to 3600"),
+        (["ens5", "--cpu", "x"], "whole number"),
+        (["ens5", "--cpu", "4000"], "--cpu 4000: this machine has the processors 0 to"),
+        (["ens5", "--rt-priority", "100"], "--rt-priority 100: it must be a whole number from 0 to 99"),
+        (["a-name-that-is-too-long"], "is not an interface name"),
+        (["../lo"], "is not an interface name"),
+        ([""], "is not an interface name"),
+    ],
+)
+def test_wrong_arguments_are_exit_code_2(arguments: list[str], named: str) -> None:
+    ended = run_here(main, *arguments)
+    assert (ended.code, ended.out) == (2, "")
+    assert named in ended.err
+    assert ended.err.splitlines()[-1].startswith("ethercat-doctor: ")
+
+
+def test_what_failed_is_json_too_and_help_names_the_exit_codes() -> None:
+    ended = run_here(main, "a/b", "--json")
+    assert (ended.code, "not an interface name" in ended.json["error"]) == (2, True)
+    assert "1 trouble" in " ".join(run_here(main, "--help").out.split())
+
+
+def test_no_such_interface_is_a_finding_and_the_machine_is_looked_at() -> None:
+    ended = doctor_here("nosuch0", "--json", "--seconds", 0.05)
+    assert ended.code == 1
+    assert (ended.json["verdict"], ended.json["worst"]) == ("trouble", "bad")
+    assert (ended.json["interface"], ended.json["seconds"]) == ("nosuch0", 0.05)
+    assert isinstance(ended.json["root"], bool)
+    assert ended.findings("interface")["link"]["found"] == "no network interface 'nosuch0'"
+    there = {(row["subject"], row["check"]) for row in ended.json["findings"]}
+    assert {(c.subject, c.name) for c in CHECKS if c.subject in {"kernel", "rights", "processors"}} <= there
+    assert "there is no such interface" in ended.findings("bus")["slaves"]["found"]
+    assert ended.findings("measurement")["all"]["level"] == "skipped"
+
+
+def test_the_loopback_interface_is_no_place_for_a_sensor() -> None:
+    ended = doctor_here("lo", "--seconds", 0)
+    assert ended.code == 1
+    assert "the loopback interface" in ended.out
+    assert "not checked: the bus is not accessed" in ended.out
+    _, _, end = ended.out.partition("\nTrouble: 1 bad, ")
+    assert end.splitlines()[1] == "  bad      interface, link: the loopback interface"
+    assert "flush" not in ended.out, "the machine needs its addresses"
+    assert " lo gro" not in ended.out
+    assert "\x1b" not in ended.out
+
+
+def test_reader_that_has_enough() -> None:
+    command, pipe = [sys.executable, "-m", MODULE, "lo", "--seconds", "0"], subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as piped:
+        assert piped.stdout is not None
+        assert piped.stderr is not None
+        piped.stdout.readline()
+        piped.stdout.close()
+        assert piped.wait(timeout=PATIENCE_S) == 1
+        assert piped.stderr.read() == ""
+
+
+def test_virtual_without_rights_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Machine, "has_capability", lambda *_: False)
+    ended = doctor_here("virtual", "--json", "--seconds", 0)
+    assert ended.code == 0
+    assert "there is no virtual bus: CAP_NET_RAW" in ended.findings("bus")["slaves"]["found"]
+    assert ended.err == ""
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def named(finding: Finding, subject: str = "kernel", check: str = "tick") -> Finding:
+    return replace(finding, subject=subject, check=check)
+
+
+def written(*findings: Finding, stream: io.StringIO | None = None) -> str:
+    stream = stream or io.StringIO()
+    report = Report(stream)
+    for finding in findings:
+        report.write(finding)
+    report.summary(findings)
+    return stream.getvalue()
+
+
+def test_everything_is_aligned_below_its_subject() -> None:
+    long = "word " * 60
+    shown = written(
+        named(ok("250 Hz")), named(warning(long, "because", "echo 1 | sudo tee /x"), "processors", "governor")
+    ).splitlines()
+    assert shown[0] == "kernel"
+    assert shown[2:4] == ["", "processors"]
+    at = shown[1].index("250 Hz")
+    assert all(line[at - 1] == " " and line[at] != " " for line in shown[4:-4])
+    assert shown[-5] == " " * at + "$ echo 1 | sudo tee /x"
+    assert shown[-6].strip() == "because"
+    assert max(map(len, shown)) <= 120
+    assert shown[-3] == "Worth a look: 1 warning, 1 ok"
+
+
+def test_the_end_repeats_what_matters_for_the_rest_scrolls_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    found = [named(ok("x"))] * 30 + [named(warning("slow " * 40, "y"))] * 9 + [named(bad("gone", "y"), "bus")]
+    end = written(*found, stream=Terminal()).rpartition("\n\n")[2].splitlines()
+    assert len(end) < 24
+    assert max(len(line) for line in end[1:]) <= 80
+    assert "Trouble" in end[0]
+    assert end[1] == "  bad      bus, tick: gone"
+    assert end[-1] == "  and 2 more above"
+
+
+def test_commands_are_never_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    command = "sudo ethtool -C ens5 adaptive-rx off adaptive-tx off rx-usecs 0 tx-usecs 0 and more of it"
+    assert f"$ {command}\n" in written(named(note("x", "y", command)), stream=Terminal())
+
+
+def test_colour_only_on_a_terminal_and_not_against_the_users_will(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    assert "\x1b" not in written(named(bad("x", "y")))
+    assert "\x1b[1;31mbad" in written(named(bad("x", "y")), stream=Terminal())
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert "\x1b" not in written(named(bad("x", "y")), stream=Terminal())
+    assert not wants_color(Terminal(), {"TERM": "dumb"})
+    assert wants_color(Terminal(), {"NO_COLOR": ""}), "empty means not set"
+
+
+def test_what_devices_say_cannot_reach_the_terminal() -> None:
+    assert " a?[2Jb c?\n" in written(named(ok("a\x1b[2Jb\rc\x07")))
+    shown = written(named(ok("name \x1b]0;evil\x07 \x9b31m")), stream=Terminal())
+    assert "\x1b]" not in shown
+    assert "\x9b" not in shown
+
+
+def test_the_worst_finding_is_the_exit_code() -> None:
+    for findings in ([], [ok("a"), note("b", "c"), skipped("d")], [skipped("d"), warning("b", "c")]):
+        assert EXIT_CODES[worst(findings)] == 0
+    assert EXIT_CODES[worst([bad("b", "c"), warning("b", "c")])] == 1
+    assert worst([skipped("d")]) is Level.GOOD
+    assert 2 not in EXIT_CODES.values(), "that is wrong usage"
+
+
+def test_json_has_it_all() -> None:
+    found = json.loads(as_json({"interface": "ens5"}, [named(warning("b", "c", "d", n=1))]))
+    assert (found["interface"], found["verdict"], found["worst"]) == ("ens5", "look", "warning")
+    where = {"subject": "kernel", "check": "tick", "level": "warning"}
+    expected = {**where, "found": "b", "why": "c", "commands": ["d"], "values": {"n": 1}}
+    assert found["findings"] == [expected]
+
+
+def test_the_docs_have_every_check_in_its_order() -> None:
+    docs = (Path(__file__).parent.parent.parent / "docs" / "doctor.md").read_text()
+    table, subject = [], ""
+    for line in docs.partition("| Subject | Check |")[2].partition("\n\n")[0].splitlines()[2:]:
+        cells = [cell.strip().strip("`") for cell in line.split("|")[1:-1]]
+        subject = cells[0] or subject
+        table.append((subject, cells[1]))
+    assert table[: len(CHECKS)] == [(check.subject, check.name) for check in CHECKS]

@@ -1,0 +1,271 @@
+"""What a sensor shows of itself, in the log, in `status` and as events: silence, NaN, CoE emergencies."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import struct
+from typing import Any
+
+import pytest
+
+from bota_ethercat.pdo import LAYOUTS, encode
+from bota_ethercat.text.json_text import JsonObject
+from ethercat_server.ethercat.slave.emergencies import Emergency
+from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.simulation.machine import Machine
+from ethercat_server.virtual_sensor.options import SensorOptions
+from tests.simulation import Simulation, check_frames, life_of
+
+SLOW = {"sinc_length": 512}
+"""The fewer samples, the faster it is simulated."""
+
+
+@pytest.fixture
+def log(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
+    caplog.set_level("INFO")
+    return caplog
+
+
+def said(log: pytest.LogCaptureFixture, words: str) -> list[str]:
+    return [record.getMessage() for record in log.records if words in record.getMessage()]
+
+
+def test_a_sensor_that_gives_nothing_new_is_logged_and_so_is_its_end(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation(settings=SLOW)
+    simulation.run(2.0)
+    simulation.command("stick")
+    simulation.run(0.5)
+    assert not said(log, "gives nothing new"), "for a moment"
+    simulation.run(5.0)
+    assert len(said(log, "sensor 0 gives nothing new")) == 1
+    simulation.command("unstick")
+    simulation.run(5.0)
+    assert len(said(log, "sensor 0 gives new samples again after")) == 1
+    assert len(said(log, "gives nothing new")) == 1
+
+
+def test_a_sensor_that_is_lost_is_not_also_silent(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation(settings=SLOW)
+    simulation.run(2.0)
+    simulation.command("power cycle 5")
+    simulation.run(10.0)
+    assert said(log, "is back after")
+    assert not said(log, "gives n")
+
+
+def measure(simulation: Simulation, **values: float) -> None:
+    """Have sensor 0 measure these values from now on, each sample a new one; as it did before without any."""
+    sampler: Any = life_of(simulation.backend).sampler
+    vars(sampler).pop("newest", None)
+    if values:
+        newest, count = sampler.newest, itertools.count()
+        last: list[bytes] = [b"", b""]
+
+        def changed(later: int = 0) -> bytes:
+            if last[0] != newest(later):
+                last[:] = newest(later), encode(len(newest(later)), {**values, "torque.z": next(count)})
+            return last[1]
+
+        sampler.newest = changed
+
+
+@pytest.mark.parametrize("field", ["force.x", "acceleration.z", "temperature", "orientation.w"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_samples_that_are_not_finite_are_counted(field: str, value: float) -> None:
+    simulation = Simulation(SensorOptions(pdo_size=max(LAYOUTS)))
+    simulation.run(0.1)
+    before = simulation.streams[0].fresh
+    assert simulation.status()["sensors"][0]["not_finite"] == 0
+    measure(simulation, **{field: value})
+    simulation.run(0.1)
+    counted = simulation.streams[0].fresh - before
+    measure(simulation)
+    simulation.run(0.1)
+    assert counted > 70
+    assert simulation.status()["sensors"][0]["not_finite"] == pytest.approx(counted, abs=2)
+
+
+def test_what_is_discarded_after_a_start_is_not_counted() -> None:
+    simulation = Simulation()
+    measure(simulation, **{"force.x": math.nan})
+    simulation.run_until(lambda: simulation.streams[0].process_data, "a sample")
+    simulation.run_until(lambda: simulation.streams[0].fresh, "a frame")
+    row = simulation.status()["sensors"][0]
+    assert row["not_finite"] == row["fresh"] > 0
+
+
+def test_not_finite_is_logged_when_it_begins_and_when_it_is_over(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation(settings=SLOW)
+    simulation.run(2.0)
+    for _ in range(4):  # on and off, but never for long
+        measure(simulation, **{"force.x": math.nan})
+        simulation.run(1.5)
+        measure(simulation)
+        simulation.run(3.0)
+    assert len(said(log, "sensor 0 measures NaN or infinity: ")) == 1
+    assert not said(log, "measures finite numbers again")
+    simulation.run(10.0)
+    assert len(said(log, "sensor 0 measures finite numbers again")) == 1
+
+
+# -- CoE emergencies: read from the mailbox, kept, counted, logged and told, whatever else goes on there
+
+HOT = "emergency 0x4210 0x09 0102030405"
+CLOCK = SensorOptions(signal="clock")
+
+
+def told(simulation: Simulation) -> list[JsonObject]:
+    return [event for event in simulation.events if event["event"] == "emergency"]
+
+
+def flood(simulation: Simulation, seconds: float, every_s: float, codes: int = 1) -> None:
+    """One emergency after the other, for so long."""
+    for n in range(int(seconds / every_s)):
+        simulation.at(n * every_s, f"emergency {0x4210 + n % codes}")
+    simulation.run(seconds)
+
+
+def test_an_emergency_is_told_logged_and_kept(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation(CLOCK, CLOCK)
+    client = simulation.subscribe()
+    simulation.run(1.0)
+    assert client.ask("status")["sensors"][1]["emergencies"] == 0
+    assert client.ask("status")["sensors"][1]["emergency"] is None
+    simulation.command(f"{HOT} @1")
+    reported = {"code": 0x4210, "text": "temperature of the device", "register": 9, "data": "0102030405"}
+    event = client.wait_event("emergency", 1)
+    words = (
+        "sensor 1 reports emergency 0x4210 (temperature of the device), error register 0x09, data 0102030405"
+    )
+    assert event == {"event": "emergency", "sensor": 1, **reported, "count": 1, "message": words}
+    assert said(log, "emergency") == [words]
+    simulation.run(2.0)
+    first, second = client.ask("status")["sensors"]
+    assert (first["emergencies"], first["emergency"]) == (0, None)
+    assert second["emergencies"] == 1
+    assert second["emergency"].pop("ago_s") == pytest.approx(2.0, abs=0.2)
+    assert second["emergency"] == reported
+    for number in range(2):
+        check_frames(frame for frame in simulation.frames if frame.sensor == number)
+    assert [stream.lost_samples for stream in simulation.streams] == [0, 0]
+
+
+def test_what_waits_in_the_mailbox_is_read_within_a_tenth_of_a_second() -> None:
+    simulation = Simulation()
+    simulation.run(1.0)
+    for _ in range(10):
+        simulation.command(HOT)
+        simulation.run(0.11)
+    assert simulation.status()["sensors"][0]["emergencies"] == 10
+
+
+def test_a_flood_floods_neither_log_nor_clients_nor_the_bus(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation(CLOCK, settings=SLOW)
+    flood(simulation, 61.0, 0.02)
+    counted = simulation.status()["sensors"][0]["emergencies"]
+    assert counted == pytest.approx(580, rel=0.1), "ten a second are read, where exchanges allow"
+    assert len(told(simulation)) == 7, "one in ten seconds"
+    assert told(simulation)[-1]["count"] > 500
+    assert len(said(log, "reports emergency")) == 2, "one a minute"
+    assert simulation.streams[0].lost_samples == 0
+
+
+def test_a_flood_of_different_codes_is_bounded_too(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation(settings=SLOW)
+    flood(simulation, 50.0, 0.1, codes=1000)
+    assert len(said(log, "reports emergency")) == 16
+    assert 50 <= len(told(simulation)) <= 50 + 5, "one a second"
+    assert simulation.status()["sensors"][0]["emergencies"] == pytest.approx(475, rel=0.1)
+
+
+def test_no_answer_is_taken_from_a_job_and_no_emergency_is_lost_to_it() -> None:
+    """The answer would be asked for again after 0.7 s."""
+    simulation = Simulation(CLOCK)
+    client = simulation.connect()
+    simulation.run(1.0)
+    for n in range(200):
+        simulation.at(n * 0.025, HOT)
+    for _ in range(200):
+        asked_ns = simulation.clock.now_ns
+        assert client.ask("sdo_read", index=0x8011, type="u16")["value"] == 800
+        assert simulation.clock.now_ns - asked_ns < 400_000_000
+    simulation.run_until(lambda: simulation.status()["sensors"][0]["emergencies"] == 200, "all of them")
+    assert simulation.streams[0].lost_samples == 0
+
+
+def test_emergencies_before_an_answer_are_read_by_the_job() -> None:
+    simulation = Simulation()
+    client = simulation.connect()
+    simulation.run(1.0)
+    for n in range(30):
+        simulation.command(f"emergency {n}")
+    assert client.ask("sdo_read", index=0x8011, type="u16")["value"] == 800
+    row = client.ask("status")["sensors"][0]
+    assert row["emergencies"] == 30
+    simulation.run(1.0)
+    assert len(told(simulation)) == 5
+
+
+def test_each_change_is_told_and_the_end_of_an_error_is_no_warning(log: pytest.LogCaptureFixture) -> None:
+    simulation = Simulation()
+    simulation.run(1.0)
+    for code in (0x4210, 0, 0x4210, 0):
+        simulation.command(f"emergency {code}")
+        simulation.run(0.5)
+    assert [event["code"] for event in told(simulation)] == [0x4210, 0, 0x4210, 0]
+    assert {r.levelname for r in log.records if "emergency 0x0000 (error reset" in r.getMessage()} == {"INFO"}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_start_survives_emergencies_and_keeps_the_last(log: pytest.LogCaptureFixture, seed: int) -> None:
+    backend = MemoryBackend(machine=Machine(seed=seed))
+
+    def report() -> None:
+        backend.command(HOT)
+
+    for n in range(400):  # from before the start until it is over; without a mailbox in INIT
+        backend.clock.at(backend.clock.now_ns + n * 7_000_000, report)
+    simulation = Simulation(backend=backend)
+    row = simulation.status()["sensors"][0]
+    assert row["emergencies"] > 0
+    assert row["emergency"]["code"] == 0x4210
+    assert len(said(log, "sensor 0 reports emergency 0x4210")) == 1
+    simulation.run(1.0)
+    assert simulation.streams[0].fresh > 0
+
+
+def test_a_lost_sensor_is_set_up_again_in_spite_of_emergencies() -> None:
+    simulation = Simulation()
+    simulation.run(1.0)
+    for n in range(300):  # without power there is no mailbox
+        simulation.at(n * 0.005, lambda: simulation.backend.command(HOT))
+    simulation.at(0.0, "power cycle 0.5")
+    simulation.run_until(
+        lambda: [e for e in simulation.events if e["event"] == "sensor_back"], "it back", 10.0
+    )
+    assert simulation.status()["sensors"][0]["emergencies"] > 0
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        (0x0000, "error reset, or no error"),
+        (0x2310, "current on the output side"),
+        (0x2400, "current"),
+        (0x4210, "temperature of the device"),
+        (0xFF07, "device-specific"),
+        (0xB000, "of no class that CiA 301 defines"),
+    ],
+)
+def test_every_code_has_words(code: int, text: str) -> None:
+    assert Emergency(code, 0, b"").text == text
+
+
+def test_messages_of_every_length_and_service_are_parsed_or_not() -> None:
+    message = struct.pack("<HHB", 0x1000, 0x1234, 0x81) + b"abcdefg"
+    for length in range(12):
+        expected = Emergency(0x1234, 0x81, b"abcde"[: length - 5]) if length >= 5 else None
+        assert Emergency.parse(message[:length]) == expected
+    for service in (0, 2, 3, 4, 8, 15):
+        assert Emergency.parse(struct.pack("<HHB5s", service << 12, 1, 1, b"")) is None

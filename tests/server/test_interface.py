@@ -1,0 +1,359 @@
+"""Real interfaces: which carry no frames, which belong to the network, who has one, and its raw socket.
+
+What the kernel says of one, and whose lock it is, only the kernel knows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ethercat_server.daemon.server import serve
+from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat import nic
+from ethercat_server.ethercat.nic import Routes, claimed, look_up, network_trouble, why_silent
+from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
+from ethercat_server.process.signals import Signals
+from tests import rights
+from tests.doctor.running import doctor_here
+from tests.rights import NO_OTHER_USER, NOBODY, as_user, needs_another_user
+from tests.server.running import Veth, needs_bus, wait_until
+from tests.tool.running import tool_here
+
+pytestmark = [pytest.mark.bus, needs_bus]
+CLAIM = """
+import sys
+from ethercat_server.ethercat.nic import claimed
+with claimed(sys.argv[1]):
+    print("claimed", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture(scope="module")
+def veth() -> Iterator[Veth]:
+    with Veth() as found:
+        yield found
+
+
+@pytest.fixture
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """In place of the one in /run."""
+    found = tmp_path / "ethercat-server"
+    monkeypatch.setattr(nic, "DIRECTORY", found)
+    return found
+
+
+def refusal(ifname: str) -> str:
+    with pytest.raises(InterfaceError) as refused, claimed(ifname):
+        pass
+    return str(refused.value)
+
+
+# -- an interface that cannot carry frames
+
+
+def test_a_small_mtu_is_named_with_its_remedy(veth: Veth) -> None:
+    veth.ip("link", "set", veth.near, "mtu", "1400")
+    try:
+        assert why_silent(veth.near) == refusal(veth.near)
+        assert refusal(veth.near).endswith(f"'sudo ip link set {veth.near} mtu 1500'")
+    finally:
+        veth.ip("link", "set", veth.near, "mtu", "1500")
+    assert why_silent(veth.near) == "check cable and power"
+
+
+def test_a_part_of_a_bridge_is_refused_and_the_bridge_is_named(veth: Veth) -> None:
+    bridge = f"br{os.getpid()}"
+    veth.ip("link", "add", bridge, "type", "bridge")
+    try:
+        veth.ip("link", "set", veth.near, "master", bridge)
+        assert f"{veth.near} is part of {bridge} (a bridge or bond)" in refusal(veth.near)
+        assert bridge in why_silent(veth.near)
+    finally:
+        veth.ip("link", "del", bridge)
+    with claimed(veth.near):
+        pass
+
+
+def test_an_interface_that_is_down_or_gone_is_why_nothing_comes_back(veth: Veth) -> None:
+    veth.ip("link", "set", veth.far, "down")
+    assert "has no carrier" in why_silent(veth.near)
+    veth.ip("link", "set", veth.near, "down")
+    assert f"{veth.near} is down: bring it up" in why_silent(veth.near)
+    veth.ip("link", "set", veth.near, "up")
+    veth.ip("link", "set", veth.far, "up")
+    wait_until(lambda: look_up(veth.near).has_carrier, "the carrier")
+    assert "no network interface 'nothing0'" in why_silent("nothing0")
+    assert why_silent("virtaul").endswith("; did you mean 'virtual'?")
+
+
+# -- an interface of the machine's network
+
+IN_A_NETWORK = """
+set -e
+ip link add near0 type veth peer name far0
+ip link set far0 up
+ip link set near0 up
+ip address add 192.0.2.7/24 dev near0
+ip route add default via 192.0.2.1
+exec "$@"
+"""
+"""In a network namespace, where a default route hurts nobody."""
+REFUSE = """
+import sys
+from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.nic import claimed
+try:
+    with claimed("near0"):
+        pass
+except InterfaceError as error:
+    print(error)
+with claimed("near0", allow_ip=True):
+    print("allowed")
+"""
+
+
+def test_the_default_route_is_refused_unless_it_is_allowed() -> None:
+    """Only in a network namespace of its own may a test have one, so this is a process."""
+    done = subprocess.run(
+        ["unshare", "--net", "bash", "-c", IN_A_NETWORK, "bash", sys.executable, "-c", REFUSE],
+        check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    refused, allowed = done.stdout.splitlines()
+    assert "near0 has the machine's default route" in refused, done.stderr
+    assert "'ethercat-sensor adapters' lists them" in refused
+    assert "--allow-ip" in refused
+    assert allowed == "allowed"
+
+
+@contextlib.contextmanager
+def address(veth: Veth, *options: str) -> Iterator[None]:
+    veth.ip("address", "add", "192.0.2.77/32", "dev", veth.near, *options)
+    try:
+        yield
+    finally:
+        veth.ip("address", "flush", "dev", veth.near)
+
+
+def test_an_address_for_some_time_is_refused_by_server_tool_and_doctor_and_marked(veth: Veth) -> None:
+    """So does a DHCP client add it."""
+    why = f"{veth.near} has the IP address 192.0.2.77/32 by DHCP"
+    with address(veth, "valid_lft", "600", "preferred_lft", "600"):
+        assert refusal(veth.near).startswith(why)
+        assert f"'sudo ip address flush dev {veth.near}'" in refusal(veth.near)
+        assert why in tool_here("watch", veth.near, code=1).err
+        with pytest.raises(InterfaceError, match="has the IP address"):
+            serve([veth.near, "14999", "--user", "root"], Signals())
+        found = doctor_here(veth.near, "--seconds", 0, "--json")
+        assert why in found.findings("bus")["slaves"]["found"]
+        assert (found.code, found.findings("other software")["addresses"]["level"]) == (1, "bad")
+        line = next(
+            line for line in tool_here("adapters").out.splitlines() if line.startswith(f"{veth.near} ")
+        )
+        assert "not for a sensor: 192.0.2.77/32" in line
+        with claimed(veth.near, allow_ip=True):
+            pass
+    with claimed(veth.near):
+        pass
+
+
+def test_an_address_that_somebody_gave_it_is_allowed(veth: Veth) -> None:
+    """The doctor warns of it: IP traffic delays the sensor's frames."""
+    with address(veth), claimed(veth.near):
+        assert f"{veth.near} " in (listed := tool_here("adapters").out)
+        assert "192.0.2.77/32" in listed
+        assert "not for a sensor: 192.0.2.77/32" not in listed
+
+
+@pytest.mark.parametrize(
+    ("routes", "why"),
+    [
+        (Routes(("10.0.0.2/24",), (), True), "default route"),
+        (Routes(leased=("2001:db8::2/64",)), "address 2001:db8::2/64 by DHCP"),
+        (Routes(("10.0.0.2/24",)), None),
+        (Routes((), ("fe80::1/64",), others=("10.1.0.0/16",)), None),
+        (Routes(), None),
+    ],
+)
+def test_what_every_interface_may_have_is_no_network(routes: Routes, why: str | None) -> None:
+    problem = network_trouble("ens5", routes)
+    assert problem is None if why is None else problem is not None and why in problem
+
+
+# -- who has it
+
+
+def test_a_master_of_somebody_elses_is_named_with_its_process(veth: Veth) -> None:
+    """It has no lock of ours, only the raw socket: whose that is only the kernel knows."""
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as its:
+        its.bind((veth.near, 0x88A4))
+        name = Path("/proc/self/comm").read_text().strip()
+        assert f"is in use by another EtherCAT master, process {os.getpid()} ({name}): stop" in refusal(
+            veth.near
+        )
+    with claimed(veth.near):
+        pass
+
+
+@contextlib.contextmanager
+def another(ifname: str) -> Iterator[subprocess.Popen[str]]:
+    """Another process that has claimed the interface."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", CLAIM, ifname], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "claimed\n"
+        yield process
+
+
+def test_the_process_that_has_the_interface_is_named_until_it_ends_in_any_way(veth: Veth) -> None:
+    with another(veth.near) as process:
+        name = Path(f"/proc/{process.pid}/comm").read_text().strip()
+        expected = f"{veth.near} is in use by another EtherCAT master, process {process.pid} ({name}): stop"
+        if os.access(nic.DIRECTORY, os.W_OK):
+            assert refusal(veth.near).startswith(expected)
+            with claimed(veth.far):
+                pass
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        with claimed(veth.near):
+            pass
+
+
+@needs_another_user
+def test_another_user_takes_neither_the_lock_nor_its_file(
+    veth: Veth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it could an abstract socket."""
+    directory = rights.temporary() / "ethercat-server"
+    monkeypatch.setattr(nic, "DIRECTORY", directory)
+    with claimed(veth.near):
+        pass
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as taken:
+        with as_user(NOBODY.pw_uid):
+            taken.bind(f"\0bota-ethercat-bridge/ifindex/{socket.if_nametoindex(veth.near)}")
+            for mode in (os.O_RDONLY, os.O_RDWR):
+                with pytest.raises(PermissionError):
+                    os.open(directory / "lock", mode)
+        with claimed(veth.near):
+            pass
+
+
+def test_what_root_made_first_is_the_services_too(veth: Veth, directory: Path) -> None:
+    directory.mkdir(mode=0o755)
+    if os.geteuid() == 0 and NO_OTHER_USER is None:
+        os.chown(directory, NOBODY.pw_uid, NOBODY.pw_gid)
+    with claimed(veth.near):
+        found = (directory / "lock").stat()
+    assert stat.S_IMODE(found.st_mode) == 0o600
+    assert found.st_uid == directory.stat().st_uid
+
+
+@pytest.mark.parametrize("trap", ["link", "hard link", "fifo", "writable"])
+def test_a_file_that_may_be_anothers_is_not_touched(veth: Veth, directory: Path, trap: str) -> None:
+    directory.mkdir(mode=0o755)
+    victim, place = directory.parent / "victim", directory / "lock"
+    victim.write_text("as it was")
+    before = victim.stat()
+    if trap == "link":
+        place.symlink_to(victim)
+    elif trap == "hard link":
+        place.hardlink_to(victim)
+    elif trap == "fifo":
+        os.mkfifo(place)
+    else:
+        directory.chmod(0o777)
+    with claimed(veth.near), pytest.raises(OSError):  # noqa: PT011 - any
+        nic._open(nic.DIRECTORY)
+    assert (victim.stat().st_uid, victim.stat().st_mode) == (before.st_uid, before.st_mode)
+
+
+def test_without_run_it_is_a_name_in_the_namespace(veth: Veth, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As for the root of a user namespace."""
+    monkeypatch.setattr(nic, "DIRECTORY", Path("/proc/ethercat-server"))
+    for _ in range(2):
+        with claimed(veth.near), pytest.raises(InterfaceError, match="in use"), claimed(veth.near):
+            pass
+
+
+# -- the raw socket, with this test at the other end
+
+FRAME = (b"\xff" * 6 + b"\x01" * 6 + b"\x88\xa4" + b"\x0e\x10").ljust(60, b"\0")
+LONG_S = 20.0
+
+
+def open_packet(ifname: str) -> socket.socket:
+    sock = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
+    sock.bind((ifname, 0x88A4))
+    sock.settimeout(LONG_S)
+    return sock
+
+
+@pytest.fixture
+def ends(veth: Veth) -> Iterator[tuple[RawSocket, socket.socket]]:
+    with (
+        open_packet(veth.near) as near,
+        open_packet(veth.far) as far,
+        contextlib.closing(RawSocket(near.fileno())) as raw,
+    ):
+        yield raw, far
+
+
+def test_frames_go_both_ways_and_none_is_none(ends: tuple[RawSocket, socket.socket]) -> None:
+    raw, far = ends
+    assert raw.receive(0) is None
+    raw.send(FRAME)
+    assert far.recv(2048) == FRAME
+    far.send(FRAME)
+    assert raw.receive(LONG_S) == FRAME
+    far.send(FRAME)
+    far.send(FRAME)
+    assert raw.receive(LONG_S) == FRAME
+    raw.discard()
+    assert raw.receive(0) is None
+
+
+def test_the_kernel_says_when_a_frame_had_arrived(ends: tuple[RawSocket, socket.socket]) -> None:
+    raw, far = ends
+    raw.arrived_ns()  # from now on
+    right = False
+    for _ in range(50):  # it is late if this process stops while it reads two clocks
+        before = time.monotonic_ns()
+        far.send(FRAME)
+        after = time.monotonic_ns()
+        time.sleep(0.002)  # in which it lies there
+        assert raw.receive(LONG_S) == FRAME
+        assert raw.arrived_ns() > before
+        right |= raw.arrived_ns() < after
+    assert right
+
+
+def test_waiting_leaves_the_processor_to_others(ends: tuple[RawSocket, socket.socket]) -> None:
+    before = time.thread_time()
+    assert ends[0].receive(0.3) is None
+    assert time.thread_time() - before < 0.15
+
+
+def test_packet_sockets_are_found_among_the_descriptors(veth: Veth) -> None:
+    with open_packet(veth.near) as packet, socket.socket() as other:
+        assert packet.fileno() in packet_sockets()
+        assert other.fileno() not in packet_sockets()
+
+
+def test_a_link_that_is_down_loses_frames(veth: Veth, ends: tuple[RawSocket, socket.socket]) -> None:
+    """The last one: it stays down."""
+    veth.ip("link", "set", veth.near, "down")
+    ends[0].send(FRAME)
+    assert ends[0].receive(0.01) is None

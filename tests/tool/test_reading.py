@@ -1,0 +1,348 @@
+"""`eeprom`, `objects`, `read` and `watch` without a server, on simulated sensors."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.wire import DATAGRAM_HEADER, FRAME_HEADER, Command
+from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, NOTE_NAMES
+from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.tool.cli import COMMANDS
+from tests.simulation import SimulatedBus, SimulatedServer, registers, simulated_bus, simulated_server
+from tests.tool.odd_firmware import FOREIGN_VENDOR, fewer_objects, foreign, no_mailbox
+from tests.tool.running import complaints, one_sentence, refused, told, tool_here
+
+
+@pytest.fixture
+def bench() -> Iterator[SimulatedBus]:
+    """One sensor with 61 bytes of process data that gives the same numbers for ever."""
+    with simulated_bus("--signal", "constant", "--serial", "4711") as bus:
+        yield bus
+
+
+@pytest.fixture
+def chain() -> Iterator[SimulatedBus]:
+    """Two with 77 bytes."""
+    models = "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8"
+    with simulated_bus("--pdo", "77", "--model", models, "--serial", "10,20") as bus:
+        yield bus
+
+
+def test_eeprom_shows_the_words_and_what_they_mean(bench: SimulatedBus) -> None:
+    shown = tool_here("eeprom", bench.near).out
+    assert "\n0008: 7a|b0|00|00\n" in shown, "as the note's script prints it"
+    assert "\n007e: " in shown
+    found = told("eeprom", bench.near)["slaves"][0]
+    assert (found["vendor"], found["product"], found["revision"], found["serial"]) == (0xB07A, 1, 3, 4711)
+    assert found["name"] == "BFT-SENS-ECAT-M8"
+    assert found["check_byte_right"]
+    assert found["mailboxes"] == {"out": [0x1000, 128], "in": [0x1080, 128]}
+    assert found["protocols"] == ["CoE", "FoE"]
+    managers = [(row["start"], row["size"], row["kind"]) for row in found["sync_managers"]]
+    assert managers[2:] == [(0x1100, 1, "outputs"), (0x1180, 61, "inputs")]
+    assert found["fmmus"] == [1, 2, 3]
+
+
+def test_eeprom_of_a_chain(chain: SimulatedBus) -> None:
+    found = told("eeprom", chain.near)["slaves"]
+    # Each slave's own name, though pysoem gives the second one the first one's.
+    assert [row["name"] for row in found] == ["BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8"]
+    assert [row["sync_managers"][3]["size"] for row in found] == [77, 77]
+    only = told("eeprom", chain.near, "--sensor", "20")["slaves"]
+    assert [row["sensor"] for row in only] == [1]
+
+
+def test_every_object_is_read_and_decoded(bench: SimulatedBus) -> None:
+    found = told("objects", bench.near)["sensors"][0]
+    assert (found["name"], found["serial"]) == ("BFT-SENS-ECAT-M8", 4711)
+    rows = {(int(row["index"], 16), row["subindex"]): row for row in found["objects"]}
+    assert set(rows) == {row.address for row in KNOWN_OBJECTS}
+    decoded: dict[tuple[int, int], dict[str, object]] = {
+        (0x8011, 0): {"value": 800, "unit": "Hz"},
+        (0x8004, 0): {"meaning": "±2 g"},
+        (0x8006, 2): {"meaning": "FIR off"},
+        (0x8006, 1): {"write_states": ["PREOP"], "allowed": {"from": 32, "to": 2048}},
+        (0x6000, 4): {"value": 1.5},
+    }
+    for address, expected in decoded.items():
+        assert expected.items() <= rows[address].items()
+    assert rows[0x8004, 0]["allowed"]["3"] == "±16 g"
+    assert "0x06020000" in rows[0x8003, 0]["error"]
+    quaternion = {(0x6000, sub) for sub in range(0x14, 0x18)}
+    assert {address for address, row in rows.items() if "error" in row} == {(0x8003, 0)} | quaternion
+
+
+def test_objects_that_cannot_be_read_have_a_line_with_the_reason(
+    bench: SimulatedBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near = bench.near
+    fewer_objects(monkeypatch)
+    bench.command("abort 0x8002 1 0x08000021")
+    lines = tool_here("objects", near).out.splitlines()
+    missing = next(line for line in lines if "0x8010:4" in line)
+    assert "this firmware does not have it (abort 0x06090011)" in missing
+    assert "refused" in next(line for line in lines if "0x8002:1" in line)
+    assert any("Sampling rate" in line and "800" in line for line in lines)
+    alone = tool_here("read", near, "0x8010:4", code=1)
+    assert "this firmware does not have it" in alone.out + alone.err
+
+
+@pytest.mark.parametrize(("size", "missing"), [("61", 5), ("77", 1)])
+def test_the_full_dump_has_a_line_for_every_object(size: str, missing: int) -> None:
+    with simulated_bus("--pdo", size) as bus:
+        lines = tool_here("objects", bus.near).out.splitlines()
+    assert len(lines) == 2 + len(KNOWN_OBJECTS)
+    assert sum("this firmware does not have it" in line for line in lines) == missing
+
+
+def test_a_foreign_slave_is_no_sensor_to_anybody(monkeypatch: pytest.MonkeyPatch) -> None:
+    foreign(monkeypatch)
+    with simulated_bus() as bus:
+        assert told("eeprom", bus.near)["slaves"][0]["vendor"] == FOREIGN_VENDOR
+        assert "no Bota Gen-0 sensor" in refused("watch", bus.near)
+        assert bus.written() == []
+
+
+def test_a_sensor_without_a_mailbox_has_no_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+    no_mailbox(monkeypatch)
+    with simulated_bus() as bus:
+        assert told("eeprom", bus.near)["slaves"][0]["protocols"] == []
+        for command in (["objects"], ["plan", "--set", "fir=on"]):
+            refused = tool_here(command[0], bus.near, *command[1:], code=1)
+            assert "has no CoE mailbox" in one_sentence(refused)
+
+
+def test_an_eeprom_that_cannot_be_read_says_so(bench: SimulatedBus) -> None:
+    bench.command("sii error")
+    said = refused("eeprom", bench.near)
+    assert "the SII of slave 0 cannot be read at word 0x0000: it refuses" in said
+    assert "cannot be read" in refused("objects", bench.near)
+    bench.command("sii ok")
+    assert told("eeprom", bench.near)["slaves"][0]["check_byte_right"]
+
+
+def test_every_row_of_table_iii_1_is_read_by_name(bench: SimulatedBus) -> None:
+    names = [name for _, _, name in NOTE_NAMES]
+    ended = tool_here("read", bench.near, *names, "--json", code=1)
+    found = ended.json["sensors"][0]["objects"]
+    read = {(int(row["index"], 16), row["subindex"]) for row in found}
+    assert {(index, subindex) for index, subindex, _ in NOTE_NAMES} <= read
+    unreadable = {row["index"] for row in found if "error" in row}
+    assert unreadable == {"0x8003", "0x6000"}, "no range, and no quaternion in 61 bytes"
+    assert re.search(
+        r"sensor 0 gave no value of .*: .*does not have it .*; and \d+ more$", one_sentence(ended)
+    )
+
+
+def test_a_sensor_that_sends_nothing_is_watched_in_vain() -> None:
+    with simulated_bus("--sinc", "512") as bus:
+        bus.at(0.6, "deaf 9")
+        ended = tool_here("watch", bus.near, "--seconds", 3, "--interval", 9, code=1)
+    assert "0 samples" in ended.out
+    said = complaints(ended.err)[-1]
+    assert said.endswith(
+        "No new sample for 3.0 s, the sensor does not answer the bus: check its cable and power"
+    )
+
+
+def test_objects_of_a_chain_by_place_serial_and_name(chain: SimulatedBus) -> None:
+    sensors = told("objects", chain.near)["sensors"]
+    assert len(sensors) == 2
+    assert not [row for row in sensors[1]["objects"] if row["index"] == "0x6000" and "error" in row]
+    for which in ("1", "20", "serial:20", "BFT-ROKS-ECAT-M8"):
+        read = tool_here("read", chain.near, "Sampling rate", "--sensor", which, "--json")
+        assert [row["serial"] for row in read.json["sensors"]] == [20]
+    assert "no sensor matches" in refused("objects", chain.near, "--sensor", "7", code=2)
+
+
+def test_watch_shows_each_block_and_writes_nothing(bench: SimulatedBus) -> None:
+    ended = tool_here("watch", bench.near, "--seconds", 0.6, "--interval", 0.2, code=1)
+    assert "No new sample for 0.6 s, the sensor repeats the same sample" in one_sentence(ended)
+    blocks = [line for line in ended.out.splitlines() if "samples" in line and line.startswith("sensor 0  ")]
+    assert 2 <= len(blocks) <= 4
+    assert "repeated" in blocks[1], "it gives nothing new, and shows"
+    assert "F +1.500 -2.250 -9.750 N" in blocks[1]
+    assert bench.written() == [], "it looks at the sensor as it is set"
+
+
+def test_watch_gives_si_units_rate_and_warnings() -> None:
+    with simulated_bus("--signal", "sine", "--pdo", "77", "--sinc", "128") as bus:
+        bus.command("warn 0x20")
+        ended = tool_here("watch", bus.near, "--samples", 200, "--interval", 10, "--json")
+    (row,) = map(json.loads, ended.out.splitlines())
+    assert row["samples"] == 200
+    assert row["rate_hz"] == pytest.approx(400, rel=0.01), "as the sensor is set, not the server's default"
+    assert row["acceleration"] == pytest.approx([0, 0, 9.80665])
+    assert row["deviation"]["force"][0] > 0.3, "a fifth of a sine of 10 N"
+    assert row["temperature"] == 35
+    assert row["warnings"][0]["meaning"] == "Overtemperature"
+
+
+def test_watch_counts_the_samples_that_the_bus_lost(chain: SimulatedBus) -> None:
+    chain.at(1.2, "deaf 0.02")
+    ended = tool_here("watch", chain.near, "--seconds", 0.9, "--interval", 10, "--json")
+    assert [json.loads(line)["gaps"] for line in ended.out.splitlines()] == [1, 1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_the_normal_end_of_watch(chain: SimulatedBus, number: signal.Signals) -> None:
+    chain.at(0.7, lambda: signal.raise_signal(number))
+    ended = tool_here("watch", chain.near, "--interval", 0.1)
+    assert complaints(ended.err) == []
+    assert "sensor 1: " in ended.out.splitlines()[-1]
+
+
+def test_a_bus_that_is_silent_is_one_sentence(bench: SimulatedBus) -> None:
+    bench.command("deaf")
+    for command in ("eeprom", "objects", "watch", "save"):
+        assert "no EtherCAT slave answers on " in refused(command, bench.near)
+
+
+FURTHER: dict[str, list[object]] = {
+    "read": ["sampling rate"], "snapshot": ["new"], "restore": ["old"],
+    "plan": ["--set", "chop=on"], "apply": ["--set", "chop=on"],
+}  # fmt: skip
+"""Arguments of commands on a bus of others."""
+SII_ACCESS = set(range(reg.SII_OWNER, reg.SII_OWNER + 8))
+"""Registers that are written to read an SII; its owner gets it back."""
+
+
+@pytest.fixture
+def old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A snapshot in the current directory."""
+    monkeypatch.chdir(tmp_path)
+    with simulated_bus() as bus:
+        tool_here("snapshot", bus.near, "old")
+
+
+@pytest.mark.usefixtures("old")
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("adapters", "find", "eeprom")])
+def test_a_bus_without_a_sensor_is_not_touched_by(command: str) -> None:
+    with simulated_bus("--chain", "EK1100,DRIVE:PREOP") as bus:
+        before, sent = [state(each) for each in registers(bus.backend)], writes(bus.backend)
+        assert "no Bota Gen-0 sensor" in refused(command, bus.near, *FURTHER.get(command, []))
+        assert [state(each) for each in registers(bus.backend)] == before
+        assert {address for _, address in sent} <= SII_ACCESS
+
+
+@pytest.mark.usefixtures("old")
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("adapters", "find")])
+def test_a_drive_at_work_is_not_touched_by(command: str) -> None:
+    with simulated_bus("--chain", "BOTA:OP,DRIVE:OP") as bus:
+        before = registers(bus.backend)
+        said = refused(command, bus.near, *FURTHER.get(command, []))
+        assert "has slaves at work that are no Bota sensors (position 1 in OP)" in said
+        option = "--take-over" if command in {"snapshot", "restore"} else "--force"
+        assert f"; {option} takes them to PREOP" in said
+        assert registers(bus.backend) == before
+        assert bus.stats_of_foreign(1)["write_count"] == 0
+
+
+def test_the_standard_objects_of_a_foreign_slave_in_the_state_it_is_in() -> None:
+    with simulated_bus("--chain", "EK1100,DRIVE:PREOP,DRIVE") as bus:
+        before, sent = [state(each) for each in registers(bus.backend)], writes(bus.backend)
+        (slave,) = told("objects", bus.near, "--slave", "1:DRIVE")["sensors"]
+        assert (slave["slave"], slave["name"]) == (1, "DRIVE")
+        found = {(row["index"], row["subindex"]): row.get("value") for row in slave["objects"]}
+        assert (found["0x1018", 1], found["0x1018", 2]) == (0x7E57, 402)
+        assert [state(each) for each in registers(bus.backend)] == before
+        assert len({address for _, address in sent} - SII_ACCESS) == 1, "its mailbox"
+        for wanted, why in (
+            ("1", "there are 0:EK1100; 1:DRIVE; 2:DRIVE"), ("0:DRIVE", "no slave is '0:DRIVE'"),
+            ("0:EK1100", "has no CoE mailbox"),
+        ):  # fmt: skip
+            assert why in refused("objects", bus.near, "--slave", wanted, code=2)
+        assert "is in INIT" in refused("objects", bus.near, "--slave", "2:DRIVE")
+
+
+def state(registers: bytes) -> bytes:
+    """What its own master has set up: station address, AL state, FMMUs, sync managers' layout."""
+    managers = registers[reg.SYNC_MANAGER : reg.SYNC_MANAGER + 4 * reg.SYNC_MANAGER_SIZE]
+    layout = b"".join(managers[at : at + 5] for at in range(0, len(managers), reg.SYNC_MANAGER_SIZE))
+    al, fmmus = registers[reg.AL_STATUS : reg.AL_STATUS + 1], registers[reg.FMMU : reg.FMMU + 64]
+    return registers[0x10:0x12] + al + fmmus + layout
+
+
+def writes(backend: MemoryBackend) -> list[tuple[Command, int]]:
+    """Filled with every datagram from now on that is not a read: command and register."""
+    found: list[tuple[Command, int]] = []
+    send = backend.send
+
+    def note(frame: bytes | bytearray) -> None:
+        at, more = FRAME_HEADER, True
+        while more:
+            command, _, _, address, length = struct.unpack_from("<BBHHH", frame, at)
+            if command not in (Command.APRD, Command.FPRD, Command.BRD):
+                found.append((Command(command), address))
+            at += DATAGRAM_HEADER + (length & 0x7FF) + 2
+            more = bool(length & 0x8000)
+        send(frame)
+
+    backend.send = note  # type: ignore[method-assign]
+    return found
+
+
+FORCE = (1.5, -2.25, -9.75)
+SERVER = ("--server", SimulatedServer.address)
+FORCE_Z = "0x6000:6"
+
+
+@pytest.fixture
+def bus() -> Iterator[SimulatedBus]:
+    with simulated_bus("--signal", "rest") as found:
+        yield found
+
+
+def unsettled_at_first(bus: SimulatedBus) -> None:
+    """The sensor gives a wrong force for the first 0.4 s in OP, from now on."""
+    state = ""
+
+    def look() -> None:
+        nonlocal state
+        before, state = state, bus.stats()["al_state"]
+        if state == "OP" != before:
+            bus.command("limit force.z 5")
+            bus.at(0.4, "limit force.z off")
+        bus.at(0.001, look)
+
+    look()
+
+
+def test_watch_begins_with_settled_data(bus: SimulatedBus) -> None:
+    unsettled_at_first(bus)
+    for end in (("--samples", 20), ("--seconds", 0.2)):
+        shown = told("watch", bus.near, *end, "--interval", 9)
+        assert (*shown["force"], shown["samples"] >= 20) == (*FORCE, True)
+
+
+@pytest.mark.parametrize("command", ["watch", "tare", "read"])
+def test_through_a_server_that_has_just_started(bus: SimulatedBus, command: str) -> None:
+    unsettled_at_first(bus)
+    with simulated_server(bus):
+        if command == "watch":
+            shown = told("watch", *SERVER, "--samples", 20, "--interval", 9)["force"][2]
+        elif command == "tare":
+            shown = -told("tare", *SERVER, "--samples", 20)["new_offset"][2]
+        else:
+            read = told("read", FORCE_Z, *SERVER)["sensors"][0]["objects"]
+            shown = read[0]["value"]
+    assert shown == FORCE[2]
+
+
+def test_watch_leaves_out_what_has_not_settled_after_a_recovery(bus: SimulatedBus) -> None:
+    unsettled_at_first(bus)
+    bus.at(1.5, "power cycle 0.2")
+    ended = tool_here("watch", bus.near, "--seconds", 3, "--interval", 0.1, "--json")
+    rows = [json.loads(line) for line in ended.out.splitlines()]
+    full = [row for row in rows if row["samples"]]
+    assert all(tuple(row["force"]) == FORCE for row in full)
+    assert len(full) < len(rows), "it was lost, and told so"
+    assert sum(row["gaps"] for row in full) == 1, full
