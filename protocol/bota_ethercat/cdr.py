@@ -8,8 +8,7 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-_LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
-"""How CDR begins on every machine that ROS 2 is built for."""
+_LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"  # how CDR begins on every machine that ROS 2 is built for
 _NS_PER_S: Final = 1_000_000_000
 
 

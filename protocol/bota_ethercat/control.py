@@ -19,8 +19,7 @@ from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable
 
 PROTOCOL_VERSION: Final = 1
-MAX_SDO_BYTES: Final = 112
-"""Largest SDO that fits a mailbox of 128 bytes unsegmented."""
+MAX_SDO_BYTES: Final = 112  # largest SDO that fits a mailbox of 128 bytes unsegmented
 MAX_TARE_SAMPLES: Final = 20_000
 _LONGEST_NAME: Final = 80
 MAX_SII_WORDS: Final = 128
@@ -34,8 +33,7 @@ class ErrorCode(StrEnum):
     DENIED = "denied"
     BUSY = "busy"
     NOT_READY = "not_ready"
-    SENSOR = "sensor"
-    """The sensor refused: an SDO abort, with `abort_code`."""
+    SENSOR = "sensor"  # the sensor refused: an SDO abort, with `abort_code`
     INTERNAL = "internal"
 
 
@@ -66,10 +64,8 @@ class Action(NamedTuple):
     """One action and its keys besides `action` and `id`."""
 
     parameters: Mapping[str, Parameter]
-    controls: bool = False
-    """Changes something, so it needs control rights."""
-    framed_only: bool = False
-    """For framed connections only."""
+    controls: bool = False  # changes something, so it needs control rights
+    framed_only: bool = False  # for framed connections only
 
 
 class Request(NamedTuple):

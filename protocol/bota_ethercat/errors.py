@@ -1,18 +1,4 @@
-"""Every exception that `protocol` raises.
-
-ProtocolError
-+-- PdoSizeError          process data of a size no sensor has
-+-- RemoteProtocolError   the peer broke the framing: answer it, then close the connection
-+-- BadMessageError       one message was no JSON object: answer it and carry on
-+-- RequestError          one request cannot be granted: answer it and carry on
-+-- SettingError          a setting's name or value is wrong
-+-- ConnectionFailedError the connection cannot be made or has ended: close it
-|   +-- UnreachableError  there is no server at that address
-|   +-- NoReplyError      a request was not answered in time
-+-- RefusedError          the server refused a request; the connection goes on
-+-- NoSampleError         no new, valid sample came in time; the client goes on
-+-- FileError             a file cannot be written, or would replace another
-"""
+"""Every exception that `protocol` raises."""
 
 from __future__ import annotations
 
@@ -40,15 +26,18 @@ class PdoSizeError(ProtocolError):
 
 
 class RemoteProtocolError(ProtocolError):
-    """The peer sent bytes that are not this protocol; nothing after them can be trusted."""
+    """The peer broke the framing, so nothing after it can be trusted: answer, then close the connection."""
 
 
 class BadMessageError(ProtocolError):
-    """One message was not a JSON object; the framing is intact and the next message can be read."""
+    """One message was not a JSON object; the framing is intact: answer it and carry on."""
 
 
 class RequestError(ProtocolError):
-    """A request that is refused. `code` is one of `bota_ethercat.control.ErrorCode`."""
+    """A request that is refused: answer it and carry on.
+
+    `code` is one of `bota_ethercat.control.ErrorCode`.
+    """
 
     def __init__(self, code: str, message: str, **extra: object) -> None:
         super().__init__(message)
@@ -77,7 +66,7 @@ class NoReplyError(ConnectionFailedError):
 
 
 class RefusedError(ProtocolError):
-    """The server refused a request; the text is its message, made safe to print.
+    """The server refused a request; the connection goes on. The text is its message, made safe to print.
 
     `code` is one of `bota_ethercat.control.ErrorCode`, `abort_code` the SDO abort code behind it, if any.
     """

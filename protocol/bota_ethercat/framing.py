@@ -30,12 +30,9 @@ class MessageType(IntEnum):
 class DataFlag(IntFlag):
     """The `flags` byte of a DATA message."""
 
-    REPEATED = 1
-    """Same process data as the frame before: nothing new from the sensor."""
-    INVALID = 2
-    """Working counter short; the process data is the last good one."""
-    GAP = 4
-    """Samples of this sensor were lost, or withheld from this client, since its previous frame."""
+    REPEATED = 1  # same process data as the frame before: nothing new from the sensor
+    INVALID = 2  # working counter short; the process data is the last good one
+    GAP = 4  # samples of this sensor were lost, or withheld from this client, since its previous frame
 
 
 class DataMessage(NamedTuple):

@@ -14,11 +14,9 @@ from typing import Final, NamedTuple
 
 from bota_ethercat.errors import PdoSizeError
 
-STANDARD_GRAVITY: Final = 9.80665
-"""m/s² in one g, as Bota's own drivers convert it."""
+STANDARD_GRAVITY: Final = 9.80665  # m/s² in one g, as Bota's own drivers convert it
 
-INPUT_OBJECT: Final = 0x6000
-"""The object whose sub-indices the TxPDO maps."""
+INPUT_OBJECT: Final = 0x6000  # the object whose sub-indices the TxPDO maps
 
 
 class PdoType(Enum):
@@ -38,15 +36,11 @@ class PdoType(Enum):
 class PdoField(NamedTuple):
     """One mapped object entry."""
 
-    subindex: int
-    """Sub-index of 0x6000. There is no 0x03."""
-    name: str
-    """Field name; a vector's parts are `vector.x`, `vector.y`, ..."""
+    subindex: int  # Sub-index of 0x6000. There is no 0x03.
+    name: str  # field name; a vector's parts are `vector.x`, `vector.y`, ...
     type: PdoType
-    unit: str
-    """Unit on the wire, before any conversion."""
-    title: str
-    """Its name in the sensor's object dictionary."""
+    unit: str  # unit on the wire, before any conversion
+    title: str  # its name in the sensor's object dictionary
 
 
 _U8, _U16, _U32, _F32 = PdoType.USINT, PdoType.UINT, PdoType.UDINT, PdoType.REAL
@@ -149,20 +143,14 @@ class Sample(NamedTuple):
     estimate as x, y, z, w, or None if it maps none or all four are zero (no estimate).
     """
 
-    force: Vector3
-    """N"""
-    torque: Vector3
-    """Nm"""
-    acceleration: Vector3
-    """m/s²; a stationary sensor measures +g along the axis that points up"""
-    angular_rate: Vector3
-    """rad/s"""
-    temperature: float
-    """°C"""
+    force: Vector3  # N
+    torque: Vector3  # Nm
+    acceleration: Vector3  # m/s²; a stationary sensor measures +g along the axis that points up
+    angular_rate: Vector3  # rad/s
+    temperature: float  # °C
     orientation: tuple[float, float, float, float] | None
     status: int
-    warnings: int
-    """The warnings register; see `bota_ethercat.sensor.warnings_register`."""
+    warnings: int  # the warnings register; see `bota_ethercat.sensor.warnings_register`
     force_torque_saturated: int
     acceleration_saturated: int
     angular_rate_saturated: int

@@ -6,6 +6,7 @@ objects are in `ethercat_server.sensor.objects.dictionary`.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
@@ -24,8 +25,7 @@ class Setting(NamedTuple):
     """What the server writes at start-up unless configured otherwise; None = not written."""
     choices: range | tuple[int, ...] | None
     meaning: str
-    preop_only: bool
-    """Can be written in PREOP only."""
+    preop_only: bool  # can be written in PREOP only
 
     @property
     def is_bool(self) -> bool:
@@ -87,8 +87,7 @@ SETTINGS: Final[Mapping[str, Setting]] = {
     )
 }
 
-BASE_SAMPLING_RATE_HZ: Final = 51200
-"""The ADC's rate: sampling rate = 51200 / SINC length."""
+BASE_SAMPLING_RATE_HZ: Final = 51200  # the ADC's rate: sampling rate = 51200 / SINC length
 
 _MOST_DIVIDED: Final = 8
 """By how much CHOP may divide the sampling rate; no source says whether it does, so object 0x8011 decides."""
@@ -148,6 +147,16 @@ def check_settings(values: Mapping[str, object]) -> dict[str, SettingValue]:
             )
         checked[name] = setting.check(value)
     return checked
+
+
+def known_settings(values: object) -> dict[str, SettingValue]:
+    """Those of `values`, from a message or a file, that exist and are allowed."""
+    found: dict[str, SettingValue] = {}
+    for name, value in values.items() if isinstance(values, dict) else ():
+        if name in SETTINGS:
+            with contextlib.suppress(SettingError):
+                found[name] = SETTINGS[name].check(value)
+    return found
 
 
 def check_combination(values: Mapping[str, SettingValue]) -> None:

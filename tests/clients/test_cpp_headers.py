@@ -1,15 +1,32 @@
-"""The C++ headers as a user includes them: alone, in several files, in every form shown to them."""
+"""The C++ headers as a user has them: alone, in several files, in every form shown, as a package."""
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterator
+import shutil
+import subprocess
+import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
 import pytest
+from catkin_pkg.package import parse_package
+from catkin_pkg.packages import find_packages
 
-from tests.clients.cpp_programs import CLIENT, HEADERS, INCLUDE, ROOT, build, needs_gxx, patient
+from bota_ethercat.client.reading import Condition
+from tests.clients.cpp_programs import (
+    CLIENT,
+    HEADERS,
+    INCLUDE,
+    ROOT,
+    build,
+    driver_program,
+    needs_gxx,
+    patient,
+)
+from tests.rights import limited, needs_root, skip_if_forbidden
 
 pytestmark = [needs_gxx, patient]
 
@@ -114,13 +131,15 @@ def test_examples_and_snippets_need_no_exceptions_and_give_no_warning(tmp_path: 
     build(source, (*PLAIN, "-shared", "-fPIC"), (other,))
 
 
-def test_the_conditions_are_documented_with_their_numbers() -> None:
-    header = (INCLUDE / "bota_ethercat/reading.hpp").read_text()
-    body = header[header.index("enum class Condition") :].partition("};")[0]
-    numbered = re.findall(r"(\w+) = (\d+),", body)
-    assert [int(number) for _, number in numbered] == list(range(10))
+def test_the_conditions_are_those_of_python_and_documented_with_their_numbers() -> None:
+    told = subprocess.run([driver_program(), "conditions"], check=True, capture_output=True, text=True).stdout
+    found = [line.split(" ", 2) for line in told.splitlines()]
+    assert [(number, name) for number, name, _ in found] == [
+        (str(c.value), c.name.lower()) for c in Condition
+    ]
+    assert [meaning for *_, meaning in found] == [str(c) for c in Condition]
     page = (ROOT / "docs" / "cpp.md").read_text()
-    assert re.findall(r"(?m)^\| (\d+) \| `(\w+)` \|", page) == [(number, name) for name, number in numbered]
+    assert re.findall(r"(?m)^\| (\d+) \| `(\w+)` \|", page) == [(number, name) for number, name, _ in found]
 
 
 @pytest.mark.long
@@ -145,3 +164,105 @@ def test_a_controller_gets_nothing_of_the_requests() -> None:
     assert "bota_ethercat/control.hpp" not in stream
     everything = {"bota_ethercat.hpp"} | includes("bota_ethercat.hpp")
     assert everything == {str(path.relative_to(INCLUDE)) for path in HEADERS}
+
+
+# -- real time, in the words of the Python client
+
+
+def scheduled(priority: int, cpu: int, limit: Callable[[], None] | None = None) -> tuple[list[int], str]:
+    command = [str(driver_program()), "real_time", str(priority), str(cpu)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, preexec_fn=limit).stdout
+    numbers, refused = said.splitlines()
+    skip_if_forbidden(refused)
+    return [int(number) for number in numbers.split()], refused
+
+
+@needs_root
+def test_real_time_scheduling_that_is_granted() -> None:
+    cpu = min(os.sched_getaffinity(0))
+    assert scheduled(40, cpu) == ([os.SCHED_FIFO, 40, 40, cpu, 1], "")
+
+
+def test_real_time_scheduling_that_is_refused() -> None:
+    numbers, refused = scheduled(40, 9999, limited())
+    assert numbers[:4] == [os.SCHED_OTHER, 0, 0, -1]
+    assert refused.startswith(
+        "CPU 9999; SCHED_FIFO 40 ('rtprio 40' in a file in /etc/security/limits.d, LimitRTPRIO=40 in a "
+        "service's unit)"
+    )
+
+
+# -- a package that CMake, colcon and rosdep can find
+
+USER = {
+    "CMakeLists.txt": """
+cmake_minimum_required(VERSION 3.14)
+project(user LANGUAGES CXX)
+find_package(bota_ethercat 99.1 QUIET)
+if(bota_ethercat_FOUND)
+  message(FATAL_ERROR "another version was found")
+endif()
+find_package(bota_ethercat 0.1 REQUIRED)
+add_executable(user user.cpp)
+target_link_libraries(user PRIVATE bota_ethercat::client)
+""",
+    "user.cpp": """
+#include <bota_ethercat/stream.hpp>
+int main() { return bota_ethercat::Client().latest().fresh(); }
+""",
+}
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def run(*command: str | Path, **environment: str) -> str:
+    done = subprocess.run(
+        command, check=False, capture_output=True, text=True, env={**os.environ, **environment}
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake here: sudo apt install cmake")
+def test_cmake_installs_the_headers_and_a_program_finds_them(tmp_path: Path) -> None:
+    """Installed without a compiler, below a prefix as colcon has it."""
+    prefix, user = tmp_path / "prefix", tmp_path / "user"
+    settings = (f"-DCMAKE_INSTALL_PREFIX={prefix}", "-Werror=dev")
+    run("cmake", "-S", CLIENT, "-B", tmp_path / "b", *settings, CXX="false")
+    run("cmake", "--install", tmp_path / "b")
+    installed = {path.relative_to(prefix / "include"): path for path in prefix.rglob("*.hpp")}
+    assert {name: path.read_bytes() for name, path in installed.items()} == {
+        path.relative_to(INCLUDE): path.read_bytes() for path in HEADERS
+    }
+    assert (prefix / "share/bota_ethercat/package.xml").exists()
+    user.mkdir()
+    for name, text in USER.items():
+        (user / name).write_text(text)
+    run("cmake", "-S", user, "-B", user / "b", f"-DCMAKE_PREFIX_PATH={prefix}")
+    run("cmake", "--build", user / "b")
+    run(user / "b/user")
+
+
+def test_the_version_is_the_projects() -> None:
+    text = (CLIENT / "CMakeLists.txt").read_text()
+    assert f"project(bota_ethercat VERSION {PROJECT['version']} " in text
+
+
+def test_the_package_is_named_as_the_ros_one_is() -> None:
+    """rosdep and colcon read package.xml; it needs nothing but CMake."""
+    package, bridge = (parse_package(path) for path in (CLIENT, ROOT / "ros2_bridge"))
+    assert (package.name, package.version) == ("bota_ethercat", PROJECT["version"])
+    assert package.get_build_type() == "cmake"
+    assert [need.name for need in package.buildtool_depends] == ["cmake"]
+    assert not [*package.build_depends, *package.exec_depends, *package.test_depends]
+    for name in ("version", "licenses", "package_format"):
+        assert getattr(package, name) == getattr(bridge, name), name
+    assert str(package.maintainers[0]) == str(bridge.maintainers[0])
+    assert package.validate() is None
+
+
+def test_the_repository_in_a_workspace_is_its_packages_and_nothing_else() -> None:
+    expected = {"ros2_bridge": "bridge", "clients/cpp": "bota_ethercat"}
+    if (ROOT / "clients/ros2_control/package.xml").exists():
+        expected["clients/ros2_control"] = "bota_ethercat_hardware"
+    found = find_packages(str(ROOT))
+    assert {path: package.name for path, package in found.items()} == expected

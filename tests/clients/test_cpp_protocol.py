@@ -32,7 +32,7 @@ from tests.golden_vectors import (
     same_sample,
 )
 from tests.hostile_bytes import FRAMED, HOSTILE_TEXTS, framed, in_chunks, mutate
-from tests.protocol.test_fuzz import LIMIT, SEED
+from tests.protocol.test_framing import LIMIT, SEED
 
 pytestmark = [needs_gxx, patient]
 
@@ -153,13 +153,7 @@ def test_golden_streams_cut_at_every_byte(vectors: list[Vector]) -> None:
 
 
 def assert_golden(decoded: Sequence[Decoded], vectors: Sequence[Vector]) -> None:
-    outcomes = expected(vectors)
-    messages = [
-        wanted._replace(process_data=bytes(len(wanted.process_data)))
-        if isinstance(wanted, DataMessage)
-        else wanted
-        for wanted in outcomes
-    ]
+    messages = [without_process_data(outcome) for outcome in expected(vectors)]
     assert [message for message, _ in decoded] == messages
     for (_, sample), vector in zip(decoded, vectors, strict=False):
         if sample is not None:
@@ -321,7 +315,7 @@ def test_numbers_at_the_edge() -> None:
 
 
 def test_offsets_and_names_are_those_of_the_python_tables() -> None:
-    header = (INCLUDE / "bota_ethercat" / "process_data.hpp").read_text()
+    header = (INCLUDE / "bota_ethercat" / "protocol.hpp").read_text()
     offsets = layout_for(77).offsets
     for field in PDO_FIELDS:
         name, _, part = field.name.partition(".")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -20,6 +21,7 @@ from tests.clients.cpp_programs import (
     Reading,
     assert_no_faults,
     build,
+    check,
     driver,
     needs_gxx,
     patient,
@@ -148,10 +150,9 @@ def test_every_sample_in_order_and_the_same_as_in_python(shared: ServedSimulatio
     with driver(shared.port, **PATIENT) as running, shared.client() as client:
         running.connect()
         client.ask("subscribe")
-        running.begin("collect", 200, 60_000)
         frames = {frame.sequence: frame for frame in client.collect(200)}
-        readings = running.answer()
-        assert len(readings) == 200
+        readings = [running.do("next", 60_000) for _ in range(200)]
+        assert all(reading["is_new"] for reading in readings)
         decoder = SampleDecoder(61)
         for reading in readings:
             assert reading["passed_over"] == 0
@@ -172,34 +173,33 @@ def test_every_sample_in_order_and_the_same_as_in_python(shared: ServedSimulatio
         assert told["names"] == ["BFT-SENS-ECAT-M8"]
 
 
-def test_latest_in_a_loop_of_1_khz(shared: ServedSimulation) -> None:
+@pytest.mark.parametrize(("count", "hz"), [(500, 1000), (20, 50)])
+def test_latest_in_a_loop_faster_and_slower_than_the_sensor(
+    shared: ServedSimulation, count: int, hz: int
+) -> None:
+    """Every sample is either seen once as new, or passed over; the age is never told too small."""
     with driver(shared.port, **STRICT_AGE) as running:
         running.connect()
-        running.do("next", 60_000)
-        told = running.do("follow", 500, 1000)
-        after = running.info()
-        # Every sample is either seen once as new, or counted as passed over; the age is never told too small.
-        assert told["new"] + told["passed_over"] + 1 == after["samples"]
-        assert (told["not_rising"], told["too_young"], after["allocated"]) == (0, 0, 0)
-        assert not told["withheld"] or told["gaps"]
-        assert told["new"] > 0
-
-
-def test_a_controller_slower_than_the_sensor_gets_the_newest(shared: ServedSimulation) -> None:
-    with driver(shared.port, **STRICT_AGE) as running:
-        running.connect()
-        running.do("next", 60_000)
-        told = running.do("follow", 20, 50)
-        after = running.info()
-        assert told["passed_over"] > 0
-        assert told["new"] + told["passed_over"] + 1 == after["samples"]
-        assert told["not_rising"] == 0
+        last = running.do("next", 60_000)
+        new = passed_over = 0
+        for _ in range(count):
+            time.sleep(1 / hz)
+            before_ns = time.monotonic_ns()
+            reading = running.latest()
+            check(reading)
+            assert reading["age_ns"] >= before_ns - reading["monotonic_ns"]
+            assert not reading["withheld"] or reading["gap"]
+            assert reading["is_new"] == (reading["monotonic_ns"] > last["monotonic_ns"])
+            new, passed_over, last = new + reading["is_new"], passed_over + reading["passed_over"], reading
+        told = running.info()
+        assert new + passed_over + 1 == told["samples"]
+        assert (new > 0, hz >= 1000 or passed_over > 0, told["allocated"]) == (True, True, 0)
 
 
 def test_one_frame_in_ten(shared: ServedSimulation) -> None:
     with driver(shared.port, every=10, **PATIENT) as running:
         running.connect()
-        readings = running.do("collect", 10, 60_000)
+        readings = [running.do("next", 60_000) for _ in range(10)]
         for one, later in pairwise(readings):
             assert later["sequence"] - one["sequence"] == 10 + later["withheld"]
 

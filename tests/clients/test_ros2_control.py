@@ -37,7 +37,7 @@ def names(table: str, file: str) -> list[str]:
 
 
 PARAMETERS = names("Row kRows[] = {", "parameters.hpp")
-SIGNALS = names("kSignals = {", "signals.hpp")
+SIGNALS = names("kSignals = {", "sensor_loop.hpp")
 
 
 def test_the_page_has_every_parameter_and_no_other() -> None:
@@ -125,21 +125,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = tmp_path_factory.mktemp("workspace")
     environment = sourced()
     python = shutil.which("python3", path=environment["PATH"])
+    command = f"colcon build --base-paths {CLIENT} {PACKAGE} --cmake-args -DPython3_EXECUTABLE={python}"
     done = subprocess.run(
-        [
-            "colcon",
-            "build",
-            "--base-paths",
-            CLIENT,
-            PACKAGE,
-            "--cmake-args",
-            f"-DPython3_EXECUTABLE={python}",
-        ],
-        cwd=workspace,
-        env=environment,
-        check=False,
-        capture_output=True,
-        text=True,
+        command.split(), cwd=workspace, env=environment, check=False, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return workspace / "install" / "setup.bash"

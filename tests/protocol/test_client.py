@@ -37,20 +37,26 @@ def scripted() -> Iterator[ScriptedServer]:
         yield running
 
 
-def test_samples_come_decoded_in_order_and_nothing_old(scripted: ScriptedServer) -> None:
-    with connect(scripted.port, timeout_s=PATIENCE_S) as sensor:
+@pytest.fixture
+def sensor(scripted: ScriptedServer) -> Iterator[Client]:
+    """One that has subscribed, and waits for long."""
+    with connect(scripted.port, timeout_s=PATIENCE_S) as client:
         assert scripted.subscribed.wait(PATIENCE_S)
-        scripted.send_sample(1.0)
-        scripted.send_sample(1.0, DataFlag.REPEATED)
-        scripted.send_sample(1.0, DataFlag.INVALID)
-        scripted.send_sample(2.0, DataFlag.GAP)
-        samples = iter(sensor)
-        first, second = next(samples), next(samples)
-        assert [first.force[0], second.force[0]] == [1.0, 2.0]
-        assert first.acceleration[0] == pytest.approx((1.0 + 6 / 16) * STANDARD_GRAVITY)
-        assert sensor.frame is not None
-        assert sensor.frame.sequence == 4
-        assert sensor.frame.flags & DataFlag.GAP
+        yield client
+
+
+def test_samples_come_decoded_in_order_and_nothing_old(scripted: ScriptedServer, sensor: Client) -> None:
+    scripted.send_sample(1.0)
+    scripted.send_sample(1.0, DataFlag.REPEATED)
+    scripted.send_sample(1.0, DataFlag.INVALID)
+    scripted.send_sample(2.0, DataFlag.GAP)
+    samples = iter(sensor)
+    first, second = next(samples), next(samples)
+    assert [first.force[0], second.force[0]] == [1.0, 2.0]
+    assert first.acceleration[0] == pytest.approx((1.0 + 6 / 16) * STANDARD_GRAVITY)
+    assert sensor.frame is not None
+    assert sensor.frame.sequence == 4
+    assert sensor.frame.flags & DataFlag.GAP
 
 
 def test_units_and_sizes(scripted: ScriptedServer) -> None:
@@ -101,23 +107,22 @@ def test_without_reconnection_the_last_frames_come_before_the_error(scripted: Sc
             sensor.poll(PATIENCE_S)
 
 
-def test_a_connection_that_ended_is_made_anew_and_its_first_sample_has_a_gap(
-    scripted: ScriptedServer,
+def test_a_connection_that_ended_is_made_anew_and_begins_with_a_gap(
+    scripted: ScriptedServer, sensor: Client
 ) -> None:
-    with connect(scripted.port, timeout_s=PATIENCE_S) as sensor:
-        for connections in (1, 2, 3):
-            assert scripted.subscribed.wait(PATIENCE_S)
-            scripted.send_sample(1.0)
-            (frame,) = sensor.receive(PATIENCE_S)
-            assert bool(frame.flags & DataFlag.GAP) == (connections > 1)
-            assert scripted.connections == connections
-            scripted.drop()
-            while sensor.session.connected:
-                sensor.poll(PATIENCE_S)
-            while not sensor.session.connected:
-                sensor.poll(PATIENCE_S)
-        kinds = [type(event) for event in sensor.events]
-        assert kinds == [Connected, Disconnected, Connected, Disconnected, Connected, Disconnected, Connected]
+    for connections in (1, 2, 3):
+        assert scripted.subscribed.wait(PATIENCE_S)
+        scripted.send_sample(1.0)
+        (frame,) = sensor.receive(PATIENCE_S)
+        assert bool(frame.flags & DataFlag.GAP) == (connections > 1)
+        assert scripted.connections == connections
+        scripted.drop()
+        while sensor.session.connected:
+            sensor.poll(PATIENCE_S)
+        while not sensor.session.connected:
+            sensor.poll(PATIENCE_S)
+    kinds = [type(event) for event in sensor.events]
+    assert kinds == [Connected, Disconnected, Connected, Disconnected, Connected, Disconnected, Connected]
 
 
 def test_nothing_new_is_an_error_that_says_why(scripted: ScriptedServer) -> None:
@@ -147,15 +152,13 @@ def test_nothing_new_is_an_error_that_says_why(scripted: ScriptedServer) -> None
         assert caught.value.condition is Condition.DISCONNECTED
 
 
-def test_what_comes_before_a_reply_is_kept(scripted: ScriptedServer) -> None:
-    with connect(scripted.port, timeout_s=PATIENCE_S) as sensor:
-        assert scripted.subscribed.wait(PATIENCE_S)
-        scripted.send_sample(1.0)
-        scripted.send_json({"event": "reconfigured", "sensor": 0})
-        assert sensor.ask("status")["ok"]
-        assert [frame.sequence for frame in sensor.poll()] == [1]
-        assert sensor.events[-1] == {"event": "reconfigured", "sensor": 0}
-        assert sensor.poll(0.01) == []
+def test_what_comes_before_a_reply_is_kept(scripted: ScriptedServer, sensor: Client) -> None:
+    scripted.send_sample(1.0)
+    scripted.send_json({"event": "reconfigured", "sensor": 0})
+    assert sensor.ask("status")["ok"]
+    assert [frame.sequence for frame in sensor.poll()] == [1]
+    assert sensor.events[-1] == {"event": "reconfigured", "sensor": 0}
+    assert sensor.poll(0.01) == []
 
 
 OURS = boot_id()
@@ -168,9 +171,7 @@ CLAIMED: list[tuple[object, bool]] = [
 
 
 @pytest.mark.parametrize(("claimed", "near"), CLAIMED)
-def test_the_clock_that_a_server_names_decides_whose_it_is(
-    scripted: ScriptedServer, claimed: object, near: bool
-) -> None:
+def test_a_named_clock_decides_whose_it_is(scripted: ScriptedServer, claimed: object, near: bool) -> None:
     """By its address the server is always here, as behind an SSH tunnel; what cannot be a name is none."""
     scripted.description = description(boot_id=claimed)
     with connect(scripted.port) as client:
@@ -308,13 +309,12 @@ def descriptors_to_1024() -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
-def test_a_program_with_more_than_1024_descriptors_receives(
-    scripted: ScriptedServer, descriptors_to_1024: None
+def test_it_receives_beyond_1024_descriptors(
+    scripted: ScriptedServer, descriptors_to_1024: None, sensor: Client
 ) -> None:
-    with connect(scripted.port, timeout_s=PATIENCE_S) as sensor:
-        assert sensor.fileno() > 1024
-        scripted.send_sample(1.0)
-        assert [frame.sequence for frame in sensor.receive(PATIENCE_S)] == [1]
+    assert sensor.fileno() > 1024
+    scripted.send_sample(1.0)
+    assert [frame.sequence for frame in sensor.receive(PATIENCE_S)] == [1]
 
 
 def test_what_waits_for_a_slow_reader_is_bounded() -> None:
@@ -378,32 +378,17 @@ def test_the_ten_lines_of_the_docs_run() -> None:
     assert "NoSampleError: no new sample of sensor 0" in run.stderr
 
 
-def pull_the_sensor(server: Simulation, _: MemoryChannel) -> None:
-    server.command("power off")
+Pull = Callable[[Simulation, MemoryChannel], object]
+PULLS: dict[str, tuple[Pull, str]] = {
+    "sensor": (lambda server, _: server.command("power off"), "no force: invalid"),
+    "cable": (lambda server, _: server.command("disconnect"), "no force: invalid"),
+    "server stopped": (lambda server, _: setattr(server, "hangs", True), "no force: (silent|late)"),
+    "server killed": (lambda _, channel: channel.kill(), "no force: disconnected"),
+}
 
 
-def pull_the_cable(server: Simulation, _: MemoryChannel) -> None:
-    server.command("disconnect")
-
-
-def stop_the_server(_: Simulation, channel: MemoryChannel) -> None:
-    channel.hangs = True
-
-
-def kill_the_server(_: Simulation, channel: MemoryChannel) -> None:
-    channel.kill()
-
-
-@pytest.mark.parametrize(
-    ("pull", "reason"),
-    [
-        (pull_the_sensor, "no force: invalid"), (pull_the_cable, "no force: invalid"),
-        (stop_the_server, "no force: (silent|late)"), (kill_the_server, "no force: disconnected"),
-    ],
-)  # fmt: skip
-def test_the_guard_of_the_docs_stops_within_two_timeouts(
-    pull: Callable[[Simulation, MemoryChannel], None], reason: str
-) -> None:
+@pytest.mark.parametrize(("pull", "reason"), PULLS.values(), ids=PULLS)
+def test_the_guard_of_the_docs_stops_within_two_timeouts(pull: Pull, reason: str) -> None:
     source = examples()[1]
     assert len(source.splitlines()) <= 15
     server = Simulation(settings={"sinc_length": 64})

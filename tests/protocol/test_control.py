@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from bota_ethercat.control import (
     ACTIONS,
@@ -22,17 +19,6 @@ from bota_ethercat.control import (
     whole_number,
 )
 from bota_ethercat.errors import RequestError
-
-scalars: st.SearchStrategy[Any] = (
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8)
-)
-anything = scalars | st.lists(scalars, max_size=7)
-
-
-def refused(message: dict[str, Any]) -> RequestError:
-    with pytest.raises(RequestError) as caught:
-        parse_request(message)
-    return caught.value
 
 
 def test_subscribe_gets_its_defaults() -> None:
@@ -78,16 +64,11 @@ def test_only_what_changes_something_needs_authority() -> None:
     ],
 )
 def test_what_is_wrong_is_named(message: dict[str, Any], code: ErrorCode, word: str) -> None:
-    error = refused(message)
-    assert error.code == code
-    assert word in str(error)
-    assert len(str(error)) < 400
-
-
-@given(st.sampled_from([*ACTIONS, "other"]), st.dictionaries(st.text(max_size=8), anything, max_size=4))
-def test_nothing_but_request_error_escapes(action: str, values: dict[str, Any]) -> None:
-    with contextlib.suppress(RequestError):
-        assert parse_request({**values, "action": action}).action == action
+    with pytest.raises(RequestError) as caught:
+        parse_request(message)
+    assert caught.value.code == code
+    assert word in str(caught.value)
+    assert len(str(caught.value)) < 400
 
 
 def test_replies_repeat_action_and_id() -> None:
@@ -118,14 +99,7 @@ def test_events_have_the_contracts_names() -> None:
 def test_whole_number_and_six_numbers() -> None:
     assert whole_number(1, 3)(3) == 3
     assert six_numbers([1, 2.5, 0, 0, 0, 0]) == (1.0, 2.5, 0.0, 0.0, 0.0, 0.0)
-    for wrong in (
-        [1, 2, 3],
-        [True] * 6,
-        [float("nan")] * 6,
-        [float("inf")] * 6,
-        "123456",
-        None,
-        [10**400] * 6,
-    ):
+    odd = [[number] * 6 for number in (True, float("nan"), float("inf"), 10**400)]
+    for wrong in ([1, 2, 3], "123456", None, *odd):
         with pytest.raises(ValueError, match="six finite numbers"):
             six_numbers(wrong)

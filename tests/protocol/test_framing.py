@@ -1,15 +1,27 @@
-"""Framed messages: whole, in pieces, together, oversized, hostile."""
+"""Messages, framed and as bare JSON lines: whole, in pieces, together, oversized, hostile.
+
+Whatever bytes arrive: only documented errors, bounded memory, nothing valid lost, however they are cut. That
+framed messages may be cut at every byte is tested with the golden vectors.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import random
 import struct
-from typing import Any
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bota_ethercat.errors import BadMessageError, ProtocolError, RemoteProtocolError
+from bota_ethercat.control import ACTIONS, ErrorCode, error_reply, parse_request, reply
+from bota_ethercat.errors import BadMessageError, ProtocolError, RemoteProtocolError, RequestError
 from bota_ethercat.framing import (
     DATA_FLAGS_OFFSET,
     MAX_DATA_MESSAGE_SIZE,
@@ -19,13 +31,171 @@ from bota_ethercat.framing import (
     encode_data,
     encode_json,
 )
-from bota_ethercat.text.json_text import MAX_JSON_LENGTH
+from bota_ethercat.text.bare_json import BareJsonDecoder, encode_bare_json
+from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject, parse_json_object
+from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, in_chunks, mutate
+
+SEED: Final = int(os.environ.get("FUZZ_SEED", "20261121"))
+LIMIT: Final = 16384
+BUFFER: Final = 65536
+"""What a FrameDecoder starts with."""
 
 SAMPLE = DataMessage(7, 1_700_000_000_000_000_000, 123_456_789, 3, int(DataFlag.GAP), 3, bytes(range(61)))
 WITH_ORIENTATION = SAMPLE._replace(sequence=8, process_data=bytes(range(77)))
 JSON: dict[str, Any] = {"reply": "describe", "id": [1, "é"], "ok": True, "nested": {"a": None}}
-MESSAGES: list[Any] = [SAMPLE, JSON, WITH_ORIENTATION, {}, SAMPLE]
-STREAM = b"".join(encode_data(*m) if isinstance(m, DataMessage) else encode_json(m) for m in MESSAGES)
+
+Decoder = FrameDecoder | BareJsonDecoder
+Outcome = DataMessage | JsonObject | tuple[str, str]
+"""A message, or the kind (`bad`: this message only, `broken`: for good) and the text of an error."""
+
+
+def server_side() -> FrameDecoder:
+    return FrameDecoder(max_json_length=LIMIT, accept_data=False)
+
+
+def client_side() -> FrameDecoder:
+    return FrameDecoder(max_json_length=LIMIT)
+
+
+def bare_side() -> BareJsonDecoder:
+    return BareJsonDecoder(max_json_length=LIMIT)
+
+
+def drain(decoder: Decoder, found: list[Outcome], take: Callable[[], Outcome | None] | None = None) -> None:
+    """`take` is what to take messages with."""
+    take = take or decoder.next_message
+    while True:
+        try:
+            message = take()
+        except BadMessageError as error:
+            found.append(("bad", str(error)))
+            continue
+        except RemoteProtocolError as error:
+            if not found or found[-1] != ("broken", str(error)):
+                found.append(("broken", str(error)))
+            return
+        if message is None:
+            return
+        found.append(message)
+
+
+def outcomes(decoder: Decoder, chunks: Sequence[bytes]) -> list[Outcome]:
+    """All that comes of it; anything undocumented escapes and fails the test."""
+    found: list[Outcome] = []
+    for chunk in chunks:
+        decoder.feed(chunk)
+        held, bound = len(decoder._buffer), LIMIT + 5 + len(chunk)
+        assert held <= (max(BUFFER, bound) if isinstance(decoder, FrameDecoder) else bound)
+        drain(decoder, found)
+        assert decoder.pending <= LIMIT + 5
+    if isinstance(decoder, BareJsonDecoder):
+        decoder.end_of_input()
+        drain(decoder, found)
+        assert decoder.pending == 0
+    return found
+
+
+def kinds(found: Sequence[Outcome]) -> list[object]:
+    """Messages, and the kinds of errors."""
+    return [each[0] if isinstance(each, tuple) and len(each) == 2 else each for each in found]
+
+
+def fed(*chunks: bytes) -> list[object]:
+    return kinds(outcomes(client_side(), chunks))
+
+
+# -- framed
+
+
+def test_messages_on_the_wire_are_as_the_contract_says() -> None:
+    wire = encode_data(*SAMPLE)
+    assert wire == struct.pack(
+        ">IBQQQBBH", 90, 1, 7, 1_700_000_000_000_000_000, 123_456_789, 3, 4, 3
+    ) + bytes(range(61))  # fmt: skip
+    assert wire[DATA_FLAGS_OFFSET] == DataFlag.GAP
+    assert len(encode_data(*WITH_ORIENTATION)) == MAX_DATA_MESSAGE_SIZE == 110
+    assert encode_json({"action": "shutdown"}) == b'\x00\x00\x00\x16\x02{"action":"shutdown"}'
+
+
+def test_bytes_that_follow_wait() -> None:
+    decoder = FrameDecoder()
+    decoder.feed(encode_json(JSON) + b"\x00\x00\x00")
+    assert list(decoder) == [JSON]
+    assert decoder.pending == 3
+
+
+def test_reading_into_the_decoders_own_buffer() -> None:
+    messages: list[Any] = [SAMPLE, JSON, WITH_ORIENTATION, {}, SAMPLE]
+    decoder, got, rest = FrameDecoder(), [], b"".join(map(encode, messages)) * 3000
+    while rest:
+        with decoder.get_buffer() as buffer:
+            count = min(len(buffer), 10_007, len(rest))
+            buffer[:count] = rest[:count]
+        rest = rest[count:]
+        decoder.received(count)
+        got += list(decoder)
+    assert got == messages * 3000
+
+
+def test_a_decoded_message_outlives_the_buffer() -> None:
+    decoder = FrameDecoder()
+    decoder.feed(encode_data(*SAMPLE))
+    message = decoder.next_message()
+    decoder.feed(encode_data(*WITH_ORIENTATION._replace(process_data=b"\xff" * 77)))
+    assert list(decoder)
+    assert message == SAMPLE
+
+
+@pytest.mark.parametrize(
+    ("decoder", "wire", "words"),
+    [
+        (FrameDecoder(), struct.pack(">I", 0), "length 0"),
+        (FrameDecoder(), struct.pack(">I", MAX_JSON_LENGTH + 2), "length"),
+        (FrameDecoder(), b"\xff\xff\xff\xff", "length"),
+        (FrameDecoder(), b"GET / HTTP/1.1\r\n", "length"),
+        (FrameDecoder(), struct.pack(">IB", 5, 0), "type 0"),
+        (FrameDecoder(), struct.pack(">IB", 5, 3), "type 3"),
+        (FrameDecoder(), struct.pack(">IB", 90 - 1, 1), "DATA message of length"),
+        (FrameDecoder(), struct.pack(">IB", 1, 1), "DATA message of length"),
+        (FrameDecoder(max_json_length=80), encode_data(*SAMPLE) + struct.pack(">IB", 82, 2), "JSON"),
+        (FrameDecoder(accept_data=False), encode_data(*SAMPLE), "type 1"),
+    ],
+)  # fmt: skip
+def test_what_is_no_message_ends_it_for_good(decoder: FrameDecoder, wire: bytes, words: str) -> None:
+    """A limit for JSON holds though DATA may be longer; a server takes no DATA."""
+    decoder.feed(encode_json(JSON) + wire)
+    assert decoder.next_message() == JSON
+    if words == "JSON":
+        assert decoder.next_message() == SAMPLE
+    with pytest.raises(RemoteProtocolError, match=words):
+        decoder.next_message()
+    decoder.feed(encode_json(JSON))
+    with pytest.raises(RemoteProtocolError, match=words):
+        decoder.next_message()
+
+
+def test_longest_json_message_passes_and_one_more_does_not() -> None:
+    decoder = FrameDecoder()
+    decoder.feed(framed(b'{"a":"' + b"x" * (MAX_JSON_LENGTH - 8) + b'"}'))
+    message = decoder.next_message()
+    assert isinstance(message, dict)
+    assert len(message["a"]) == MAX_JSON_LENGTH - 8
+    decoder.feed(struct.pack(">IB", 2 + MAX_JSON_LENGTH, 2))
+    with pytest.raises(RemoteProtocolError):
+        decoder.next_message()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"", b"[]", b"null", b"1", b'"x"', b"{", b'{"a":}', b"\xff\xfe", b'{"a":NaN}', b'{"a":Infinity}',
+        b'{"a":-Infinity}', b"{} {}", b"[" * 16000, b'{"a":' * 40 + b"1" + b"}" * 40,
+        b'{"a":' + b"9" * 5000 + b"}",
+    ],
+)  # fmt: skip
+def test_a_message_that_is_no_object_costs_only_itself(text: bytes) -> None:
+    assert fed(framed(text) + encode_json(JSON)) == ["bad", JSON]
+
 
 u64 = st.integers(0, 2**64 - 1)
 u8, u16 = st.integers(0, 255), st.integers(0, 65535)
@@ -43,222 +213,223 @@ def encode(message: Any) -> bytes:
     return encode_data(*message) if isinstance(message, DataMessage) else encode_json(message)
 
 
-def drain(decoder: FrameDecoder) -> list[Any]:
-    return list(decoder)
-
-
-def test_data_message_on_the_wire_is_as_the_contract_says() -> None:
-    wire = encode_data(*SAMPLE)
-    assert wire == struct.pack(
-        ">IBQQQBBH", 90, 1, 7, 1_700_000_000_000_000_000, 123_456_789, 3, 4, 3
-    ) + bytes(range(61))  # fmt: skip
-    assert wire[DATA_FLAGS_OFFSET] == DataFlag.GAP
-    assert len(encode_data(*WITH_ORIENTATION)) == MAX_DATA_MESSAGE_SIZE == 110
-
-
-def test_json_message_on_the_wire_is_as_the_contract_says() -> None:
-    assert encode_json({"action": "shutdown"}) == b'\x00\x00\x00\x16\x02{"action":"shutdown"}'
-
-
-def test_whole() -> None:
-    decoder = FrameDecoder()
-    decoder.feed(STREAM)
-    assert drain(decoder) == MESSAGES
-    assert decoder.pending == 0
-
-
-def test_byte_by_byte() -> None:
-    decoder, got = FrameDecoder(), []
-    for byte in STREAM:
-        decoder.feed(bytes([byte]))
-        got += drain(decoder)
-    assert got == MESSAGES
-
-
-def test_every_split_in_two() -> None:
-    for at in range(len(STREAM)):
-        decoder = FrameDecoder()
-        decoder.feed(STREAM[:at])
-        got = drain(decoder)
-        decoder.feed(STREAM[at:])
-        assert got + drain(decoder) == MESSAGES
-
-
-def test_bytes_that_follow_wait() -> None:
-    decoder = FrameDecoder()
-    decoder.feed(encode_json(JSON) + b"\x00\x00\x00")
-    assert decoder.next_message() == JSON
-    assert decoder.next_message() is None
-    assert decoder.pending == 3
-
-
-def test_reading_into_the_decoders_own_buffer() -> None:
-    decoder, got, rest = FrameDecoder(), [], STREAM * 3000
-    while rest:
-        with decoder.get_buffer() as buffer:
-            count = min(len(buffer), 10_007, len(rest))
-            buffer[:count] = rest[:count]
-        rest = rest[count:]
-        decoder.received(count)
-        got += drain(decoder)
-    assert got == MESSAGES * 3000
-
-
-def test_a_decoded_message_outlives_the_buffer() -> None:
-    decoder = FrameDecoder()
-    decoder.feed(encode_data(*SAMPLE))
-    message = decoder.next_message()
-    decoder.feed(encode_data(*WITH_ORIENTATION._replace(process_data=b"\xff" * 77)))
-    assert drain(decoder)
-    assert message == SAMPLE
-
-
-@given(st.lists(data_messages | json_objects, max_size=6), st.lists(st.integers(1, 200), min_size=1))
-def test_round_trip_in_any_pieces(messages: list[Any], sizes: list[int]) -> None:
-    stream = b"".join(encode(message) for message in messages)
-    decoder, got, at, turn = FrameDecoder(), [], 0, 0
-    while at < len(stream):
-        size = sizes[turn % len(sizes)]
-        decoder.feed(stream[at : at + size])
-        at, turn = at + size, turn + 1
-        got += drain(decoder)
-    assert got == messages
-
-
-@pytest.mark.parametrize(
-    ("wire", "words"),
-    [
-        (struct.pack(">I", 0), "length 0"),
-        (struct.pack(">I", MAX_JSON_LENGTH + 2), "length"),
-        (b"\xff\xff\xff\xff", "length"),
-        (b"GET / HTTP/1.1\r\n", "length"),
-        (struct.pack(">IB", 5, 0), "type 0"),
-        (struct.pack(">IB", 5, 3), "type 3"),
-        (struct.pack(">IB", 90 - 1, 1), "DATA message of length"),
-        (struct.pack(">IB", 1, 1), "DATA message of length"),
-    ],
-)  # fmt: skip
-def test_what_is_no_message_ends_it_at_once_and_for_good(wire: bytes, words: str) -> None:
-    decoder = FrameDecoder()
-    decoder.feed(encode_json(JSON) + wire)
-    assert decoder.next_message() == JSON
-    with pytest.raises(RemoteProtocolError, match=words):
-        decoder.next_message()
-    decoder.feed(encode_json(JSON))
-    with pytest.raises(RemoteProtocolError, match=words):
-        decoder.next_message()
-
-
-def test_longest_json_message_passes_and_one_more_does_not() -> None:
-    text = b'{"a":"' + b"x" * (MAX_JSON_LENGTH - 8) + b'"}'
-    decoder = FrameDecoder()
-    decoder.feed(struct.pack(">IB", 1 + len(text), 2) + text)
-    message = decoder.next_message()
-    assert isinstance(message, dict)
-    assert len(message["a"]) == MAX_JSON_LENGTH - 8
-    decoder.feed(struct.pack(">IB", 2 + len(text), 2))
-    with pytest.raises(RemoteProtocolError):
-        decoder.next_message()
-
-
-def test_a_small_limit_holds_for_json_though_data_is_longer() -> None:
-    decoder = FrameDecoder(max_json_length=10)
-    decoder.feed(encode_data(*SAMPLE))
-    assert decoder.next_message() == SAMPLE
-    decoder.feed(struct.pack(">IB", 12, 2))
-    with pytest.raises(RemoteProtocolError, match="JSON"):
-        decoder.next_message()
-
-
-def test_a_server_takes_no_data() -> None:
-    decoder = FrameDecoder(accept_data=False)
-    decoder.feed(encode_data(*SAMPLE))
-    with pytest.raises(RemoteProtocolError, match="type 1"):
-        decoder.next_message()
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        b"", b"[]", b"null", b"1", b'"x"', b"{", b'{"a":}', b"\xff\xfe", b'{"a":NaN}', b'{"a":Infinity}',
-        b'{"a":-Infinity}', b"{} {}", b"[" * 60000, b'{"a":' * 40 + b"1" + b"}" * 40,
-        b'{"a":' + b"9" * 5000 + b"}",
-    ],
-)  # fmt: skip
-def test_a_message_that_is_no_object_costs_only_itself(text: bytes) -> None:
-    decoder = FrameDecoder()
-    decoder.feed(struct.pack(">IB", 1 + len(text), 2) + text + encode_json(JSON))
-    with pytest.raises(BadMessageError):
-        decoder.next_message()
-    assert decoder.next_message() == JSON
-
-
-@given(st.binary(max_size=400))
-def test_garbage_is_an_error_or_a_message_and_never_anything_else(garbage: bytes) -> None:
-    decoder = FrameDecoder()
-    decoder.feed(garbage)
-    for _ in range(len(garbage) + 1):
-        try:
-            if decoder.next_message() is None:
-                break
-        except RemoteProtocolError:
-            return
-        except ProtocolError:
-            continue
-    assert decoder.pending <= len(garbage)
-
-
-@given(st.integers(0, len(STREAM) - 1), st.integers(1, 255))
-def test_a_flipped_byte_never_escapes_as_another_exception(at: int, flip: int) -> None:
-    wire = bytearray(STREAM)
-    wire[at] ^= flip
-    decoder = FrameDecoder()
-    decoder.feed(wire)
-    for _ in range(len(wire)):
-        try:
-            if decoder.next_message() is None:
-                return
-        except RemoteProtocolError:
-            return
-        except BadMessageError:
-            continue
-
-
-def outcomes(decoder: FrameDecoder, *, with_take_data: bool) -> list[Any]:
-    """What a decoder gives for the bytes it has: messages, and errors by their text."""
-    got: list[Any] = []
-    while True:
-        try:
-            message = decoder.take_data(got) if with_take_data else decoder.next_message()
-        except BadMessageError as error:
-            got.append(str(error))
-            continue
-        except RemoteProtocolError as error:
-            return [*got, str(error)]
-        if message is None:
-            return got
-        got.append(message)
-
-
 @given(
     st.lists(data_messages | json_objects, max_size=6),
     st.lists(st.integers(1, 200), min_size=1),
     st.lists(st.tuples(st.integers(0, 2000), st.integers(1, 255)), max_size=2),
     st.booleans(),
 )
-def test_taking_data_in_bulk_is_the_same_as_one_by_one(
+def test_round_trip_in_any_pieces_one_by_one_and_in_bulk(
     messages: list[Any], sizes: list[int], flips: list[tuple[int, int]], accept_data: bool
 ) -> None:
-    stream = bytearray(b"".join(encode(message) for message in messages))
+    """Where bytes were flipped both give the same."""
+    stream = bytearray(b"".join(map(encode, messages)))
     for at, flip in flips:
         if at < len(stream):
             stream[at] ^= flip
     one, bulk = FrameDecoder(accept_data=accept_data), FrameDecoder(accept_data=accept_data)
+    found: list[Any] = []
+    found_in_bulk: list[Any] = []
+    take_in_bulk = partial(bulk.take_data, found_in_bulk)
     at, turn = 0, 0
     while at < len(stream):
         size = sizes[turn % len(sizes)]
         for decoder in (one, bulk):
             decoder.feed(stream[at : at + size])
-        assert outcomes(bulk, with_take_data=True) == outcomes(one, with_take_data=False)
+        drain(one, found)
+        drain(bulk, found_in_bulk, take_in_bulk)
+        assert found_in_bulk == found
         assert bulk.pending == one.pending
         at, turn = at + size, turn + 1
+    if not flips and accept_data:
+        assert found == messages
+
+
+# -- bare JSON: one object a line, the newline optional
+
+OBJECT: dict[str, Any] = {"action": "shutdown", "id": 'a "quoted" \\ } { text'}
+LINE = encode_bare_json(OBJECT)
+
+
+@pytest.mark.parametrize(
+    ("chunks", "expected"),
+    [
+        ([LINE], [OBJECT]),
+        ([LINE.rstrip()], [OBJECT]),
+        ([LINE.rstrip() + b"  "], [OBJECT]),
+        ([b'{"action": "shutdown"}'], [{"action": "shutdown"}]),  # the note's client
+        ([bytes([byte]) for byte in LINE + LINE], [OBJECT, OBJECT]),  # in the middle of escapes, too
+        ([LINE + b"\r\n \n" + LINE.rstrip() + LINE], [OBJECT] * 3),
+        ([b"\n\n"], []),
+        ([LINE + b'{"act', b'ion":1}'], [OBJECT, {"action": 1}]),
+        ([LINE + b'{"action": "shu'], [OBJECT, "bad"]),  # half an object at the end
+        ([b'{"a": "unclosed\n' + LINE], ["bad", OBJECT]),  # a broken line costs only itself
+        ([b'{"a": }\n' + LINE], ["bad", OBJECT]),
+        ([b"{{\n" + LINE], ["bad", OBJECT]),
+        ([b'{"a": "x\\\n' + LINE], ["bad", OBJECT]),
+        ([b"nonsense\n" + LINE], ["bad", OBJECT]),
+        ([b'{"a": "x\\', b"\n" + LINE], ["bad", OBJECT]),  # the backslash escapes no end of a line
+    ],
+)
+def test_bare_lines(chunks: list[bytes], expected: list[object]) -> None:
+    assert kinds(outcomes(bare_side(), chunks)) == expected
+
+
+def test_pretty_printing_is_no_line() -> None:
+    assert kinds(outcomes(bare_side(), [json.dumps(OBJECT, indent=1).encode()]))[0] == "bad"
+
+
+def test_a_bare_line_may_be_as_long_as_allowed_and_longer_is_final() -> None:
+    assert outcomes(BareJsonDecoder(max_json_length=len(LINE) - 1), [LINE.rstrip()]) == [OBJECT]
+    for end in (b"", b'"}', b'"}\n'):
+        decoder = BareJsonDecoder(max_json_length=64)
+        decoder.feed(b'{"a":"' + b"x" * 100 + end)
+        for _ in range(2):
+            with pytest.raises(RemoteProtocolError, match="64"):
+                decoder.next_message()
+        assert decoder.pending == 0
+
+
+simple_objects = st.dictionaries(
+    st.text(), st.text() | st.integers() | st.lists(st.text(), max_size=3), max_size=4
+)
+
+
+@given(st.lists(simple_objects, max_size=5), st.integers(1, 50), st.booleans())
+def test_bare_round_trip_in_any_pieces(messages: list[Any], size: int, newline: bool) -> None:
+    lines = [encode_bare_json(message) for message in messages]
+    stream = b"".join(lines if newline else map(bytes.rstrip, lines))
+    chunks = [stream[at : at + size] for at in range(0, len(stream), size)]
+    assert outcomes(BareJsonDecoder(), chunks) == messages
+
+
+# -- any bytes: found by hypothesis
+
+
+def check(make: Callable[[], Decoder], valid: bytes, rest: bytes, chunks: Sequence[bytes]) -> None:
+    """`valid` are whole messages, `rest` is anything; `chunks` are both, cut anywhere."""
+    expected = outcomes(make(), [valid])
+    assert "broken" not in kinds(expected)
+    whole = outcomes(make(), [valid + rest])
+    assert whole[: len(expected)] == expected, "valid messages before the first bad one are lost"
+    assert outcomes(make(), chunks) == whole, "it matters how the bytes are cut"
+
+
+seeds = st.integers(0, 2**32)
+hostile_texts = st.sampled_from(HOSTILE_TEXTS) | st.binary(max_size=60)
+bare_pieces = st.lists(st.sampled_from(BARE) | hostile_texts | st.just(b"\n"), max_size=6).map(b"".join)
+framed_pieces = st.lists(
+    st.sampled_from(FRAMED) | hostile_texts.map(framed) | st.binary(max_size=20), max_size=6
+).map(b"".join)
+
+
+@pytest.mark.parametrize(
+    ("make", "good", "pieces"),
+    [
+        (client_side, FRAMED[:-2], framed_pieces),
+        (server_side, FRAMED[:-2], framed_pieces),
+        (bare_side, BARE, bare_pieces),
+    ],
+)
+@given(st.data(), seeds)
+def test_any_bytes_are_messages_or_documented_errors_however_they_are_cut(
+    make: Callable[[], Decoder], good: Sequence[bytes], pieces: Any, data: st.DataObject, seed: int
+) -> None:
+    rng, start = random.Random(seed), b"".join(data.draw(st.lists(st.sampled_from(good), max_size=4)))
+    rest = data.draw(pieces)
+    check(make, start, rest, in_chunks(rng, start + rest))
+    if rest:
+        broken = mutate(rng, rest, BARE if good is BARE else FRAMED)
+        check(make, start, broken, in_chunks(rng, start + broken))
+
+
+keys = st.sampled_from(["action", "id", "sensors", "every", "fresh_only", "settings", "target"]) | st.text()
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.sampled_from([*ACTIONS]),
+    lambda inner: st.lists(inner, max_size=7) | st.dictionaries(keys, inner, max_size=3),
+    max_leaves=8,
+)
+requests = st.builds(lambda action, more: {"action": action, **more}, st.sampled_from([*ACTIONS, "other"]),
+                     st.dictionaries(keys, values, max_size=4))  # fmt: skip
+
+
+@given(requests | st.dictionaries(keys, values, max_size=4))
+def test_any_object_is_a_checked_request_or_a_refusal_with_a_code(message: JsonObject) -> None:
+    refusals: list[RequestError] = []
+    try:
+        request = parse_request(message)
+    except RequestError as error:
+        refusals.append(error)
+    for refusal in refusals:
+        assert refusal.code in list(ErrorCode)
+        assert len(str(refusal)) < 1000, "a refusal does not repeat all that was sent"
+        return
+    assert request.action == message["action"]
+    assert request.values.keys() == ACTIONS[request.action].parameters.keys()
+    assert (request.has_id, request.id) == ("id" in message, message.get("id"))
+
+
+def test_whatever_is_understood_can_be_answered_and_the_answer_read() -> None:
+    for text in HOSTILE_TEXTS:
+        assert len(text) <= LIMIT, "the server would not read it"
+        message = None
+        try:
+            message = parse_json_object(text)
+            answer = reply(parse_request(message))
+        except ProtocolError as error:
+            answer = error_reply(message, ErrorCode.BAD_REQUEST, str(error))
+        assert outcomes(FrameDecoder(), [encode_json(answer)]) == [answer], text
+        assert outcomes(BareJsonDecoder(), [encode_bare_json(answer)]) == [answer], text
+
+
+@pytest.mark.parametrize(("make", "poison"), [(client_side, b"\xff" * 5), (bare_side, b"x" * (LIMIT + 1))])
+def test_a_broken_decoder_keeps_nothing_it_is_still_given(make: Callable[[], Decoder], poison: bytes) -> None:
+    decoder = make()
+    outcomes(decoder, [poison])
+    for _ in range(100):
+        decoder.feed(bytes(10_000))
+    assert decoder.pending == 0
+    assert len(decoder._buffer) <= BUFFER
+
+
+# -- many, fast
+
+
+def resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def storm(count: int, seed: int) -> None:
+    """Streams of valid, hostile and mutated messages, `count` in all; memory stays what it was."""
+    rng, done, resident = random.Random(seed), 0, 0.0
+    sides = (client_side, FRAMED), (server_side, FRAMED[:-2]), (bare_side, BARE)
+    while done < count:
+        make, good = rng.choice(sides)
+        valid = b"".join(rng.choices(good, k=rng.randint(0, 4)))
+        rest = []
+        for _ in range(rng.randint(1, 6)):
+            piece = rng.choice(good)
+            if rng.random() < 0.05:
+                piece = rng.choice(HOSTILE_TEXTS)
+                piece = piece if good is BARE else framed(piece)
+            rest.append(mutate(rng, piece, good) if rng.random() < 0.6 and piece else piece)
+        spoilt = b"".join(rest)
+        check(make, valid, spoilt, in_chunks(rng, valid + spoilt))
+        if done < count // 4 <= done + len(rest):
+            resident = resident_mb()
+        done += len(rest)
+    assert resident_mb() - resident < 4, f"memory grew from {resident} MB"
+
+
+def test_a_storm_of_mutations() -> None:
+    storm(2_000, SEED)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_a_million_mutations() -> None:
+    print(f"FUZZ_SEED={SEED}")
+    began = time.monotonic()
+    storm(1_000_000, SEED)
+    print(f"{time.monotonic() - began:.0f} s")

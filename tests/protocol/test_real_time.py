@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from tests.limited import IPC_LOCK, SYS_RESOURCE, limited, needs_limits, needs_root, skip_if_forbidden
+from tests.rights import IPC_LOCK, SYS_RESOURCE, limited, needs_limits, needs_root, skip_if_forbidden
 
 PROBE = """
 import json, os, sys, threading
@@ -69,7 +69,7 @@ def test_refused_with_what_would_grant_it() -> None:
 
 @needs_root
 def test_memory_is_not_locked_up_to_a_limit() -> None:
-    found = probe(40, -1, limit=limited(without=(IPC_LOCK, SYS_RESOURCE)))
+    found = probe(40, -1, limit=limited(lacks=(IPC_LOCK, SYS_RESOURCE)))
     assert found["own"][:2] == [os.SCHED_FIFO, 40]
     assert not found["locked"]
     assert "not granted: locked memory ('memlock unlimited' in a file in" in found["text"]

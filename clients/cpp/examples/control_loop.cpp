@@ -40,15 +40,6 @@ void sleep_until(std::int64_t due_ns) {
     clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, nullptr);
 }
 
-/// A number from `low` to `high`, or the program ends with 2.
-double number(const char* option, const char* text, double low, double high) {
-    char* end = nullptr;
-    const double value = text ? std::strtod(text, &end) : 0.0;
-    if (text && *text != '\0' && *end == '\0' && value >= low && value <= high) return value;
-    std::fprintf(stderr, "control_loop: %s needs a number from %g to %g\n", option, low, high);
-    std::exit(2);
-}
-
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -57,12 +48,14 @@ int main(int argc, char** argv) {
     const char* server = nullptr;
     double hz = 1000.0, seconds = 1e9;
     for (int i = 1; i < argc; i += 2) {
-        const char* const value = i + 1 < argc ? argv[i + 1] : nullptr;
-        if (std::strcmp(argv[i], "--server") == 0 && value) server = value;
-        else if (std::strcmp(argv[i], "--hz") == 0) hz = number("--hz", value, 1, 10000);
-        else if (std::strcmp(argv[i], "--seconds") == 0) seconds = number("--seconds", value, 0, 1e9);
-        else return std::fprintf(stderr, "usage: control_loop [--server HOST:PORT] [--hz N] [--seconds N]\n"), 2;
+        const char* const value = i + 1 < argc ? argv[i + 1] : "";
+        if (std::strcmp(argv[i], "--server") == 0) server = value;
+        else if (std::strcmp(argv[i], "--hz") == 0) hz = std::atof(value);
+        else if (std::strcmp(argv[i], "--seconds") == 0) seconds = std::atof(value);
+        else hz = 0.0;
     }
+    if (!(hz >= 1.0 && hz <= 10000.0 && seconds >= 0.0 && seconds <= 1e9))
+        return std::fprintf(stderr, "usage: control_loop [--server HOST:PORT] [--hz 1 to 10000] [--seconds N]\n"), 2;
     if (!bota_ethercat::choose_server(server, options))
         return std::fprintf(stderr, "control_loop: %s is no HOST:PORT\n", server ? server : "$BOTA_SERVER"), 2;
     std::signal(SIGINT, [](int) { ending = 1; });

@@ -25,12 +25,8 @@
 // Threads. None of its own. An object is used by one thread at a time; objects share nothing.
 // Network input is not trusted: lengths, depth and numbers are limited as in protocol/framing.py, and a server that breaks
 //   the framing is disconnected.
-#ifndef BOTA_ETHERCAT_HPP
-#define BOTA_ETHERCAT_HPP
+#pragma once
 
 #include "bota_ethercat/control.hpp"
 #include "bota_ethercat/real_time.hpp"
-#include "bota_ethercat/server_choice.hpp"
 #include "bota_ethercat/stream.hpp"
-
-#endif  // BOTA_ETHERCAT_HPP

@@ -25,48 +25,27 @@ ARGUMENTS = (
 
 def start(context):
     """What the arguments ask for."""
-
-    def value(name):
-        return LaunchConfiguration(name).perform(context)
-
+    given = {name: LaunchConfiguration(name).perform(context) for name, _, _ in ARGUMENTS}
     urdf = PathJoinSubstitution([PACKAGE, "urdf", "mock_arm.urdf.xacro"])
-    description = Command(["xacro ", urdf, f" host:={value('host')} port:={value('port')}"])
-    actions = []
-    if value("virtual").lower() == "true":
-        actions.append(
-            ExecuteProcess(
-                cmd=[*shlex.split(value("server_command")), "virtual", value("port")],
-                name="ethercat-server",
-                output="screen",
-                on_exit=Shutdown(reason="ethercat-server has ended"),
-            )
-        )
-    return [
-        *actions,
+    description = Command(["xacro ", urdf, f" host:={given['host']} port:={given['port']}"])
+    robot = {"robot_description": ParameterValue(description, value_type=str)}
+    server = [*shlex.split(given["server_command"]), "virtual", given["port"]]
+    spawned = [*given["controllers"].split(), "--param-file", CONTROLLERS]
+    actions = [
+        Node(package="robot_state_publisher", executable="robot_state_publisher", parameters=[robot]),
         Node(
-            package="robot_state_publisher",
-            executable="robot_state_publisher",
-            parameters=[{"robot_description": ParameterValue(description, value_type=str)}],
+            package="controller_manager", executable="ros2_control_node", parameters=[CONTROLLERS],
+            output="screen", on_exit=Shutdown(reason="the controller manager has ended"),
         ),
-        Node(
-            package="controller_manager",
-            executable="ros2_control_node",
-            parameters=[CONTROLLERS],
-            output="screen",
-            on_exit=Shutdown(reason="the controller manager has ended"),
-        ),
-        Node(
-            package="controller_manager",
-            executable="spawner",
-            arguments=[*value("controllers").split(), "--param-file", CONTROLLERS],
-            output="screen",
-        ),
-    ]
+        Node(package="controller_manager", executable="spawner", arguments=spawned, output="screen"),
+    ]  # fmt: skip
+    if given["virtual"].lower() == "true":
+        ended = Shutdown(reason="ethercat-server has ended")
+        actions.insert(0, ExecuteProcess(cmd=server, name="ethercat-server", output="screen", on_exit=ended))
+    return actions
 
 
 def generate_launch_description():
     """See the top."""
-    arguments = [
-        DeclareLaunchArgument(name, default_value=d, description=text) for name, d, text in ARGUMENTS
-    ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=start)])
+    declared = [DeclareLaunchArgument(name, default_value=d, description=text) for name, d, text in ARGUMENTS]
+    return LaunchDescription([*declared, OpaqueFunction(function=start)])

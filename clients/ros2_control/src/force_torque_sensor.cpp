@@ -1,15 +1,13 @@
 // The plugin `bota_ethercat_hardware/ForceTorqueSensor`: a SensorLoop as a component of ros2_control.
 //
 // Reading goes on while the component is inactive, where trouble is only seen (NaN, `condition`); once active, trouble that
-// lasts makes read() fail. What is done in which condition: gate.hpp; what is refused: identity.hpp, parameters.hpp.
+// lasts makes read() fail. What is done in which condition, and what is refused: sensor_loop.hpp.
 #include <memory>
 #include <string>
-#include <string_view>
 #include <utility>
 #include <vector>
 
 #include "bota_ethercat_hardware/sensor_loop.hpp"
-#include "bota_ethercat_hardware/signals.hpp"
 #include "hardware_interface/sensor_interface.hpp"
 #include "pluginlib/class_list_macros.hpp"
 #include "rclcpp/rclcpp.hpp"
@@ -24,10 +22,9 @@ public:
     CallbackReturn on_init(const hardware_interface::HardwareComponentInterfaceParams& params) override {
         if (SensorInterface::on_init(params) != CallbackReturn::SUCCESS) return CallbackReturn::ERROR;
         parameters_ = Parameters();
-        std::string wrong;
+        std::string wrong = take_sensor();
         for (const auto& [name, value] : info_.hardware_parameters)
             if (wrong.empty()) wrong = set_parameter(parameters_, name, value);
-        if (wrong.empty()) wrong = take_sensor();
         return wrong.empty() ? CallbackReturn::SUCCESS : refuse(wrong, CallbackReturn::ERROR);
     }
 
@@ -35,11 +32,9 @@ public:
         handles_.clear();
         for (const auto& interface : info_.sensors[0].state_interfaces)
             handles_.emplace_back(get_state_interface_handle(info_.sensors[0].name + "/" + interface.name), signal(interface.name));
-        loop_.reset();
-        auto loop = std::make_unique<SensorLoop>(parameters_, [this](Level level, const std::string& text) { log(level, text); });
+        loop_ = std::make_unique<SensorLoop>(parameters_, [this](Level level, const std::string& text) { log(level, text); });
         std::string why;
-        if (!loop->open(why)) return refuse(why, CallbackReturn::FAILURE);
-        loop_ = std::move(loop);
+        if (!loop_->open(why)) return loop_.reset(), refuse(why, CallbackReturn::FAILURE);
         introduce();
         return CallbackReturn::SUCCESS;
     }
@@ -60,8 +55,12 @@ public:
         return CallbackReturn::SUCCESS;
     }
 
-    CallbackReturn on_cleanup(const rclcpp_lifecycle::State&) override { return end(); }
-    CallbackReturn on_shutdown(const rclcpp_lifecycle::State&) override { return end(); }
+    CallbackReturn on_cleanup(const rclcpp_lifecycle::State& state) override {
+        loop_.reset();
+        return on_deactivate(state);
+    }
+
+    CallbackReturn on_shutdown(const rclcpp_lifecycle::State& state) override { return on_cleanup(state); }
 
     /// In the control thread if read() has failed, and then twice: the receiving thread is told to end, not waited for.
     CallbackReturn on_error(const rclcpp_lifecycle::State&) override {
@@ -87,9 +86,7 @@ private:
         if (sensor.state_interfaces.empty()) return "the <sensor> " + sensor.name + " has no <state_interface>";
         for (const auto& interface : sensor.state_interfaces) {
             const std::size_t which = signal(interface.name);
-            if (which == kSignals.size())
-                return "there is no state interface \"" + interface.name + "\"" + detail::meant(interface.name, kSignals) +
-                       "; there are: " + detail::listed(kSignals);
+            if (which == kSignals.size()) return detail::unknown("state interface", interface.name, kSignals);
             if (interface.data_type != "double")
                 return "the state interface " + interface.name + " has the data type " + interface.data_type + "; it must be double";
             if (which >= kImu && which < kOrientation) parameters_.wants_imu = true;
@@ -100,9 +97,9 @@ private:
 
     /// Which sensor it is, and what its user should know of it.
     void introduce() {
-        const Identity& sensor = loop_->identity();
+        const SensorInfo& sensor = loop_->sensor();
         const auto rate = detail::text(sensor.rate_hz);
-        log(Level::info, "sensor " + std::to_string(parameters_.sensor) + " is " + detail::named(sensor) + ", " + rate +
+        log(Level::info, "sensor " + std::to_string(parameters_.sensor()) + " is " + detail::named(sensor) + ", " + rate +
                              " Hz; a sample is fresh up to " + detail::text(loop_->max_age()) + " s");
         if (sensor.rate_hz > 0.0 && sensor.rate_hz < 0.99 * info_.rw_rate)
             log(Level::warning, "the sensor gives " + rate + " samples a second and is read " + std::to_string(info_.rw_rate) +
@@ -118,23 +115,15 @@ private:
         for (const auto& [handle, which] : handles_) (void)set_state(handle, values[which], false);
     }
 
-    CallbackReturn end() {
-        is_active_ = false;
-        loop_.reset();
-        return CallbackReturn::SUCCESS;
-    }
-
     CallbackReturn refuse(const std::string& why, CallbackReturn result) {
         log(Level::error, why);
         return result;
     }
 
     void log(Level level, const std::string& text) const {
-        switch (level) {
-            case Level::info: RCLCPP_INFO(get_logger(), "%s", text.c_str()); break;
-            case Level::warning: RCLCPP_WARN(get_logger(), "%s", text.c_str()); break;
-            case Level::error: RCLCPP_ERROR(get_logger(), "%s", text.c_str()); break;
-        }
+        if (level == Level::error) RCLCPP_ERROR(get_logger(), "%s", text.c_str());
+        else if (level == Level::warning) RCLCPP_WARN(get_logger(), "%s", text.c_str());
+        else RCLCPP_INFO(get_logger(), "%s", text.c_str());
     }
 
     Parameters parameters_;

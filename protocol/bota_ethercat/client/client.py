@@ -38,10 +38,8 @@ from bota_ethercat.text.json_text import JsonObject
 
 ANSWER_TIMEOUT_S: Final = 5.0
 _MOST_EVENTS: Final = 1000
-_MOST_READS: Final = 64
-"""Reads in one call, so that it returns whatever arrives."""
-_BACKLOG: Final = 2048
-"""Bytes received at once that are more than any steady stream: more may be waiting."""
+_MOST_READS: Final = 64  # reads in one call, so that it returns whatever arrives
+_BACKLOG: Final = 2048  # bytes received at once that are more than any steady stream: more may be waiting
 _AGAIN_S: Final = 0.5
 _CLOSED: Final = "this client has been closed"
 

@@ -1,6 +1,6 @@
 """What a client knows of one sensor: its newest frame, its newest sample, and what that is worth now.
 
-Conditions, their numbers and the rules are those of the C++ header (`reading.hpp`, `sensor_state.hpp`).
+Conditions, their numbers and the rules are those of the C++ header (`reading.hpp`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 
 _REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
 _CLOCK_TOLERANCE_NS: Final = 1_000_000
-_LEAST_SILENCE_NS: Final = 30_000_000
-"""Three times the pace of REPEATED frames."""
+_LEAST_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
 _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
 _WARNINGS: Final = slice(
     LAYOUTS[min(LAYOUTS)].offsets["warnings"], LAYOUTS[min(LAYOUTS)].offsets["warnings"] + 4
@@ -66,20 +65,14 @@ class Reading(NamedTuple):
 
     condition: Condition
     sensor: int
-    sample: Sample | None
-    """The newest new and valid one; None before the first."""
-    frame: DataMessage | None
-    """What it came in: sequence, stamps, flags."""
-    is_new: bool
-    """No earlier reading had it."""
+    sample: Sample | None  # the newest new and valid one; None before the first
+    frame: DataMessage | None  # what it came in: sequence, stamps, flags
+    is_new: bool  # no earlier reading had it
     age_s: float
     """Of the sample, now; infinity if unknown. From its arrival where the server's clock is not ours."""
-    gap: bool
-    """Samples were lost or withheld, or the connection was made anew, since the reading before."""
-    passed_over: int
-    """New samples since the reading before that came before this one."""
-    warnings_seen: int
-    """Warnings registers of all of them, joined by OR: a warning can last one sample."""
+    gap: bool  # samples were lost or withheld, or the connection was made anew, since the reading before
+    passed_over: int  # new samples since the reading before that came before this one
+    warnings_seen: int  # warnings registers of all of them, joined by OR: a warning can last one sample
 
     @property
     def fresh(self) -> bool:

@@ -12,8 +12,7 @@ import sys
 from pathlib import Path
 from typing import Final, NamedTuple
 
-HIGHEST_PRIORITY: Final = 98
-"""99 is the kernel's own threads'."""
+HIGHEST_PRIORITY: Final = 98  # 99 is the kernel's own threads'
 _MLOCK: Final = 1 | 2 | 4
 """MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT: pages stay in memory once they have been used."""
 _CAP_IPC_LOCK: Final = 14
@@ -23,13 +22,10 @@ _LIMITS: Final = "a file in /etc/security/limits.d"
 class Scheduling(NamedTuple):
     """What a thread was given. As text it is one phrase."""
 
-    priority: int = 0
-    """Of SCHED_FIFO; 0: its scheduling is as it was."""
-    cpu: int | None = None
-    """The CPU that it is pinned to."""
+    priority: int = 0  # of SCHED_FIFO; 0: its scheduling is as it was
+    cpu: int | None = None  # the CPU that it is pinned to
     memory_locked: bool = False
-    refused: tuple[str, ...] = ()
-    """What was not granted, each with what would grant it."""
+    refused: tuple[str, ...] = ()  # what was not granted, each with what would grant it
 
     def __str__(self) -> str:
         """What was granted, then what was not."""

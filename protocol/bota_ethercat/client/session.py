@@ -40,8 +40,7 @@ _LONGEST_RETRY_NS: Final = 1_000_000_000
 _LASTED_NS: Final = 1_000_000_000
 """A connection that lasted this long was a good one: the next attempt follows at once."""
 _MOST_HZ: Final = 1e6
-_MOST_ITEMS: Final = 65536
-"""Kept while nobody takes them; a tare of 20,000 samples needs fewer."""
+_MOST_ITEMS: Final = 65536  # kept while nobody takes them; a tare of 20,000 samples needs fewer
 _HANDSHAKE_NS: Final = 5_000_000_000
 _LEAST_TIMEOUT_S: Final = 0.02
 _TIMEOUT_PERIODS: Final = 5
@@ -51,18 +50,15 @@ class Connected(NamedTuple):
     """A connection was made, and what was asked for is granted."""
 
     description: JsonObject
-    again: bool
-    """It is not the first."""
-    missing: tuple[int, ...]
-    """Sensors that were asked for and are not there."""
+    again: bool  # it is not the first
+    missing: tuple[int, ...]  # sensors that were asked for and are not there
 
 
 class Disconnected(NamedTuple):
     """A connection has ended, or an attempt to make one has failed."""
 
     reason: str
-    reachable: bool
-    """There is a server."""
+    reachable: bool  # there is a server
     was_connected: bool
 
 
@@ -170,7 +166,7 @@ class Session:
                     self._take(now_ns)
                 if message is None:
                     return answer
-                answer += self._hear(message)
+                answer += self._take_json(message)
         except (RemoteProtocolError, BadMessageError) as error:
             raise ConnectionFailedError(f"what came is not this protocol: {printable(error)}") from None
 
@@ -199,10 +195,10 @@ class Session:
             if waiting is future:
                 self._replies.pop(identifier, None)
 
-    def _hear(self, message: JsonObject) -> bytes:
+    def _take_json(self, message: JsonObject) -> bytes:
         """Take a JSON message; what to send."""
         if "event" in message:
-            self._hear_event(message)
+            self._take_event(message)
             return b""
         identifier = message.get("id")
         future = self._replies.pop(identifier, None) if type(identifier) is int else None
@@ -263,7 +259,7 @@ class Session:
                 self.state(position)
             self._take_rate(row)
 
-    def _hear_event(self, message: JsonObject) -> None:
+    def _take_event(self, message: JsonObject) -> None:
         state = self.sensors.get(position) if (position := _position(message)) is not None else None
         if state is not None and message["event"] == Event.SENSOR_LOST:
             state.lost = True

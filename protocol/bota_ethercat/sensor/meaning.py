@@ -1,6 +1,6 @@
-"""What settings mean in words and figures: sampling rate, cut-off frequency, added delay.
+"""What settings mean in words and figures: sampling rate, cut-off frequency, delay.
 
-From the tables of `filters`; what they lack is called not in the table.
+Cut-off frequencies are those of `filters`; what it lacks is called not in the table. Delays are `response`'s.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from bota_ethercat.sensor.filters import (
     ForceTorqueFilter,
     ImuFilter,
 )
+from bota_ethercat.sensor.response import Response, force_torque_response
 from bota_ethercat.settings import SettingValue, rate_divisor, sampling_rate_hz, sinc_length_of
 
 NOT_IN_TABLE: Final = "not in the table"
@@ -84,6 +85,7 @@ class Meaning(NamedTuple):
     """Sampling rate."""
     cutoff_hz: float | None
     """Of force and torque. None with FAST on, which switches between the two cut-offs, and with CHOP on."""
+    force_torque: Response
     acceleration: ImuFilter | None
     angular_rate: ImuFilter | None
 
@@ -93,7 +95,7 @@ class Meaning(NamedTuple):
         cutoff = NOT_IN_TABLE if self.cutoff_hz is None else f"{self.cutoff_hz:g} Hz"
         return [
             f"sampling rate {rate}",
-            f"force and torque: cut-off {cutoff}, added delay {NOT_IN_TABLE}",
+            f"force and torque: cut-off {cutoff}, delay {self.force_torque}",
             f"acceleration: {_or_not(self.acceleration)}",
             f"angular rate: {_or_not(self.angular_rate)}",
         ]
@@ -103,6 +105,8 @@ class Meaning(NamedTuple):
         return {
             "rate_hz": self.rate_hz,
             "cutoff_hz": self.cutoff_hz,
+            "delay_ms": self.force_torque.delay_ms,
+            "delay_source": self.force_torque.source.value,
             "acceleration": self.acceleration._asdict() if self.acceleration else None,
             "angular_rate": self.angular_rate._asdict() if self.angular_rate else None,
         }
@@ -120,6 +124,7 @@ def meaning(settings: Mapping[str, SettingValue], rate_hz: int | None = None) ->
     return Meaning(
         rate_hz or (sampling_rate_hz(length) if length else None),
         row.cutoff_hz(bool(fir)) if row is not None and known else None,
+        force_torque_response(settings, rate_hz),
         ACCELERATION_FILTERS.get(settings.get("acceleration_filter", 0)),
         ANGULAR_RATE_FILTERS.get(settings.get("angular_rate_filter", 0)),
     )

@@ -15,8 +15,7 @@ class SdoType(NamedTuple):
 
     name: str
     aliases: tuple[str, ...]
-    format: str
-    """Empty for text."""
+    format: str  # empty for text
 
     def pack(self, value: object) -> bytes:
         """The bytes of `value`; the text of ValueError is what is allowed."""

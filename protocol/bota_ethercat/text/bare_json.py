@@ -13,8 +13,7 @@ from typing import Final
 from bota_ethercat.errors import RemoteProtocolError
 from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject, encode_json_text, parse_json_object
 
-BARE_JSON_FIRST_BYTE: Final = b"{"
-"""A connection that starts with this byte is a bare JSON connection."""
+BARE_JSON_FIRST_BYTE: Final = b"{"  # A connection that starts with this byte is a bare JSON connection
 
 _NEWLINE: Final = ord("\n")
 

@@ -10,10 +10,8 @@ from bota_ethercat.errors import BadMessageError
 
 JsonObject = dict[str, Any]
 
-MAX_JSON_LENGTH: Final = 65536
-"""Maximum length of a JSON text in a message, bytes."""
-MAX_JSON_DEPTH: Final = 32
-"""Maximum nesting of objects and arrays."""
+MAX_JSON_LENGTH: Final = 65536  # maximum length of a JSON text in a message, bytes
+MAX_JSON_DEPTH: Final = 32  # maximum nesting of objects and arrays
 
 
 def encode_json_text(message: JsonObject) -> bytes:

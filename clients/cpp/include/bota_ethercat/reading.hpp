@@ -1,17 +1,12 @@
-// What a controller asks for and is told: `Options`, `Condition`, `Reading`, `Counters`.
-#ifndef BOTA_ETHERCAT_READING_HPP
-#define BOTA_ETHERCAT_READING_HPP
+// What a controller is told: `Condition`, `Reading`, `Counters`; and what they are made of, `StreamAccounting`, `SensorState`.
+#pragma once
 
-#include <chrono>
-#include <cstddef>
-#include <cstdint>
+#include <array>
+#include <cmath>
+#include <cstring>
 #include <limits>
-#include <string>
-#include <vector>
 
-#include "bota_ethercat/accounting.hpp"
-#include "bota_ethercat/process_data.hpp"
-#include "bota_ethercat/text.hpp"
+#include "bota_ethercat/connection.hpp"
 
 namespace bota_ethercat {
 
@@ -48,33 +43,75 @@ inline const char* to_string(Condition condition) noexcept {
     return "?";
 }
 
-/// What the age of a sample is counted from.
-enum class AgeFrom : std::uint8_t {
-    automatic,  ///< the sample's instant if the server shares this machine's CLOCK_MONOTONIC, its arrival if not
-    instant,    ///< `monotonic_ns`: server and client must share CLOCK_MONOTONIC
-    arrival,    ///< the moment it was read from the socket: a lower bound of the age
+/// What a frame is. The words here and in `StreamCounts` are those of docs/protocol.md.
+enum class FrameKind : std::uint8_t { sample, repeated, invalid, old };
+
+/// Counts of one sensor's frames and samples: `protocol.accounting` in C++.
+struct StreamCounts {
+    std::uint64_t samples = 0;   ///< new and valid ones: `new`, which is taken in C++
+    std::uint64_t repeated = 0;  ///< the sensor has nothing new
+    std::uint64_t invalid = 0;   ///< the working counter was short
+    std::uint64_t old = 0;       ///< duplicates and frames out of order; ignored
+    std::uint64_t restarts = 0;  ///< the server's numbering began again
+    std::uint64_t gaps = 0;      ///< frames with GAP
+    std::uint64_t withheld = 0;  ///< sequence numbers of frames that this client did not read in time
+    std::uint64_t lost = 0;      ///< samples that the server never had; an estimate
+    std::uint64_t skipped = 0;   ///< sequence numbers that `every` and `fresh_only` left out
+
+    std::uint64_t frames() const noexcept { return samples + repeated + invalid + old; }
 };
 
-/// Who makes a connection that was lost anew.
-enum class Reconnect : std::uint8_t {
-    by_itself,  ///< `latest`, `update` and `next`, a non-blocking step in each call
-    when_told,  ///< only `Client::reconnect` and `connect`; without a connection the others just read the clock
-};
+/// Classifies and counts the frames of one sensor.
+class StreamAccounting {
+public:
+    StreamCounts counts;
+    double rate_hz = 0.0;     ///< the sensor's sampling rate, at most 1e6; 0 if it is unknown
+    std::uint32_t every = 1;  ///< as subscribed
+    bool fresh_only = true;
 
-struct Options {
-    std::string host = "localhost";
-    std::uint16_t port = 12001;
-    std::vector<std::uint8_t> sensors{};  ///< positions on the bus; empty = all
-    std::uint32_t every = 1;              ///< one frame in so many
-    bool fresh_only = true;               ///< REPEATED frames only every 10 ms, to show that the sensor is silent
-    ImuUnits imu_units = ImuUnits::g_dps;
-    nanoseconds max_age = std::chrono::milliseconds(10);  ///< an older sample is never `Condition::fresh`
-    bool judge_imu = false;  ///< `Condition` judges acceleration, angular rate and orientation too, not only force and torque
-    Reconnect reconnect = Reconnect::by_itself;
-    nanoseconds reconnect_every = std::chrono::milliseconds(100);  ///< shortest time between two attempts
-    AgeFrom age_from = AgeFrom::automatic;
-    std::size_t max_bytes_per_call = 262144;  ///< that `update` and `latest` read at most; some 2700 frames
-    int receive_buffer = 65536;  ///< SO_RCVBUF: how much old data a stall can leave; at least 16384, 0 = the system's
+    /// A new subscription begins: nothing before its first frame counts as missing, unless it has GAP.
+    void begin() noexcept { begun_ = has_new_ = false; }
+    /// Whether a frame has come since.
+    bool begun() const noexcept { return begun_; }
+
+    FrameKind take(std::uint64_t sequence, std::uint64_t monotonic_ns, std::uint8_t flags) noexcept {
+        std::uint64_t jump = 0;
+        if (begun_ && sequence <= sequence_) {
+            if (monotonic_ns <= monotonic_ns_) return ++counts.old, FrameKind::old;
+            ++counts.restarts;
+        } else if (begun_) {
+            jump = sequence - sequence_ - 1;
+        }
+        if (jump > 0 || (flags & kGap) != 0) count_missing(jump, monotonic_ns, (flags & kGap) != 0);
+        sequence_ = sequence;
+        monotonic_ns_ = monotonic_ns;
+        begun_ = true;
+        if ((flags & kInvalid) != 0) return ++counts.invalid, FrameKind::invalid;
+        if ((flags & kRepeated) != 0) return ++counts.repeated, FrameKind::repeated;
+        new_ns_ = monotonic_ns;
+        has_new_ = true;
+        return ++counts.samples, FrameKind::sample;
+    }
+
+private:
+    void count_missing(std::uint64_t jump, std::uint64_t monotonic_ns, bool gap) noexcept {
+        const std::uint64_t between = every > 0 ? every - 1 : 0;
+        const std::uint64_t skipped = (fresh_only && !gap) || jump < between ? jump : between;
+        counts.skipped += skipped;
+        counts.withheld += jump - skipped;
+        if (!gap) return;
+        ++counts.gaps;
+        std::uint64_t lost = jump > skipped ? 0 : 1;
+        if (has_new_ && rate_hz > 0.0 && monotonic_ns > new_ns_) {
+            const double periods = std::nearbyint(static_cast<double>(monotonic_ns - new_ns_) * rate_hz / 1e9);
+            const std::uint64_t room = periods < 1.0 ? 0 : static_cast<std::uint64_t>(periods) - 1;
+            if (room > jump && room - jump > lost) lost = room - jump;
+        }
+        counts.lost += lost;
+    }
+
+    std::uint64_t sequence_ = 0, monotonic_ns_ = 0, new_ns_ = 0;
+    bool begun_ = false, has_new_ = false;
 };
 
 /// What is known of a sensor at the moment of a call.
@@ -114,6 +151,106 @@ struct Counters : StreamCounts {
     std::uint64_t passed_over = 0;  ///< samples that `latest` left out for a newer one
 };
 
-}  // namespace bota_ethercat
+namespace detail {
 
-#endif  // BOTA_ETHERCAT_READING_HPP
+/// What a client knows of one sensor: its newest frame, its newest sample, and what a reading makes of them. As in
+/// protocol/bota_ethercat/client/reading.py.
+class SensorState {
+public:
+    StreamAccounting accounting;
+    bool lost = false;                  // says the server
+    std::uint64_t all_passed_over = 0;  // in readings so far
+
+    /// The sensor of a new connection.
+    void begin(std::uint32_t every, bool fresh_only) noexcept {
+        anew_ = accounting.counts.frames() > 0;  // nobody knows what was lost meanwhile
+        accounting.begin();
+        accounting.every = every;
+        accounting.fresh_only = fresh_only;
+        lost = false;
+    }
+
+    /// A frame that was received at `received_ns`; `same_clock`: its stamps are of our CLOCK_MONOTONIC. GAP of a frame that
+    /// brings no sample is carried to the next that does.
+    void take(const Frame& frame, std::int64_t received_ns, bool same_clock) noexcept {
+        const std::uint64_t restarts = accounting.counts.restarts;
+        const FrameKind kind = accounting.take(frame.sequence, frame.monotonic_ns, frame.flags);
+        if (kind == FrameKind::old) return;
+        if (anew_ || accounting.counts.restarts > restarts || (frame.flags & kGap) != 0) carried_gap_ = true;
+        anew_ = false;
+        next_.flags = frame.flags;
+        next_.wkc = frame.wkc;
+        received_ns_ = received_ns;
+        if (kind != FrameKind::sample) return;
+        next_.passed_over += next_.is_new ? 1 : 0;
+        next_.has_sample = next_.is_new = true;
+        next_.sequence = frame.sequence;
+        next_.stamp_ns = frame.stamp_ns;
+        next_.monotonic_ns = frame.monotonic_ns;
+        next_.received_ns = received_ns;
+        next_.age_is_lower_bound = !same_clock;  // another connection may lead to another machine
+        next_.warnings_seen |= little_endian<std::uint32_t>(frame.process_data + kWarningsAt);
+        next_.gap = next_.gap || carried_gap_;
+        std::memcpy(process_data_.data(), frame.process_data, frame.size);
+        size_ = frame.size;
+        carried_gap_ = lost = false;
+    }
+
+    /// What this sensor knows, as of `now_ns`; the next reading begins.
+    Reading read(const Options& options, bool connected, std::int64_t now_ns) noexcept {
+        Reading reading = next_;
+        reading.gap = next_.gap || carried_gap_;
+        reading.withheld = accounting.counts.withheld - read_.withheld;
+        reading.lost = accounting.counts.lost - read_.lost;
+        read_ = accounting.counts;
+        all_passed_over += next_.passed_over;
+        next_.is_new = next_.gap = false;
+        next_.passed_over = next_.warnings_seen = 0;
+        bool ahead = false;
+        if (reading.has_sample) {
+            (void)decode(process_data_.data(), size_, options.imu_units, reading.sample);
+            const auto received = static_cast<std::uint64_t>(reading.received_ns);
+            const auto from = reading.age_is_lower_bound ? received : reading.monotonic_ns;
+            const auto now = static_cast<std::uint64_t>(now_ns);
+            ahead = from > now && from - now > kClockToleranceNs;
+            if (!ahead) reading.age_ns = from < now ? static_cast<std::int64_t>(now - from) : 0;
+        }
+        const std::int64_t max_age_ns = options.max_age.count();
+        const bool recent = reading.has_sample && !ahead && reading.age_ns <= max_age_ns;
+        reading.condition = recent ? worth(reading.sample, options.judge_imu) : why_old(max_age_ns, connected, now_ns, ahead);
+        return reading;
+    }
+
+private:
+    static constexpr std::uint64_t kClockToleranceNs = 1'000'000;
+    static constexpr std::int64_t kLeastSilenceNs = 30'000'000;  // three times the pace of REPEATED frames
+
+    /// What a recent sample is worth.
+    static Condition worth(const Sample& sample, bool judge_imu) noexcept {
+        if (!sample.wrench_is_finite() || (judge_imu && !sample.imu_is_finite())) return Condition::not_finite;
+        if (sample.wrench_is_saturated() || (judge_imu && sample.imu_is_saturated())) return Condition::saturated;
+        return Condition::fresh;
+    }
+
+    /// Why there is no recent sample.
+    Condition why_old(std::int64_t max_age_ns, bool connected, std::int64_t now_ns, bool ahead) const noexcept {
+        if (!connected) return Condition::disconnected;
+        if (lost) return Condition::sensor_lost;
+        const std::int64_t silence_ns = now_ns - received_ns_;
+        if (!accounting.begun() || (silence_ns >= kLeastSilenceNs && silence_ns / 2 >= max_age_ns)) return Condition::silent;
+        if ((next_.flags & kInvalid) != 0) return Condition::invalid;
+        if ((next_.flags & kRepeated) != 0) return Condition::repeated;
+        return ahead ? Condition::bad_clock : Condition::late;
+    }
+
+    Reading next_;  // without what depends on the moment of the call
+    std::array<std::uint8_t, kPdoSizeWithOrientation> process_data_{};  // of the newest sample
+    std::size_t size_ = 0;
+    std::int64_t received_ns_ = 0;  // of the newest frame of any kind
+    bool anew_ = false, carried_gap_ = false;
+    StreamCounts read_;  // when the last reading was taken
+};
+
+}  // namespace detail
+
+}  // namespace bota_ethercat

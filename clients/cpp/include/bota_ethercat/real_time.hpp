@@ -1,7 +1,6 @@
 // Real-time scheduling for the calling thread: SCHED_FIFO, a CPU, memory that is never paged out; protocol/client/real_time.py
 // in C++. Each right is used if the system allows it; what is not allowed is said, with what would allow it.
-#ifndef BOTA_ETHERCAT_REAL_TIME_HPP
-#define BOTA_ETHERCAT_REAL_TIME_HPP
+#pragma once
 
 #include <pthread.h>
 #include <sched.h>
@@ -21,24 +20,6 @@ struct Scheduling {
     std::string refused;         ///< what was not granted, each with what would grant it; empty: nothing
 };
 
-namespace detail {
-
-inline std::string grants_priority(int priority) {
-    rlimit limit{};
-    if (getrlimit(RLIMIT_RTPRIO, &limit) == 0 && limit.rlim_cur >= static_cast<rlim_t>(priority))
-        return "a container, a control group or RestrictRealtime= forbids it";
-    const std::string number = std::to_string(priority);
-    return "'rtprio " + number + "' in a file in /etc/security/limits.d, LimitRTPRIO=" + number + " in a service's unit";
-}
-
-/// Not up to a limit: beyond it every allocation would fail.
-inline bool may_lock_all() noexcept {
-    rlimit limit{};
-    return geteuid() == 0 || (getrlimit(RLIMIT_MEMLOCK, &limit) == 0 && limit.rlim_cur == RLIM_INFINITY);
-}
-
-}  // namespace detail
-
 /// Give the calling thread SCHED_FIFO `priority` (1 to 98; 0: ordinary scheduling), pin it to `cpu` (-1: none), and with
 /// `lock_memory` lock the process's memory, current and future. Threads that it starts later inherit priority and CPU.
 /// Allocates: for the start of a program or thread, not for a loop.
@@ -55,9 +36,18 @@ inline Scheduling make_real_time(int priority, int cpu = -1, bool lock_memory = 
     sched_param wanted{};
     wanted.sched_priority = priority;
     if (pthread_setschedparam(pthread_self(), priority > 0 ? SCHED_FIFO : SCHED_OTHER, &wanted) == 0) given.priority = priority;
-    else refuse("SCHED_FIFO " + std::to_string(priority) + " (" + detail::grants_priority(priority) + ")");
+    else {
+        rlimit limit{};
+        const std::string number = std::to_string(priority);
+        const bool may = getrlimit(RLIMIT_RTPRIO, &limit) == 0 && limit.rlim_cur >= static_cast<rlim_t>(priority);
+        refuse("SCHED_FIFO " + number + (may ? " (a container, a control group or RestrictRealtime= forbids it)"
+                                             : " ('rtprio " + number + "' in a file in /etc/security/limits.d, LimitRTPRIO=" +
+                                                   number + " in a service's unit)"));
+    }
     if (lock_memory) {
-        given.memory_locked = detail::may_lock_all() && mlockall(MCL_CURRENT | MCL_FUTURE) == 0;
+        rlimit limit{};  // not up to a limit: beyond it every allocation would fail
+        const bool may = geteuid() == 0 || (getrlimit(RLIMIT_MEMLOCK, &limit) == 0 && limit.rlim_cur == RLIM_INFINITY);
+        given.memory_locked = may && mlockall(MCL_CURRENT | MCL_FUTURE) == 0;
         if (!given.memory_locked)
             refuse("locked memory ('memlock unlimited' in a file in /etc/security/limits.d, LimitMEMLOCK=infinity)");
     }
@@ -65,5 +55,3 @@ inline Scheduling make_real_time(int priority, int cpu = -1, bool lock_memory = 
 }
 
 }  // namespace bota_ethercat
-
-#endif  // BOTA_ETHERCAT_REAL_TIME_HPP

@@ -2,10 +2,7 @@
 #pragma once
 
 #include <algorithm>
-#include <array>
 #include <charconv>
-#include <chrono>
-#include <cmath>
 #include <cstdint>
 #include <limits>
 #include <optional>
@@ -17,8 +14,6 @@
 
 namespace bota_ethercat_hardware {
 
-using std::chrono::nanoseconds;
-
 /// What controllers see while there is no sample to act on.
 enum class Reaction : std::uint8_t {
     error,  ///< read() fails at once: the controller manager stops the controllers of this sensor
@@ -27,15 +22,11 @@ enum class Reaction : std::uint8_t {
     use,    ///< the sample as it is
 };
 
-constexpr std::string_view to_string(Reaction reaction) noexcept {
-    constexpr std::string_view kNames[] = {"error", "nan", "hold", "use"};
-    return kNames[static_cast<int>(reaction)];
-}
+inline constexpr const char* kReactions[] = {"error", "nan", "hold", "use"};
+constexpr const char* name(Reaction reaction) noexcept { return kReactions[static_cast<int>(reaction)]; }
 
 struct Parameters {
-    std::string host = "localhost";
-    std::uint16_t port = 12001;
-    std::uint8_t sensor = 0;                 ///< position on the bus
+    bota_ethercat::Options client{"localhost", 12001, {0}};  ///< host, port, the position on the bus, and imu_units
     std::optional<std::uint32_t> serial;     ///< another sensor at that position is refused
     std::optional<double> max_age;           ///< s; none: four sample periods, at least 0.01
     Reaction on_stale = Reaction::nan;       ///< no sample younger than `max_age`
@@ -45,17 +36,17 @@ struct Parameters {
     double connect_timeout = 5.0;            ///< s that on_configure waits for the server
     bool on_activate_tare = false;
     int receive_priority = 51;               ///< SCHED_FIFO, of the receiving thread, above a controller manager's 50; 0: none
-    bota_ethercat::ImuUnits imu_raw_units = bota_ethercat::ImuUnits::g_dps;
     // From the <sensor> tag:
     bool wants_imu = false, wants_orientation = false;
+
+    std::uint8_t sensor() const noexcept { return client.sensors.front(); }
 };
 
 namespace detail {
 
 inline std::string_view stripped(std::string_view text) noexcept {
     constexpr std::string_view kBlanks = " \t\r\n";
-    const std::size_t from = text.find_first_not_of(kBlanks);
-    if (from == std::string_view::npos) return {};
+    const std::size_t from = std::min(text.find_first_not_of(kBlanks), text.size());
     return text.substr(from, text.find_last_not_of(kBlanks) + 1 - from);
 }
 
@@ -69,29 +60,23 @@ bool number(std::string_view text, Number least, Number most, Number& into) noex
     return true;
 }
 
-inline bool flag(std::string_view text, bool& into) noexcept {  // xacro writes them as Python does
-    if (text != "true" && text != "True" && text != "false" && text != "False") return false;
-    into = text.size() == 4;
-    return true;
-}
-
 inline bool reaction(std::string_view text, Reaction most, Reaction& into) noexcept {
-    for (int i = 0; i <= static_cast<int>(most); ++i)
-        if (text == to_string(static_cast<Reaction>(i))) return into = static_cast<Reaction>(i), true;
-    return false;
+    const auto found = static_cast<Reaction>(std::find(std::begin(kReactions), std::end(kReactions), text) - kReactions);
+    return found <= most && (into = found, true);
 }
 
 struct Row {
-    std::string_view name, allowed;
+    const char *name, *allowed;
     bool (*parse)(std::string_view text, Parameters& into);
 };
 
 using P = Parameters;
 using S = std::string_view;
 inline constexpr Row kRows[] = {
-    {"host", "a host name or address", [](S t, P& p) { return !t.empty() && (p.host = t, true); }},
-    {"port", "1 to 65535", [](S t, P& p) { return number<std::uint16_t>(t, 1, 65535, p.port); }},
-    {"sensor", "a position on the bus, 0 to 255", [](S t, P& p) { return number<std::uint8_t>(t, 0, 255, p.sensor); }},
+    {"host", "a host name or address", [](S t, P& p) { return !t.empty() && (p.client.host = t, true); }},
+    {"port", "1 to 65535", [](S t, P& p) { return number<std::uint16_t>(t, 1, 65535, p.client.port); }},
+    {"sensor", "a position on the bus, 0 to 255",
+     [](S t, P& p) { return number<std::uint8_t>(t, 0, 255, p.client.sensors[0]); }},
     {"serial", "a serial number in decimal digits",
      [](S t, P& p) { return number<std::uint32_t>(t, 0, 0xFFFFFFFF, p.serial.emplace()); }},
     {"max_age", "0.001 to 10 (s)", [](S t, P& p) { return number(t, 0.001, 10.0, p.max_age.emplace()); }},
@@ -101,62 +86,44 @@ inline constexpr Row kRows[] = {
     {"error_after", "0 or more (s), or inf for never",
      [](S t, P& p) { return number(t, 0.0, std::numeric_limits<double>::infinity(), p.error_after); }},
     {"connect_timeout", "0 to 600 (s)", [](S t, P& p) { return number(t, 0.0, 600.0, p.connect_timeout); }},
-    {"on_activate_tare", "true or false", [](S t, P& p) { return flag(t, p.on_activate_tare); }},
+    {"on_activate_tare", "true or false", [](S t, P& p) {  // xacro writes them as Python does
+         return p.on_activate_tare = t == "true" || t == "True", p.on_activate_tare || t == "false" || t == "False";
+     }},
     {"receive_priority", "0 to 99", [](S t, P& p) { return number(t, 0, 99, p.receive_priority); }},
     {"imu_raw_units", "g_dps or si",
-     [](S t, P& p) {
-         p.imu_raw_units = t == "si" ? bota_ethercat::ImuUnits::si : bota_ethercat::ImuUnits::g_dps;
-         return t == "si" || t == "g_dps";
-     }},
+     [](S t, P& p) { return p.client.imu_units = static_cast<bota_ethercat::ImuUnits>(t == "si"), t == "si" || t == "g_dps"; }},
 };
 
-/// How many letters must be changed, added or left out.
-inline std::size_t distance(std::string_view a, std::string_view b) {
-    std::vector<std::size_t> row(b.size() + 1);
-    for (std::size_t j = 0; j <= b.size(); ++j) row[j] = j;
-    for (std::size_t i = 1; i <= a.size(); ++i) {
-        std::size_t diagonal = row[0]++;
-        for (std::size_t j = 1; j <= b.size(); ++j) {
-            const std::size_t above = row[j];
-            row[j] = std::min({above + 1, row[j - 1] + 1, diagonal + (a[i - 1] == b[j - 1] ? 0 : 1)});
-            diagonal = above;
-        }
+/// Whether two names differ in one place only, by one or two letters.
+inline bool are_near(std::string_view a, std::string_view b) noexcept {
+    for (; !a.empty() && !b.empty() && a.front() == b.front(); b.remove_prefix(1)) a.remove_prefix(1);
+    for (; !a.empty() && !b.empty() && a.back() == b.back(); b.remove_suffix(1)) a.remove_suffix(1);
+    return std::max(a.size(), b.size()) <= 2;
+}
+
+/// That there is nothing of this kind and name; what there is, and if one has nearly that name, whether it was meant.
+template <typename Names>
+std::string unknown(std::string_view kind, std::string_view name, const Names& names) {
+    std::string meant, all;
+    for (const std::string_view each : names) {
+        if (are_near(name, each)) meant = " (did you mean \"" + std::string(each) + "\"?)";
+        all.append(all.empty() ? "" : ", ").append(each);
     }
-    return row[b.size()];
-}
-
-/// " (did you mean "NAME"?)", if there is one of nearly that name.
-template <typename Names>
-std::string meant(std::string_view name, const Names& names) {
-    std::size_t least = 1 + name.size() / 3;
-    std::string found;
-    for (const std::string_view each : names)
-        if (const std::size_t found_at = distance(name, each); found_at <= least) {
-            found = " (did you mean \"" + std::string(each) + "\"?)";
-            least = found_at - (found_at > 0 ? 1 : 0);
-        }
-    return found;
-}
-
-template <typename Names>
-std::string listed(const Names& names) {
-    std::string text;
-    for (const std::string_view each : names) text.append(text.empty() ? "" : ", ").append(each);
-    return text;
+    return "there is no " + std::string(kind) + " \"" + std::string(name) + "\"" + meant + "; there are: " + all;
 }
 
 }  // namespace detail
 
 /// Take one parameter; what is wrong with it, or nothing.
 inline std::string set_parameter(Parameters& parameters, std::string_view name, std::string_view value) {
-    std::array<std::string_view, std::size(detail::kRows)> names{};
-    std::transform(std::begin(detail::kRows), std::end(detail::kRows), names.begin(), [](const auto& row) { return row.name; });
-    const auto row = std::find_if(std::begin(detail::kRows), std::end(detail::kRows), [&](const auto& r) { return r.name == name; });
-    if (row == std::end(detail::kRows))
-        return "there is no parameter \"" + std::string(name) + "\"" + detail::meant(name, names) +
-               "; there are: " + detail::listed(names);
-    if (row->parse(detail::stripped(value), parameters)) return {};
-    return "the parameter " + std::string(name) + " is \"" + std::string(value) + "\"; allowed: " + std::string(row->allowed);
+    std::vector<std::string_view> names;
+    for (const detail::Row& row : detail::kRows) {
+        names.push_back(row.name);
+        if (row.name != name) continue;
+        if (row.parse(detail::stripped(value), parameters)) return {};
+        return "the parameter " + std::string(name) + " is \"" + std::string(value) + "\"; allowed: " + row.allowed;
+    }
+    return detail::unknown("parameter", name, names);
 }
 
 }  // namespace bota_ethercat_hardware

@@ -1,0 +1,141 @@
+"""What the sensor's filters do to a signal: delay and magnitude of each channel, and how that is known.
+
+Force and torque: Bota publishes rate and -3 dB point (`filters`), no delay. With the FIR filter off the
+point is 0.262 of the rate, that of a third-order sinc filter, which delays by 1.5 sample periods. With FIR
+on it is 0.0394. Names of the settings and rates are those of the AD7730 and AD7731 converters, whose second
+filter has 22 taps and linear phase: their settling time is 22 periods where that of the first filter is one
+(AD7731, Table III). For the same filter in its IP3102, Beckhoff gives -3 dB at 0.0390 of the rate and 64.5
+dB from 0.140 on. A Kaiser window of 22 taps with beta 8.8 behind a third-order sinc filter has -3 dB at
+0.0390 and 65 dB from 0.140 on.
+
+Accelerometer and gyroscope: bandwidth and delay are Bota's tables, which are those of an MPU-9250. Their
+magnitude is that of a first-order low-pass filter of this bandwidth, which is an approximation.
+"""
+
+from __future__ import annotations
+
+import cmath
+import functools
+import math
+from collections.abc import Callable, Mapping
+from enum import Enum
+from typing import Final, NamedTuple
+
+from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS, ImuFilter
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
+
+SINC_ORDER: Final = 3
+FIR_TAPS: Final = 22  # symmetrical
+_KAISER_BETA: Final = 8.8
+
+
+class Source(Enum):
+    """How a delay is known."""
+
+    PUBLISHED = "published by Bota"
+    DERIVED = "derived from the cut-off frequency"
+    FIR = "derived from the converter's data sheet, ± 0.5 periods"
+    FAST = "unknown: FAST switches the FIR filter off on steps"
+    CHOP = "unknown: CHOP"
+    UNKNOWN = "unknown"
+
+
+class Response(NamedTuple):
+    """Of one channel."""
+
+    delay_s: float | None  # group delay, the same at all frequencies that pass; None: unknown
+    source: Source
+    gain: Callable[[float], float]  # magnitude at a frequency in Hz; 1 at 0
+
+    @property
+    def delay_ms(self) -> float | None:
+        """Rounded, for display."""
+        return None if self.delay_s is None else round(self.delay_s * 1e3, 2)
+
+    def phase_deg(self, hz: float) -> float | None:
+        """By how much a sine of this frequency comes late, degrees; None: unknown."""
+        return None if self.delay_s is None else 360.0 * hz * self.delay_s
+
+    def __str__(self) -> str:
+        """The delay, for display."""
+        return self.source.value if self.delay_s is None else f"{self.delay_ms:g} ms ({self.source.value})"
+
+
+def force_torque_response(settings: Mapping[str, SettingValue], rate_hz: float | None = None) -> Response:
+    """Of force and torque, sampled at `rate_hz`, by default what `sinc_length` implies."""
+    length = settings.get("sinc_length") or 0
+    rate = rate_hz or (BASE_SAMPLING_RATE_HZ / length if length else 0.0)
+    if not rate:
+        return Response(None, Source.UNKNOWN, lambda _: 1.0)
+    chop, fir, fast = settings.get("chop"), settings.get("fir"), settings.get("fast")
+
+    def gain(hz: float) -> float:
+        return sinc_gain(hz / rate) * (fir_gain(hz / rate) if fir else 1.0)
+
+    if chop or fir is None:
+        return Response(None, Source.CHOP if chop else Source.UNKNOWN, gain)
+    if fir and fast:
+        return Response(None, Source.FAST, gain)
+    periods = SINC_ORDER / 2 + ((FIR_TAPS - 1) / 2 if fir else 0.0)
+    return Response(periods / rate, Source.FIR if fir else Source.DERIVED, gain)
+
+
+def acceleration_response(settings: Mapping[str, SettingValue]) -> Response:
+    """Of the accelerometer."""
+    return _imu(ACCELERATION_FILTERS.get(settings.get("acceleration_filter", 0)))
+
+
+def angular_rate_response(settings: Mapping[str, SettingValue]) -> Response:
+    """Of the gyroscope."""
+    return _imu(ANGULAR_RATE_FILTERS.get(settings.get("angular_rate_filter", 0)))
+
+
+def force_lag_s(settings: Mapping[str, SettingValue], rate_hz: float | None = None) -> float | None:
+    """By how much force and torque are later than the accelerometer; negative: earlier; None: unknown."""
+    force_torque, imu = force_torque_response(settings, rate_hz), acceleration_response(settings)
+    if force_torque.delay_s is None or imu.delay_s is None:
+        return None
+    return force_torque.delay_s - imu.delay_s
+
+
+def delays_ms(settings: Mapping[str, SettingValue], rate_hz: float | None = None) -> dict[str, float | None]:
+    """Of all channels, as `describe` gives them; None: unknown."""
+    return {
+        "force_torque": force_torque_response(settings, rate_hz).delay_ms,
+        "acceleration": acceleration_response(settings).delay_ms,
+        "angular_rate": angular_rate_response(settings).delay_ms,
+    }
+
+
+def _imu(row: ImuFilter | None) -> Response:
+    if row is None:
+        return Response(None, Source.UNKNOWN, lambda _: 1.0)
+    cutoff_hz = row.bandwidth_hz
+    return Response(row.delay_ms * 1e-3, Source.PUBLISHED, lambda hz: 1 / math.hypot(1.0, hz / cutoff_hz))
+
+
+def sinc_gain(share: float) -> float:
+    """Magnitude of the sinc filter at this share of the sampling rate."""
+    return 1.0 if share == 0 else abs(math.sin(math.pi * share) / (math.pi * share)) ** SINC_ORDER
+
+
+def fir_gain(share: float) -> float:
+    """Magnitude of the FIR filter at this share of the sampling rate."""
+    return abs(sum(tap * cmath.exp(-2j * math.pi * share * number) for number, tap in enumerate(fir_taps())))
+
+
+@functools.cache
+def fir_taps() -> tuple[float, ...]:
+    """The FIR filter's coefficients; their sum is 1."""
+    window = [kaiser(2 * k / (FIR_TAPS - 1) - 1) for k in range(FIR_TAPS)]
+    return tuple(value / sum(window) for value in window)
+
+
+def kaiser(x: float) -> float:
+    """The FIR filter's window, 1 in its middle, at x from -1 to 1; 0 beyond."""
+    return _bessel(_KAISER_BETA * math.sqrt(1 - x * x)) / _bessel(_KAISER_BETA) if -1 <= x <= 1 else 0.0
+
+
+def _bessel(x: float) -> float:
+    """The modified Bessel function I0."""
+    return sum((x / 2) ** (2 * k) / math.factorial(k) ** 2 for k in range(30))
